@@ -1,0 +1,243 @@
+"""A map: which cell is floor, wall, start, goal or trap.
+
+Maps are text, one line a row and one sign a cell:
+
+    S  start (several: each episode draws one of them, uniformly)
+    G  goal, ends the episode
+    T  trap, ends the episode
+    #  wall, cannot be entered
+    .  floor
+
+`Layout` is the checked, immutable form. Whatever holds one can rely on it: there is a start and a goal, no
+cell is two things, and every start can reach a goal without stepping on a trap.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.resources import files
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+from gridworld.errors import InputError
+
+Cell = tuple[int, int]  # (row, column), both from 0, the top-left cell first
+
+MAX_CELLS = 512 * 512
+MOVES: tuple[Cell, ...] = ((-1, 0), (0, 1), (1, 0), (0, -1))  # up, right, down, left: action 0, 1, 2, 3
+
+CLASSIC = "classic"
+_TILES = "SGT#."
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A checked map. Raises `InputError` where it could not be played."""
+
+    name: str
+    num_rows: int
+    num_cols: int
+    starts: tuple[Cell, ...]
+    goals: tuple[Cell, ...]
+    traps: tuple[Cell, ...] = ()
+    walls: frozenset[Cell] = frozenset()
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+    @cached_property
+    def terminals(self) -> tuple[Cell, ...]:
+        """Cells that end an episode, goals first."""
+        return self.goals + self.traps
+
+    def cells(self) -> Iterable[Cell]:
+        """All cells in the order of their state numbers."""
+        return ((row, col) for row in range(self.num_rows) for col in range(self.num_cols))
+
+    def state(self, cell: Cell) -> int:
+        """The cell's state number, row by row from the top left."""
+        return cell[0] * self.num_cols + cell[1]
+
+    def text(self) -> str:
+        """The map as text, one line a row, no newline at the end; `parse` reads it back."""
+        grid = [["."] * self.num_cols for _ in range(self.num_rows)]
+        for tile, cells in zip("SGT#", (self.starts, self.goals, self.traps, self.walls), strict=True):
+            for row, col in cells:
+                grid[row][col] = tile
+        return "\n".join(map("".join, grid))
+
+
+def classic(num_rows: int = 5, num_cols: int = 6) -> Layout:
+    """The GridWorld of the tutorial: start in the corner, a goal with a trap on three of its sides.
+
+    Only the cell right of the goal leads into it, so the grid needs a row above and below the traps to walk
+    around them: at least 4 rows and 4 columns.
+    """
+    num_rows, num_cols = positive_int("num_rows", num_rows), positive_int("num_cols", num_cols)
+    if num_rows < 4 or num_cols < 4:
+        raise InputError(
+            f"layout classic: {num_rows} rows and {num_cols} columns cannot hold a goal and three traps "
+            "with a way around them; give at least 4 rows and 4 columns"
+        )
+    row, col = num_rows // 2, num_cols - 2
+    traps = ((row + 1, col), (row, col - 1), (row - 1, col))
+    return Layout(CLASSIC, num_rows, num_cols, starts=((0, 0),), goals=((row, col),), traps=traps)
+
+
+def parse(text: str, name: str) -> Layout:
+    """Read a map from its text. `name` is what error messages call it."""
+    lines = [line.rstrip() for line in text.splitlines()]
+    while lines and not lines[-1]:
+        lines.pop()
+    if not lines:
+        raise InputError(f"{name}: the map is empty; it needs at least a start 'S' and a goal 'G'")
+    _check_size(name, len(lines), len(lines[0]))
+    found: dict[str, list[Cell]] = {tile: [] for tile in _TILES}
+    for row, line in enumerate(lines):
+        for col, tile in enumerate(line):
+            if tile not in found:
+                raise InputError(
+                    f"{name}: row {row + 1}, column {col + 1}: unknown tile {tile!r}; "
+                    "known are S (start), G (goal), T (trap), # (wall) and . (floor)"
+                )
+            found[tile].append((row, col))
+        if len(line) != len(lines[0]):
+            raise InputError(
+                f"{name}: row {row + 1} has {len(line)} columns, row 1 has {len(lines[0])}; "
+                "all rows must be equally long"
+            )
+    return Layout(
+        name=name,
+        num_rows=len(lines),
+        num_cols=len(lines[0]),
+        starts=tuple(found["S"]),
+        goals=tuple(found["G"]),
+        traps=tuple(found["T"]),
+        walls=frozenset(found["#"]),
+    )
+
+
+def load(layout: str | PathLike[str] | Layout, num_rows: int = 5, num_cols: int = 6) -> Layout:
+    """The layout of that name (`classic` or a shipped map), or the one in a file, or the one given.
+
+    `num_rows` and `num_cols` size `classic`. A map has its own size: other numbers than the default ones
+    must then agree with it.
+    """
+    if layout == CLASSIC:
+        return classic(num_rows, num_cols)
+    loaded = layout if isinstance(layout, Layout) else _read(layout)
+    for what, asked, default, actual in (
+        ("num_rows", num_rows, 5, loaded.num_rows),
+        ("num_cols", num_cols, 6, loaded.num_cols),
+    ):
+        if positive_int(what, asked) not in (default, actual):
+            raise InputError(
+                f"{what}={asked}: the map {loaded.name} has {actual}; leave {what} out, "
+                "it only sizes the layout classic"
+            )
+    return loaded
+
+
+def shipped_layouts() -> tuple[str, ...]:
+    """Names of all layouts that come with the package."""
+    maps = (entry.name for entry in files("gridworld").joinpath("layouts").iterdir())
+    return tuple(sorted([CLASSIC, *(name.removesuffix(".txt") for name in maps if name.endswith(".txt"))]))
+
+
+def positive_int(what: str, value: Any) -> int:
+    """`value` as an int of at least 1; numpy's integers are fine, bools, floats and strings are not."""
+    try:
+        number = None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or number < 1:
+        raise InputError(f"{what}={value!r}: must be a whole number of at least 1")
+    return number
+
+
+def _read(layout: str | PathLike[str]) -> Layout:
+    try:
+        given = fspath(layout)
+    except TypeError:
+        given = None
+    if not isinstance(given, str) or not given:
+        raise InputError(f"layout={layout!r}: must be a layout's name, a map file's path or a Layout")
+    if given in shipped_layouts():
+        return parse(files("gridworld").joinpath("layouts", f"{given}.txt").read_text("utf-8"), name=given)
+    path = Path(given)
+    try:
+        # A row may end in blanks or \r\n; far more than that is no map, and is not read.
+        with path.open("rb") as file:
+            raw = file.read(4 * MAX_CELLS + 1)
+    except (FileNotFoundError, ValueError, OSError) as error:
+        if isinstance(error, FileNotFoundError | ValueError | NotADirectoryError):
+            reason = f"neither a shipped layout ({', '.join(shipped_layouts())}) nor a file"
+        else:
+            reason = f"the map cannot be read ({error.strerror}); give a readable text file"
+        raise InputError(f"layout {given!r}: {reason}") from None
+    if len(raw) > 4 * MAX_CELLS:
+        raise InputError(f"{given}: the map is too large; at most {MAX_CELLS} cells fit")
+    try:
+        return parse(raw.decode("utf-8-sig"), name=given)
+    except UnicodeDecodeError as error:
+        raise InputError(f"{given}: not a text file (byte {error.start + 1} is not UTF-8)") from None
+
+
+def _check_size(name: str, num_rows: int, num_cols: int) -> None:
+    if num_rows * num_cols > MAX_CELLS:
+        raise InputError(
+            f"{name}: {num_rows} rows of {num_cols} columns are too large; at most {MAX_CELLS} cells fit"
+        )
+
+
+def _check(layout: Layout) -> None:
+    name = layout.name
+    positive_int("num_rows", layout.num_rows)
+    positive_int("num_cols", layout.num_cols)
+    _check_size(name, layout.num_rows, layout.num_cols)
+    if not layout.starts:
+        raise InputError(f"{name}: there is no start; mark at least one cell with 'S'")
+    if not layout.goals:
+        raise InputError(f"{name}: there is no goal; mark at least one cell with 'G'")
+    kind: dict[Cell, str] = {}
+    for what, cells in (
+        ("goal", layout.goals),
+        ("trap", layout.traps),
+        ("wall", layout.walls),
+        ("start", layout.starts),
+    ):
+        for row, col in cells:
+            where = f"{name}: row {row + 1}, column {col + 1}"
+            if not (0 <= row < layout.num_rows and 0 <= col < layout.num_cols):
+                raise InputError(f"{where}: this {what} lies outside the grid; move it inside")
+            if (row, col) in kind:
+                raise InputError(f"{where}: a {what} on a {kind[row, col]}; a cell can be one thing only")
+            kind[row, col] = what
+    reaching = _cells_that_reach_a_goal(layout)
+    for row, col in layout.starts:
+        if (row, col) not in reaching:
+            raise InputError(
+                f"{name}: no goal can be reached from the start in row {row + 1}, column {col + 1}; "
+                "open a way past the walls and traps"
+            )
+
+
+def _cells_that_reach_a_goal(layout: Layout) -> set[Cell]:
+    """Breadth-first from the goals backwards; moves are symmetric between cells that are not terminal."""
+    closed = layout.walls.union(layout.traps)
+    seen = set(layout.goals)
+    queue = deque(layout.goals)
+    while queue:
+        row, col = queue.popleft()
+        for down, right in MOVES:
+            cell = row + down, col + right
+            inside = 0 <= cell[0] < layout.num_rows and 0 <= cell[1] < layout.num_cols
+            if inside and cell not in seen and cell not in closed:
+                seen.add(cell)
+                queue.append(cell)
+    return seen

@@ -1,0 +1,135 @@
+"""The world compiled into tables: everything that touches it indexes these arrays.
+
+A move succeeds with probability 1 - slip; otherwise one of the two perpendicular moves happens instead, with
+probability slip / 2 each. A move off the grid or into a wall leaves the agent where it is. The reward of a
+step is `step_reward` plus the reward of the cell entered (goal, trap, or nothing). Terminal cells and walls
+absorb: every action stays there and pays nothing.
+
+Reference: M. L. Puterman, Markov Decision Processes, 1994, chapter 2.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from numbers import Real
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gridworld.errors import InputError
+from gridworld.layout import MOVES, Cell, Layout
+
+IntArray = NDArray[np.integer[Any]]
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+NUM_ACTIONS = len(MOVES)
+ACTION_NAMES = ("up", "right", "down", "left")
+
+
+@dataclass(frozen=True, eq=False)
+class Mdp:
+    """Read-only tables of one world. S states, A = 4 actions, K outcomes (1 without slip, 3 with)."""
+
+    layout: Layout
+    slip: float
+    step_reward: float
+    goal_reward: float
+    trap_reward: float
+    neighbour: IntArray  # (S, A), where a move leads, geometry alone: borders and walls, no slip, no end
+    next_state: IntArray  # (S, A, K)
+    probability: FloatArray  # (S, A, K), rows sum to 1
+    reward: FloatArray  # (S, A, K)
+    terminal: BoolArray  # (S,), goals and traps
+    goal: BoolArray  # (S,)
+    wall: BoolArray  # (S,)
+    start: FloatArray  # (S,), a distribution
+
+    @property
+    def num_states(self) -> int:
+        return self.layout.num_rows * self.layout.num_cols
+
+    @cached_property
+    def start_states(self) -> IntArray:
+        """States with a start, ascending."""
+        return np.flatnonzero(self.start)
+
+    @cached_property
+    def trap(self) -> BoolArray:
+        """(S,), terminal and no goal."""
+        return self.terminal & ~self.goal
+
+
+def compile_mdp(
+    layout: Layout,
+    slip: float = 0.0,
+    step_reward: float = 0.0,
+    goal_reward: float = 1.0,
+    trap_reward: float = -1.0,
+) -> Mdp:
+    """Compile a layout and its rewards into tables. Raises `InputError` for a setting that makes no world."""
+    slip = _finite("slip", slip)
+    if not 0 <= slip <= 1:
+        raise InputError(f"slip={slip}: must be a probability, from 0 to 1")
+    step_reward = _finite("step_reward", step_reward)
+    goal_reward = _finite("goal_reward", goal_reward)
+    trap_reward = _finite("trap_reward", trap_reward)
+
+    goal, trap, wall = (_mask(layout, cells) for cells in (layout.goals, layout.traps, layout.walls))
+    terminal = goal | trap
+    absorbing = terminal | wall
+    neighbour = _neighbours(layout, wall)
+
+    # Outcome 0 is the move itself; with slip, 1 and 2 are the moves at right angles to it.
+    outcomes = [neighbour] if slip == 0 else [neighbour, np.roll(neighbour, -1, 1), np.roll(neighbour, 1, 1)]
+    chances = [1.0] if slip == 0 else [1 - slip, slip / 2, slip / 2]
+    next_state = np.stack(outcomes, axis=-1)
+    next_state[absorbing] = np.flatnonzero(absorbing).reshape(-1, 1, 1)
+    reward = (step_reward + goal_reward * goal + trap_reward * trap)[next_state]
+    reward[absorbing] = 0.0
+
+    start = _mask(layout, layout.starts) / len(layout.starts)
+    for table in (neighbour, next_state, reward, terminal, goal, wall, start):
+        table.setflags(write=False)
+    return Mdp(
+        layout=layout,
+        slip=slip,
+        step_reward=step_reward,
+        goal_reward=goal_reward,
+        trap_reward=trap_reward,
+        neighbour=neighbour,
+        next_state=next_state,
+        probability=np.broadcast_to(np.array(chances), next_state.shape),
+        reward=reward,
+        terminal=terminal,
+        goal=goal,
+        wall=wall,
+        start=start,
+    )
+
+
+def _mask(layout: Layout, cells: tuple[Cell, ...] | frozenset[Cell]) -> BoolArray:
+    mask = np.zeros(layout.num_rows * layout.num_cols, dtype=np.bool_)
+    mask[[layout.state(cell) for cell in cells]] = True
+    return mask
+
+
+def _neighbours(layout: Layout, wall: BoolArray) -> IntArray:
+    states = np.arange(wall.size, dtype=np.int32)
+    rows, cols = np.divmod(states, layout.num_cols)
+    table = np.empty((wall.size, NUM_ACTIONS), dtype=np.int32)
+    for action, (down, right) in enumerate(MOVES):
+        row = np.clip(rows + down, 0, layout.num_rows - 1)
+        col = np.clip(cols + right, 0, layout.num_cols - 1)
+        target = row * layout.num_cols + col
+        table[:, action] = np.where(wall[target], states, target)
+    return table
+
+
+def _finite(what: str, value: Any) -> float:
+    if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or not math.isfinite(value):
+        raise InputError(f"{what}={value!r}: must be a finite number")
+    return float(value)

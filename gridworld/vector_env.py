@@ -1,0 +1,196 @@
+"""Many GridWorlds at once: a batch of steps is a handful of array look-ups, whatever its size.
+
+With (state, action, outcome) flattened to one index, the next states, rewards and ends of a whole batch are
+three look-ups in the same frozen tables that the single environment uses. No environment has a Python
+object of its own.
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from gridworld import render as drawing
+from gridworld.errors import InputError
+from gridworld.layout import CLASSIC, Layout, load, positive_int
+from gridworld.mdp import NUM_ACTIONS, BoolArray, FloatArray, compile_mdp
+from gridworld.render import CELL_SIZE, Frame
+
+StateArray = NDArray[np.int64]
+Step = tuple[StateArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]
+
+
+class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
+    """`num_envs` GridWorlds that step together; `gym.make_vec("GridWorld-v0", num_envs=64)` makes one.
+
+    All draws come from the one `np_random`, a number for each environment that needs it, in their order: a
+    batch of one and the single environment take the same walk for the same seed and actions. `seed` is
+    therefore one number, not one per environment.
+
+    `autoreset_mode` says what follows an episode's end, in Gymnasium's terms:
+    - `NextStep` (default): the next step ignores the action and returns the new episode's start, reward 0;
+    - `SameStep`: the same step returns the new start; `infos["final_obs"]` has the states where episodes
+      ended, valid where `infos["_final_obs"]` is True;
+    - `Disabled`: nothing; `reset(options={"reset_mask": mask})` starts those environments anew.
+
+    Episodes are truncated after `max_episode_steps` (None: never). The other arguments are those of
+    `GridWorldEnv`; `render_mode="rgb_array"` gives one frame per environment.
+    """
+
+    metadata = {  # noqa: RUF012
+        "render_modes": ["rgb_array"],
+        "render_fps": 20,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        num_rows: int = 5,
+        num_cols: int = 6,
+        render_mode: str | None = None,
+        *,
+        max_episode_steps: int | None = 100,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        layout: str | PathLike[str] | Layout = CLASSIC,
+        slip: float = 0.0,
+        step_reward: float = 0.0,
+        goal_reward: float = 1.0,
+        trap_reward: float = -1.0,
+        cell_size: int = CELL_SIZE,
+    ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise InputError(f"render_mode={render_mode!r}: a batch can be drawn as rgb_array only (or None)")
+        try:
+            self._autoreset = AutoresetMode(autoreset_mode)
+        except ValueError:
+            known = ", ".join(mode.value for mode in AutoresetMode)
+            raise InputError(f"autoreset_mode={autoreset_mode!r}: must be one of {known}") from None
+        self.num_envs = positive_int("num_envs", num_envs)
+        self.max_episode_steps = (
+            None if max_episode_steps is None else positive_int("max_episode_steps", max_episode_steps)
+        )
+        self._step_limit = self.max_episode_steps or np.iinfo(np.int64).max
+        world = load(layout, num_rows, num_cols)
+        self.mdp = compile_mdp(world, slip, step_reward, goal_reward, trap_reward)
+        self.render_mode = render_mode
+        self.cell_size = positive_int("cell_size", cell_size)
+        self.metadata = {**self.metadata, "autoreset_mode": self._autoreset}
+        self.single_observation_space = spaces.Discrete(self.mdp.num_states)
+        self.single_action_space = spaces.Discrete(NUM_ACTIONS)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+        # Flat tables, indexed by (state * A + action) * K + outcome.
+        self._num_outcomes = self.mdp.next_state.shape[2]
+        self._next_state = self.mdp.next_state.ravel().astype(np.int64)
+        self._reward = self.mdp.reward.ravel()
+        self._terminated = self.mdp.terminal[self._next_state]
+        self._state: StateArray = np.full(self.num_envs, self.mdp.start_states[0], dtype=np.int64)
+        self._elapsed = np.zeros(self.num_envs, dtype=np.int64)
+        self._over = np.zeros(self.num_envs, dtype=np.bool_)  # waiting for the reset of their next step
+        self._any_over = False
+
+    @property
+    def states(self) -> StateArray:
+        """(num_envs,) current states, a copy."""
+        return self._state.copy()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[StateArray, dict[str, Any]]:
+        """Start new episodes, in all environments or where `options["reset_mask"]` is True."""
+        if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int | np.integer)):
+            raise InputError(
+                f"seed={seed!r}: must be one whole number; all environments draw from one generator"
+            )
+        super().reset(seed=None if seed is None else int(seed))
+        mask = (options or {}).get("reset_mask")
+        if mask is None:
+            which = np.arange(self.num_envs)
+        else:
+            mask = np.asarray(mask)
+            if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
+                raise InputError(
+                    f"reset_mask: must be {self.num_envs} booleans, at least one of them True, got {mask!r}"
+                )
+            which = np.flatnonzero(mask)
+        self._restart(which)
+        self._over[which] = False
+        self._any_over = bool(self._over.any())
+        return self._state.copy(), {}
+
+    def step(self, actions: NDArray[Any]) -> Step:
+        """Move all environments once. Raises `InputError` for an action other than 0 to 3."""
+        index = self._state * NUM_ACTIONS
+        index += self._check_actions(actions)
+        starting = np.flatnonzero(self._over) if self._any_over else None
+        if self._num_outcomes > 1:
+            index *= self._num_outcomes
+            index += self._slips(starting)
+        state = self._next_state[index]
+        rewards = self._reward[index]
+        terminated = self._terminated[index]
+        self._state = state
+        self._elapsed += 1
+        if starting is not None:
+            self._restart(starting)
+            rewards[starting] = 0.0
+            terminated[starting] = False
+        truncated = self._elapsed >= self._step_limit
+        over = terminated | truncated
+        infos: dict[str, Any] = {}
+        if self._autoreset is AutoresetMode.SAME_STEP:
+            which = np.flatnonzero(over)
+            if which.size:
+                infos = {"final_obs": state, "_final_obs": over}
+                self._state = state.copy()
+                self._restart(which)
+        elif self._autoreset is AutoresetMode.NEXT_STEP:
+            self._over = over
+            self._any_over = bool(over.any())
+        return self._state.copy(), rewards, terminated, truncated, infos
+
+    def render(self) -> tuple[Frame, ...] | None:
+        """One fresh frame per environment."""
+        if self.render_mode is None:
+            return None
+        return tuple(drawing.draw_frame(self.mdp, int(state), self.cell_size) for state in self._state)
+
+    def _restart(self, which: NDArray[np.intp]) -> None:
+        starts = self.mdp.start_states
+        if len(starts) == 1:
+            self._state[which] = starts[0]
+        else:
+            self._state[which] = starts[(self.np_random.random(len(which)) * len(starts)).astype(np.intp)]
+        self._elapsed[which] = 0
+
+    def _slips(self, starting: NDArray[np.intp] | None) -> NDArray[np.int64]:
+        """(num_envs,) outcomes 0 to 2; an environment that ended or starts anew draws nothing."""
+        still = self.mdp.terminal[self._state]
+        if starting is not None:
+            still[starting] = True
+        moving = np.flatnonzero(~still)
+        draws = self.np_random.random(len(moving))
+        outcomes = np.zeros(self.num_envs, dtype=np.int64)
+        slip = self.mdp.slip
+        outcomes[moving] = (draws >= 1 - slip).astype(np.int64) + (draws >= 1 - slip / 2)
+        return outcomes
+
+    def _check_actions(self, actions: Any) -> NDArray[np.int64]:
+        given = np.asarray(actions)
+        if given.shape == (self.num_envs,) and given.dtype.kind in "iu":
+            moves = given.astype(np.int64, copy=False)
+            # Seen as unsigned, a negative number is huge: one comparison covers both ends.
+            if moves.view(np.uint64).max() < NUM_ACTIONS:
+                return moves
+        raise InputError(
+            f"actions={actions!r}: must be {self.num_envs} whole numbers, "
+            "each 0 (up), 1 (right), 2 (down) or 3 (left)"
+        )
