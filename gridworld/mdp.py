@@ -52,6 +52,16 @@ class Mdp:
     def num_states(self) -> int:
         return self.layout.num_rows * self.layout.num_cols
 
+    def settings(self) -> dict[str, Any]:
+        """The keyword arguments that make an environment of this very world."""
+        return {
+            "layout": self.layout,
+            "slip": self.slip,
+            "step_reward": self.step_reward,
+            "goal_reward": self.goal_reward,
+            "trap_reward": self.trap_reward,
+        }
+
     @cached_property
     def start_states(self) -> IntArray:
         """States with a start, ascending."""

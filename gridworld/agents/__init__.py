@@ -1,0 +1,78 @@
+"""Agents: whatever learns. One algorithm family per folder or module; nothing outside knows how it works.
+
+A family is a module `gridworld.agents.<family>` with two functions, found by the `family` of its config:
+
+    check(config)                    raises InputError for settings that could not train
+    build(config, seat) -> Agent     an agent that is ready to learn
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol, cast
+
+from gridworld.mdp import FloatArray, IntArray
+from gridworld.observations import ObservationTable
+from gridworld.vector_env import GridWorldVectorEnv
+
+if TYPE_CHECKING:
+    from gridworld.config import AgentConfig, TrainConfig
+
+WriteScalars = Callable[[Mapping[str, float], int], None]  # ({tag: value}, environment steps)
+
+
+@dataclass(frozen=True, eq=False)
+class Beliefs:
+    """What an agent holds of every state, right now: all that evaluation and pictures need of it."""
+
+    greedy: IntArray  # (S,), the action it would take if it had to be right
+    sampled: FloatArray  # (S, A), the distribution it explores with
+    values: FloatArray  # (S,), its estimate of V
+    q: FloatArray | None = None  # (S, A), its estimate of Q, where it has one
+
+
+@dataclass(frozen=True, eq=False)
+class Seat:
+    """Where an agent learns: its environments, what it sees of them, and its sources of chance."""
+
+    envs: GridWorldVectorEnv  # autoreset in the same step
+    observation: ObservationTable
+    seed: int
+    device: str
+    threads: int = 1  # of the agent's numerical library
+    write_scalars: WriteScalars | None = None  # takes the agent's own training metrics
+
+
+class Agent(Protocol):
+    """What the experiment asks of an agent."""
+
+    def learn(self, total_timesteps: int, on_step: Callable[[int], bool]) -> None:
+        """Learn for that many environment steps (a whole last batch counts).
+
+        `on_step(steps so far)` is called after every batch of steps; learning ends when it returns False.
+        """
+
+    def beliefs(self) -> Beliefs:
+        """What it believes of every state now."""
+
+    def save(self, path: Path) -> None:
+        """Write the model to `path`, whole or not at all."""
+
+    def load(self, path: Path) -> None:
+        """Take the parameters from a model file. Raises `InputError` where they do not fit."""
+
+
+class Family(Protocol):
+    """The two functions of an algorithm family's module."""
+
+    def check(self, config: TrainConfig) -> None: ...
+
+    def build(self, config: AgentConfig, seat: Seat) -> Agent: ...
+
+
+def family(config: AgentConfig) -> Family:
+    """The module of the config's family, imported now."""
+    return cast("Family", importlib.import_module(f"gridworld.agents.{config.family}"))

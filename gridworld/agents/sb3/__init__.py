@@ -1,0 +1,23 @@
+"""Stable-Baselines3: DQN, PPO, and the adapter that lets them learn on the native batch.
+
+Settings are checked without importing torch, as far as they can be; building an agent imports it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from gridworld.agents.sb3.checks import check
+
+if TYPE_CHECKING:
+    from gridworld.agents import Agent, Seat
+    from gridworld.config import AgentConfig
+
+__all__ = ["build", "check"]
+
+
+def build(config: AgentConfig, seat: Seat) -> Agent:
+    """An SB3 model on the seat's environments."""
+    from gridworld.agents.sb3.agent import SB3Agent
+
+    return SB3Agent(config, seat)

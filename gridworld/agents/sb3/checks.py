@@ -1,0 +1,124 @@
+"""Settings that SB3 would trip over later, or accept and mean something else, refused before training."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gridworld.config import (
+    DQNConfig,
+    PPOConfig,
+    SB3Config,
+    Schedule,
+    TrainConfig,
+    above_zero,
+    at_least,
+    within,
+)
+from gridworld.errors import InputError
+
+LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end, as RL Zoo writes it
+
+
+def check(config: TrainConfig) -> None:
+    """Raise `InputError` for the first setting that could not train as it says."""
+    agent = config.agent
+    assert isinstance(agent, SB3Config)
+    check_schedule("agent.learning_rate", agent.learning_rate)
+    at_least("agent.batch_size", agent.batch_size, 1)
+    within("agent.gamma", agent.gamma, 0, 1)
+    at_least("agent.stats_window_size", agent.stats_window_size, 1)
+    at_least("agent.log_interval", agent.log_interval, 1)
+    if config.observation.kind == "image" and agent.policy == "MlpPolicy":
+        raise InputError(
+            "observation=image: agent.policy=MlpPolicy cannot see images; set agent.policy=CnnPolicy"
+        )
+    if config.observation.kind != "image" and agent.policy == "CnnPolicy":
+        raise InputError(
+            f"observation={config.observation.kind}: agent.policy=CnnPolicy sees images only; "
+            "set observation=image or agent.policy=MlpPolicy"
+        )
+    if isinstance(agent, DQNConfig):
+        _check_dqn(agent, config)
+    elif isinstance(agent, PPOConfig):
+        _check_ppo(agent, config)
+
+
+def check_schedule(key: str, value: Schedule) -> None:
+    """A rate that is finite and not negative, or lin_ and such a rate."""
+    number: Any = value
+    if isinstance(value, str):
+        try:
+            number = float(value.removeprefix(LINEAR) if value.startswith(LINEAR) else "nan")
+        except ValueError:
+            number = float("nan")
+    if not 0 <= number < float("inf"):
+        raise InputError(
+            f"{key}={value}: must be a number of at least 0, or {LINEAR}NUMBER for a linear decay"
+        )
+
+
+def _check_dqn(agent: DQNConfig, config: TrainConfig) -> None:
+    at_least("agent.buffer_size", agent.buffer_size, 1)
+    if agent.buffer_size < agent.batch_size:
+        raise InputError(
+            f"agent.buffer_size={agent.buffer_size}: smaller than a batch; "
+            f"must be at least agent.batch_size={agent.batch_size}"
+        )
+    at_least("agent.learning_starts", agent.learning_starts, 0)
+    if agent.learning_starts >= config.total_timesteps:
+        raise InputError(
+            f"agent.learning_starts={agent.learning_starts}: nothing would be learned; "
+            f"must be below total_timesteps={config.total_timesteps}"
+        )
+    within("agent.tau", agent.tau, 0, 1)
+    _check_train_freq(agent.train_freq, config.n_envs)
+    at_least("agent.gradient_steps", agent.gradient_steps, -1)
+    at_least("agent.n_steps", agent.n_steps, 1)
+    at_least("agent.target_update_interval", agent.target_update_interval, 1)
+    above_zero("agent.exploration_fraction", agent.exploration_fraction)
+    within("agent.exploration_fraction", agent.exploration_fraction, 0, 1)
+    within("agent.exploration_initial_eps", agent.exploration_initial_eps, 0, 1)
+    within("agent.exploration_final_eps", agent.exploration_final_eps, 0, 1)
+    above_zero("agent.max_grad_norm", agent.max_grad_norm)
+
+
+def _check_train_freq(value: Any, n_envs: int) -> None:
+    count, unit = value if isinstance(value, list | tuple) and len(value) == 2 else (value, "step")
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1 or unit not in ("step", "episode"):
+        raise InputError(
+            f"agent.train_freq={value}: must be a whole number of at least 1, or [N,step] or [N,episode]"
+        )
+    if unit == "episode" and n_envs > 1:
+        raise InputError(
+            f"agent.train_freq={value}: SB3 counts episodes with one environment only; "
+            f"set n_envs=1 (it is {n_envs}) or count steps"
+        )
+
+
+def _check_ppo(agent: PPOConfig, config: TrainConfig) -> None:
+    at_least("agent.n_steps", agent.n_steps, 1)
+    at_least("agent.n_epochs", agent.n_epochs, 1)
+    rollout = agent.n_steps * config.n_envs
+    if rollout % agent.batch_size:
+        raise InputError(
+            f"agent.batch_size={agent.batch_size}: must divide the rollout, "
+            f"agent.n_steps={agent.n_steps} x n_envs={config.n_envs} = {rollout} steps"
+        )
+    if agent.normalize_advantage and agent.batch_size < 2:
+        raise InputError(
+            "agent.batch_size=1: an advantage cannot be normalised alone; "
+            "must be at least 2, or set agent.normalize_advantage=false"
+        )
+    within("agent.gae_lambda", agent.gae_lambda, 0, 1)
+    check_schedule("agent.clip_range", agent.clip_range)
+    if agent.clip_range_vf is not None:
+        check_schedule("agent.clip_range_vf", agent.clip_range_vf)
+    at_least("agent.ent_coef", agent.ent_coef, 0)
+    at_least("agent.vf_coef", agent.vf_coef, 0)
+    above_zero("agent.max_grad_norm", agent.max_grad_norm)
+    if agent.use_sde:
+        raise InputError(
+            "agent.use_sde=true: gSDE explores continuous actions; GridWorld's are four, set it to false"
+        )
+    if agent.target_kl is not None:
+        above_zero("agent.target_kl", agent.target_kl)

@@ -1,0 +1,196 @@
+"""Every setting of a training run, typed: the schema that the files in `conf/` fill in.
+
+Plain dataclasses. Hydra merges the yaml files and the command line into them and refuses a misspelt key or
+a wrong type by name; `check` refuses values that make no sense together. Nothing heavy is imported here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Optional, Union
+
+from gridworld.errors import InputError
+
+# OmegaConf reads these annotations at run time and knows no `X | None`.
+Schedule = Union[int, float, str]  # noqa: UP007
+
+
+@dataclass
+class EnvConfig:
+    """The world; the arguments of `GridWorldEnv`."""
+
+    layout: str = "classic"
+    num_rows: Optional[int] = None  # noqa: UP045
+    num_cols: Optional[int] = None  # noqa: UP045
+    slip: float = 0.0
+    step_reward: float = 0.0
+    goal_reward: float = 1.0
+    trap_reward: float = -1.0
+    max_episode_steps: int = 100
+
+
+@dataclass
+class ObservationConfig:
+    """What the agent sees of a state."""
+
+    kind: str = "one_hot"
+    cell_size: int = 8  # pixels, for images
+
+
+@dataclass
+class EvaluationConfig:
+    """The exact evaluation."""
+
+    every: int = 1000  # environment steps
+    gamma: float = 0.99  # discount of value and regret, whatever discount the agent learns with
+    stop_after: Optional[int] = None  # noqa: UP045  # end training at this many certificates in a row
+
+
+@dataclass
+class LoggingConfig:
+    """What is told while training."""
+
+    tensorboard: bool = True
+    policy_map_every: int = 5  # evaluations between two pictures of the policy; 0 for none
+    progress: bool = True
+
+
+@dataclass
+class RecordingConfig:
+    """The final policy's episode in pictures."""
+
+    frames: bool = True  # numbered PNGs in frames/
+    gif: bool = True
+    mp4: bool = False  # needs the extra `video`
+    cell_size: Optional[int] = None  # noqa: UP045  # pixels; null: 100, less on large maps
+    fps: int = 4
+
+
+@dataclass
+class AgentConfig:
+    """What all agents share. `family` is the module in gridworld/agents that knows the algorithm."""
+
+    name: str = "???"
+    family: str = "???"
+
+
+@dataclass
+class SB3Config(AgentConfig):
+    """An algorithm of Stable-Baselines3: `algorithm` is its class, the other fields are its arguments."""
+
+    family: str = "sb3"
+    algorithm: str = "???"
+    log_interval: int = 1  # of SB3's learn(): episodes for DQN, iterations for PPO
+    policy: str = "MlpPolicy"
+    learning_rate: Schedule = 1e-3  # a number, or lin_NUMBER to fall linearly to 0 at the end of training
+    batch_size: int = 64
+    gamma: float = 0.99
+    stats_window_size: int = 100
+    policy_kwargs: Optional[dict[str, Any]] = None  # noqa: UP045
+
+
+@dataclass
+class DQNConfig(SB3Config):
+    """Arguments of `stable_baselines3.DQN`, with its defaults."""
+
+    name: str = "dqn"
+    algorithm: str = "DQN"
+    log_interval: int = 4
+    learning_rate: Schedule = 1e-4
+    batch_size: int = 32
+    buffer_size: int = 1_000_000
+    learning_starts: int = 100
+    tau: float = 1.0
+    train_freq: Any = 4  # steps of the batch, or [n, step] or [n, episode]
+    gradient_steps: int = 1
+    replay_buffer_class: Optional[str] = None  # noqa: UP045
+    replay_buffer_kwargs: Optional[dict[str, Any]] = None  # noqa: UP045
+    optimize_memory_usage: bool = False
+    n_steps: int = 1
+    target_update_interval: int = 10_000
+    exploration_fraction: float = 0.1
+    exploration_initial_eps: float = 1.0
+    exploration_final_eps: float = 0.05
+    max_grad_norm: float = 10.0
+
+
+@dataclass
+class PPOConfig(SB3Config):
+    """Arguments of `stable_baselines3.PPO`, with its defaults."""
+
+    name: str = "ppo"
+    algorithm: str = "PPO"
+    learning_rate: Schedule = 3e-4
+    n_steps: int = 2048
+    n_epochs: int = 10
+    gae_lambda: float = 0.95
+    clip_range: Schedule = 0.2
+    clip_range_vf: Optional[Schedule] = None  # noqa: UP045
+    normalize_advantage: bool = True
+    ent_coef: float = 0.0
+    vf_coef: float = 0.5
+    max_grad_norm: float = 0.5
+    use_sde: bool = False
+    sde_sample_freq: int = -1
+    rollout_buffer_class: Optional[str] = None  # noqa: UP045
+    rollout_buffer_kwargs: Optional[dict[str, Any]] = None  # noqa: UP045
+    target_kl: Optional[float] = None  # noqa: UP045
+
+
+@dataclass
+class TrainConfig:
+    """One training run."""
+
+    seed: int = 0
+    total_timesteps: int = 20_000  # environment steps
+    n_envs: int = 64
+    device: str = "cpu"
+    threads: int = 1  # of torch
+    agent: AgentConfig = field(default_factory=AgentConfig)  # the chosen agent's own schema in its place
+    env: EnvConfig = field(default_factory=EnvConfig)
+    observation: ObservationConfig = field(default_factory=ObservationConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    logging: LoggingConfig = field(default_factory=LoggingConfig)
+    recording: RecordingConfig = field(default_factory=RecordingConfig)
+
+
+AGENT_SCHEMAS: dict[str, type[AgentConfig]] = {"dqn": DQNConfig, "ppo": PPOConfig}
+
+
+def check(config: TrainConfig) -> None:
+    """Raise `InputError` for a value that no run could use. Maps and rewards check themselves when built."""
+    at_least("seed", config.seed, 0)
+    if config.seed >= 2**32:
+        raise InputError(f"seed={config.seed}: must be below 2**32")
+    at_least("total_timesteps", config.total_timesteps, 1)
+    at_least("n_envs", config.n_envs, 1)
+    at_least("threads", config.threads, 1)
+    at_least("env.max_episode_steps", config.env.max_episode_steps, 1)
+    at_least("observation.cell_size", config.observation.cell_size, 1)
+    at_least("evaluation.every", config.evaluation.every, 1)
+    within("evaluation.gamma", config.evaluation.gamma, 0, 1)
+    if config.evaluation.stop_after is not None:
+        at_least("evaluation.stop_after", config.evaluation.stop_after, 1)
+    at_least("logging.policy_map_every", config.logging.policy_map_every, 0)
+    if config.recording.cell_size is not None:
+        at_least("recording.cell_size", config.recording.cell_size, 2)
+    within("recording.fps", config.recording.fps, 1, 100)
+
+
+def at_least(key: str, value: float, bound: float) -> None:
+    """Refuse a value that is below the bound, infinite or NaN."""
+    if not bound <= value < math.inf:
+        raise InputError(f"{key}={value}: must be at least {bound}")
+
+
+def above_zero(key: str, value: float) -> None:
+    """Refuse a value that is not positive, infinite or NaN."""
+    if not 0 < value < math.inf:
+        raise InputError(f"{key}={value}: must be a positive number")
+
+
+def within(key: str, value: float, low: float, high: float) -> None:
+    """Refuse a value outside [low, high], or NaN."""
+    if not low <= value <= high:
+        raise InputError(f"{key}={value}: must be from {low} to {high}")

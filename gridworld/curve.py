@@ -1,0 +1,159 @@
+"""The learning curve: exact scores of the agent's policies while it learns, to CSV and TensorBoard."""
+
+from __future__ import annotations
+
+import csv
+import time
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from gridworld.agents import Agent, Beliefs
+from gridworld.config import TrainConfig
+from gridworld.errors import InputError
+from gridworld.evaluation import Judge, Score
+from gridworld.events import EventWriter
+from gridworld.policy_map import draw_policy_map
+from gridworld.progress import Progress
+from gridworld.solve import one_hot_policy
+
+GREEDY, SAMPLED = "eval", "eval_sampled"  # TensorBoard's groups of the two policies
+
+CHARTS = {
+    "value": [f"{GREEDY}/value", f"{SAMPLED}/value", f"{GREEDY}/optimal_value"],
+    "regret": [f"{GREEDY}/regret", f"{SAMPLED}/regret"],
+    "goal probability": [
+        f"{GREEDY}/goal_probability",
+        f"{SAMPLED}/goal_probability",
+        f"{GREEDY}/optimal_goal_probability",
+    ],
+    "length": [f"{GREEDY}/length", f"{SAMPLED}/length", f"{GREEDY}/optimal_length"],
+}
+
+
+class Curve:
+    """Evaluates an agent every so many environment steps, and at the end.
+
+    Two policies are scored side by side: the greedy one and the one it samples actions from.
+    """
+
+    def __init__(self, judge: Judge, agent: Agent, config: TrainConfig, path: Path) -> None:
+        self.judge = judge
+        self.first_certified_step: int | None = None
+        self.certified_since_step: int | None = None  # of the streak that still holds
+        self.greedy: Score | None = None  # the newest scores
+        self.sampled: Score | None = None
+        self.beliefs: Beliefs | None = None
+        self.seconds = 0.0  # spent on evaluation
+        self._agent = agent
+        self._every = config.evaluation.every
+        self._stop_after = config.evaluation.stop_after
+        self._map_every = config.logging.policy_map_every
+        self._events: EventWriter | None = None
+        self._step = -1
+        self._streak = 0
+        self._evaluations = 0
+        self._next = self._every
+        self._file: IO[str] = path.open("w", newline="", encoding="utf-8")
+        self._rows: csv.DictWriter[str] | None = None
+        self._progress = Progress(
+            config.total_timesteps, f"{config.agent.name} on {judge.mdp.layout.name}", config.logging.progress
+        )
+
+    def log_to(self, events: EventWriter) -> None:
+        """Write every evaluation to this event file too."""
+        self._events = events
+        events.charts("learning curves beside the optimum", CHARTS)
+
+    def on_step(self, step: int) -> bool:
+        """Evaluate if it is due; False once the certificate has held for long enough."""
+        if step >= self._next:
+            self._next += self._every * ((step - self._next) // self._every + 1)
+            self.evaluate(step)
+        return self._stop_after is None or self._streak < self._stop_after
+
+    def evaluate(self, step: int, last: bool = False) -> None:
+        """Score both policies as they are after `step` steps and write a row."""
+        if step != self._step:
+            started = time.perf_counter()
+            self._score(step)
+            self.seconds += time.perf_counter() - started
+        if self._events is not None and self._map_every and (last or self._due_for_map()):
+            self._draw(step)
+
+    def close(self) -> None:
+        """Close the CSV and the progress bar."""
+        self._file.close()
+        self._progress.close()
+
+    def _score(self, step: int) -> None:
+        self._step = step
+        self.beliefs = beliefs = self._agent.beliefs()
+        if not (np.isfinite(beliefs.values).all() and np.isfinite(beliefs.sampled).all()):
+            raise InputError(
+                f"training diverged: the agent's values are no finite numbers after {step} steps; "
+                "try a smaller agent.learning_rate"
+            )
+        self.greedy = greedy = self.judge.score(one_hot_policy(beliefs.greedy))
+        self.sampled = self.judge.score(beliefs.sampled)
+        self._streak = self._streak + 1 if greedy.certified else 0
+        if not greedy.certified:
+            self.certified_since_step = None
+        elif self._streak == 1:
+            self.certified_since_step = step
+            if self.first_certified_step is None:
+                self.first_certified_step = step
+        self._evaluations += 1
+        self._write(step, greedy, self.sampled)
+        note = f"regret {greedy.regret:.3g}, goal {greedy.outcome.goal:.0%}"
+        self._progress.update(step, note + (", certified optimal" if greedy.certified else ""))
+
+    def _due_for_map(self) -> bool:
+        return (self._evaluations - 1) % self._map_every == 0
+
+    def _write(self, step: int, greedy: Score, sampled: Score) -> None:
+        row: dict[str, Any] = {"step": step, **_columns(greedy)}
+        row |= {f"sampled_{name}": value for name, value in _columns(sampled).items()}
+        if self._rows is None:
+            self._rows = csv.DictWriter(self._file, fieldnames=list(row), lineterminator="\n")
+            self._rows.writeheader()
+        self._rows.writerow(row)
+        self._file.flush()
+        if self._events is not None:
+            self._events.scalars(self._tags(greedy, sampled), step)
+
+    def _tags(self, greedy: Score, sampled: Score) -> dict[str, float]:
+        tags = {
+            f"{GREEDY}/optimal_value": self.judge.optimal_value,
+            f"{GREEDY}/optimal_goal_probability": self.judge.optimum.goal,
+            f"{GREEDY}/optimal_length": self.judge.optimum.expected_length,
+        }
+        for group, score in ((GREEDY, greedy), (SAMPLED, sampled)):
+            tags |= {f"{group}/{name}": float(value) for name, value in _columns(score).items()}
+        return tags
+
+    def _draw(self, step: int) -> None:
+        assert self._events is not None
+        assert self.beliefs is not None
+        frame = draw_policy_map(
+            self.judge.mdp,
+            self.beliefs.values,
+            self.beliefs.greedy,
+            self.judge.solution.optimal,
+            caption=f"greedy policy after {step:,} steps",
+        )
+        self._events.image("policy", frame, step)
+
+
+def _columns(score: Score) -> dict[str, float | int]:
+    return {
+        "value": score.value,
+        "regret": score.regret,
+        "certified": int(score.certified),
+        "goal_probability": score.outcome.goal,
+        "trap_probability": score.outcome.trap,
+        "timeout_probability": score.outcome.timeout,
+        "return": score.outcome.expected_return,
+        "length": score.outcome.expected_length,
+    }

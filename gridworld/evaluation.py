@@ -1,0 +1,149 @@
+"""How good a policy is: exactly, by solving for its value, and by playing episodes beside that.
+
+The exact scores carry no sampling noise and cannot hang: a policy that walks in circles has a time-out
+probability of 1, whatever its number of steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridworld.layout import Cell
+from gridworld.mdp import FloatArray, IntArray, Mdp
+from gridworld.solve import (
+    Outcome,
+    Solution,
+    check_policy,
+    endless_states,
+    one_hot_policy,
+    outcome,
+    policy_value,
+    value_iteration,
+)
+from gridworld.vector_env import GridWorldVectorEnv
+
+REGRET_TOLERANCE = 1e-6  # relative; a detour of one step costs at least 1 % at the default discount
+
+
+@dataclass(frozen=True)
+class Score:
+    """Exact scores of one policy, in expectation over starts."""
+
+    value: float  # discounted
+    regret: float  # optimal value - value, at least 0 up to rounding
+    certified: bool  # no policy is better
+    outcome: Outcome
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over sampled episodes with the half-width of its 95 % interval (normal approximation)."""
+
+    mean: float
+    half_width: float
+
+    def __str__(self) -> str:
+        return f"{self.mean:.4g} ± {self.half_width:.2g}"
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """Scores of one policy as estimated from episodes, each cut at the step limit."""
+
+    episodes: int
+    value: Estimate  # discounted
+    goal: Estimate
+    trap: Estimate
+    timeout: Estimate
+    episode_return: Estimate
+    length: Estimate
+
+
+class Judge:
+    """Scores policies of one world under one discount and step limit. Solves the world once."""
+
+    def __init__(self, mdp: Mdp, gamma: float, max_episode_steps: int) -> None:
+        self.mdp = mdp
+        self.max_episode_steps = max_episode_steps
+        self.solution: Solution = value_iteration(mdp, gamma)
+        self.optimal_value = self._at_start(self.solution.v)
+        self.optimum: Outcome = outcome(mdp, self.optimal_policy(), max_episode_steps)
+
+    def optimal_policy(self) -> FloatArray:
+        """(S, A), deterministic: the first of the optimal actions."""
+        return one_hot_policy(np.argmax(self.solution.optimal, axis=1))
+
+    def score(self, policy: FloatArray) -> Score:
+        """The exact scores of a policy table (S, A)."""
+        value = self._at_start(policy_value(self.mdp, policy, self.solution.gamma))
+        regret = self.optimal_value - value
+        certified = regret <= REGRET_TOLERANCE * self._at_start(self.solution.scale)
+        return Score(value, regret, certified, outcome(self.mdp, policy, self.max_episode_steps))
+
+    def endless_cells(self, policy: FloatArray) -> list[Cell]:
+        """Cells in which the policy may walk for ever; empty for one that ends."""
+        cols = self.mdp.layout.num_cols
+        return [divmod(int(state), cols) for state in endless_states(self.mdp, policy)]
+
+    def sample(self, policy: FloatArray, episodes: int, seed: int) -> Sampled:
+        """Play `episodes` episodes, all at once."""
+        policy = check_policy(self.mdp, policy)
+        envs = GridWorldVectorEnv(
+            episodes,
+            max_episode_steps=self.max_episode_steps,
+            autoreset_mode="Disabled",
+            **self.mdp.settings(),
+        )
+        actions = np.random.default_rng(seed)
+        cumulative = policy.cumsum(axis=1)
+        states, _ = envs.reset(seed=seed)
+        running = np.ones(episodes, dtype=np.bool_)
+        discounted, total, length = np.zeros(episodes), np.zeros(episodes), np.zeros(episodes)
+        for step in range(self.max_episode_steps):
+            draws = actions.random(episodes)[:, None]
+            chosen = np.minimum((draws >= cumulative[states]).sum(axis=1), policy.shape[1] - 1)
+            states, rewards, terminated, _, _ = envs.step(chosen)
+            discounted += running * rewards * self.solution.gamma**step
+            total += running * rewards
+            length += running
+            running &= ~terminated
+            if not running.any():
+                break
+        return Sampled(
+            episodes=episodes,
+            value=_estimate(discounted),
+            goal=_estimate(self.mdp.goal[states]),
+            trap=_estimate(self.mdp.trap[states]),
+            timeout=_estimate(running),
+            episode_return=_estimate(total),
+            length=_estimate(length),
+        )
+
+    def _at_start(self, values: FloatArray) -> float:
+        starts = self.mdp.start_states
+        return float(values[starts] @ self.mdp.start[starts])
+
+
+def play_episode(mdp: Mdp, policy: FloatArray, max_episode_steps: int, seed: int) -> IntArray:
+    """States of one episode, from its start to its end or the step limit."""
+    policy = check_policy(mdp, policy)
+    env = GridWorldVectorEnv(
+        1, max_episode_steps=max_episode_steps, autoreset_mode="Disabled", **mdp.settings()
+    )
+    actions = np.random.default_rng(seed)
+    states, _ = env.reset(seed=seed)
+    visited, over = [int(states[0])], False
+    while not over:
+        row = policy[visited[-1]]
+        states, _, terminated, truncated, _ = env.step(np.array([actions.choice(len(row), p=row)]))
+        visited.append(int(states[0]))
+        over = bool(terminated[0] or truncated[0])
+    return np.array(visited)
+
+
+def _estimate(samples: FloatArray | np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Estimate:
+    samples = np.asarray(samples, dtype=np.float64)
+    spread = float(samples.std(ddof=1)) if len(samples) > 1 else 0.0
+    return Estimate(float(samples.mean()), 1.96 * spread / len(samples) ** 0.5)

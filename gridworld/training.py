@@ -1,0 +1,252 @@
+"""One training run: a world, an agent, its learning curve, and what it comes to."""
+
+from __future__ import annotations
+
+import dataclasses
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+from gridworld import record
+from gridworld.agents import Agent, Seat, family
+from gridworld.config import EnvConfig, TrainConfig, check
+from gridworld.curve import GREEDY, Curve
+from gridworld.evaluation import Judge, Score, play_episode
+from gridworld.events import EventWriter, HParamValue
+from gridworld.files import write_json
+from gridworld.layout import Layout, load
+from gridworld.mdp import Mdp, compile_mdp
+from gridworld.observations import ObservationTable, make_observation
+from gridworld.render import frame_size
+from gridworld.run import Run
+from gridworld.solve import one_hot_policy
+from gridworld.vector_env import GridWorldVectorEnv
+
+HPARAM_METRICS = tuple(
+    f"{GREEDY}/{name}" for name in ("value", "regret", "goal_probability", "length", "certified")
+)
+EPISODE_GIF = "episode.gif"
+EPISODE_MP4 = "episode.mp4"
+
+Summary = dict[str, Any]
+
+
+class Interrupted(BaseException):
+    """Training was asked to stop (Ctrl-C or SIGTERM); the run's files are closed and say so."""
+
+    def __init__(self, signal_number: int) -> None:
+        super().__init__(f"stopped by {signal.Signals(signal_number).name}")
+        self.exit_code = 128 + signal_number
+
+
+def train(config: TrainConfig, run: Run, overrides: list[str]) -> Summary:
+    """Train, evaluate and record as configured; everything it writes goes to the run's folder.
+
+    Raises `InputError` for a mistake in the settings, before anything is written, and `Interrupted`.
+    """
+    check(config)
+    algorithms = family(config.agent)
+    algorithms.check(config)
+    mdp = make_mdp(config.env)
+    observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
+    _check_recording(config, mdp)
+    judge = Judge(mdp, config.evaluation.gamma, config.env.max_episode_steps)
+    log = _Log()
+    agent = algorithms.build(config.agent, make_seat(config, mdp, observation, log))
+
+    run.start(dataclasses.asdict(config), mdp.layout.text(), overrides)
+    try:
+        with _signals_raise():
+            summary = _learn(config, run, judge, agent, log)
+    except Interrupted as interruption:
+        run.end("interrupted", str(interruption))
+        raise
+    except BaseException as error:
+        run.end("failed", f"{type(error).__name__}: {error}")
+        raise
+    run.end("finished")
+    return summary
+
+
+def make_mdp(env: EnvConfig, layout: Layout | None = None) -> Mdp:
+    """The world of these settings; `layout` stands in for the configured map."""
+    if layout is None:
+        size = {"num_rows": env.num_rows, "num_cols": env.num_cols}
+        layout = load(env.layout, **{name: count for name, count in size.items() if count is not None})
+    return compile_mdp(layout, env.slip, env.step_reward, env.goal_reward, env.trap_reward)
+
+
+def make_seat(config: TrainConfig, mdp: Mdp, observation: ObservationTable, log: _Log | None = None) -> Seat:
+    """Environments and observations for an agent of this configuration."""
+    envs = GridWorldVectorEnv(
+        config.n_envs,
+        max_episode_steps=config.env.max_episode_steps,
+        autoreset_mode="SameStep",
+        **mdp.settings(),
+    )
+    return Seat(
+        envs,
+        observation,
+        config.seed,
+        config.device,
+        config.threads,
+        write_scalars=log.scalars if log is not None and config.logging.tensorboard else None,
+    )
+
+
+class _Log:
+    """The agent's way to the event file, which is opened only when everything else is ready."""
+
+    events: EventWriter | None = None
+
+    def scalars(self, values: Any, step: int) -> None:
+        if self.events is not None:
+            self.events.scalars(values, step)
+
+
+def _check_recording(config: TrainConfig, mdp: Mdp) -> None:
+    wanted = config.recording
+    if wanted.mp4:
+        record.require_video()
+    if (wanted.frames or wanted.gif or wanted.mp4) and wanted.cell_size is not None:
+        frame_size(mdp, wanted.cell_size)
+
+
+def _learn(config: TrainConfig, run: Run, judge: Judge, agent: Agent, log: _Log) -> Summary:
+    curve = Curve(judge, agent, config, run.curve_file)
+    events = EventWriter(run.folder) if config.logging.tensorboard else None
+    succeeded = False
+    try:
+        if events is not None:
+            log.events = events
+            events.hparams(hparams(config), HPARAM_METRICS)
+            curve.log_to(events)
+        curve.evaluate(0)
+        steps, seconds = _timed_learning(config, agent, curve)
+        curve.evaluate(steps, last=True)
+        agent.save(run.model_file)
+        summary = _summarise(config, curve, steps, seconds)
+        _record(config, run, judge.mdp, curve, events, steps)
+        write_json(run.summary_file, summary)
+        succeeded = True
+    finally:
+        curve.close()
+        if events is not None:
+            events.end_session(succeeded)
+            events.close()
+    return summary
+
+
+def _timed_learning(config: TrainConfig, agent: Agent, curve: Curve) -> tuple[int, float]:
+    """Environment steps and seconds; the seconds include the evaluations."""
+    steps = 0
+
+    def on_step(done: int) -> bool:
+        nonlocal steps
+        steps = done
+        return curve.on_step(done)
+
+    started = time.perf_counter()
+    agent.learn(config.total_timesteps, on_step)
+    return steps, time.perf_counter() - started
+
+
+def _summarise(config: TrainConfig, curve: Curve, steps: int, seconds: float) -> Summary:
+    judge, greedy, sampled, beliefs = curve.judge, curve.greedy, curve.sampled, curve.beliefs
+    assert greedy is not None
+    assert sampled is not None
+    assert beliefs is not None
+    return {
+        "agent": config.agent.name,
+        "env": judge.mdp.layout.name,
+        "observation": config.observation.kind,
+        "seed": config.seed,
+        "total_timesteps": config.total_timesteps,
+        "timesteps": steps,
+        "gamma": config.evaluation.gamma,
+        "certified": greedy.certified,
+        "first_certified_step": curve.first_certified_step,
+        "certified_since_step": curve.certified_since_step,
+        "optimal_value": judge.optimal_value,
+        "optimal_goal_probability": judge.optimum.goal,
+        "optimal_length": judge.optimum.expected_length,
+        **scores(greedy),
+        "endless_cells": judge.endless_cells(one_hot_policy(beliefs.greedy)),
+        "sampled": scores(sampled),
+        "train_seconds": round(seconds, 3),
+        "evaluation_seconds": round(curve.seconds, 3),
+    }
+
+
+def scores(score: Score) -> dict[str, float]:
+    """A score as the summary's fields."""
+    return {
+        "value": score.value,
+        "regret": score.regret,
+        "goal_probability": score.outcome.goal,
+        "trap_probability": score.outcome.trap,
+        "timeout_probability": score.outcome.timeout,
+        "return": score.outcome.expected_return,
+        "length": score.outcome.expected_length,
+    }
+
+
+def _record(
+    config: TrainConfig, run: Run, mdp: Mdp, curve: Curve, events: EventWriter | None, steps: int
+) -> None:
+    wanted = config.recording
+    if not (wanted.frames or wanted.gif or wanted.mp4):
+        return
+    assert curve.beliefs is not None
+    policy = one_hot_policy(curve.beliefs.greedy)
+    states = play_episode(mdp, policy, config.env.max_episode_steps, config.seed)
+    frames = record.draw_states(mdp, states, wanted.cell_size)
+    if wanted.frames:
+        record.save_pngs(frames, run.frames_folder)
+    if wanted.gif:
+        gif = record.encode_gif(frames, wanted.fps)
+        record.save_bytes(gif, run.folder / EPISODE_GIF)
+        if events is not None:
+            events.animation("episode", gif, frames[0], steps)
+    if wanted.mp4:
+        record.save_mp4(frames, run.folder / EPISODE_MP4, wanted.fps)
+
+
+def hparams(config: TrainConfig) -> dict[str, HParamValue]:
+    """The settings that make a difference to learning, flat: {"agent.learning_rate": 0.003, ...}."""
+    content = dataclasses.asdict(config)
+    for told_elsewhere in ("logging", "recording"):
+        del content[told_elsewhere]
+    return dict(_flatten(content))
+
+
+def _flatten(content: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, HParamValue]]:
+    for key, value in content.items():
+        if isinstance(value, dict):
+            yield from _flatten(value, f"{prefix}{key}.")
+        elif value is None or isinstance(value, bool | int | float | str):
+            yield prefix + key, value
+        else:
+            yield prefix + key, str(value)
+
+
+@contextmanager
+def _signals_raise() -> Iterator[None]:
+    """SIGINT and SIGTERM raise `Interrupted` in the main thread, so that files are closed on the way out."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise Interrupted(number)
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
