@@ -62,6 +62,7 @@ class RecordingConfig:
 
     frames: bool = True  # numbered PNGs in frames/
     gif: bool = True
+    policy_map: bool = True  # policy.png, values and greedy actions
     mp4: bool = False  # needs the extra `video`
     cell_size: Optional[int] = None  # noqa: UP045  # pixels; null: 100, less on large maps
     fps: int = 4
@@ -76,6 +77,32 @@ class AgentConfig:
 
 
 @dataclass
+class PolicyKwargs:
+    """SB3's `policy_kwargs`; null or {} leaves SB3's own default. Classes are import paths, torch.nn.ReLU."""
+
+    net_arch: Any = None  # layer widths, [64, 64]
+    activation_fn: Optional[str] = None  # noqa: UP045
+    features_extractor_class: Optional[str] = None  # noqa: UP045
+    features_extractor_kwargs: dict[str, Any] = field(default_factory=dict)
+    normalize_images: Optional[bool] = None  # noqa: UP045
+    optimizer_class: Optional[str] = None  # noqa: UP045
+    optimizer_kwargs: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class ActorCriticPolicyKwargs(PolicyKwargs):
+    """The same for policies with a value network; net_arch may be {pi: [...], vf: [...]}."""
+
+    ortho_init: Optional[bool] = None  # noqa: UP045
+    use_sde: Optional[bool] = None  # noqa: UP045
+    log_std_init: Optional[float] = None  # noqa: UP045
+    full_std: Optional[bool] = None  # noqa: UP045
+    use_expln: Optional[bool] = None  # noqa: UP045
+    squash_output: Optional[bool] = None  # noqa: UP045
+    share_features_extractor: Optional[bool] = None  # noqa: UP045
+
+
+@dataclass
 class SB3Config(AgentConfig):
     """An algorithm of Stable-Baselines3: `algorithm` is its class, the other fields are its arguments."""
 
@@ -87,7 +114,7 @@ class SB3Config(AgentConfig):
     batch_size: int = 64
     gamma: float = 0.99
     stats_window_size: int = 100
-    policy_kwargs: Optional[dict[str, Any]] = None  # noqa: UP045
+    policy_kwargs: PolicyKwargs = field(default_factory=PolicyKwargs)
 
 
 @dataclass
@@ -105,7 +132,7 @@ class DQNConfig(SB3Config):
     train_freq: Any = 4  # steps of the batch, or [n, step] or [n, episode]
     gradient_steps: int = 1
     replay_buffer_class: Optional[str] = None  # noqa: UP045
-    replay_buffer_kwargs: Optional[dict[str, Any]] = None  # noqa: UP045
+    replay_buffer_kwargs: dict[str, Any] = field(default_factory=dict)
     optimize_memory_usage: bool = False
     n_steps: int = 1
     target_update_interval: int = 10_000
@@ -121,6 +148,7 @@ class PPOConfig(SB3Config):
 
     name: str = "ppo"
     algorithm: str = "PPO"
+    policy_kwargs: ActorCriticPolicyKwargs = field(default_factory=ActorCriticPolicyKwargs)
     learning_rate: Schedule = 3e-4
     n_steps: int = 2048
     n_epochs: int = 10
@@ -134,7 +162,7 @@ class PPOConfig(SB3Config):
     use_sde: bool = False
     sde_sample_freq: int = -1
     rollout_buffer_class: Optional[str] = None  # noqa: UP045
-    rollout_buffer_kwargs: Optional[dict[str, Any]] = None  # noqa: UP045
+    rollout_buffer_kwargs: dict[str, Any] = field(default_factory=dict)
     target_kl: Optional[float] = None  # noqa: UP045
 
 

@@ -16,6 +16,7 @@ from gridworld.evaluation import Judge, Score
 from gridworld.events import EventWriter
 from gridworld.policy_map import draw_policy_map
 from gridworld.progress import Progress
+from gridworld.render import Frame
 from gridworld.solve import one_hot_policy
 
 GREEDY, SAMPLED = "eval", "eval_sampled"  # TensorBoard's groups of the two policies
@@ -80,7 +81,18 @@ class Curve:
             self._score(step)
             self.seconds += time.perf_counter() - started
         if self._events is not None and self._map_every and (last or self._due_for_map()):
-            self._draw(step)
+            self._events.image("policy", self.policy_map(), step)
+
+    def policy_map(self) -> Frame:
+        """A picture of the policy as it was evaluated last."""
+        assert self.beliefs is not None
+        return draw_policy_map(
+            self.judge.mdp,
+            self.beliefs.values,
+            self.beliefs.greedy,
+            self.judge.solution.optimal,
+            caption=f"greedy policy after {self._step:,} steps",
+        )
 
     def close(self) -> None:
         """Close the CSV and the progress bar."""
@@ -132,18 +144,6 @@ class Curve:
         for group, score in ((GREEDY, greedy), (SAMPLED, sampled)):
             tags |= {f"{group}/{name}": float(value) for name, value in _columns(score).items()}
         return tags
-
-    def _draw(self, step: int) -> None:
-        assert self._events is not None
-        assert self.beliefs is not None
-        frame = draw_policy_map(
-            self.judge.mdp,
-            self.beliefs.values,
-            self.beliefs.greedy,
-            self.judge.solution.optimal,
-            caption=f"greedy policy after {step:,} steps",
-        )
-        self._events.image("policy", frame, step)
 
 
 def _columns(score: Score) -> dict[str, float | int]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import re
 import secrets
 import shutil
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -20,8 +21,11 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.config import AGENT_SCHEMAS, TrainConfig
 from gridworld.errors import EXIT_CODE, InputError
+from gridworld.hydra_errors import refuse_added_keys, sentence
+from gridworld.manual import manual
 from gridworld.run import MANIFEST, Run, check_new
 
+FULL_ERROR = "HYDRA_FULL_ERROR"
 _LONGEST_NAME = 100  # characters of a job's folder
 
 
@@ -55,17 +59,30 @@ class RefuseUsedFolders(Callback):
 
 def main(conf: Path) -> None:
     """Run the command line; `conf` is the folder of the yaml files."""
-    _register(conf)
-    hydra.main(version_base="1.3", config_path=str(conf), config_name="train")(run_job)()
+    if {"--help", "-h"} & set(sys.argv[1:]):
+        print(manual(conf))
+        return
+    _register()
+    asked_for_traceback = FULL_ERROR in os.environ
+    os.environ[FULL_ERROR] = "1"  # so that Hydra raises its errors instead of printing them
+    try:
+        hydra.main(version_base="1.3", config_path=str(conf), config_name="train")(run_job)()
+    except Exception as error:
+        # Until a job begins, whatever goes wrong is the command line's or a yaml file's fault.
+        mistake = isinstance(error, CompactHydraException) or not HydraConfig.initialized()
+        if asked_for_traceback or not mistake:
+            raise
+        sys.exit(_tell(error))
 
 
 def run_job(settings: DictConfig) -> float:
     """One training run with its summary on standard output; returns the final regret, for sweepers."""
     context = HydraConfig.get()
     folder = Path(context.runtime.output_dir)
-    overrides = list(context.overrides.task)
+    overrides = cast("list[str]", OmegaConf.to_container(context.overrides.task))
     try:
-        config: TrainConfig = OmegaConf.to_object(settings)  # type: ignore[assignment]
+        refuse_added_keys(settings)
+        config = cast(TrainConfig, OmegaConf.to_object(settings))
         from gridworld.summary import summary_text
         from gridworld.training import Interrupted, train
 
@@ -77,20 +94,19 @@ def run_job(settings: DictConfig) -> float:
     except (InputError, OmegaConfBaseException) as error:
         _discard(folder)
         if context.mode is RunMode.MULTIRUN:
-            raise JobError(f"error: {_sentence(error)}") from None
+            raise JobError(sentence(error)) from None
         sys.exit(_tell(error))
     print(summary_text(summary, _shown(folder)))
     return float(summary["regret"])
 
 
-def _register(conf: Path) -> None:
+def _register() -> None:
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
     for name, schema in AGENT_SCHEMAS.items():
         store.store(group="agent/schema", name=name, node=schema)
     OmegaConf.register_new_resolver("slug", _slug, replace=True)
     OmegaConf.register_new_resolver("token", lambda: secrets.token_hex(3), use_cache=True, replace=True)
-    OmegaConf.register_new_resolver("manual", lambda: manual(conf), replace=True)
 
 
 def _slug(text: Any) -> str:
@@ -99,25 +115,8 @@ def _slug(text: Any) -> str:
     return name.strip("-.")[:_LONGEST_NAME] or "run"
 
 
-def manual(conf: Path) -> str:
-    """The choices of every config group, each with the first comment of its file."""
-    lines = []
-    for group in sorted(folder for folder in conf.iterdir() if folder.is_dir()):
-        lines.append(f"  {group.name}=")
-        for file in sorted(group.glob("*.yaml")):
-            comments = [line for line in file.read_text("utf-8").splitlines() if line.startswith("# ")]
-            about = next((line[2:] for line in comments if "@package" not in line), "")
-            lines.append(f"    {file.stem:<16} {about}")
-    return "\n".join(lines)
-
-
-def _sentence(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
-
-
 def _tell(error: Exception) -> int:
-    print(f"error: {_sentence(error)}", file=sys.stderr)
+    print(f"error: {sentence(error)}", file=sys.stderr)
     return EXIT_CODE
 
 

@@ -56,6 +56,11 @@ def save_pngs(frames: Sequence[Frame], folder: Path) -> None:
     part.rename(folder)
 
 
+def save_png(frame: Frame, path: Path) -> None:
+    """One picture."""
+    save_bytes(_png(Image.fromarray(frame)), path)
+
+
 def encode_gif(frames: Sequence[Frame], fps: int) -> bytes:
     """An endless GIF. GIF counts hundredths of a second, so the rate is rounded to those."""
     return _animation(frames, "GIF", duration=10 * round(100 / fps))

@@ -5,6 +5,7 @@
     summary.json    the result
     model.zip       the trained model
     frames/, episode.gif, ...   the final policy's episode
+    policy.png      the final policy's values and greedy actions
     .hydra/         the configuration as Hydra composed it
     events.out...   TensorBoard's event file
 
@@ -17,10 +18,8 @@ from __future__ import annotations
 import json
 import os
 import platform
-import subprocess
 import sys
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -123,6 +122,9 @@ def _now() -> str:
 
 
 def _versions() -> dict[str, str | None]:
+    # Imported here, as subprocess below, to keep them out of the way of `train.py --help`.
+    from importlib.metadata import PackageNotFoundError, version
+
     found: dict[str, str | None] = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -134,6 +136,8 @@ def _versions() -> dict[str, str | None]:
 
 def _git() -> dict[str, Any] | None:
     """Commit of the source tree and whether it has changes; None outside a git checkout."""
+    import subprocess
+
     source = Path(__file__).parents[1]
     if not (source / ".git").exists():
         return None

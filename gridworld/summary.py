@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 Summary = dict[str, Any]
@@ -25,7 +26,7 @@ def summary_text(summary: Summary, folder: str) -> str:
     for label, key, optimal in _ROWS:
         numbers = (summary[key], summary["sampled"][key], summary[optimal])
         lines.append(f"  {label:<18}" + "".join(f"{number:>10.4g}" for number in numbers))
-    regrets = (abs(summary["regret"]), abs(summary["sampled"]["regret"]))
+    regrets = (max(0.0, summary["regret"]), max(0.0, summary["sampled"]["regret"]))
     lines.append(f"  {'regret':<18}" + "".join(f"{regret:>10.3g}" for regret in regrets) + f"{0:>10}")
     look = f"tensorboard --logdir {folder}"
     lines += ["", f"  {verdict(summary)}", f"  files: {folder}", f"  curves: {look}"]
@@ -36,13 +37,17 @@ def verdict(summary: Summary) -> str:
     """Whether the final greedy policy is optimal, in a sentence."""
     if summary["certified"]:
         return f"certified optimal since step {summary['certified_since_step']:,}"
-    problem = f"not optimal: regret {summary['regret']:.3g}"
-    cells = summary["endless_cells"]
-    if cells and summary["timeout_probability"] > 0:
-        shown = ", ".join(f"({row},{col})" for row, col in cells[:8])
-        more = f" and {len(cells) - 8} more" if len(cells) > 8 else ""
-        problem += (
-            f"; with probability {summary['timeout_probability']:.3g} it walks in circles "
-            f"until the time is out, in cells (row,column) {shown}{more}"
-        )
-    return problem
+    circles = circles_text(summary["endless_cells"], summary["timeout_probability"])
+    return f"not optimal: regret {summary['regret']:.3g}{circles}"
+
+
+def circles_text(cells: Sequence[Sequence[int]], timeout_probability: float) -> str:
+    """Half a sentence on a policy that never ends, or nothing."""
+    if not cells:
+        return ""
+    shown = ", ".join(f"({row},{col})" for row, col in cells[:8])
+    more = f" and {len(cells) - 8} more" if len(cells) > 8 else ""
+    return (
+        f"; it walks in circles until the time is out (probability {timeout_probability:.3g}), "
+        f"in cells (row,column) {shown}{more}"
+    )

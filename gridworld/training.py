@@ -31,6 +31,7 @@ HPARAM_METRICS = tuple(
 )
 EPISODE_GIF = "episode.gif"
 EPISODE_MP4 = "episode.mp4"
+POLICY_PNG = "policy.png"
 
 Summary = dict[str, Any]
 
@@ -199,6 +200,8 @@ def _record(
     config: TrainConfig, run: Run, mdp: Mdp, curve: Curve, events: EventWriter | None, steps: int
 ) -> None:
     wanted = config.recording
+    if wanted.policy_map:
+        record.save_png(curve.policy_map(), run.folder / POLICY_PNG)
     if not (wanted.frames or wanted.gif or wanted.mp4):
         return
     assert curve.beliefs is not None

@@ -57,7 +57,12 @@ class World:
                 chance[target] = chance.get(target, 0.0) + probability
         entering = {"G": self.settings["goal_reward"], "T": self.settings["trap_reward"]}
         return [
-            (p, target, self.settings["step_reward"] + entering.get(self.tile[target], 0.0), self.ends(target))
+            (
+                p,
+                target,
+                self.settings["step_reward"] + entering.get(self.tile[target], 0.0),
+                self.ends(target),
+            )
             for target, p in chance.items()
         ]
 

@@ -29,7 +29,9 @@ def test_the_tables_equal_the_rules(world):
             ):
                 if p > 0:
                     table[state, reward] = table.get((state, reward), 0.0) + p
-            rules = {(world.state(target), reward): p for p, target, reward, _ in world.outcomes(cell, action)}
+            rules = {
+                (world.state(target), reward): p for p, target, reward, _ in world.outcomes(cell, action)
+            }
             assert table == pytest.approx(rules, abs=1e-12)
             assert mdp.neighbour[row] == world.state(world.moved(cell, action)) or world.tile[cell] == "#"
 
@@ -104,7 +106,9 @@ def test_numbers_of_any_kind_will_do(value):
 
 
 def test_rewards_and_slip_by_hand():
-    mdp = compile_mdp(parse("S.T\n.#.\n..G", "map"), slip=0.5, step_reward=-0.1, goal_reward=2, trap_reward=-3)
+    mdp = compile_mdp(
+        parse("S.T\n.#.\n..G", "map"), slip=0.5, step_reward=-0.1, goal_reward=2, trap_reward=-3
+    )
     assert mdp.next_state[1, 1].tolist() == [2, 1, 1]  # right into the trap; down is a wall, up the border
     assert mdp.probability[1, 1].tolist() == [0.5, 0.25, 0.25]
     assert mdp.reward[1, 1].tolist() == pytest.approx([-3.1, -0.1, -0.1])

@@ -180,4 +180,6 @@ def test_importing_the_package_loads_nothing_heavy():
     heavy = "{'torch', 'stable_baselines3', 'hydra', 'omegaconf', 'pygame', 'gymnasium', 'numpy'}"
     assert python(f"import gridworld, sys; print(*{heavy} & set(sys.modules))") == []
     heavy = "{'torch', 'stable_baselines3', 'hydra', 'omegaconf', 'pygame', 'scipy'}"
-    assert python(f"import gridworld.env, gridworld.vector_env, sys; print(*{heavy} & set(sys.modules))") == []
+    assert (
+        python(f"import gridworld.env, gridworld.vector_env, sys; print(*{heavy} & set(sys.modules))") == []
+    )

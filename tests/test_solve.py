@@ -123,7 +123,9 @@ def test_without_discount_and_with_costs_the_optimum_is_that_of_a_long_horizon(w
     walked = solve.policy_value(mdp, greedy, 1)
     assert walked == pytest.approx(solution.v, abs=1e-9)
     ends = np.isfinite(solution.v)
-    assert (solution.v[ends] >= solve.policy_value(mdp, np.full((mdp.num_states, 4), 0.25), 1)[ends] - 1e-9).all()
+    assert (
+        solution.v[ends] >= solve.policy_value(mdp, np.full((mdp.num_states, 4), 0.25), 1)[ends] - 1e-9
+    ).all()
     assert solution.v[ends] == pytest.approx(solve.value_iteration(mdp, 1 - 1e-9).v[ends], abs=1e-5)
 
 
@@ -172,7 +174,9 @@ def test_endless_states_of_a_cycle():
     assert solve.endless_states(mdp, solve.one_hot_policy(actions)).size == 0
     assert solve.endless_states(mdp, solve.one_hot_policy(np.zeros(9, dtype=int))).tolist() == [0]
     assert solve.endless_states(mdp, np.full((9, 4), 0.25)).size == 0
-    slippery = made("S..\n...\n..G", slip=0.1)  # "up" never leaves the first row, "right" slips down in the end
+    slippery = made(
+        "S..\n...\n..G", slip=0.1
+    )  # "up" never leaves the first row, "right" slips down in the end
     assert solve.endless_states(slippery, solve.one_hot_policy(np.full(9, 0))).tolist() == [0, 1, 2]
     assert solve.endless_states(slippery, solve.one_hot_policy(np.full(9, 1))).size == 0
 

@@ -9,11 +9,13 @@ A family is a module `gridworld.agents.<family>` with two functions, found by th
 from __future__ import annotations
 
 import importlib
+import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
+from gridworld.errors import InputError
 from gridworld.mdp import FloatArray, IntArray
 from gridworld.observations import ObservationTable
 from gridworld.vector_env import GridWorldVectorEnv
@@ -74,5 +76,10 @@ class Family(Protocol):
 
 
 def family(config: AgentConfig) -> Family:
-    """The module of the config's family, imported now."""
+    """The module of the config's family, imported now. Raises `InputError` where there is none."""
+    known = sorted(module.name for module in pkgutil.iter_modules(__path__))
+    if config.family not in known:
+        raise InputError(
+            f"agent.family={config.family}: there is no such family; there are {', '.join(known)}"
+        )
     return cast("Family", importlib.import_module(f"gridworld.agents.{config.family}"))

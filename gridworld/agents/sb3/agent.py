@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import inspect
+import json
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import CategoricalDistribution
 from stable_baselines3.common.logger import KVWriter, Logger
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import LinearSchedule
@@ -25,12 +26,14 @@ from stable_baselines3.common.utils import LinearSchedule
 from gridworld.agents import Beliefs, Seat, WriteScalars
 from gridworld.agents.sb3.checks import LINEAR
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.config import AgentConfig, SB3Config
+from gridworld.config import AgentConfig, PolicyKwargs, SB3Config
 from gridworld.errors import InputError
 from gridworld.files import replacing
+from gridworld.observations import ObservationTable
 from gridworld.solve import one_hot_policy
 
 _CHUNK = 4096  # states a forward pass
+_SMALLEST_IMAGE = 36  # pixels that SB3's NatureCNN needs on each side
 
 # Fields of the config that are ours, not arguments of the algorithm's class.
 _OWN_FIELDS = {field.name for field in dataclasses.fields(AgentConfig)} | {"algorithm", "log_interval"}
@@ -96,10 +99,14 @@ class SB3Agent:
             self.model.save(file)
 
     def load(self, path: Path) -> None:
-        """Reads tensors alone (`weights_only`): nothing in the file is unpickled or run."""
+        """Reads tensors (`weights_only`) and one number: nothing in the file is unpickled or run."""
         try:
             _, parameters, _ = load_from_zip_file(path, device=self.model.device, load_data=False)
             self.model.set_parameters(parameters, exact_match=True, device=self.model.device)
+            with zipfile.ZipFile(path) as archive:
+                rate = json.loads(archive.read("data")).get("exploration_rate")
+            if isinstance(rate, float):
+                self.model.exploration_rate = rate  # type: ignore[attr-defined]
         except (OSError, ValueError, RuntimeError, KeyError, AssertionError, zipfile.BadZipFile) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise InputError(
@@ -159,12 +166,15 @@ def _make_model(config: SB3Config, seat: Seat) -> BaseAlgorithm:
         known = ", ".join(name for name in algorithm.policy_aliases if name != "MultiInputPolicy")
         raise InputError(f"agent.policy={config.policy}: {config.algorithm} has {known}")
     policy_class = algorithm.policy_aliases[config.policy]
-    arguments["policy_kwargs"] = _policy_kwargs(policy_class, config.policy_kwargs or {})
+    arguments["policy_kwargs"] = _policy_kwargs(config.policy_kwargs)
+    if policy_class.__name__.endswith("CnnPolicy") and config.policy_kwargs.features_extractor_class is None:
+        _check_image_size(seat.observation)
+    device = _device(seat.device)
     try:
         return algorithm(
             env=GridWorldVecEnv(seat.envs, seat.observation),
             seed=seat.seed,
-            device=_device(seat.device),
+            device=device,
             **arguments,
         )
     except (AssertionError, ValueError, TypeError, RuntimeError) as error:
@@ -189,30 +199,31 @@ def _schedule(value: Any) -> Any:
     return value
 
 
-def _policy_kwargs(policy_class: type[BasePolicy], given: dict[str, Any]) -> dict[str, Any]:
-    """Checked against the policy's own signature; classes come as import paths."""
-    known = set(inspect.signature(policy_class).parameters) - {
-        "observation_space",
-        "action_space",
-        "lr_schedule",
-    }
+def _check_image_size(observation: ObservationTable) -> None:
+    height, width = observation.space.shape[1:] if observation.space.shape else (0, 0)
+    if min(height, width) < _SMALLEST_IMAGE:
+        raise InputError(
+            f"observation=image: frames of {width} x {height} pixels are too small for CnnPolicy, "
+            f"whose convolutions need {_SMALLEST_IMAGE}; take a larger observation.cell_size"
+        )
+
+
+def _policy_kwargs(given: PolicyKwargs) -> dict[str, Any]:
+    """What was given, the classes imported."""
     kinds = {
         "activation_fn": torch.nn.Module,
         "optimizer_class": torch.optim.Optimizer,
         "features_extractor_class": BaseFeaturesExtractor,
     }
-    checked = dict(given)
-    for key, value in given.items():
-        where = f"agent.policy_kwargs.{key}"
-        if key not in known:
-            raise InputError(
-                f"{where}: {policy_class.__name__} has no such argument; it has {', '.join(sorted(known))}"
-            )
-        if key in kinds and value is not None:
-            checked[key] = _import(where, value, kinds[key])
-        elif key == "net_arch" and not _is_net_arch(value):
-            raise InputError(f"{where}={value}: must be a list of layer widths, e.g. [64,64]")
-    return checked
+    arguments = {key: value for key, value in vars(given).items() if value is not None and value != {}}
+    for key, value in arguments.items():
+        if key in kinds:
+            arguments[key] = _import(f"agent.policy_kwargs.{key}", value, kinds[key])
+    if not _is_net_arch(arguments.get("net_arch", [])):
+        raise InputError(
+            f"agent.policy_kwargs.net_arch={arguments['net_arch']}: must be layer widths, e.g. [64,64]"
+        )
+    return arguments
 
 
 def _is_net_arch(value: Any) -> bool:

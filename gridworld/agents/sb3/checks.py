@@ -23,6 +23,11 @@ def check(config: TrainConfig) -> None:
     """Raise `InputError` for the first setting that could not train as it says."""
     agent = config.agent
     assert isinstance(agent, SB3Config)
+    own = type(agent)().algorithm
+    if agent.algorithm != own:
+        raise InputError(
+            f"agent.algorithm={agent.algorithm}: these are the settings of {own}; choose agent=..."
+        )
     check_schedule("agent.learning_rate", agent.learning_rate)
     at_least("agent.batch_size", agent.batch_size, 1)
     within("agent.gamma", agent.gamma, 0, 1)

@@ -1,0 +1,27 @@
+"""Command lines over finished runs and the benchmark, one module each, behind the files in `scripts/`.
+
+A module has `main(arguments)`, which `run` calls with what stands on the command line.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+
+from gridworld.errors import EXIT_CODE, InputError
+
+Main = Callable[[Sequence[str]], None]
+
+
+def run(main: Main) -> None:
+    """Call `main`; a user's mistake ends the program with one sentence and no traceback."""
+    try:
+        main(sys.argv[1:])
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(EXIT_CODE)
+    except OSError as error:
+        print(f"error: {error.filename or 'file'}: {error.strerror}", file=sys.stderr)
+        sys.exit(EXIT_CODE)
+    except KeyboardInterrupt:
+        sys.exit(130)

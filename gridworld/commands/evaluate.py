@@ -1,0 +1,103 @@
+"""Score a finished run again: exactly, and by playing episodes."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gridworld.env import GridWorldEnv
+from gridworld.errors import InputError
+from gridworld.evaluation import Judge, Sampled, Score
+from gridworld.mdp import FloatArray
+from gridworld.render import has_display
+from gridworld.saved_run import SavedRun, choose_policy
+from gridworld.summary import circles_text
+
+_LABELS = (
+    "value",
+    "goal probability",
+    "trap probability",
+    "time-out probability",
+    "return",
+    "episode length",
+)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Print the scores."""
+    options = _parser().parse_args(arguments)
+    if options.episodes < 1:
+        raise InputError(f"--episodes {options.episodes}: must be at least 1")
+    if options.seed < 0:
+        raise InputError(f"--seed {options.seed}: must be at least 0")
+    if options.render == "human" and not has_display():
+        raise InputError(
+            "--render human: there is no display to open a window on; set DISPLAY, or use record.py"
+        )
+    saved = SavedRun(options.run)
+    judge = saved.judge(options.layout)
+    policy = choose_policy(saved.beliefs(), options.policy)
+    if options.render == "human":
+        _show(judge, policy, options.seed)
+    score = judge.score(policy)
+    sampled = judge.sample(policy, options.episodes, options.seed)
+    print(f"{options.policy} policy of {options.run} on {judge.mdp.layout.name}")
+    print(_table(judge, score, sampled))
+    print(_verdict(judge, policy, score))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="evaluate.py", description=__doc__)
+    parser.add_argument("run", type=Path, help="the run's folder, e.g. runs/2026-...")
+    parser.add_argument("--layout", help="score it on another map of the same size: a name or a file")
+    parser.add_argument(
+        "--policy",
+        choices=("greedy", "sampled"),
+        default="greedy",
+        help="the best action, or the distribution it explores with",
+    )
+    parser.add_argument("--episodes", type=int, default=1000, help="episodes to sample (default 1000)")
+    parser.add_argument("--seed", type=int, default=0, help="of the sampled episodes (default 0)")
+    parser.add_argument("--render", choices=("human",), help="first show one episode in a window")
+    return parser
+
+
+def _table(judge: Judge, score: Score, sampled: Sampled) -> str:
+    exact, optimum = score.outcome, judge.optimum
+    numbers = (
+        (score.value, sampled.value, judge.optimal_value),
+        (exact.goal, sampled.goal, optimum.goal),
+        (exact.trap, sampled.trap, optimum.trap),
+        (exact.timeout, sampled.timeout, optimum.timeout),
+        (exact.expected_return, sampled.episode_return, optimum.expected_return),
+        (exact.expected_length, sampled.length, optimum.expected_length),
+    )
+    lines = [f"  {'':<22}{'exact':>10}  {f'{sampled.episodes:,} episodes':<20}{'optimum':>10}"]
+    for label, (value, estimate, best) in zip(_LABELS, numbers, strict=True):
+        lines.append(f"  {label:<22}{value:>10.4g}  {estimate!s:<20}{best:>10.4g}")
+    return "\n".join(lines)
+
+
+def _verdict(judge: Judge, policy: FloatArray, score: Score) -> str:
+    if score.certified:
+        return "  certified optimal"
+    circles = circles_text(judge.endless_cells(policy), score.outcome.timeout)
+    return f"  not optimal: regret {score.regret:.3g}{circles}"
+
+
+def _show(judge: Judge, policy: FloatArray, seed: int) -> None:
+    """One episode in a window."""
+    env = GridWorldEnv(render_mode="human", **judge.mdp.settings())
+    actions = np.random.default_rng(seed)
+    state, _ = env.reset(seed=seed)
+    try:
+        for _ in range(judge.max_episode_steps):
+            row = policy[state]
+            state, _, terminated, _, _ = env.step(int(actions.choice(len(row), p=row)))
+            if terminated:
+                break
+    finally:
+        env.close()

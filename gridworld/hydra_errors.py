@@ -1,0 +1,74 @@
+"""Hydra's complaints about a command line, each in one sentence.
+
+Hydra tells what went wrong over several lines and advises to append an unknown key with `+`, which the
+schema would refuse as well. What is kept is the fact; what is added is what would have been right.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import re
+
+from hydra.errors import OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+
+from gridworld import config as schemas
+from gridworld.errors import InputError
+
+
+def sentence(error: BaseException) -> str:
+    """The exception's facts on one line."""
+    message = str(error)
+    if isinstance(error, InputError):
+        return message
+    if "Could not find" in message and "Available options in" in message:
+        return _unknown_choice(message)
+    lines = message.splitlines() or [type(error).__name__]
+    facts = lines[: 2 if lines[0].endswith(":") or lines[0].startswith("Error parsing") else 1]
+    facts[0] = facts[0].removeprefix("Error merging override ").removeprefix("Error parsing override ")
+    facts += str(error.__cause__ or "").splitlines()[:1]
+    override = getattr(error, "override", None)
+    if isinstance(error, OverrideParseException) and override and override not in facts[0]:
+        facts.insert(0, override)
+    return ": ".join(fact.strip().rstrip(".:") for fact in facts) + _suggestion(" ".join(facts))
+
+
+def refuse_added_keys(settings: DictConfig) -> None:
+    """`+key=value` gets past the schema while Hydra composes; raise `InputError` for such a key."""
+    _refuse(settings, "")
+
+
+def _refuse(node: DictConfig, prefix: str) -> None:
+    schema = OmegaConf.get_type(node)
+    known = {field.name for field in dataclasses.fields(schema)} if dataclasses.is_dataclass(schema) else None
+    for key in map(str, node):
+        if known is not None and key not in known:
+            hint = _closest(key, sorted(known))
+            raise InputError(f"{prefix}{key}: there is no such key{hint}")
+        child = node._get_node(key)
+        if isinstance(child, DictConfig) and not child._is_none() and not child._is_missing():
+            _refuse(child, f"{prefix}{key}.")
+
+
+def _unknown_choice(message: str) -> str:
+    missing = re.search(r"Could not find '([^']*)'", message)
+    group = re.search(r"Available options in '([^']*)':((?:\n\t\S+)*)", message)
+    assert missing is not None
+    choices = ", ".join(group.group(2).split()) if group else ""
+    return f"{missing.group(1).replace('/', '=', 1)}: there is no such choice; there are {choices}"
+
+
+def _suggestion(facts: str) -> str:
+    if "Ambiguous value" in facts:
+        return "; to run one job for each of the values, add -m"
+    unknown = re.search(r"Key '([^']*)' not in '([^']*)'", facts)
+    schema = getattr(schemas, unknown.group(2), None) if unknown else None
+    if unknown is None or not dataclasses.is_dataclass(schema):
+        return ""
+    return _closest(unknown.group(1), [field.name for field in dataclasses.fields(schema)])
+
+
+def _closest(key: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(key, known, n=3)
+    return f"; did you mean {' or '.join(close)}?" if close else f"; there are {', '.join(known)}"

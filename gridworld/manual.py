@@ -1,0 +1,54 @@
+"""What `scripts/train.py --help` prints: how to use it, and every choice with its file's own first comment.
+
+Hydra's generic help takes twice as long, since it loads every configuration to list their names.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_TEXT = """\
+Train an agent on a GridWorld whose optimum is known exactly.
+
+usage: python scripts/train.py [-m] [group=choice ...] [key=value ...]
+
+Choices:
+{choices}
+
+Keys, with their values: python scripts/train.py --cfg job
+  seed, total_timesteps, n_envs, device, threads  the run itself
+  agent.*        the algorithm's own settings, by their names in Stable-Baselines3
+  env.*          layout (a name above or a map file), slip, rewards, max_episode_steps
+  observation.*  kind, cell_size of images
+  evaluation.*   how often the policy is scored exactly, and when to stop
+  logging.*      TensorBoard, pictures of the policy, progress
+  recording.*    PNGs, GIF and MP4 of the final policy's episode
+  hydra.run.dir  the folder to write to, instead of a new one in runs/
+
+Examples:
+  python scripts/train.py agent=ppo seed=3
+      one run; its folder in runs/ has the model, the curve, the pictures and a summary
+  python scripts/train.py agent=dqn env=four_rooms env.slip=0.1 total_timesteps=200000
+      another world, slippery, and more time
+  python scripts/train.py -m agent=dqn,ppo seed=0,1,2
+      a sweep of six runs, a folder each; look at them with tensorboard --logdir runs
+
+Afterwards: scripts/evaluate.py and scripts/record.py, with a run's folder.
+Hydra's own options: python scripts/train.py --hydra-help
+"""
+
+
+def manual(conf: Path) -> str:
+    """The text, with the choices found in `conf`."""
+    return _TEXT.format(choices="\n".join(_choices(conf)))
+
+
+def _choices(conf: Path) -> list[str]:
+    lines = []
+    for group in sorted(folder for folder in conf.iterdir() if folder.is_dir()):
+        lines.append(f"  {group.name}=...")
+        for file in sorted(group.glob("*.yaml")):
+            comments = [line[2:] for line in file.read_text("utf-8").splitlines() if line.startswith("# ")]
+            about = next((comment for comment in comments if not comment.startswith("@package")), "")
+            lines.append(f"    {file.stem:<16} {about}")
+    return lines

@@ -1,0 +1,341 @@
+"""A batch of worlds does what as many single ones would."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracle import MOVES, worlds
+
+import gridworld
+from gridworld import GridWorldVectorEnv, InputError
+from gridworld.layout import parse
+
+MODES = list(AutoresetMode)
+TWO_STARTS = parse("S..T\n.#..\nS..G", "two starts")
+UP, RIGHT, DOWN, LEFT = range(4)
+
+
+def moves(num_steps, num_envs, seed=0):
+    return np.random.default_rng(seed).integers(4, size=(num_steps, num_envs))
+
+
+def same(results, others):
+    """Equal observations, rewards and flags."""
+    return all(np.array_equal(a, b) for a, b in zip(results[:4], others[:4], strict=True))
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.4])
+@pytest.mark.parametrize("layout", [TWO_STARTS, "classic", "cliff"], ids=["two starts", "classic", "cliff"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_batch_of_one_takes_the_walk_of_the_single_env(layout, slip, seed):
+    arguments = {"layout": layout, "slip": slip, "step_reward": -0.1, "max_episode_steps": 15}
+    one, batch = gym.make("GridWorld-v0", **arguments), gym.make_vec("GridWorld-v0", num_envs=1, **arguments)
+    assert one.reset(seed=seed)[0] == batch.reset(seed=seed)[0][0]
+    over = False
+    for [action] in moves(400, 1, seed):
+        result = (one.reset()[0], 0.0, False, False) if over else one.step(action)[:4]
+        assert tuple(part[0] for part in batch.step(np.array([action]))[:4]) == result
+        over = result[2] or result[3]
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("layout", ["classic", "frozen_lake_4x4", "four_rooms", "maze"])
+def test_a_deterministic_batch_equals_gymnasiums_own(layout, mode):
+    arguments = {"layout": layout, "step_reward": -0.1, "max_episode_steps": 12}
+    native = gym.make_vec("GridWorld-v0", num_envs=5, autoreset_mode=mode, **arguments)
+    copies = SyncVectorEnv([lambda: gym.make("GridWorld-v0", **arguments)] * 5, autoreset_mode=mode)
+    assert native.observation_space == copies.observation_space
+    assert native.action_space == copies.action_space
+    assert native.metadata["autoreset_mode"] == copies.metadata["autoreset_mode"] == mode
+    assert np.array_equal(native.reset(seed=0)[0], copies.reset(seed=0)[0])
+    endings = 0
+    for actions in moves(200, 5):
+        ours, theirs = native.step(actions), copies.step(actions)
+        assert same(ours, theirs)
+        assert [part.dtype for part in ours[:4]] == [part.dtype for part in theirs[:4]]
+        over = ours[2] | ours[3]
+        endings += over.sum()
+        if mode is AutoresetMode.SAME_STEP and over.any():
+            assert np.array_equal(ours[4]["_final_obs"], theirs[4]["_final_obs"])
+            assert ours[4]["final_obs"][over].tolist() == theirs[4]["final_obs"][over].tolist()
+        if mode is AutoresetMode.DISABLED and over.any():
+            options = {"reset_mask": over}
+            assert np.array_equal(native.reset(options=options)[0], copies.reset(options=options)[0])
+    assert endings > 50
+
+
+@settings(max_examples=40)
+@given(worlds(), st.sampled_from(MODES), st.integers(0, 2**32 - 1))
+def test_every_transition_of_a_big_batch_is_one_of_the_rules(world, mode, seed):
+    envs = GridWorldVectorEnv(
+        64, layout=parse(world.text, "map"), autoreset_mode=mode, max_episode_steps=None, **world.settings
+    )
+    rules = {
+        (world.state(cell), action): {
+            (world.state(c), r, end) for _, c, r, end in world.outcomes(cell, action)
+        }
+        for cell in world.cells
+        for action in MOVES
+    }
+    starts = {world.state(cell) for cell in world.starts}
+    states, _ = envs.reset(seed=seed)
+    assert set(states.tolist()) <= starts
+    over = np.zeros(64, dtype=bool)
+    for actions in moves(20, 64, seed):
+        following, rewards, terminated, truncated, infos = envs.step(actions)
+        ended_at = infos["final_obs"] if "final_obs" in infos else following
+        for i, before in enumerate(zip(states.tolist(), actions.tolist(), strict=True)):
+            if over[i] and mode is AutoresetMode.NEXT_STEP:
+                assert following[i] in starts
+                assert (rewards[i], terminated[i]) == (0.0, False)
+            else:
+                state, reward, end = int(ended_at[i]), float(rewards[i]), bool(terminated[i])
+                assert any((state, end) == (s, e) and abs(reward - r) < 1e-12 for s, r, e in rules[before])
+            if mode is AutoresetMode.SAME_STEP and terminated[i]:
+                assert following[i] in starts
+        assert not truncated.any()
+        states, over = following, terminated
+
+
+@pytest.fixture(params=MODES, ids=[mode.value for mode in MODES])
+def mode(request):
+    return request.param
+
+
+def corridor(mode, limit=None):
+    """Two worlds of three cells; going right twice reaches the goal."""
+    layout = parse("S.G", "corridor")
+    return GridWorldVectorEnv(2, layout=layout, autoreset_mode=mode, max_episode_steps=limit)
+
+
+def lists(result):
+    return [part.tolist() for part in result[:4]]
+
+
+def test_next_step_restarts_with_the_step_after_the_end():
+    envs = corridor("NextStep")
+    envs.reset()
+    envs.step([RIGHT, UP])
+    assert lists(envs.step([RIGHT, RIGHT])) == [[2, 1], [1, 0], [True, False], [False, False]]
+    assert lists(envs.step([RIGHT, RIGHT])) == [[0, 2], [0, 1], [False, True], [False, False]]
+    assert lists(envs.step([RIGHT, RIGHT])) == [[1, 0], [0, 0], [False, False], [False, False]]
+
+
+def test_same_step_restarts_at_once_and_hands_over_the_end():
+    envs = corridor("SameStep")
+    envs.reset()
+    assert envs.step([RIGHT, UP])[4] == {}
+    result = envs.step([RIGHT, RIGHT])
+    assert lists(result) == [[0, 1], [1, 0], [True, False], [False, False]]
+    assert result[4]["_final_obs"].tolist() == [True, False]
+    assert result[4]["final_obs"][0] == 2
+    assert lists(envs.step([RIGHT, RIGHT]))[0] == [1, 0]
+
+
+def test_disabled_waits_for_a_reset_with_a_mask():
+    envs = corridor("Disabled")
+    envs.reset()
+    envs.step([RIGHT, UP])
+    envs.step([RIGHT, RIGHT])
+    assert lists(envs.step([LEFT, UP])) == [[2, 1], [0, 0], [True, False], [False, False]]
+    states, _ = envs.reset(options={"reset_mask": np.array([True, False])})
+    assert states.tolist() == [0, 1]
+    assert lists(envs.step([RIGHT, RIGHT])) == [[1, 2], [0, 1], [False, True], [False, False]]
+
+
+def test_truncation_after_the_limit(mode):
+    envs = corridor(mode, limit=3)
+    envs.reset()
+    assert not any(envs.step([UP, DOWN])[3].any() for _ in range(2))
+    _, rewards, terminated, truncated, _ = envs.step([UP, DOWN])
+    assert (terminated.any(), truncated.all(), rewards.any()) == (False, True, False)
+    if mode is AutoresetMode.DISABLED:
+        envs.reset(options={"reset_mask": np.array([True, True])})
+    elif mode is AutoresetMode.NEXT_STEP:
+        assert not envs.step([UP, UP])[3].any()  # the restart
+    assert [bool(envs.step([UP, UP])[3].all()) for _ in range(3)] == [False, False, True]
+
+
+def test_the_limit_counts_per_environment():
+    envs = corridor("SameStep", limit=4)
+    envs.reset()
+    envs.step([RIGHT, UP])
+    assert envs.step([RIGHT, UP])[2].tolist() == [True, False]
+    assert [envs.step([UP, UP])[3].tolist() for _ in range(4)] == [
+        [False, False],
+        [False, True],
+        [False, False],
+        [True, False],
+    ]
+
+
+def test_limits_by_name():
+    assert gym.make_vec("GridWorld-v0").unwrapped.max_episode_steps == 100
+    assert gym.make_vec("GridWorld-v0", max_episode_steps=7).unwrapped.max_episode_steps == 7
+    endless = GridWorldVectorEnv(1, max_episode_steps=None)
+    endless.reset()
+    assert not any(endless.step([UP])[3].any() for _ in range(300))
+
+
+def test_a_reset_starts_all_anew(mode):
+    envs = corridor(mode, limit=3)
+    envs.reset()
+    envs.step([RIGHT, UP])
+    envs.step([RIGHT, UP])
+    assert envs.reset()[0].tolist() == [0, 0]
+    assert lists(envs.step([RIGHT, RIGHT])) == [[1, 1], [0, 0], [False] * 2, [False] * 2]
+    assert not envs.step([UP, UP])[3].any()
+    assert envs.step([UP, UP])[3].all()
+
+
+def test_the_seed_fixes_the_walk(mode):
+    def walk(seed):
+        envs = GridWorldVectorEnv(8, layout=TWO_STARTS, slip=0.3, autoreset_mode=mode)
+        trace = [envs.reset(seed=seed)[0].tolist()]
+        return trace + [lists(envs.step(actions)) for actions in moves(50, 8)]
+
+    assert walk(1) == walk(1)
+    assert walk(1) != walk(2)
+
+
+def test_starts_and_slips_are_independent_and_fair():
+    num_envs = 20_000
+    envs = GridWorldVectorEnv(num_envs, layout=TWO_STARTS, slip=0.4)
+    starts, _ = envs.reset(seed=0)
+    assert abs((starts == 0).sum() - num_envs / 2) < 5 * (num_envs / 4) ** 0.5
+    states, *_ = envs.step(np.full(num_envs, RIGHT))
+    top = starts == 0  # right with 0.6, up into the border with 0.2, down with 0.2
+    for state, p in ((1, 0.6), (0, 0.2), (4, 0.2)):
+        assert abs((states[top] == state).sum() - p * top.sum()) < 5 * (p * (1 - p) * top.sum()) ** 0.5
+
+
+def test_returned_arrays_are_fresh(mode):
+    touched, left_alone = (GridWorldVectorEnv(4, slip=0.2, autoreset_mode=mode) for _ in range(2))
+    for envs in (touched, left_alone):
+        envs.reset(seed=3)[0][:] = 29 if envs is touched else 0
+    touched.states[:] = 29
+    for actions in moves(150, 4):
+        mine, theirs = touched.step(actions), left_alone.step(actions)
+        assert same(mine, theirs)
+        for part in (*mine[:4], *mine[4].values()):
+            part[:] = 1
+
+
+@pytest.mark.parametrize(
+    "actions",
+    [
+        np.array([0, 1]),
+        np.array([[0, 1, 2]]),
+        np.array(0),
+        np.array([0.0, 1.0, 2.0]),
+        np.array([0, np.nan, 2]),
+        np.array([0, -1, 2]),
+        np.array([0, 4, 2]),
+        np.array([True, False, True]),
+        np.array([0, 2**64 - 1, 2], dtype=np.uint64),
+        np.array([0, 2**63, 2], dtype=np.uint64),
+        np.array([0, -(2**63), 2]),
+        np.array(["0", "1", "2"]),
+        np.array([0, None, 2]),
+        None,
+        1,
+        [],
+    ],
+    ids=repr,
+)
+def test_what_are_no_actions_is_refused(actions):
+    envs = GridWorldVectorEnv(3)
+    envs.reset()
+    envs.step([RIGHT, DOWN, UP])
+    with pytest.raises(InputError, match="actions"):
+        envs.step(actions)
+    assert envs.states.tolist() == [1, 6, 0]
+
+
+@pytest.mark.parametrize("dtype", [np.int8, np.int32, np.uint8, np.uint64, list])
+def test_whole_numbers_of_any_kind_are_actions(dtype):
+    envs = GridWorldVectorEnv(3)
+    envs.reset()
+    actions = [RIGHT, DOWN, UP] if dtype is list else np.array([RIGHT, DOWN, UP], dtype=dtype)
+    assert envs.step(actions)[0].tolist() == [1, 6, 0]
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [np.array([True]), np.array([1, 0, 1]), np.zeros(3, dtype=bool), np.array([[True] * 3]), "all"],
+    ids=repr,
+)
+def test_a_reset_mask_is_one_boolean_per_environment(mask):
+    envs = GridWorldVectorEnv(3)
+    with pytest.raises(InputError, match="reset_mask"):
+        envs.reset(options={"reset_mask": mask})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "mistake"),
+    [
+        ({"num_envs": 0}, "num_envs"),
+        ({"num_envs": 2.0}, "num_envs"),
+        ({"max_episode_steps": 0}, "max_episode_steps"),
+        ({"max_episode_steps": 1.5}, "max_episode_steps"),
+        ({"autoreset_mode": "Never"}, "autoreset_mode.*NextStep.*SameStep"),
+        ({"render_mode": "human"}, "render_mode"),
+        ({"slip": 2}, "slip"),
+        ({"layout": "cliff", "num_rows": 9}, "num_rows=9"),
+    ],
+)
+def test_settings_that_make_no_batch_are_refused(arguments, mistake):
+    with pytest.raises(InputError, match=mistake):
+        GridWorldVectorEnv(**arguments)
+
+
+@pytest.mark.parametrize("seed", [[1, 2, 3], 1.5, "1", True])
+def test_a_batch_has_one_seed(seed):
+    with pytest.raises(InputError, match="seed"):
+        GridWorldVectorEnv(3).reset(seed=seed)
+
+
+def test_spaces_and_names():
+    envs = gym.make_vec("GridWorld-v0", num_envs=3)
+    assert isinstance(envs.unwrapped, GridWorldVectorEnv)
+    assert envs.num_envs == 3
+    assert envs.single_observation_space == spaces.Discrete(30)
+    assert envs.single_action_space == spaces.Discrete(4)
+    assert envs.observation_space == spaces.MultiDiscrete([30] * 3)
+    assert envs.action_space == spaces.MultiDiscrete([4] * 3)
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    envs.reset(seed=0)
+    assert envs.step(envs.action_space.sample())[0] in envs.observation_space
+
+
+def test_a_frame_per_environment():
+    envs = gym.make_vec("GridWorld-v0", num_envs=2, render_mode="rgb_array", cell_size=10)
+    one = gym.make("GridWorld-v0", render_mode="rgb_array", cell_size=10)
+    envs.reset()
+    one.reset()
+    envs.step([RIGHT, UP])
+    one.step(RIGHT)
+    first, second = envs.render()
+    assert np.array_equal(first, one.render())
+    assert not np.array_equal(first, second)
+    assert GridWorldVectorEnv(2).render() is None
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
+def test_wrapped_batches_show_the_rows_of_their_states(mode):
+    envs = gridworld.VectorOneHotObservation(GridWorldVectorEnv(4, autoreset_mode=mode))
+    assert envs.single_observation_space == spaces.Box(0, 1, (30,), np.float32)
+    assert envs.observation_space.shape == (4, 30)
+    observations, _ = envs.reset(seed=0)
+    for actions in moves(60, 4):
+        assert np.array_equal(observations.argmax(axis=1), envs.unwrapped.states)
+        assert np.array_equal(observations.sum(axis=1), np.ones(4))
+        observations, *_ = envs.step(actions)
+
+
+def test_a_batch_of_another_world_is_not_wrapped():
+    with pytest.raises(InputError, match="GridWorld"):
+        gridworld.VectorOneHotObservation(SyncVectorEnv([lambda: gym.make("FrozenLake-v1")]))
