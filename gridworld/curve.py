@@ -56,6 +56,7 @@ class Curve:
         self._streak = 0
         self._evaluations = 0
         self._next = self._every
+        self._total = config.total_timesteps
         self._file: IO[str] = path.open("w", newline="", encoding="utf-8")
         self._rows: csv.DictWriter[str] | None = None
         self._progress = Progress(
@@ -68,8 +69,11 @@ class Curve:
         events.charts("learning curves beside the optimum", CHARTS)
 
     def on_step(self, step: int) -> bool:
-        """Evaluate if it is due; False once the certificate has held for long enough."""
-        if step >= self._next:
+        """Evaluate if it is due; False once the certificate has held for long enough.
+
+        The last step is left to the evaluation after training, since an update may still follow it.
+        """
+        if self._next <= step < self._total:
             self._next += self._every * ((step - self._next) // self._every + 1)
             self.evaluate(step)
         return self._stop_after is None or self._streak < self._stop_after

@@ -6,12 +6,13 @@ probability of 1, whatever its number of steps.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from gridworld.layout import Cell
-from gridworld.mdp import FloatArray, IntArray, Mdp
+from gridworld.mdp import BoolArray, FloatArray, IntArray, Mdp
 from gridworld.solve import (
     Outcome,
     Solution,
@@ -39,13 +40,14 @@ class Score:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean over sampled episodes with the half-width of its 95 % interval (normal approximation)."""
+    """A mean over sampled episodes with its 95 % interval."""
 
     mean: float
-    half_width: float
+    low: float
+    high: float
 
     def __str__(self) -> str:
-        return f"{self.mean:.4g} ± {self.half_width:.2g}"
+        return f"{self.mean:.4g} [{self.low:.3g}, {self.high:.3g}]"
 
 
 @dataclass(frozen=True)
@@ -113,12 +115,12 @@ class Judge:
                 break
         return Sampled(
             episodes=episodes,
-            value=_estimate(discounted),
-            goal=_estimate(self.mdp.goal[states]),
-            trap=_estimate(self.mdp.trap[states]),
-            timeout=_estimate(running),
-            episode_return=_estimate(total),
-            length=_estimate(length),
+            value=_mean(discounted),
+            goal=_share(self.mdp.goal[states]),
+            trap=_share(self.mdp.trap[states]),
+            timeout=_share(running),
+            episode_return=_mean(total),
+            length=_mean(length),
         )
 
     def _at_start(self, values: FloatArray) -> float:
@@ -143,7 +145,23 @@ def play_episode(mdp: Mdp, policy: FloatArray, max_episode_steps: int, seed: int
     return np.array(visited)
 
 
-def _estimate(samples: FloatArray | np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Estimate:
-    samples = np.asarray(samples, dtype=np.float64)
-    spread = float(samples.std(ddof=1)) if len(samples) > 1 else 0.0
-    return Estimate(float(samples.mean()), 1.96 * spread / len(samples) ** 0.5)
+_Z = 1.96  # standard deviations of the normal distribution on either side of 95 % of it
+
+
+def _mean(samples: FloatArray) -> Estimate:
+    """Normal approximation."""
+    mean, count = float(samples.mean()), len(samples)
+    half_width = _Z * float(samples.std(ddof=1)) / count**0.5 if count > 1 else math.inf
+    return Estimate(mean, mean - half_width, mean + half_width)
+
+
+def _share(hits: BoolArray) -> Estimate:
+    """Wilson's score interval, which stays honest where no episode, or every one, is a hit.
+
+    E. B. Wilson, Journal of the American Statistical Association 22, 1927.
+    """
+    count, share = len(hits), float(hits.mean())
+    middle = (share + _Z**2 / (2 * count)) / (1 + _Z**2 / count)
+    spread = share * (1 - share) / count + _Z**2 / (4 * count**2)
+    half_width = _Z / (1 + _Z**2 / count) * spread**0.5
+    return Estimate(share, max(0.0, middle - half_width), min(1.0, middle + half_width))

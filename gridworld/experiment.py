@@ -62,7 +62,7 @@ def main(conf: Path) -> None:
     if {"--help", "-h"} & set(sys.argv[1:]):
         print(manual(conf))
         return
-    _register()
+    register_schemas()
     asked_for_traceback = FULL_ERROR in os.environ
     os.environ[FULL_ERROR] = "1"  # so that Hydra raises its errors instead of printing them
     try:
@@ -100,7 +100,7 @@ def run_job(settings: DictConfig) -> float:
     return float(summary["regret"])
 
 
-def _register() -> None:
+def register_schemas() -> None:
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
     for name, schema in AGENT_SCHEMAS.items():

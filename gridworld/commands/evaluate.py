@@ -75,9 +75,9 @@ def _table(judge: Judge, score: Score, sampled: Sampled) -> str:
         (exact.expected_return, sampled.episode_return, optimum.expected_return),
         (exact.expected_length, sampled.length, optimum.expected_length),
     )
-    lines = [f"  {'':<22}{'exact':>10}  {f'{sampled.episodes:,} episodes':<20}{'optimum':>10}"]
+    lines = [f"  {'':<22}{'exact':>10}  {f'{sampled.episodes:,} episodes [95 %]':<26}{'optimum':>10}"]
     for label, (value, estimate, best) in zip(_LABELS, numbers, strict=True):
-        lines.append(f"  {label:<22}{value:>10.4g}  {estimate!s:<20}{best:>10.4g}")
+        lines.append(f"  {label:<22}{value:>10.4g}  {estimate!s:<26}{best:>10.4g}")
     return "\n".join(lines)
 
 

@@ -1,0 +1,51 @@
+"""What several tests need: the repository's paths, its configurations composed, its scripts run."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from gridworld.config import TrainConfig
+from gridworld.experiment import register_schemas
+from gridworld.run import Run
+from gridworld.training import train
+
+ROOT = Path(__file__).resolve().parents[1]
+CONF = ROOT / "conf"
+
+# A run that takes a moment: too short to learn, long enough to pass through everything.
+SHORT = {
+    "dqn": ["agent=dqn", "total_timesteps=2000", "agent.learning_starts=300", "evaluation.every=500"],
+    "ppo": ["agent=ppo", "total_timesteps=2000", "n_envs=16", "agent.n_steps=32", "agent.batch_size=64"],
+}
+
+
+def configure(*overrides: str) -> TrainConfig:
+    """The configuration that the command line would give to a run."""
+    register_schemas()
+    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        settings = compose(config_name="train", overrides=list(overrides))
+    config = OmegaConf.to_object(settings)
+    assert isinstance(config, TrainConfig)
+    return config
+
+
+def train_in(folder: Path, *overrides: str) -> dict[str, object]:
+    """A run in `folder` without a process of its own; returns its summary."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return train(configure(*overrides), Run(folder), list(overrides))
+
+
+def script(name: str, *arguments: str, cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run one of the scripts as a user does, from another folder."""
+    return subprocess.run(
+        [sys.executable, str(ROOT / "scripts" / name), *arguments],
+        cwd=cwd,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )

@@ -1,0 +1,165 @@
+"""A mistake on a command line gets one sentence, exit code 2, no traceback, and leaves nothing behind."""
+
+from pathlib import Path
+
+import pytest
+from support import script
+
+MAPS = {
+    "unknown": "S.x\n..G\n",
+    "ragged": "S..\n.G\n",
+    "no_start": "...\n..G\n",
+    "no_goal": "S..\n...\n",
+    "empty": "",
+    "enclosed": "S#G\n.#.\n",
+}
+
+# (command line, words of the sentence)
+TRAIN = [
+    ("env.layout={maps}/unknown.txt", "unknown.txt: row 1, column 3: unknown tile 'x'"),
+    ("env.layout={maps}/ragged.txt", "ragged.txt: row 2 has 2 columns, row 1 has 3"),
+    ("env.layout={maps}/no_start.txt", "no_start.txt: there is no start"),
+    ("env.layout={maps}/no_goal.txt", "no_goal.txt: there is no goal"),
+    ("env.layout={maps}/empty.txt", "empty.txt: the map is empty"),
+    ("env.layout={maps}/enclosed.txt", "no goal can be reached from the start in row 1, column 1"),
+    ("env.layout={maps}/binary.txt", "not a text file"),
+    ("env.layout={maps}/large.txt", "at most 262144 cells"),
+    ("env.layout={maps}", "cannot be read"),
+    ("env.layout=nowhere.txt", "neither a shipped layout (aima_4x3, classic"),
+    ("env.num_rows=3", "at least 4 rows and 4 columns"),
+    ("env.num_cols=3", "at least 4 rows and 4 columns"),
+    ("env.num_rows=0", "num_rows=0: must be a whole number of at least 1"),
+    ("env.num_cols=-2", "num_cols=-2: must be a whole number of at least 1"),
+    ("env.num_rows=4.5", "env.num_rows=4.5: Value '4.5' of type 'float' could not be converted to Integer"),
+    ("env.num_rows=true", "env.num_rows=true: Value 'True' of type 'bool'"),
+    ("env=maze env.num_rows=9", "num_rows=9: the map maze has 15"),
+    ("env.slip=1.5", "slip=1.5: must be a probability, from 0 to 1"),
+    ("env.slip=nan", "slip=nan: must be a finite number"),
+    ("env.goal_reward=inf", "goal_reward=inf: must be a finite number"),
+    ("env.max_episode_steps=0", "env.max_episode_steps=0: must be at least 1"),
+    ("agent.learning_rate=-1", "agent.learning_rate=-1: must be a number of at least 0"),
+    ("agent.learning_rate=nan", "agent.learning_rate=nan: must be"),
+    ("agent.learning_rate=inf", "agent.learning_rate=inf: must be"),
+    ("agent.learning_rate=fast", "agent.learning_rate=fast: must be a number of at least 0, or lin_NUMBER"),
+    ("agent.learning_rate=true", "agent.learning_rate=true"),
+    ("agent.gamma=1.1", "agent.gamma=1.1: must be from 0 to 1"),
+    ("evaluation.gamma=-0.1", "evaluation.gamma=-0.1: must be from 0 to 1"),
+    ("evaluation.gamma=1 env.step_reward=1", "gamma=1 with step_reward=1.0: the return grows without end"),
+    ("evaluation.every=0", "evaluation.every=0: must be at least 1"),
+    ("total_timesteps=0", "total_timesteps=0: must be at least 1"),
+    ("total_timesteps=1e3", "total_timesteps=1e3: Value '1000.0'"),
+    ("seed=-1", "seed=-1: must be at least 0"),
+    ("seed=abc", "seed=abc: Value 'abc' of type 'str' could not be converted to Integer"),
+    ("seed=1,2", "Ambiguous value for argument 'seed=1,2'; to run one job for each of the values, add -m"),
+    ("seed=[1", "seed=[1: no viable alternative"),
+    ("n_envs=0", "n_envs=0: must be at least 1"),
+    ("threads=0", "threads=0: must be at least 1"),
+    ("agent=ppo agent.batch_size=1000", "agent.batch_size=1000: must divide the rollout"),
+    ("agent=ppo agent.use_sde=true", "agent.use_sde=true: gSDE explores continuous actions"),
+    ("agent=ppo agent.clip_range=-0.1", "agent.clip_range=-0.1: must be"),
+    ("agent=ppo agent.ent_coef=nan", "agent.ent_coef=nan: must be at least 0"),
+    ("agent=ppo agent.target_kl=0", "agent.target_kl=0.0: must be a positive number"),
+    ("agent.buffer_size=10", "agent.buffer_size=10: smaller than a batch"),
+    ("agent.learning_starts=100000", "must be below total_timesteps="),
+    ("agent.train_freq=often", "agent.train_freq=often: must be a whole number"),
+    ("agent.train_freq=[1,episode]", "SB3 counts episodes with one environment only; set n_envs=1"),
+    ("agent.exploration_fraction=0", "agent.exploration_fraction=0.0: must be a positive number"),
+    ("observation=image", "agent.policy=MlpPolicy cannot see images; set agent.policy=CnnPolicy"),
+    ("agent.policy=CnnPolicy", "agent.policy=CnnPolicy sees images only"),
+    ("agent=sarsa_max", "agent=sarsa_max: there is no such choice; there are dqn"),
+    ("env=mars", "env=mars: there is no such choice; there are aima_4x3, classic"),
+    ("env=null", "Config group override must be a string or a list"),
+    ("ganma=1", "Key 'ganma' not in 'TrainConfig'"),
+    ("agent.learning_rat=1", "Key 'learning_rat' not in 'DQNConfig'; did you mean learning_rate"),
+    ("+agent.learning_rat=1", "agent.learning_rat: there is no such key; did you mean learning_rate"),
+    ("agent.policy_kwargs.netarch=[8]", "Key 'netarch' not in 'PolicyKwargs'; did you mean net_arch?"),
+    ("agent.algorithm=PPO", "agent.algorithm=PPO: these are the settings of DQN"),
+    ("agent.family=tf", "agent.family=tf: there is no such family"),
+    ("recording.cell_size=100000", "too large to draw"),
+    ("recording.fps=0", "recording.fps=0: must be from 1 to 100"),
+    ("--frobnicate", "unrecognized arguments: --frobnicate"),
+]
+
+TRAIN_WITH_SB3 = [
+    ("agent.policy=TransformerPolicy", "agent.policy=TransformerPolicy: DQN has MlpPolicy, CnnPolicy"),
+    ("agent.policy_kwargs.net_arch=[0]", "agent.policy_kwargs.net_arch=[0]: must be layer widths"),
+    ("agent.policy_kwargs.activation_fn=os.system", "activation_fn=os.system: must be the import path"),
+    ("device=cuda:99", "device=cuda:99: torch finds no CUDA device"),
+    ("device=abacus", "device=abacus: must be auto, cpu, cuda or cuda:N"),
+    ("observation=image agent.policy=CnnPolicy observation.cell_size=4", "32 x 28 pixels are too small"),
+]
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("maps")
+    for name, text in MAPS.items():
+        (folder / f"{name}.txt").write_text(text)
+    (folder / "binary.txt").write_bytes(bytes(range(128, 256)))
+    (folder / "large.txt").write_text(("." * 1000 + "\n") * 300)
+    return folder
+
+
+@pytest.mark.parametrize(("line", "words"), TRAIN + TRAIN_WITH_SB3, ids=lambda value: str(value)[:60])
+def test_train_refuses_before_it_writes(line: str, words: str, maps: Path, tmp_path: Path) -> None:
+    done = script("train.py", *line.format(maps=maps).split(), cwd=tmp_path)
+    sentence = done.stderr.strip().splitlines()[-1]
+    assert words in sentence
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+def test_a_used_folder_is_refused_and_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "used").mkdir()
+    (tmp_path / "used" / "manifest.json").write_text("{}")
+    done = script("train.py", "hydra.run.dir=used", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "error: used: holds a run already; choose another folder with hydra.run.dir=...\n"
+    assert [path.name for path in (tmp_path / "used").iterdir()] == ["manifest.json"]
+
+
+def test_a_folder_under_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    done = script("train.py", "hydra.run.dir=file/run", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "error: file/run: cannot be made, file is a file" in done.stderr
+
+
+def test_a_used_sweep_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "sweep" / "0_seed=0").mkdir(parents=True)
+    (tmp_path / "sweep" / "0_seed=0" / "manifest.json").write_text("{}")
+    done = script("train.py", "-m", "seed=0", "hydra.sweep.dir=sweep", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "sweep/0_seed=0: holds a run already" in done.stderr
+
+
+def test_divergence_is_told_and_marked(tmp_path: Path) -> None:
+    done = script("train.py", "agent.learning_rate=1e30", "hydra.run.dir=run", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "training diverged" in done.stderr
+    assert '"status": "failed"' in (tmp_path / "run" / "manifest.json").read_text()
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "words"),
+    [
+        ("evaluate.py", "nowhere", "nowhere: no such folder"),
+        ("evaluate.py", ".", "not a run's folder, it has no manifest.json"),
+        ("evaluate.py", ". --episodes 0", "--episodes 0: must be at least 1"),
+        ("evaluate.py", ". --render human", "there is no display"),
+        ("evaluate.py", "", "the following arguments are required: run"),
+        ("record.py", "nowhere", "nowhere: no such folder"),
+        ("record.py", ". --fps 0", "--fps 0: must be from 1 to 100"),
+        ("record.py", ". --cell-size 1", "--cell-size 1: must be at least 2"),
+        ("record.py", ". --format bmp", "invalid choice: 'bmp'"),
+        ("record.py", ". --episodes 0", "--episodes 0: must be from 1"),
+        ("benchmark.py", "--fast", "unrecognized arguments: --fast"),
+    ],
+)
+def test_the_other_scripts_refuse_too(name: str, line: str, words: str, tmp_path: Path) -> None:
+    done = script(name, *line.split(), cwd=tmp_path, SDL_VIDEODRIVER="", DISPLAY="", WAYLAND_DISPLAY="")
+    assert words in done.stderr.strip().splitlines()[-1]
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,210 @@
+"""The command lines, as a user types them: train, look, sweep, stop."""
+
+import fcntl
+import json
+import os
+import pty
+import re
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import time
+from pathlib import Path
+
+import pytest
+from support import CONF, ROOT, SHORT, script
+
+from gridworld.commands import benchmark, evaluate
+from gridworld.commands import record as record_command
+from gridworld.manual import manual
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run from the real command line, its output in output.txt beside it."""
+    folder = tmp_path_factory.mktemp("finished")
+    done = script("train.py", *SHORT["dqn"], "hydra.run.dir=run", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    (folder / "output.txt").write_text(done.stdout)
+    return folder / "run"
+
+
+def test_train_tells_what_was_reached_and_where(finished: Path) -> None:
+    output = (finished.parent / "output.txt").read_text()
+    summary = json.loads((finished / "summary.json").read_text())
+    assert re.search(r"value +\S+ +\S+ +0\.9321", output)
+    assert "certified optimal since" in output if summary["certified"] else "not optimal: regret" in output
+    assert "  files: run\n" in output
+    assert "  curves: tensorboard --logdir run\n" in output
+    assert {"config.yaml", "hydra.yaml", "overrides.yaml"} == {
+        p.name for p in (finished / ".hydra").iterdir()
+    }
+
+
+def test_runs_get_folders_of_their_own_even_in_the_same_second(tmp_path: Path) -> None:
+    command = [sys.executable, str(ROOT / "scripts" / "train.py"), *SHORT["dqn"], "env.layout=my map.txt"]
+    (tmp_path / "my map.txt").write_text("S..\n..G\n")
+    runs = [subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL) for _ in range(2)]
+    assert [run.wait(timeout=120) for run in runs] == [0, 0]
+    folders = sorted(path.name for path in (tmp_path / "runs").iterdir())
+    assert len(folders) == 2
+    for folder in folders:
+        assert re.fullmatch(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_dqn_my-map.txt_seed0_[0-9a-f]{6}", folder)
+
+
+def test_a_sweep_has_a_folder_per_job_and_survives_a_bad_one(tmp_path: Path) -> None:
+    line = ["-m", "agent=dqn", "seed=0,-1,2", "total_timesteps=1000", "hydra.sweep.dir=sweep"]
+    done = script("train.py", *line, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "error: seed=-1: must be at least 0" in done.stderr
+    assert "Traceback" not in done.stderr
+    jobs = sorted(path.name for path in (tmp_path / "sweep").iterdir() if path.is_dir())
+    assert jobs == [
+        f"{number}_agent=dqn,seed={seed},total_timesteps=1000" for number, seed in ((0, 0), (2, 2))
+    ]
+    for job in jobs:
+        assert json.loads((tmp_path / "sweep" / job / "summary.json").read_text())["seed"] == int(job[0])
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_a_run_cleanly(number: signal.Signals, code: int, tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        str(ROOT / "scripts" / "train.py"),
+        "total_timesteps=100000000",
+        "hydra.run.dir=run",
+    ]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        curve = tmp_path / "run" / "curve.csv"
+        deadline = time.monotonic() + 60
+        while not (curve.exists() and curve.read_text().count("\n") > 2) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=20)
+    assert process.returncode == code
+    assert f"stopped by {number.name}; run holds what there was until then" in errors
+    assert "Traceback" not in errors
+    assert json.loads((tmp_path / "run" / "manifest.json").read_text())["status"] == "interrupted"
+    again = script("evaluate.py", "run", cwd=tmp_path)
+    assert again.returncode == 2
+    assert "this run is 'interrupted'" in again.stderr
+
+
+def test_progress_is_a_bar_on_a_terminal_only(finished: Path, tmp_path: Path) -> None:
+    main, terminal = pty.openpty()
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
+    command = [sys.executable, str(ROOT / "scripts" / "train.py"), *SHORT["dqn"], "hydra.run.dir=run"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=terminal) as process:
+        os.close(terminal)
+        shown = b""
+        while True:
+            try:
+                shown += (part := os.read(main, 4096))
+            except OSError:
+                break
+            if not part:
+                break
+    os.close(main)
+    assert process.returncode == 0
+    assert b"dqn on classic: 100%" in shown
+    assert b"regret" in shown
+    assert "%|" not in (finished.parent / "output.txt").read_text()
+
+
+def test_help_is_a_manual_with_every_choice(tmp_path: Path) -> None:
+    done = script("train.py", "--help", cwd=tmp_path)
+    assert done.returncode == 0
+    assert done.stdout.strip() == manual(CONF).strip()
+    for file in CONF.glob("*/*.yaml"):
+        line = next(line for line in done.stdout.splitlines() if line.strip().split(" ")[0] == file.stem)
+        assert len(line.split()) > 2, f"{file} opens with no comment that says what it is"
+    assert done.stdout.count("python scripts/train.py") >= 5
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--cfg", "job"]])
+def test_asking_imports_nothing_heavy(arguments: list[str], tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", str(ROOT / "scripts" / "train.py"), *arguments],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0
+    modules = {line.rsplit("|", 1)[1].strip() for line in done.stderr.splitlines() if "|" in line}
+    assert "hydra" in modules
+    assert not modules & {"torch", "stable_baselines3", "gymnasium", "numpy", "pygame", "tensorboard"}
+
+
+def test_evaluate_scores_again_exactly_and_by_sampling(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    evaluate.main([str(finished), "--episodes", "50"])
+    output = capsys.readouterr().out
+    summary = json.loads((finished / "summary.json").read_text())
+    value = next(line for line in output.splitlines() if line.strip().startswith("value"))
+    assert float(value.split()[1]) == pytest.approx(summary["value"], abs=1e-4)
+    assert "50 episodes" in output
+
+    other = tmp_path / "other.txt"
+    other.write_text("S....G\n......\n......\n......\n......\n")
+    evaluate.main([str(finished), "--layout", str(other), "--policy", "sampled", "--episodes", "50"])
+    assert f"on {other}" in capsys.readouterr().out
+
+    done = script("evaluate.py", str(finished), "--layout", "cliff", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == (
+        "error: layout cliff: is 4x12, the agent was trained on 5x6; take a map of that size\n"
+    )
+
+
+def test_evaluate_shows_an_episode_in_a_window(finished: Path, tmp_path: Path) -> None:
+    done = script("evaluate.py", str(finished), "--render", "human", cwd=tmp_path, SDL_VIDEODRIVER="dummy")
+    assert done.returncode == 0, done.stderr
+    assert "greedy policy of" in done.stdout
+
+
+def test_record_writes_every_format_it_names(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["--format", "png", "gif", "apng", "mp4", "--cell-size", "11", "--fps", "7", "--policy", "sampled"]
+    record_command.main(
+        [str(finished), *line, "--episodes", "2", "--seed", "3", "--out", str(tmp_path / "out")]
+    )
+    named = [Path(line) for line in capsys.readouterr().out.splitlines()]
+    assert [path.name for path in named] == ["frames", "episode.gif", "episode.apng", "episode.mp4"]
+    assert all(path.exists() for path in named)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {path.name for path in named}
+
+
+def test_a_run_whose_files_were_damaged_is_refused(finished: Path, tmp_path: Path) -> None:
+    for name, damage, words in (
+        ("model.zip", b"no zip", "model.zip: not a model"),
+        ("model.zip", None, "model.zip: not a model"),
+        ("manifest.json", b"{", "manifest.json: cannot be read"),
+        ("manifest.json", b"[]", "not the manifest of a run"),
+        ("manifest.json", b"\xff\xfe", "manifest.json: cannot be read"),
+    ):
+        copy = tmp_path / "copy"
+        subprocess.run(["cp", "-r", str(finished), str(copy)], check=True)
+        if damage is None:
+            (copy / name).unlink()
+        else:
+            (copy / name).write_bytes(damage)
+        done = script("evaluate.py", "copy", cwd=tmp_path)
+        assert (done.returncode, "Traceback" in done.stderr) == (2, False)
+        assert words in done.stderr
+        subprocess.run(["rm", "-r", str(copy)], check=True)
+
+
+def test_the_benchmark_prints_a_ratio_per_row(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = benchmark.comparisons(seconds=0.002)
+    measured = [benchmark.compare(row, repetitions=1) for row in rows]
+    assert all(ours > 0 and theirs > 0 for ours, theirs, _ in measured)
+    assert all(ratio == pytest.approx(ours / theirs) for ours, theirs, ratio in measured)
+    benchmark.main(["--quick"])
+    output = capsys.readouterr().out
+    for row in rows:
+        assert re.search(re.escape(row.name) + r" +[\d,]+ +[\d,]+ +[\d.]+x", output)
