@@ -13,10 +13,10 @@ from gridworld.agents import Agent, Beliefs
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge, Score
-from gridworld.events import EventWriter
+from gridworld.events import IMAGES_TAB, EventWriter
 from gridworld.policy_map import draw_policy_map
 from gridworld.progress import Progress
-from gridworld.render import Frame
+from gridworld.render import Frame, fitting_cell_size
 from gridworld.solve import one_hot_policy
 
 GREEDY, SAMPLED = "eval", "eval_sampled"  # TensorBoard's groups of the two policies
@@ -85,9 +85,10 @@ class Curve:
             self._score(step)
             self.seconds += time.perf_counter() - started
         if self._events is not None and self._map_every and (last or self._due_for_map()):
-            self._events.image("policy", self.policy_map(), step)
+            cell_size = fitting_cell_size(self.judge.mdp, IMAGES_TAB)
+            self._events.image("policy", self.policy_map(cell_size), step)
 
-    def policy_map(self) -> Frame:
+    def policy_map(self, cell_size: int | None = None) -> Frame:
         """A picture of the policy as it was evaluated last."""
         assert self.beliefs is not None
         return draw_policy_map(
@@ -96,6 +97,7 @@ class Curve:
             self.beliefs.greedy,
             self.judge.solution.optimal,
             caption=f"greedy policy after {self._step:,} steps",
+            cell_size=cell_size,
         )
 
     def close(self) -> None:

@@ -23,6 +23,10 @@ from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 from gridworld.render import Frame
 
+# Pixels that pictures have in TensorBoard. It scales by skipping pixels: thin lines vanish, text frays.
+IMAGES_TAB = 350
+TIME_SERIES_CARD = 240
+
 HParamValue = bool | float | str | None
 
 

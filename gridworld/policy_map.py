@@ -30,11 +30,13 @@ def draw_policy_map(
     greedy: IntArray,
     optimal: BoolArray,
     caption: str = "",
+    cell_size: int | None = None,
 ) -> Frame:
     """`values` (S,), `greedy` (S,) and `optimal` (S, A) as a frame with caption and colour scale."""
     pygame = drawing.import_pygame()
     layout = mdp.layout
-    cell = max(4, min(64, _LONGEST_SIDE // (max(layout.num_rows, layout.num_cols) + 2)))
+    cell = drawing.fitting_cell_size(mdp, _LONGEST_SIDE, largest=64) if cell_size is None else cell_size
+    cell = max(4, cell)
     surface = pygame.Surface(drawing.frame_size(mdp, cell))
     surface.fill(drawing.BACKGROUND)
     shown = ~(mdp.terminal | mdp.wall)

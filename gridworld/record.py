@@ -19,7 +19,7 @@ from gridworld.errors import InputError
 from gridworld.files import replacing
 from gridworld.layout import positive_int
 from gridworld.mdp import IntArray, Mdp
-from gridworld.render import CELL_SIZE, Frame, draw_frame
+from gridworld.render import Frame, draw_frame, fitting_cell_size
 
 FORMATS = ("png", "gif", "apng", "mp4")
 
@@ -29,8 +29,7 @@ _LAST_FRAME_HOLD = 4  # frames; an animation rests on its end before it starts a
 
 def automatic_cell_size(mdp: Mdp) -> int:
     """The environment's own 100 pixels where the frame stays near 1000, less on larger maps."""
-    cells = max(mdp.layout.num_rows, mdp.layout.num_cols) + 2
-    return max(2, min(CELL_SIZE, _LONGEST_SIDE // cells))
+    return fitting_cell_size(mdp, _LONGEST_SIDE)
 
 
 def draw_states(mdp: Mdp, states: IntArray, cell_size: int | None = None) -> list[Frame]:

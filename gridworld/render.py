@@ -58,6 +58,12 @@ def frame_size(mdp: Mdp, cell_size: int = CELL_SIZE) -> tuple[int, int]:
     return width, height
 
 
+def fitting_cell_size(mdp: Mdp, longest_side: int, largest: int = CELL_SIZE) -> int:
+    """The cell size with which a frame's longest side is about `longest_side`, at most `largest`."""
+    cells = max(mdp.layout.num_rows, mdp.layout.num_cols) + 2
+    return max(2, min(largest, longest_side // cells))
+
+
 def draw_frame(mdp: Mdp, state: int | None, cell_size: int = CELL_SIZE) -> Frame:
     """The frame with the agent in `state` (None: without an agent), as a fresh array."""
     pygame = import_pygame()

@@ -16,12 +16,12 @@ from gridworld.agents import Agent, Seat, family
 from gridworld.config import EnvConfig, TrainConfig, check
 from gridworld.curve import GREEDY, Curve
 from gridworld.evaluation import Judge, Score, play_episode
-from gridworld.events import EventWriter, HParamValue
+from gridworld.events import TIME_SERIES_CARD, EventWriter, HParamValue
 from gridworld.files import write_json
 from gridworld.layout import Layout, load
 from gridworld.mdp import Mdp, compile_mdp
 from gridworld.observations import ObservationTable, make_observation
-from gridworld.render import frame_size
+from gridworld.render import fitting_cell_size, frame_size
 from gridworld.run import Run
 from gridworld.solve import one_hot_policy
 from gridworld.vector_env import GridWorldVectorEnv
@@ -211,10 +211,10 @@ def _record(
     if wanted.frames:
         record.save_pngs(frames, run.frames_folder)
     if wanted.gif:
-        gif = record.encode_gif(frames, wanted.fps)
-        record.save_bytes(gif, run.folder / EPISODE_GIF)
-        if events is not None:
-            events.animation("episode", gif, frames[0], steps)
+        record.save_animation(frames, run.folder / EPISODE_GIF, wanted.fps)
+    if wanted.gif and events is not None:
+        small = record.draw_states(mdp, states, fitting_cell_size(mdp, TIME_SERIES_CARD))
+        events.animation("episode", record.encode_gif(small, wanted.fps), small[0], steps)
     if wanted.mp4:
         record.save_mp4(frames, run.folder / EPISODE_MP4, wanted.fps)
 

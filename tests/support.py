@@ -18,7 +18,10 @@ CONF = ROOT / "conf"
 
 # A run that takes a moment: too short to learn, long enough to pass through everything.
 SHORT = {
-    "dqn": ["agent=dqn", "total_timesteps=2000", "agent.learning_starts=300", "evaluation.every=500"],
+    "dqn": [
+        *("agent=dqn", "total_timesteps=2000", "evaluation.every=500"),
+        *("agent.learning_starts=300", "agent.exploration_fraction=1"),
+    ],
     "ppo": ["agent=ppo", "total_timesteps=2000", "n_envs=16", "agent.n_steps=32", "agent.batch_size=64"],
 }
 
