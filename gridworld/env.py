@@ -85,8 +85,6 @@ class GridWorldEnv(gym.Env[int, int]):
         self.observation_space = spaces.Discrete(self.mdp.num_states)
         self.action_space = spaces.Discrete(NUM_ACTIONS)
 
-        self.window: Any = None  # pygame's surface once human mode has opened it
-        self.clock: Any = None
         self._window: drawing.Window | None = None
         self._state: int = int(self.mdp.start_states[0])
         self._describe(world)
@@ -104,6 +102,16 @@ class GridWorldEnv(gym.Env[int, int]):
         self.trap_cells = list(world.traps)
         self.trap_states = [self.grid2state[cell] for cell in world.traps]
         self.terminal_states = [self.grid2state[cell] for cell in world.terminals]
+
+    @property
+    def window(self) -> Any:
+        """pygame's surface of the window, None until human mode has opened one."""
+        return None if self._window is None else self._window.surface
+
+    @property
+    def clock(self) -> Any:
+        """pygame's clock that keeps the frame rate, None until human mode has opened a window."""
+        return None if self._window is None else self._window.clock
 
     def _move(self, action: int, row: int, col: int) -> Cell:
         return self.state2grid[int(self.mdp.neighbour[self.grid2state[row, col], action])]
@@ -143,6 +151,8 @@ class GridWorldEnv(gym.Env[int, int]):
         move = check_action(action)
         state, mdp = self._state, self.mdp
         if mdp.terminal[state]:
+            if self.render_mode == "human":
+                self._show()
             return state, 0.0, True, False, {}
         outcome = 0 if mdp.slip == 0 else slip_outcome(mdp.slip, self.np_random.random())
         self._state = int(mdp.next_state[state, move, outcome])
@@ -169,21 +179,17 @@ class GridWorldEnv(gym.Env[int, int]):
     def _show(self) -> None:
         if self._window is None:
             self._window = drawing.Window(drawing.frame_size(self.mdp, self.cell_size), "GridWorld")
-            self.window, self.clock = self._window.surface, self._window.clock
         try:
             self._window.show(self.mdp, self._state, self.cell_size, self.metadata["render_fps"], self.delay)
         except SystemExit:
-            self._forget_window()
+            self._window = None
             raise
 
     def close(self) -> None:
         """Close the window, if there is one. May be called again."""
         if self._window is not None:
             self._window.close()
-            self._forget_window()
-
-    def _forget_window(self) -> None:
-        self._window = self.window = self.clock = None
+            self._window = None
 
     def get_coords(self, row: int, col: int, loc: str = "center") -> Point | list[Point]:
         """Pixels for drawing into the cell: one (x, y) for `center`, else a list of them.

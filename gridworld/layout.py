@@ -81,8 +81,8 @@ def classic(num_rows: int = 5, num_cols: int = 6) -> Layout:
     num_rows, num_cols = positive_int("num_rows", num_rows), positive_int("num_cols", num_cols)
     if num_rows < 4 or num_cols < 4:
         raise InputError(
-            f"layout classic: {num_rows} rows and {num_cols} columns cannot hold a goal and three traps "
-            "with a way around them; give at least 4 rows and 4 columns"
+            f"layout classic: {num_rows} rows and {num_cols} columns are too few for a goal, its three traps "
+            "and a way around them; give at least 4 rows and 4 columns"
         )
     row, col = num_rows // 2, num_cols - 2
     traps = ((row + 1, col), (row, col - 1), (row - 1, col))
@@ -91,7 +91,7 @@ def classic(num_rows: int = 5, num_cols: int = 6) -> Layout:
 
 def parse(text: str, name: str) -> Layout:
     """Read a map from its text. `name` is what error messages call it."""
-    lines = [line.rstrip() for line in text.splitlines()]
+    lines = [line.rstrip() for line in text.replace("\r\n", "\n").replace("\r", "\n").split("\n")]
     while lines and not lines[-1]:
         lines.pop()
     if not lines:
@@ -128,7 +128,7 @@ def load(layout: str | PathLike[str] | Layout, num_rows: int = 5, num_cols: int 
     `num_rows` and `num_cols` size `classic`. A map has its own size: other numbers than the default ones
     must then agree with it.
     """
-    if layout == CLASSIC:
+    if isinstance(layout, str) and layout == CLASSIC:
         return classic(num_rows, num_cols)
     loaded = layout if isinstance(layout, Layout) else _read(layout)
     for what, asked, default, actual in (

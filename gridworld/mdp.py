@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ from gridworld.layout import MOVES, Cell, Layout
 IntArray = NDArray[np.integer[Any]]
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+Table = TypeVar("Table", bound=NDArray[Any])
 
 NUM_ACTIONS = len(MOVES)
 ACTION_NAMES = ("up", "right", "down", "left")
@@ -65,12 +66,12 @@ class Mdp:
     @cached_property
     def start_states(self) -> IntArray:
         """States with a start, ascending."""
-        return np.flatnonzero(self.start)
+        return _frozen(np.flatnonzero(self.start))
 
     @cached_property
     def trap(self) -> BoolArray:
         """(S,), terminal and no goal."""
-        return self.terminal & ~self.goal
+        return _frozen(self.terminal & ~self.goal)
 
 
 def compile_mdp(
@@ -102,23 +103,26 @@ def compile_mdp(
     reward[absorbing] = 0.0
 
     start = _mask(layout, layout.starts) / len(layout.starts)
-    for table in (neighbour, next_state, reward, terminal, goal, wall, start):
-        table.setflags(write=False)
     return Mdp(
         layout=layout,
         slip=slip,
         step_reward=step_reward,
         goal_reward=goal_reward,
         trap_reward=trap_reward,
-        neighbour=neighbour,
-        next_state=next_state,
+        neighbour=_frozen(neighbour),
+        next_state=_frozen(next_state),
         probability=np.broadcast_to(np.array(chances), next_state.shape),
-        reward=reward,
-        terminal=terminal,
-        goal=goal,
-        wall=wall,
-        start=start,
+        reward=_frozen(reward),
+        terminal=_frozen(terminal),
+        goal=_frozen(goal),
+        wall=_frozen(wall),
+        start=_frozen(start),
     )
+
+
+def _frozen(table: Table) -> Table:
+    table.setflags(write=False)
+    return table
 
 
 def _mask(layout: Layout, cells: tuple[Cell, ...] | frozenset[Cell]) -> BoolArray:
@@ -140,6 +144,11 @@ def _neighbours(layout: Layout, wall: BoolArray) -> IntArray:
 
 
 def _finite(what: str, value: Any) -> float:
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or not math.isfinite(value):
-        raise InputError(f"{what}={value!r}: must be a finite number")
-    return float(value)
+    try:
+        plain = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
+        number = float(value) if plain else math.nan
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise InputError(f"{what}={str(value)[:50]}: must be a finite number")
+    return number

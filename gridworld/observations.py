@@ -12,7 +12,6 @@ all there is to it, for one environment, a batch, a replay buffer or the whole s
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,7 +40,16 @@ class ObservationTable:
     kind: str
     space: gym.Space[Any]
     num_states: int
-    rows: Callable[[IntArray], NDArray[Any]]  # states (...) -> fresh observations (..., *shape)
+    stored: NDArray[Any] | None  # (S, *shape), read-only; None: one-hot rows, written when asked for
+
+    def rows(self, states: IntArray) -> NDArray[Any]:
+        """Fresh observations (..., *shape) of states (...)."""
+        if self.stored is not None:
+            return np.array(self.stored[states])
+        flat = np.ravel(states)
+        rows = np.zeros((flat.size, self.num_states), dtype=np.float32)
+        rows[np.arange(flat.size), flat] = 1.0
+        return rows.reshape(*np.shape(states), self.num_states)
 
     def table(self) -> NDArray[Any]:
         """(S, *shape), all of them."""
@@ -51,16 +59,9 @@ class ObservationTable:
 def one_hot(mdp: Mdp) -> ObservationTable:
     """A unit vector per state."""
     size = mdp.num_states
-
-    def scattered(states: IntArray) -> NDArray[np.float32]:
-        flat = np.ravel(states)
-        rows = np.zeros((flat.size, size), dtype=np.float32)
-        rows[np.arange(flat.size), flat] = 1.0
-        return rows.reshape(*np.shape(states), size)
-
     small = size * size * 4 <= _SMALL_TABLE_BYTES
-    rows = _lookup(np.eye(size, dtype=np.float32)) if small else scattered
-    return ObservationTable("one_hot", spaces.Box(0.0, 1.0, (size,), np.float32), size, rows)
+    stored = np.eye(size, dtype=np.float32) if small else None
+    return _table("one_hot", spaces.Box(0.0, 1.0, (size,), np.float32), mdp, stored)
 
 
 def coordinates(mdp: Mdp) -> ObservationTable:
@@ -68,8 +69,7 @@ def coordinates(mdp: Mdp) -> ObservationTable:
     layout = mdp.layout
     cells = np.array(list(layout.cells()), dtype=np.float32)
     scaled = cells / np.maximum(np.array([layout.num_rows, layout.num_cols], dtype=np.float32) - 1, 1)
-    box = spaces.Box(0.0, 1.0, (2,), np.float32)
-    return ObservationTable("coordinates", box, mdp.num_states, _lookup(scaled))
+    return _table("coordinates", spaces.Box(0.0, 1.0, (2,), np.float32), mdp, scaled)
 
 
 def image(mdp: Mdp, cell_size: int = IMAGE_CELL_SIZE) -> ObservationTable:
@@ -83,18 +83,19 @@ def image(mdp: Mdp, cell_size: int = IMAGE_CELL_SIZE) -> ObservationTable:
             f"{size / 2**30:.1f} GiB, more than 1; take a cell_size below {cell_size} or another observation"
         )
     frames = np.stack([drawing.draw_frame(mdp, state, cell_size) for state in range(mdp.num_states)])
-    table = np.ascontiguousarray(frames.transpose(0, 3, 1, 2))
-    box = spaces.Box(0, 255, table.shape[1:], np.uint8)
-    return ObservationTable("image", box, mdp.num_states, _lookup(table))
+    pixels = np.ascontiguousarray(frames.transpose(0, 3, 1, 2))
+    return _table("image", spaces.Box(0, 255, pixels.shape[1:], np.uint8), mdp, pixels)
 
 
 def none(mdp: Mdp) -> ObservationTable:
     """The state's number as it is."""
+    return _table("none", spaces.Discrete(mdp.num_states), mdp, np.arange(mdp.num_states))
 
-    def rows(states: IntArray) -> NDArray[np.int64]:
-        return np.array(states, dtype=np.int64)
 
-    return ObservationTable("none", spaces.Discrete(mdp.num_states), mdp.num_states, rows)
+def _table(kind: str, space: gym.Space[Any], mdp: Mdp, stored: NDArray[Any] | None) -> ObservationTable:
+    if stored is not None:
+        stored.setflags(write=False)
+    return ObservationTable(kind, space, mdp.num_states, stored)
 
 
 def make_observation(mdp: Mdp, kind: str, cell_size: int = IMAGE_CELL_SIZE) -> ObservationTable:
@@ -107,15 +108,6 @@ def make_observation(mdp: Mdp, kind: str, cell_size: int = IMAGE_CELL_SIZE) -> O
     return plain[kind](mdp)
 
 
-def _lookup(table: NDArray[Any]) -> Callable[[IntArray], NDArray[Any]]:
-    table.setflags(write=False)
-
-    def rows(states: IntArray) -> NDArray[Any]:
-        return table[np.asarray(states)]
-
-    return rows
-
-
 class _TableObservation(gym.ObservationWrapper[Any, int, int], gym.utils.RecordConstructorArgs):
     def __init__(self, env: gym.Env[int, int], table: ObservationTable, **arguments: Any) -> None:
         gym.utils.RecordConstructorArgs.__init__(self, **arguments)
@@ -124,7 +116,7 @@ class _TableObservation(gym.ObservationWrapper[Any, int, int], gym.utils.RecordC
         self.observation_space = table.space
 
     def observation(self, observation: int) -> NDArray[Any]:
-        return np.array(self.table.rows(np.asarray(observation)))
+        return self.table.rows(np.asarray(observation))
 
 
 class OneHotObservation(_TableObservation):

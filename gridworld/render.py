@@ -152,10 +152,15 @@ class Window:
                 "human mode found no display, so its window cannot be seen; "
                 "set DISPLAY, or use render_mode='rgb_array'"
             )
-        pygame.display.init()  # not pygame.init(), which would look for a sound card too
-        self.surface = pygame.display.set_mode(size)
-        pygame.display.set_caption(title)
+        self._size, self._title = size, title
         self.clock = pygame.time.Clock()
+        self._open()
+
+    def _open(self) -> None:
+        display = import_pygame().display
+        display.init()  # not pygame.init(), which would look for a sound card too
+        self.surface = display.set_mode(self._size)
+        display.set_caption(self._title)
 
     def show(self, mdp: Mdp, state: int, cell_size: int, fps: int, delay: float) -> None:
         """Draw and show one frame, keep to `fps`, then wait `delay` seconds more.
@@ -163,6 +168,8 @@ class Window:
         Somebody closing the window shuts pygame down and raises `SystemExit`.
         """
         pygame = import_pygame()
+        if not pygame.display.get_init():  # pygame has one display a process, and another window closed it
+            self._open()
         draw_world(self.surface, mdp, state, cell_size)
         for event in pygame.event.get():
             if event.type == pygame.QUIT:

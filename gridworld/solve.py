@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gridworld.errors import InputError
+from gridworld.layout import positive_int
 from gridworld.mdp import NUM_ACTIONS, BoolArray, FloatArray, IntArray, Mdp
 
 # Two actions whose values agree to this relative precision are equally good. Rounding stays far below it.
@@ -75,17 +76,21 @@ def value_iteration(mdp: Mdp, gamma: float) -> Solution:
         )
     v = _sweep(mdp, gamma)
     q = _backup(mdp, v, gamma)
-    greedy = np.argmax(q, axis=1)
     if gamma == 1:
-        return Solution(gamma, v, q, _ties(q, v, np.abs(v)), np.abs(v))
+        return Solution(gamma, v, q, q >= (v - TIE * np.abs(v))[:, None], np.abs(v))
+    greedy, seen = np.argmax(q, axis=1), set()
     while True:
-        v, scale = _solve(mdp, one_hot_policy(greedy), gamma)
+        v, scale = _solve(mdp, one_hot_policy(greedy), gamma, precise=True)
         q = _backup(mdp, v, gamma)
-        current = np.take_along_axis(q, greedy[:, None], axis=1)[:, 0]
-        better = q.max(axis=1) - current > _IMPROVEMENT * scale
-        if not better.any():
-            return Solution(gamma, v, q, _ties(q, v, scale), scale)
-        greedy = np.where(better, np.argmax(q, axis=1), greedy)
+        q_scale = _backup(mdp, scale, gamma, magnitude=True)
+        best = np.argmax(q, axis=1)
+        gain = _pick(q, best) - _pick(q, greedy)
+        better = gain > _IMPROVEMENT * np.maximum(_pick(q_scale, best), _pick(q_scale, greedy))
+        seen.add(greedy.tobytes())
+        greedy = np.where(better, best, greedy)
+        if greedy.tobytes() in seen:  # no better action anywhere; by rounding, perhaps one met before
+            tolerance = TIE * np.maximum(q_scale, _pick(q_scale, best)[:, None])
+            return Solution(gamma, v, q, q >= _pick(q, best)[:, None] - tolerance, scale)
 
 
 def policy_value(mdp: Mdp, policy: FloatArray, gamma: float) -> FloatArray:
@@ -95,6 +100,7 @@ def policy_value(mdp: Mdp, policy: FloatArray, gamma: float) -> FloatArray:
 
 def outcome(mdp: Mdp, policy: FloatArray, max_steps: int) -> Outcome:
     """Goal, trap and time-out probability, return and length, exact for episodes of at most `max_steps`."""
+    positive_int("max_steps", max_steps)
     policy = check_policy(mdp, policy)
     transition, reward = _policy_tables(mdp, policy)
     backwards = transition.T
@@ -105,7 +111,7 @@ def outcome(mdp: Mdp, policy: FloatArray, max_steps: int) -> Outcome:
         if running == 0.0:
             break
         expected_length += running
-        expected_return += float(mass @ reward)
+        expected_return += float((mass * reward).sum())  # a dot product would wake BLAS's threads
         mass = backwards @ mass
     goal, trap = float(mass[mdp.goal].sum()), float(mass[mdp.trap].sum())
     return Outcome(goal, trap, float(mass[live].sum()), expected_return, expected_length)
@@ -141,7 +147,10 @@ def one_hot_policy(actions: IntArray) -> FloatArray:
 
 def check_policy(mdp: Mdp, policy: ArrayLike) -> FloatArray:
     """`policy` as float64 with rows that sum to 1; `InputError` where it is no policy of this world."""
-    table: FloatArray = np.asarray(policy, dtype=np.float64)
+    try:
+        table: FloatArray = np.asarray(policy, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"policy={policy!r}: must be a table of action probabilities") from None
     if table.shape != (mdp.num_states, NUM_ACTIONS):
         raise InputError(
             f"policy of shape {table.shape}: this world needs ({mdp.num_states}, {NUM_ACTIONS}), "
@@ -156,13 +165,25 @@ def check_policy(mdp: Mdp, policy: ArrayLike) -> FloatArray:
     return normalised
 
 
-def _backup(mdp: Mdp, v: FloatArray, gamma: float, states: IntArray | slice = slice(None)) -> FloatArray:
-    """Q (n, A) of these states from the values of their successors."""
-    target = mdp.reward[states] + gamma * v[mdp.next_state[states]]
+def _backup(
+    mdp: Mdp,
+    v: FloatArray,
+    gamma: float,
+    states: IntArray | slice = slice(None),
+    magnitude: bool = False,
+) -> FloatArray:
+    """Q (n, A) of these states from the values of their successors; with `magnitude`, rewards as |reward|."""
+    reward = np.abs(mdp.reward[states]) if magnitude else mdp.reward[states]
+    target = reward + gamma * v[mdp.next_state[states]]
     if target.shape[2] == 1:
         return target[:, :, 0]
     q: FloatArray = np.einsum("sak,sak->sa", mdp.probability[states], target)
     return q
+
+
+def _pick(table: FloatArray, actions: IntArray) -> FloatArray:
+    """table[s, actions[s]] for every state."""
+    return table[np.arange(len(actions)), actions]
 
 
 def _sweep(mdp: Mdp, gamma: float) -> FloatArray:
@@ -190,12 +211,14 @@ def _sweep(mdp: Mdp, gamma: float) -> FloatArray:
     return v
 
 
-def _ties(q: FloatArray, v: FloatArray, scale: FloatArray) -> BoolArray:
-    return q >= (v - TIE * scale)[:, None]
+def _solve(
+    mdp: Mdp, policy: FloatArray, gamma: float, precise: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """V_π and the same sum over |reward|, both (S,).
 
-
-def _solve(mdp: Mdp, policy: FloatArray, gamma: float) -> tuple[FloatArray, FloatArray]:
-    """V_π and the same sum over |reward|, both (S,)."""
+    `precise` takes the slower elimination whose error is small beside each state's own scale, not only
+    beside the largest one, so that it tells good from better even where values have become tiny.
+    """
     transition, reward = _policy_tables(mdp, policy)
     absolute = np.einsum("sa,sak,sak->s", policy, mdp.probability, np.abs(mdp.reward))
     values = np.zeros((mdp.num_states, 2))
@@ -213,14 +236,37 @@ def _solve(mdp: Mdp, policy: FloatArray, gamma: float) -> tuple[FloatArray, Floa
     right = np.stack([reward, absolute], axis=1)[states]
     if isinstance(transition, np.ndarray):
         matrix = np.eye(len(states)) - gamma * transition[np.ix_(states, states)]
-        values[states] = np.linalg.solve(matrix, right)
+        values[states] = _eliminate(matrix, right) if precise else np.linalg.solve(matrix, right)
     else:
         from scipy.sparse import eye_array
         from scipy.sparse.linalg import splu
 
         matrix = eye_array(len(states), format="csr") - gamma * transition[states][:, states]
-        values[states] = splu(matrix.tocsc()).solve(right)
+        factors = splu(
+            matrix.tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+        values[states] = factors.solve(right)
     return values[:, 0], values[:, 1]
+
+
+def _eliminate(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Gaussian elimination without pivoting, in place.
+
+    I - γ P_π is an M-matrix: nothing cancels off the diagonal, the diagonal stays at least 1 - γ, and sums
+    of non-negative numbers stay exactly that. Pivoting would give this up for nothing.
+    """
+    size = len(matrix)
+    for k in range(size - 1):
+        factors = matrix[k + 1 :, k] / matrix[k, k]
+        rows = np.flatnonzero(factors)
+        matrix[k + 1 + rows, k:] -= factors[rows, None] * matrix[k, k:]
+        right[k + 1 + rows] -= factors[rows, None] * right[k]
+    for k in range(size - 1, -1, -1):
+        right[k] = (right[k] - matrix[k, k + 1 :] @ right[k + 1 :]) / matrix[k, k]
+    return right
 
 
 def _policy_tables(mdp: Mdp, policy: FloatArray) -> tuple[Any, FloatArray]:

@@ -134,8 +134,11 @@ def test_a_layout_is_passed_through():
 
 @pytest.mark.parametrize(
     ("num_rows", "num_cols"),
-    [(3, 6), (2, 6), (1, 6), (0, 6), (-5, 6), (5, 2), (5, 1), (5, 0), (5, -1), (5.0, 6), (5, 6.5), (5, "6")]
-    + [(True, 6), (5, None), (float("nan"), 6), (600, 600)],
+    [
+        *[(rows, 6) for rows in (3, 2, 1, 0, -5, 5.0, "5", True, None, float("nan"))],
+        *[(5, cols) for cols in (3, 2, 1, 0, -1, 6.5, "6", None)],
+        (600, 600),
+    ],
 )
 def test_classic_refuses_what_cannot_hold_it(num_rows, num_cols):
     with pytest.raises(InputError, match=r"classic|num_rows|num_cols"):

@@ -59,6 +59,9 @@ def test_shapes_and_sums(world):
     assert mdp.start.sum() == pytest.approx(1, abs=1e-12)
 
 
+TABLES = ["neighbour", "next_state", "probability", "reward", "terminal", "goal", "wall", "start"]
+
+
 @pytest.mark.parametrize("name", ["layout", "slip", "reward"])
 def test_a_world_is_immutable(name):
     with pytest.raises(dataclasses.FrozenInstanceError):
@@ -66,11 +69,7 @@ def test_a_world_is_immutable(name):
 
 
 @pytest.mark.parametrize("slip", [0.0, 0.2])
-@pytest.mark.parametrize(
-    "name",
-    ["neighbour", "next_state", "probability", "reward", "terminal", "goal", "trap", "wall"]
-    + ["start", "start_states"],
-)
+@pytest.mark.parametrize("name", [*TABLES, "trap", "start_states"])
 def test_every_table_is_read_only(name, slip):
     table = getattr(compile_mdp(load("classic"), slip=slip), name)
     with pytest.raises(ValueError, match="read-only"):

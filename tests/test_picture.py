@@ -137,10 +137,8 @@ def test_the_map_as_text():
 def test_a_frame_that_would_be_too_large_is_refused():
     layout = Layout("vast", 100, 100, starts=((0, 0),), goals=((99, 99),))
     for mode in ("rgb_array", "human"):
-        env = GridWorldEnv(render_mode=mode, layout=layout)
         with pytest.raises(InputError, match=r"vast.*10200 x 10200.*cell_size"):
-            env.reset()
-            env.render()
+            GridWorldEnv(render_mode=mode, layout=layout).render()
     small = GridWorldEnv(render_mode="rgb_array", layout=layout, cell_size=10)
     assert small.render().shape == (1020, 1020, 3)
 
@@ -149,6 +147,11 @@ def test_a_frame_that_would_be_too_large_is_refused():
 def test_a_cell_size_is_a_positive_whole_number(cell_size):
     with pytest.raises(InputError, match="cell_size"):
         GridWorldEnv(cell_size=cell_size)
+
+
+def test_without_a_render_mode_nothing_is_drawn():
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert GridWorldEnv().render() is None
 
 
 @pytest.mark.parametrize("mode", ["rgb", "", "Human", 1])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracle import DEFAULT_ROWS, MOVES, World, policies, worlds
+from oracle import DEFAULT_ROWS, MOVES, World, maps, policies, worlds
 
 from gridworld import InputError, solve
 from gridworld.layout import load, parse
@@ -37,6 +37,7 @@ def test_the_optimum_equals_brute_force(world, gamma):
     assert solution.gamma == gamma
     assert solution.v == pytest.approx(np.array([best[cell] for cell in world.cells]), abs=1e-9)
     assert solution.q == pytest.approx(np.array(q), abs=1e-9)
+    assert solution.optimal.any(axis=1).all()
     top = solution.q.max(axis=1, keepdims=True)
     assert np.array_equal(solution.optimal, solution.q >= top - 1e-9 * solution.scale[:, None])
 
@@ -114,6 +115,14 @@ def test_the_optimal_actions_are_the_shortest_safe_ones():
         assert solution.v[world.state(cell)] == pytest.approx(0.99 ** (steps - 1), rel=1e-12)
 
 
+@given(maps(), st.sampled_from([0.0, 0.2, 0.6]))
+def test_without_discount_and_without_costs_the_optimum_equals_brute_force(rows, slip):
+    world = World(rows, slip=slip)
+    best = world.optimal_values(1, tolerance=1e-13)
+    solution = solve.value_iteration(compiled(world), 1)
+    assert solution.v == pytest.approx(np.array([best[cell] for cell in world.cells]), abs=1e-9)
+
+
 @settings(max_examples=15)
 @given(worlds(max_side=3).filter(lambda world: world.settings["step_reward"] < 0))
 def test_without_discount_and_with_costs_the_optimum_is_that_of_a_long_horizon(world):
@@ -163,6 +172,30 @@ def test_without_discount_a_cell_that_cannot_end_is_lost():
     assert values[[6, 7]].tolist() == [-np.inf, -np.inf]
     assert values[[0, 1]] == pytest.approx([0, 0.5])
     assert not solve.value_iteration(made("S.G\n###\n..#"), 1).v[[6, 7]].any()
+
+
+@pytest.mark.parametrize(
+    ("text", "slip", "gamma"),
+    [
+        ("T.SG", 1.0, 0.99),
+        ("..#\n.T.\nTSG", 0.1, 0.9),
+        ("..#..\n.GT.#\n.##TT\n.....\n..ST.\nTT.#.", 0.1, 0.999),
+    ],
+    ids=["line", "square", "rooms"],
+)
+def test_where_nothing_can_be_won_there_still_is_a_best_action(text, slip, gamma):
+    code = (  # in a process of its own, which can be stopped
+        "from gridworld.layout import parse; from gridworld.mdp import compile_mdp;"
+        "from gridworld import solve;"
+        f"solution = solve.value_iteration(compile_mdp(parse({text!r}, 'map'), slip={slip}), {gamma});"
+        "print(solution.optimal.any(axis=1).all(), *solution.v)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=5)
+    always, *values = done.stdout.split()
+    world = World(text.split(), slip=slip)
+    best = world.optimal_values(gamma, tolerance=1e-14)
+    assert list(map(float, values)) == pytest.approx([best[cell] for cell in world.cells], abs=1e-9)
+    assert always == "True"
 
 
 def test_endless_states_of_a_cycle():

@@ -1,0 +1,138 @@
+"""Every shipped layout under every observation, single or batched, keeps the contract."""
+
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import gridworld
+from gridworld import GridWorldEnv, InputError
+from gridworld.layout import parse
+from gridworld.observations import make_observation
+
+LAYOUTS = gridworld.shipped_layouts()
+WRAPPERS = {  # kind: (wrapper of one environment, wrapper of a batch)
+    "none": (lambda env: env, lambda envs: envs),
+    "one_hot": (gridworld.OneHotObservation, gridworld.VectorOneHotObservation),
+    "coordinates": (gridworld.CoordinateObservation, gridworld.VectorCoordinateObservation),
+    "image": (gridworld.ImageObservation, gridworld.VectorImageObservation),
+}
+
+
+@pytest.fixture(params=[0.0, 0.2], ids=["", "slip"])
+def slip(request):
+    return request.param
+
+
+@pytest.mark.parametrize("kind", WRAPPERS)
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_one_env(layout, kind, slip):
+    from stable_baselines3.common.env_checker import check_env as check_for_sb3
+
+    env = WRAPPERS[kind][0](gym.make("GridWorld-v0", layout=layout, slip=slip))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_for_sb3(env)
+    table = make_observation(env.unwrapped.mdp, kind).table()
+    assert len(table) == env.unwrapped.mdp.num_states
+    observation, _ = env.reset(seed=1)
+    for action in np.random.default_rng(1).integers(4, size=60):
+        row = table[env.unwrapped.state]
+        assert observation in env.observation_space
+        assert np.array_equal(observation, row)
+        assert np.asarray(observation).dtype == table.dtype == env.observation_space.dtype
+        observation, _, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:
+            observation, _ = env.reset()
+
+
+@pytest.mark.parametrize("kind", WRAPPERS)
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_batch_of_envs(layout, kind, slip):
+    envs = WRAPPERS[kind][1](gym.make_vec("GridWorld-v0", num_envs=3, layout=layout, slip=slip))
+    table = make_observation(envs.unwrapped.mdp, kind).table()
+    assert envs.observation_space.shape == (3, *envs.single_observation_space.shape)
+    observations, _ = envs.reset(seed=1)
+    for actions in np.random.default_rng(1).integers(4, size=(60, 3)):
+        assert observations in envs.observation_space
+        assert np.array_equal(observations, table[envs.unwrapped.states])
+        assert observations.dtype == table.dtype == envs.single_observation_space.dtype
+        assert all(row in envs.single_observation_space for row in observations)
+        observations, *_ = envs.step(actions)
+
+
+def test_what_the_observations_show():
+    mdp = GridWorldEnv(4, 5).mdp
+    rows, cols = np.divmod(np.arange(20), 5)
+    assert np.array_equal(make_observation(mdp, "none").table(), np.arange(20))
+    assert np.array_equal(make_observation(mdp, "one_hot").table(), np.eye(20))
+    assert make_observation(mdp, "coordinates").table() == pytest.approx(
+        np.stack([rows / 3, cols / 4], axis=1)
+    )
+    pictures = make_observation(mdp, "image", cell_size=8).table()
+    env = GridWorldEnv(4, 5, render_mode="rgb_array", cell_size=8)
+    for state in range(20):
+        env.state = state
+        assert np.array_equal(pictures[state].transpose(1, 2, 0), env.render())
+    for text, scaled in (("S.G", [[0, 0], [0, 0.5], [0, 1]]), ("S.\n.G", [[0, 0], [0, 1], [1, 0], [1, 1]])):
+        small = GridWorldEnv(layout=parse(text, "small")).mdp
+        assert make_observation(small, "coordinates").table().tolist() == scaled
+
+
+@pytest.mark.parametrize("kind", WRAPPERS)
+def test_observations_are_fresh(kind):
+    env = WRAPPERS[kind][0](GridWorldEnv())
+    table = make_observation(env.unwrapped.mdp, kind)
+    before, first = table.table(), env.reset()[0]
+    if kind != "none":
+        first[...] = 7
+        table.rows(np.arange(3))[...] = 7
+    assert np.array_equal(table.table(), before)
+    assert np.array_equal(env.reset()[0], before[0])
+
+
+def test_one_hot_rows_of_a_large_world():
+    world = "\n".join(["S" + "." * 63, *["." * 64] * 62, "." * 63 + "G"])
+    env = gridworld.OneHotObservation(GridWorldEnv(layout=parse(world, "large")))
+    for state in (0, 77, 4095):
+        env.unwrapped.state = state
+        observation = env.observation(state)
+        assert observation in env.observation_space
+        assert np.flatnonzero(observation).tolist() == [state]
+    assert env.table.rows(np.array([[5, 6]])).shape == (1, 2, 4096)
+
+
+def test_wrappers_refuse_what_they_cannot_show():
+    with pytest.raises(InputError, match="GridWorld"):
+        gridworld.OneHotObservation(gym.make("FrozenLake-v1"))
+    with pytest.raises(InputError, match="GiB"):
+        gridworld.ImageObservation(GridWorldEnv(30, 30), cell_size=50)
+    with pytest.raises(InputError, match="cell_size"):
+        gridworld.ImageObservation(GridWorldEnv(), cell_size=0)
+    with pytest.raises(InputError, match="observation kind 'pixels'"):
+        make_observation(GridWorldEnv().mdp, "pixels")
+
+
+def test_a_wrapped_env_can_be_made_again_from_its_spec():
+    env = gridworld.ImageObservation(gym.make("GridWorld-v0", layout="cliff", slip=0.1), cell_size=10)
+    again = gym.make(env.spec)
+    assert again.observation_space == env.observation_space
+    assert np.array_equal(again.reset(seed=0)[0], env.reset(seed=0)[0])
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
+def test_wrapped_batches_show_the_rows_of_their_states(mode):
+    envs = gridworld.VectorOneHotObservation(gridworld.GridWorldVectorEnv(4, autoreset_mode=mode))
+    assert envs.single_observation_space == gym.spaces.Box(0, 1, (30,), np.float32)
+    assert envs.observation_space.shape == (4, 30)
+    observations, _ = envs.reset(seed=0)
+    for actions in np.random.default_rng(0).integers(4, size=(60, 4)):
+        assert np.array_equal(observations.argmax(axis=1), envs.unwrapped.states)
+        assert np.array_equal(observations.sum(axis=1), np.ones(4))
+        observations, *_ = envs.step(actions)
+
+
+def test_a_batch_of_another_world_is_not_wrapped():
+    with pytest.raises(InputError, match="GridWorld"):
+        gridworld.VectorOneHotObservation(gym.make_vec("FrozenLake-v1"))
