@@ -13,6 +13,7 @@ Reinforcement Learning, 2nd ed., 2018, chapter 4.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -190,7 +191,8 @@ def _sweep(mdp: Mdp, gamma: float) -> FloatArray:
     """Value iteration from V = 0, each sweep only where a neighbour's value has just changed.
 
     Changes are measured relative to the value, so the wave of a far goal is followed to the last cell,
-    however small the discounted value has become there.
+    however small the discounted value has become there. Measured so, a value that fades away to 0 never
+    comes to rest; with γ < 1 the waves from all ends have long passed when sweeping stops.
     """
     tolerance = _UNDISCOUNTED_TOLERANCE if gamma == 1 else _SWEEP_TOLERANCE
     v = np.zeros(mdp.num_states)
@@ -200,7 +202,14 @@ def _sweep(mdp: Mdp, gamma: float) -> FloatArray:
         v[playing & ~can_end] = -np.inf
         playing &= can_end
     active = np.flatnonzero(playing)
-    while active.size:
+    sweeps = (
+        itertools.count()
+        if gamma == 1
+        else range(100 + 2 * max(_farthest(mdp, ends) for ends in (mdp.goal, mdp.trap)))
+    )
+    for _ in sweeps:
+        if not active.size:
+            break
         new = _backup(mdp, v, gamma, active).max(axis=1)
         changed = active[np.abs(new - v[active]) > tolerance * np.abs(new)]
         v[active] = new
@@ -282,6 +291,19 @@ def _policy_tables(mdp: Mdp, policy: FloatArray) -> tuple[Any, FloatArray]:
 
     used = weight > 0
     return csr_array((weight[used], (rows[used], mdp.next_state[used])), shape=(size, size)), reward
+
+
+def _farthest(mdp: Mdp, ends: BoolArray) -> int:
+    """Moves to the nearest of these ends from the cell that is farthest from them, past all other ends."""
+    reached = mdp.terminal.copy()
+    frontier: IntArray = np.flatnonzero(ends)
+    moves = 0
+    while frontier.size:
+        around = np.unique(mdp.neighbour[frontier])
+        frontier = around[~reached[around]]
+        reached[frontier] = True
+        moves += 1
+    return moves
 
 
 def _taken(mdp: Mdp, policy: FloatArray) -> BoolArray:
