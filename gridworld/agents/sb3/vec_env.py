@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,21 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from gridworld.errors import InputError
+from gridworld.mdp import BoolArray, FloatArray
 from gridworld.observations import ObservationTable
-from gridworld.vector_env import GridWorldVectorEnv
+from gridworld.vector_env import GridWorldVectorEnv, StateArray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class StateStep:
+    """What a step of the batch did; all arrays (num_envs,)."""
+
+    states: StateArray  # the new ones, after the reset of episodes that ended
+    last_states: StateArray  # where the step led to, before that reset
+    rewards: FloatArray
+    dones: BoolArray
+    truncated: BoolArray  # ended by the step limit alone
+    ended: dict[int, dict[str, Any]]  # SB3's info of each environment whose episode ended
 
 
 class GridWorldVecEnv(VecEnv):
@@ -35,6 +49,11 @@ class GridWorldVecEnv(VecEnv):
         self._lengths = np.zeros(envs.num_envs, dtype=np.int64)
         super().__init__(envs.num_envs, observation.space, envs.single_action_space)
 
+    @property
+    def states(self) -> StateArray:
+        """(num_envs,) current states."""
+        return self.envs.states
+
     def reset(self) -> VecEnvObs:
         """Start all episodes; a seed given by `seed()` before is used once."""
         states, _ = self.envs.reset(seed=self._seeds[0])
@@ -48,28 +67,42 @@ class GridWorldVecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        states, rewards, terminated, truncated, ended = self.envs.step(self._actions)
+        step = self.step_states(self._actions)
+        rewards = step.rewards.astype(np.float32)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for index, info in step.ended.items():
+            infos[index] = info
+        return self.observation.rows(step.states), rewards, step.dones, infos
+
+    def step_states(self, actions: NDArray[Any]) -> StateStep:
+        """One step of all environments, told in states instead of observations."""
+        states, rewards, terminated, truncated, ended = self.envs.step(actions)
         self._returns += rewards
         self._lengths += 1
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        dones = terminated | truncated
-        if ended:
-            over = np.flatnonzero(dones)
-            elapsed = round(time.time() - self._started, 6)
-            last = self.observation.rows(ended["final_obs"][over])
-            for index, observation in zip(over.tolist(), last, strict=True):
-                infos[index] = {
-                    "terminal_observation": observation,
-                    "TimeLimit.truncated": bool(truncated[index] and not terminated[index]),
-                    "episode": {
-                        "r": float(self._returns[index]),
-                        "l": int(self._lengths[index]),
-                        "t": elapsed,
-                    },
-                }
-            self._returns[over] = 0.0
-            self._lengths[over] = 0
-        return self.observation.rows(states), rewards.astype(np.float32), dones, infos
+        if not ended:
+            return StateStep(states, states, rewards, terminated, truncated, {})
+        dones, last = ended["_final_obs"], ended["final_obs"]
+        truncated &= ~terminated
+        over = np.flatnonzero(dones)
+        elapsed = round(time.time() - self._started, 6)
+        infos = {
+            index: {
+                "terminal_observation": observation,
+                "TimeLimit.truncated": cut,
+                "episode": {"r": episode_return, "l": length, "t": elapsed},
+            }
+            for index, observation, cut, episode_return, length in zip(
+                over.tolist(),
+                self.observation.rows(last[over]),
+                truncated[over].tolist(),
+                self._returns[over].tolist(),
+                self._lengths[over].tolist(),
+                strict=True,
+            )
+        }
+        self._returns[over] = 0.0
+        self._lengths[over] = 0
+        return StateStep(states, last, rewards, dones, truncated, infos)
 
     def close(self) -> None:
         self.envs.close()
