@@ -20,7 +20,7 @@ CONF = ROOT / "conf"
 SHORT = {
     "dqn": [
         *("agent=dqn", "total_timesteps=2000", "evaluation.every=500"),
-        *("agent.learning_starts=300", "agent.exploration_fraction=1"),
+        *("agent.learning_starts=300", "agent.exploration_fraction=1", "agent.log_interval=4"),
     ],
     "ppo": ["agent=ppo", "total_timesteps=2000", "n_envs=16", "agent.n_steps=32", "agent.batch_size=64"],
 }
