@@ -108,6 +108,7 @@ class SB3Config(AgentConfig):
 
     family: str = "sb3"
     algorithm: str = "???"
+    engine: str = "tabulated"  # the network runs once per state; stock: SB3's own loop, once per sample
     log_interval: int = 1  # of SB3's learn(): episodes for DQN, iterations for PPO
     policy: str = "MlpPolicy"
     learning_rate: Schedule = 1e-3  # a number, or lin_NUMBER to fall linearly to 0 at the end of training

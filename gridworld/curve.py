@@ -10,6 +10,7 @@ from typing import IO, Any
 import numpy as np
 
 from gridworld.agents import Agent, Beliefs
+from gridworld.chain import one_hot_policy
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge, Score
@@ -17,7 +18,6 @@ from gridworld.events import IMAGES_TAB, EventWriter
 from gridworld.policy_map import draw_policy_map
 from gridworld.progress import Progress
 from gridworld.render import Frame, fitting_cell_size
-from gridworld.solve import one_hot_policy
 
 GREEDY, SAMPLED = "eval", "eval_sampled"  # TensorBoard's groups of the two policies
 

@@ -11,18 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gridworld.chain import Chain, Outcome, check_policy, one_hot_policy
 from gridworld.layout import Cell
 from gridworld.mdp import BoolArray, FloatArray, IntArray, Mdp
-from gridworld.solve import (
-    Outcome,
-    Solution,
-    check_policy,
-    endless_states,
-    one_hot_policy,
-    outcome,
-    policy_value,
-    value_iteration,
-)
+from gridworld.solve import Solution, value_iteration
 from gridworld.vector_env import GridWorldVectorEnv
 
 REGRET_TOLERANCE = 1e-6  # relative; a detour of one step costs at least 1 % at the default discount
@@ -71,7 +63,7 @@ class Judge:
         self.max_episode_steps = max_episode_steps
         self.solution: Solution = value_iteration(mdp, gamma)
         self.optimal_value = self._at_start(self.solution.v)
-        self.optimum: Outcome = outcome(mdp, self.optimal_policy(), max_episode_steps)
+        self.optimum: Outcome = Chain(mdp, self.optimal_policy()).outcome(max_episode_steps)
 
     def optimal_policy(self) -> FloatArray:
         """(S, A), deterministic: the first of the optimal actions."""
@@ -79,15 +71,16 @@ class Judge:
 
     def score(self, policy: FloatArray) -> Score:
         """The exact scores of a policy table (S, A)."""
-        value = self._at_start(policy_value(self.mdp, policy, self.solution.gamma))
+        chain = Chain(self.mdp, policy)
+        value = self._at_start(chain.value(self.solution.gamma))
         regret = self.optimal_value - value
         certified = regret <= REGRET_TOLERANCE * self._at_start(self.solution.scale)
-        return Score(value, regret, certified, outcome(self.mdp, policy, self.max_episode_steps))
+        return Score(value, regret, certified, chain.outcome(self.max_episode_steps))
 
     def endless_cells(self, policy: FloatArray) -> list[Cell]:
         """Cells in which the policy may walk for ever; empty for one that ends."""
         cols = self.mdp.layout.num_cols
-        return [divmod(int(state), cols) for state in endless_states(self.mdp, policy)]
+        return [divmod(int(state), cols) for state in Chain(self.mdp, policy).endless_states()]
 
     def sample(self, policy: FloatArray, episodes: int, seed: int) -> Sampled:
         """Play `episodes` episodes, all at once."""

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gridworld.agents import Beliefs, family
+from gridworld.chain import one_hot_policy
 from gridworld.config import AGENT_SCHEMAS, AgentConfig, TrainConfig, check
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge
@@ -19,7 +20,6 @@ from gridworld.layout import Layout, load, parse
 from gridworld.mdp import FloatArray, Mdp
 from gridworld.observations import make_observation
 from gridworld.run import Run, open_run
-from gridworld.solve import one_hot_policy
 from gridworld.training import make_mdp, make_seat
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from gridworld import record
 from gridworld.agents import Agent, Seat, family
+from gridworld.chain import one_hot_policy
 from gridworld.config import EnvConfig, TrainConfig, check
 from gridworld.curve import GREEDY, Curve
 from gridworld.evaluation import Judge, Score, play_episode
@@ -23,7 +24,6 @@ from gridworld.mdp import Mdp, compile_mdp
 from gridworld.observations import ObservationTable, make_observation
 from gridworld.render import fitting_cell_size, frame_size
 from gridworld.run import Run
-from gridworld.solve import one_hot_policy
 from gridworld.vector_env import GridWorldVectorEnv
 
 HPARAM_METRICS = tuple(

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from gridworld.chain import one_hot_policy
 from gridworld.evaluation import Judge, play_episode
 from gridworld.layout import load, parse
 from gridworld.mdp import compile_mdp
-from gridworld.solve import one_hot_policy
 
 CLASSIC = Judge(compile_mdp(load("classic")), 0.99, 100)
 

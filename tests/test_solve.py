@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import DEFAULT_ROWS, MOVES, World, maps, policies, worlds
 
-from gridworld import InputError, solve
+from gridworld import InputError, chain, solve
+from gridworld.chain import Chain, one_hot_policy
 from gridworld.layout import load, parse
 from gridworld.mdp import compile_mdp
 
@@ -45,7 +46,7 @@ def test_the_optimum_equals_brute_force(world, gamma):
 @given(st.data(), worlds(), GAMMAS)
 def test_the_value_of_a_policy_equals_brute_force(data, world, gamma):
     policy = data.draw(policies(world))
-    exact = solve.policy_value(compiled(world), table(world, policy), gamma)
+    exact = Chain(compiled(world), table(world, policy)).value(gamma)
     slow = world.policy_values(policy, gamma)
     assert exact == pytest.approx(np.array([slow[cell] for cell in world.cells]), abs=1e-9)
 
@@ -53,7 +54,7 @@ def test_the_value_of_a_policy_equals_brute_force(data, world, gamma):
 @given(st.data(), worlds(), st.integers(0, 12))
 def test_the_outcome_within_the_limit_equals_brute_force(data, world, max_steps):
     policy = data.draw(policies(world))
-    result = solve.outcome(compiled(world), table(world, policy), max_steps)
+    result = Chain(compiled(world), table(world, policy)).outcome(max_steps)
     exact = result.goal, result.trap, result.timeout, result.expected_return, result.expected_length
     assert exact == pytest.approx(world.episode(policy, max_steps), abs=1e-12)
     assert result.goal + result.trap + result.timeout == pytest.approx(1, abs=1e-12)
@@ -62,12 +63,12 @@ def test_the_outcome_within_the_limit_equals_brute_force(data, world, max_steps)
 @given(st.data(), worlds(), GAMMAS)
 def test_large_worlds_are_solved_as_small_ones(data, world, gamma):
     mdp, policy = compiled(world), table(world, data.draw(policies(world)))
-    dense = solve.value_iteration(mdp, gamma), solve.policy_value(mdp, policy, gamma)
-    short = solve.outcome(mdp, policy, 7)
+    dense = solve.value_iteration(mdp, gamma), Chain(mdp, policy).value(gamma)
+    short = Chain(mdp, policy).outcome(7)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(solve, "_DENSE_STATES", 0)
-        sparse = solve.value_iteration(mdp, gamma), solve.policy_value(mdp, policy, gamma)
-        assert vars(solve.outcome(mdp, policy, 7)) == pytest.approx(vars(short), abs=1e-12)
+        patch.setattr(chain, "_DENSE_STATES", 0)
+        sparse = solve.value_iteration(mdp, gamma), Chain(mdp, policy).value(gamma)
+        assert vars(Chain(mdp, policy).outcome(7)) == pytest.approx(vars(short), abs=1e-12)
     assert sparse[0].q == pytest.approx(dense[0].q, abs=1e-11)
     assert np.array_equal(sparse[0].optimal, dense[0].optimal)
     assert sparse[1] == pytest.approx(dense[1], abs=1e-11)
@@ -128,13 +129,11 @@ def test_without_discount_and_without_costs_the_optimum_equals_brute_force(rows,
 def test_without_discount_and_with_costs_the_optimum_is_that_of_a_long_horizon(world):
     mdp = compiled(world)
     solution = solve.value_iteration(mdp, 1)
-    greedy = solve.one_hot_policy(np.argmax(solution.q, axis=1))
-    walked = solve.policy_value(mdp, greedy, 1)
+    greedy = one_hot_policy(np.argmax(solution.q, axis=1))
+    walked = Chain(mdp, greedy).value(1)
     assert walked == pytest.approx(solution.v, abs=1e-9)
     ends = np.isfinite(solution.v)
-    assert (
-        solution.v[ends] >= solve.policy_value(mdp, np.full((mdp.num_states, 4), 0.25), 1)[ends] - 1e-9
-    ).all()
+    assert (solution.v[ends] >= Chain(mdp, np.full((mdp.num_states, 4), 0.25)).value(1)[ends] - 1e-9).all()
     assert solution.v[ends] == pytest.approx(solve.value_iteration(mdp, 1 - 1e-9).v[ends], abs=1e-5)
 
 
@@ -148,22 +147,22 @@ def test_without_discount_a_positive_step_reward_has_no_optimum():
 @pytest.mark.parametrize(("step_reward", "worth"), [(0.0, 0.0), (-0.1, -np.inf), (0.1, np.inf)])
 def test_without_discount_a_policy_that_never_ends(step_reward, worth):
     mdp = made("S.G", step_reward=step_reward)
-    back_and_forth = solve.one_hot_policy(np.array([1, 3, 0]))
-    assert solve.policy_value(mdp, back_and_forth, 1).tolist() == [worth, worth, 0]
+    back_and_forth = one_hot_policy(np.array([1, 3, 0]))
+    assert Chain(mdp, back_and_forth).value(1).tolist() == [worth, worth, 0]
     half = back_and_forth.copy()
     half[1] = [0, 0.5, 0, 0.5]  # ends surely, after a while: four steps in the mean from the start
-    assert solve.policy_value(mdp, half, 1)[0] == pytest.approx(1 + 4 * step_reward)
+    assert Chain(mdp, half).value(1)[0] == pytest.approx(1 + 4 * step_reward)
 
 
 def test_without_discount_a_chance_of_never_ending_counts():
     ways = "..S#G\n....."  # left for ever, or down, to the right and up
-    policy = solve.one_hot_policy(np.array([0, 0, 0, 0, 0, 1, 1, 1, 1, 0]))
+    policy = one_hot_policy(np.array([0, 0, 0, 0, 0, 1, 1, 1, 1, 0]))
     policy[2] = [0.5, 0, 0.5, 0]  # waits a while, then goes down
-    assert solve.policy_value(made(ways), policy, 1)[2] == pytest.approx(1)
+    assert Chain(made(ways), policy).value(1)[2] == pytest.approx(1)
     policy[2] = [0, 0, 0.5, 0.5]  # goes down or left
-    assert solve.policy_value(made(ways), policy, 1)[2] == pytest.approx(0.5)
-    assert solve.policy_value(made(ways, step_reward=-1), policy, 1)[2] == -np.inf
-    assert solve.endless_states(made(ways), policy).tolist() == [1]
+    assert Chain(made(ways), policy).value(1)[2] == pytest.approx(0.5)
+    assert Chain(made(ways, step_reward=-1), policy).value(1)[2] == -np.inf
+    assert Chain(made(ways), policy).endless_states().tolist() == [1]
 
 
 def test_without_discount_a_cell_that_cannot_end_is_lost():
@@ -202,16 +201,16 @@ def test_endless_states_of_a_cycle():
     mdp = made("S..\n...\n..G")
     cycle = {0: 1, 1: 1, 2: 2, 5: 3, 4: 0}  # right twice, down, left, up and round again
     actions = np.array([cycle.get(state, 1) for state in range(9)])
-    assert solve.endless_states(mdp, solve.one_hot_policy(actions)).tolist() == [1, 2, 4, 5]
+    assert Chain(mdp, one_hot_policy(actions)).endless_states().tolist() == [1, 2, 4, 5]
     actions[5] = 2
-    assert solve.endless_states(mdp, solve.one_hot_policy(actions)).size == 0
-    assert solve.endless_states(mdp, solve.one_hot_policy(np.zeros(9, dtype=int))).tolist() == [0]
-    assert solve.endless_states(mdp, np.full((9, 4), 0.25)).size == 0
+    assert Chain(mdp, one_hot_policy(actions)).endless_states().size == 0
+    assert Chain(mdp, one_hot_policy(np.zeros(9, dtype=int))).endless_states().tolist() == [0]
+    assert Chain(mdp, np.full((9, 4), 0.25)).endless_states().size == 0
     slippery = made(
         "S..\n...\n..G", slip=0.1
     )  # "up" never leaves the first row, "right" slips down in the end
-    assert solve.endless_states(slippery, solve.one_hot_policy(np.full(9, 0))).tolist() == [0, 1, 2]
-    assert solve.endless_states(slippery, solve.one_hot_policy(np.full(9, 1))).size == 0
+    assert Chain(slippery, one_hot_policy(np.full(9, 0))).endless_states().tolist() == [0, 1, 2]
+    assert Chain(slippery, one_hot_policy(np.full(9, 1))).endless_states().size == 0
 
 
 def test_a_world_of_200_by_200_cells_fits_into_a_gigabyte():
@@ -236,7 +235,7 @@ def test_a_gamma_is_a_number_from_0_to_1(gamma):
     with pytest.raises(InputError, match="gamma="):
         solve.value_iteration(mdp, gamma)
     with pytest.raises(InputError, match="gamma="):
-        solve.policy_value(mdp, UNIFORM, gamma)
+        Chain(mdp, UNIFORM).value(gamma)
 
 
 def broken(value):
@@ -261,9 +260,9 @@ def broken(value):
 def test_what_is_no_policy_is_refused(policy, mistake):
     mdp = compile_mdp(load("classic"))
     for use in (
-        lambda: solve.policy_value(mdp, policy, 0.9),
-        lambda: solve.outcome(mdp, policy, 10),
-        lambda: solve.endless_states(mdp, policy),
+        lambda: Chain(mdp, policy).value(0.9),
+        lambda: Chain(mdp, policy).outcome(10),
+        lambda: Chain(mdp, policy).endless_states(),
     ):
         with pytest.raises(InputError, match=mistake):
             use()

@@ -11,11 +11,11 @@ from PIL import Image
 from support import SHORT, configure, train_in
 
 from gridworld.agents import Beliefs
+from gridworld.chain import one_hot_policy
 from gridworld.curve import Curve
 from gridworld.evaluation import Judge
 from gridworld.observations import one_hot
 from gridworld.saved_run import SavedRun
-from gridworld.solve import one_hot_policy
 from gridworld.training import make_mdp
 
 FILES = {"manifest.json", "curve.csv", "model.zip", "summary.json", "frames", "episode.gif", "policy.png"}

@@ -16,6 +16,7 @@ from gridworld.config import (
 )
 from gridworld.errors import InputError
 
+ENGINES = ("tabulated", "stock")
 LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end, as RL Zoo writes it
 
 
@@ -28,6 +29,8 @@ def check(config: TrainConfig) -> None:
         raise InputError(
             f"agent.algorithm={agent.algorithm}: these are the settings of {own}; choose agent=..."
         )
+    if agent.engine not in ENGINES:
+        raise InputError(f"agent.engine={agent.engine}: must be {' or '.join(ENGINES)}")
     check_schedule("agent.learning_rate", agent.learning_rate)
     at_least("agent.batch_size", agent.batch_size, 1)
     within("agent.gamma", agent.gamma, 0, 1)

@@ -29,11 +29,15 @@ from gridworld.config import DQNConfig, PPOConfig, SB3Config
 from gridworld.mdp import IntArray
 from gridworld.observations import ObservationTable
 
+_RANDOM_LAYERS = ("Dropout", "RReLU")
 _FEW_STATES = 1024  # up to here all states are cheaper than finding out which ones a batch holds
 
 
 def why_not(config: SB3Config) -> str | None:
     """Why these settings need SB3's own loop, or None where the tabulated one gives the same."""
+    activation = config.policy_kwargs.activation_fn or ""
+    if any(name in activation for name in _RANDOM_LAYERS):
+        return f"agent.policy_kwargs.activation_fn={activation} draws at random for every sample"
     if config.policy_kwargs.features_extractor_class is not None:
         return "agent.policy_kwargs.features_extractor_class may keep more than a function of the state"
     if isinstance(config, DQNConfig):
@@ -52,11 +56,10 @@ def why_not(config: SB3Config) -> str | None:
 
 
 class StateInputs:
-    """Feeds a policy's networks with states, all of them or some, and takes the steps of its optimiser."""
+    """Feeds a policy's networks with states, all of them or some."""
 
     def __init__(self, policy: BasePolicy, observation: ObservationTable) -> None:
         self.num_states = observation.num_states
-        self._parameters = list(policy.parameters())
         self._policy = policy
         self._observation = observation
         self._one_hot = observation.kind in ("one_hot", "none") and isinstance(
@@ -92,15 +95,6 @@ class StateInputs:
             self._all = self._tensor(np.arange(self.num_states))
         return self._all
 
-    def descend(self, loss: Tensor, gradient: Tensor | None, max_grad_norm: float) -> None:
-        """One step down the loss, or from a table of outputs along the loss's `gradient` there."""
-        optimizer = self._policy.optimizer
-        for parameter in self._parameters:
-            parameter.grad = None
-        torch.autograd.backward(loss, gradient)
-        torch.nn.utils.clip_grad_norm_(self._parameters, max_grad_norm)
-        optimizer.step()
-
     def _tensor(self, states: IntArray) -> Tensor:
         tensor, _ = self._policy.obs_to_tensor(self._observation.rows(states))
         assert isinstance(tensor, Tensor)
@@ -115,11 +109,33 @@ def infos_of(step: StateStep, num_envs: int) -> list[dict[str, Any]]:
     return infos
 
 
-def fuse(optimizer: torch.optim.Optimizer) -> None:
-    """Let Adam update all parameters in one kernel; the arithmetic stays the same."""
-    if isinstance(optimizer, torch.optim.Adam):
-        for group in optimizer.param_groups:
-            group["fused"], group["foreach"] = True, False
+class Descent:
+    """Steps of an optimiser as SB3 takes them: gradients from zero, clipped by their common norm.
+
+    On networks this small the framework's overhead is the cost. So all gradients are views of one vector,
+    which is cleared, measured and scaled at once, and Adam updates all parameters in one kernel.
+    """
+
+    def __init__(self, optimizer: torch.optim.Optimizer) -> None:
+        self._optimizer = optimizer
+        self._parameters = [p for group in optimizer.param_groups for p in group["params"]]
+        sizes = [parameter.numel() for parameter in self._parameters]
+        self._gradient = torch.zeros(sum(sizes), device=self._parameters[0].device)
+        parts = torch.split(self._gradient, sizes)
+        self._views = [part.view_as(of) for part, of in zip(parts, self._parameters, strict=True)]
+        if isinstance(optimizer, torch.optim.Adam):
+            for group in optimizer.param_groups:
+                group["fused"], group["foreach"] = True, False
+
+    def step(self, outputs: Tensor, gradient: Tensor | None, max_grad_norm: float) -> None:
+        """One step down a loss, or, from a table of outputs, along the loss's `gradient` there."""
+        self._gradient.zero_()
+        for parameter, view in zip(self._parameters, self._views, strict=True):
+            parameter.grad = view
+        torch.autograd.backward(outputs, gradient)
+        # As torch.nn.utils.clip_grad_norm_ does it.
+        self._gradient *= (max_grad_norm / (self._gradient.norm() + 1e-6)).clamp(max=1.0)
+        self._optimizer.step()
 
 
 def smallest_integer(largest: int) -> np.dtype[Any]:

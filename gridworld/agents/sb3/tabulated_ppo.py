@@ -31,7 +31,7 @@ from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
-from gridworld.agents.sb3.tabulated import StateInputs, fuse, infos_of
+from gridworld.agents.sb3.tabulated import Descent, StateInputs, infos_of
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.mdp import NUM_ACTIONS, FloatArray, IntArray
 
@@ -70,13 +70,14 @@ class TabulatedPPO(PPO):
     def _setup_model(self) -> None:
         self.rollout_buffer_class = StateRolloutBuffer
         super()._setup_model()
-        fuse(self.policy.optimizer)
+        self.policy.set_training_mode(False)  # SB3's networks know no difference; switching takes time
+        self.descent = Descent(self.policy.optimizer)
         self.inputs = StateInputs(self.policy, self.env.observation)
         self._old_log_prob: Float32Array = np.empty(0, dtype=np.float32)  # (S, A), of this rollout's policy
         self._old_values: Float32Array = np.empty(0, dtype=np.float32)  # (S,)
 
     def _excluded_save_params(self) -> list[str]:
-        ours = ["rollout_buffer_class", "inputs", "_old_log_prob", "_old_values"]
+        ours = ["rollout_buffer_class", "descent", "inputs", "_old_log_prob", "_old_values"]
         return [*super()._excluded_save_params(), *ours]
 
     def tables(self, states: IntArray | None = None) -> tuple[Tensor, Tensor]:
@@ -98,7 +99,6 @@ class TabulatedPPO(PPO):
         n_rollout_steps: int,
     ) -> bool:
         assert isinstance(env, GridWorldVecEnv)
-        self.policy.set_training_mode(False)
         rollout_buffer.reset()
         callback.on_rollout_start()
         with torch.no_grad():
@@ -139,7 +139,6 @@ class TabulatedPPO(PPO):
         return True
 
     def train(self) -> None:
-        self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         clip_range, clip_range_vf = self._clip_ranges()
         buffer = self.rollout_buffer
@@ -160,7 +159,7 @@ class TabulatedPPO(PPO):
                 goes_on = self.target_kl is None or logged[-1][_KL].item() <= 1.5 * self.target_kl
                 if not goes_on:
                     break
-                self.inputs.descend(losses[0], None, self.max_grad_norm)
+                self.descent.step(losses[0], None, self.max_grad_norm)
             epoch += 1
         self._n_updates += epoch
         self._log(torch.stack(logged), first, clip_range, clip_range_vf)
