@@ -29,6 +29,7 @@ from gridworld.vector_env import GridWorldVectorEnv
 HPARAM_METRICS = tuple(
     f"{GREEDY}/{name}" for name in ("value", "regret", "goal_probability", "length", "certified")
 )
+MOST_FRAMES = 500  # of an episode that finds no end; by then a greedy one goes round in circles
 EPISODE_GIF = "episode.gif"
 EPISODE_MP4 = "episode.mp4"
 POLICY_PNG = "policy.png"
@@ -206,7 +207,7 @@ def _record(
         return
     assert curve.beliefs is not None
     policy = one_hot_policy(curve.beliefs.greedy)
-    states = play_episode(mdp, policy, config.env.max_episode_steps, config.seed)
+    states = play_episode(mdp, policy, config.env.max_episode_steps, config.seed)[:MOST_FRAMES]
     frames = record.draw_states(mdp, states, wanted.cell_size)
     if wanted.frames:
         record.save_pngs(frames, run.frames_folder)

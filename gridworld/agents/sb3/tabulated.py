@@ -21,7 +21,6 @@ from typing import Any, cast
 import numpy as np
 import torch
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import Tensor, nn
 
 from gridworld.agents.sb3.vec_env import StateStep
@@ -62,9 +61,7 @@ class StateInputs:
         self.num_states = observation.num_states
         self._policy = policy
         self._observation = observation
-        self._one_hot = observation.kind in ("one_hot", "none") and isinstance(
-            policy.features_extractor, FlattenExtractor
-        )
+        self._one_hot = observation.kind in ("one_hot", "none")  # SB3 makes unit vectors of numbers
         self._all: Tensor | None = None  # the observations of all states, once they were asked for
 
     def distinct(self, states: IntArray) -> tuple[IntArray | None, IntArray]:
