@@ -75,6 +75,14 @@ def main(conf: Path) -> None:
         sys.exit(_tell(error))
 
 
+def compose(conf: Path, overrides: list[str]) -> TrainConfig:
+    """The configuration that the command line would give to a run."""
+    register_schemas()
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf)):
+        settings = hydra.compose(config_name="train", overrides=overrides)
+    return cast(TrainConfig, OmegaConf.to_object(settings))
+
+
 def run_job(settings: DictConfig) -> float:
     """One training run with its summary on standard output; returns the final regret, for sweepers."""
     context = HydraConfig.get()

@@ -5,11 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
-
 from gridworld.config import TrainConfig
-from gridworld.experiment import register_schemas
+from gridworld.experiment import compose
 from gridworld.run import Run
 from gridworld.training import train
 
@@ -28,12 +25,7 @@ SHORT = {
 
 def configure(*overrides: str) -> TrainConfig:
     """The configuration that the command line would give to a run."""
-    register_schemas()
-    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        settings = compose(config_name="train", overrides=list(overrides))
-    config = OmegaConf.to_object(settings)
-    assert isinstance(config, TrainConfig)
-    return config
+    return compose(CONF, list(overrides))
 
 
 def train_in(folder: Path, *overrides: str) -> dict[str, object]:

@@ -33,6 +33,7 @@ _SCHEDULES = {"learning_rate", "clip_range", "clip_range_vf"}
 
 def make_model(config: SB3Config, seat: Seat) -> BaseAlgorithm:
     """The model on the seat's environments. Raises `InputError` for what only SB3 or torch can judge."""
+    keep_compiler_out()
     algorithm = _algorithm(config)
     arguments = {
         field.name: getattr(config, field.name)
@@ -64,6 +65,18 @@ def make_model(config: SB3Config, seat: Seat) -> BaseAlgorithm:
     except (AssertionError, ValueError, TypeError, RuntimeError) as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         raise InputError(f"agent={config.name}: SB3 cannot build it: {lines[0]}") from error
+
+
+def keep_compiler_out() -> None:
+    """Spare a run the import of torch's compiler, which takes as long as half of SB3's own.
+
+    Optimisers import it to exempt some methods from compilation. Nothing here is compiled, so these are
+    marked as exempt beforehand; a torch that is built otherwise imports what it wants.
+    """
+    for name in ("add_param_group", "state_dict", "load_state_dict"):
+        method = getattr(getattr(torch.optim.Optimizer, name), "__wrapped__", None)
+        if method is not None and not hasattr(method, "__dynamo_disable"):
+            method.__dict__["__dynamo_disable"] = method
 
 
 def _algorithm(config: SB3Config) -> type[BaseAlgorithm]:

