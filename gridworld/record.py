@@ -6,6 +6,7 @@ Pillow's; MP4 needs PyAV (the extra `video`).
 
 from __future__ import annotations
 
+import functools
 import io
 import shutil
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from gridworld.errors import InputError
@@ -129,7 +131,7 @@ def _with_palette(frames: Sequence[Frame]) -> list[Image.Image]:
             colours.setdefault(colour, len(colours))  # type: ignore[arg-type]
         if found is None or len(colours) > 256:
             return [images[id(frame)] for frame in frames]
-    index = np.zeros(1 << 24, dtype=np.uint8)
+    index = _colour_index()
     for (red, green, blue), number in colours.items():
         index[(red << 16) | (green << 8) | blue] = number
     palette = bytes(channel for colour in colours for channel in colour)
@@ -140,6 +142,12 @@ def _with_palette(frames: Sequence[Frame]) -> list[Image.Image]:
         indexed.putpalette(palette)
         converted[key] = indexed
     return [converted[id(frame)] for frame in frames]
+
+
+@functools.cache
+def _colour_index() -> NDArray[np.uint8]:
+    """A number for every RGB colour, 16 MB of which only the pages of used colours are ever touched."""
+    return np.zeros(1 << 24, dtype=np.uint8)
 
 
 def _png(image: Image.Image) -> bytes:

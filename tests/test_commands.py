@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 from support import CONF, ROOT, SHORT, script
 
+from gridworld.benchmark.measure import Comparison, compare
 from gridworld.commands import benchmark, evaluate
 from gridworld.commands import record as record_command
 from gridworld.manual import manual
@@ -199,12 +200,56 @@ def test_a_run_whose_files_were_damaged_is_refused(finished: Path, tmp_path: Pat
         subprocess.run(["rm", "-r", str(copy)], check=True)
 
 
-def test_the_benchmark_prints_a_ratio_per_row(capsys: pytest.CaptureFixture[str]) -> None:
-    rows = benchmark.comparisons(seconds=0.002)
-    measured = [benchmark.compare(row, repetitions=1) for row in rows]
-    assert all(ours > 0 and theirs > 0 for ours, theirs, _ in measured)
-    assert all(ratio == pytest.approx(ours / theirs) for ours, theirs, ratio in measured)
-    benchmark.main(["--quick"])
+def test_the_benchmark_prints_tables_and_writes_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "benchmark.json"
+    benchmark.main(["--quick", "--only", "stepping", "training", "--out", str(out)])
     output = capsys.readouterr().out
-    for row in rows:
-        assert re.search(re.escape(row.name) + r" +[\d,]+ +[\d,]+ +[\d.]+x", output)
+    results = json.loads(out.read_text())["results"]
+    assert {result["table"] for result in results} == {
+        "stepping, environment steps per second",
+        "training, environment steps per second",
+    }
+    for result in results:
+        assert result["name"] in output
+        assert result["ours"] > 0
+        if result["theirs"] is None:
+            assert "not measured" in result["peer"]  # and says why
+        else:
+            assert result["ratio"] == pytest.approx(result["ours"] / result["theirs"])
+
+
+def test_a_measurement_compares_pair_by_pair() -> None:
+    ours, theirs = iter([1.0, 2.0, 30.0]), iter([1.0, 1.0, 10.0])
+    result = compare(Comparison("t", "n", lambda: next(ours), "p", lambda: next(theirs)), repetitions=3)
+    assert (result.ours, result.theirs, result.ratio) == (2.0, 1.0, 2.0)
+
+
+@pytest.mark.slow
+def test_whole_runs_are_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    benchmark.main(["--quick", "--only", "whole", "--out", str(tmp_path / "benchmark.json")])
+    output = capsys.readouterr().out
+    assert re.search(r"dqn, median of 1 seeds +0\.\d+", output)
+    memory = {
+        result["name"]: result["ours"]
+        for result in json.loads((tmp_path / "benchmark.json").read_text())["results"]
+        if "memory" in result["table"]
+    }
+    assert max(memory.values()) < 2000  # 200x200 in under 2 GB
+
+
+def test_training_commands_never_import_torchs_compiler(tmp_path: Path) -> None:
+    code = (
+        "import runpy, sys; sys.argv = ['train.py', *sys.argv[2:]];"
+        f"runpy.run_path({str(ROOT / 'scripts' / 'train.py')!r}, run_name='__main__');"
+        "assert 'torch' in sys.modules and 'torch._dynamo' not in sys.modules"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "", *SHORT["dqn"], "hydra.run.dir=run"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr

@@ -97,6 +97,7 @@ def _certified(agent: str, seeds: range) -> Callable[[], float]:
             started = time.perf_counter()
             made.learn(config.total_timesteps, curve.on_step)
             seconds.append(time.perf_counter() - started - curve.seconds)
+            curve.close()
             if curve.first_certified_step is None:
                 raise RuntimeError(f"agent={agent} seed={seed}: never certified")
         return statistics.median(seconds)
