@@ -19,7 +19,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv, VectorObservationWrapper
-from gymnasium.vector.utils import batch_space
+from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
 from gridworld import render as drawing
@@ -42,14 +42,17 @@ class ObservationTable:
     num_states: int
     stored: NDArray[Any] | None  # (S, *shape), read-only; None: one-hot rows, written when asked for
 
-    def rows(self, states: IntArray) -> NDArray[Any]:
-        """Fresh observations (..., *shape) of states (...)."""
+    def rows(self, states: IntArray, out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Observations (..., *shape) of states (...), in a fresh array or written to `out`."""
         if self.stored is not None:
-            return np.array(self.stored[states])
-        flat = np.ravel(states)
-        rows = np.zeros((flat.size, self.num_states), dtype=np.float32)
-        rows[np.arange(flat.size), flat] = 1.0
-        return rows.reshape(*np.shape(states), self.num_states)
+            # States are within the table; "clip" merely spares numpy a buffered copy.
+            return np.take(self.stored, states, axis=0, out=out, mode="clip" if out is not None else "raise")
+        if out is None:
+            out = np.zeros((*np.shape(states), self.num_states), dtype=np.float32)
+        else:
+            out[...] = 0.0
+        np.put_along_axis(out, np.asarray(states)[..., None], 1.0, axis=-1)
+        return out
 
     def table(self) -> NDArray[Any]:
         """(S, *shape), all of them."""
@@ -141,35 +144,38 @@ class ImageObservation(_TableObservation):
 
 
 class _VectorTableObservation(VectorObservationWrapper[Any, Any, Any, Any]):
-    def __init__(self, env: VectorEnv[Any, Any, Any], table: ObservationTable) -> None:
+    def __init__(self, env: VectorEnv[Any, Any, Any], table: ObservationTable, copy: bool) -> None:
         super().__init__(env)
         self.table = table
         self.single_observation_space = table.space
         self.observation_space = batch_space(table.space, self.num_envs)
+        self._reused: Any = None if copy else create_empty_array(table.space, self.num_envs)
 
     def observations(self, observations: IntArray) -> NDArray[Any]:
-        return self.table.rows(observations)
+        return self.table.rows(observations, out=self._reused)
 
 
 class VectorOneHotObservation(_VectorTableObservation):
-    """float32 (num_envs, S)."""
+    """float32 (num_envs, S). Without `copy`, every step writes to the same array, as in SyncVectorEnv."""
 
-    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
-        super().__init__(env, one_hot(_mdp(env)))
+    def __init__(self, env: VectorEnv[Any, Any, Any], copy: bool = True) -> None:
+        super().__init__(env, one_hot(_mdp(env)), copy)
 
 
 class VectorCoordinateObservation(_VectorTableObservation):
-    """float32 (num_envs, 2)."""
+    """float32 (num_envs, 2). `copy` as above."""
 
-    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
-        super().__init__(env, coordinates(_mdp(env)))
+    def __init__(self, env: VectorEnv[Any, Any, Any], copy: bool = True) -> None:
+        super().__init__(env, coordinates(_mdp(env)), copy)
 
 
 class VectorImageObservation(_VectorTableObservation):
-    """uint8 (num_envs, 3, H, W)."""
+    """uint8 (num_envs, 3, H, W). `copy` as above."""
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], cell_size: int = IMAGE_CELL_SIZE) -> None:
-        super().__init__(env, image(_mdp(env), cell_size))
+    def __init__(
+        self, env: VectorEnv[Any, Any, Any], cell_size: int = IMAGE_CELL_SIZE, copy: bool = True
+    ) -> None:
+        super().__init__(env, image(_mdp(env), cell_size), copy)
 
 
 def _mdp(env: Any) -> Mdp:

@@ -8,7 +8,8 @@ import pytest
 
 import gridworld
 from gridworld import GridWorldEnv, InputError
-from gridworld.layout import parse
+from gridworld.layout import classic, parse
+from gridworld.mdp import compile_mdp
 from gridworld.observations import make_observation
 
 LAYOUTS = gridworld.shipped_layouts()
@@ -136,3 +137,27 @@ def test_wrapped_batches_show_the_rows_of_their_states(mode):
 def test_a_batch_of_another_world_is_not_wrapped():
     with pytest.raises(InputError, match="GridWorld"):
         gridworld.VectorOneHotObservation(gym.make_vec("FrozenLake-v1"))
+
+
+@pytest.mark.parametrize("kind", ["one_hot", "coordinates", "image"])
+def test_a_batch_may_write_to_one_array_over_and_over(kind):
+    wrap = WRAPPERS[kind][1]
+    fresh, reused = (wrap(gridworld.GridWorldVectorEnv(8), copy=copy) for copy in (True, False))
+    kept = [fresh.reset(seed=0)[0]]
+    first, _ = reused.reset(seed=0)
+    for actions in np.random.default_rng(0).integers(4, size=(5, 8)):
+        kept.append(fresh.step(actions)[0])
+        again = reused.step(actions)[0]
+        assert again is first
+        assert np.array_equal(again, kept[-1])
+    assert not np.array_equal(kept[0], kept[-1])
+
+
+def test_one_hot_rows_of_a_large_world_are_written_when_asked_for():
+    table = make_observation(compile_mdp(classic(60, 60)), "one_hot")
+    assert table.stored is None  # no matrix of S x S
+    rows = table.rows(np.array([[0, 3599], [7, 8]]))
+    assert rows.shape == (2, 2, 3600)
+    assert rows.sum() == 4
+    assert rows[0, 1, 3599] == rows[1, 0, 7] == 1
+    assert np.array_equal(table.rows(np.array([5]), out=rows[0, :1]), np.eye(3600, dtype=np.float32)[5:6])
