@@ -107,7 +107,10 @@ class Curve:
 
     def _score(self, step: int) -> None:
         self._step = step
-        self.beliefs = beliefs = self._agent.beliefs()
+        before, beliefs = self.beliefs, self._agent.beliefs()
+        # Between two updates the same policy may be met again; it earns one certificate, not several.
+        is_new = before is None or not np.array_equal(before.values, beliefs.values)
+        self.beliefs = beliefs
         if not (np.isfinite(beliefs.values).all() and np.isfinite(beliefs.sampled).all()):
             raise InputError(
                 f"training diverged: the agent's values are no finite numbers after {step} steps; "
@@ -115,10 +118,10 @@ class Curve:
             )
         self.greedy = greedy = self.judge.score(one_hot_policy(beliefs.greedy))
         self.sampled = self.judge.score(beliefs.sampled)
-        self._streak = self._streak + 1 if greedy.certified else 0
+        self._streak = self._streak + is_new if greedy.certified else 0
         if not greedy.certified:
             self.certified_since_step = None
-        elif self._streak == 1:
+        elif self.certified_since_step is None:
             self.certified_since_step = step
             if self.first_certified_step is None:
                 self.first_certified_step = step

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import secrets
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -26,6 +27,7 @@ from gridworld.manual import manual
 from gridworld.run import MANIFEST, Run, check_new
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
+_jobs_begun: list[int] = []  # numbers of this process's jobs
 _LONGEST_NAME = 100  # characters of a job's folder
 
 
@@ -69,10 +71,13 @@ def main(conf: Path) -> None:
         hydra.main(version_base="1.3", config_path=str(conf), config_name="train")(run_job)()
     except Exception as error:
         # Until a job begins, whatever goes wrong is the command line's or a yaml file's fault.
-        mistake = isinstance(error, CompactHydraException) or not HydraConfig.initialized()
+        mistake = isinstance(error, CompactHydraException) or not _jobs_begun
         if asked_for_traceback or not mistake:
             raise
         sys.exit(_tell(error))
+    except KeyboardInterrupt:
+        print("interrupted before training began", file=sys.stderr)
+        sys.exit(130)
 
 
 def compose(conf: Path, overrides: list[str]) -> TrainConfig:
@@ -86,6 +91,7 @@ def compose(conf: Path, overrides: list[str]) -> TrainConfig:
 def run_job(settings: DictConfig) -> float:
     """One training run with its summary on standard output; returns the final regret, for sweepers."""
     context = HydraConfig.get()
+    _jobs_begun.append(context.job.num if context.mode is RunMode.MULTIRUN else 0)
     folder = Path(context.runtime.output_dir)
     overrides = cast("list[str]", OmegaConf.to_container(context.overrides.task))
     try:
@@ -102,9 +108,13 @@ def run_job(settings: DictConfig) -> float:
     except (InputError, OmegaConfBaseException) as error:
         _discard(folder)
         if context.mode is RunMode.MULTIRUN:
+            print(f"job {context.job.num} failed: {sentence(error)}", file=sys.stderr)
             raise JobError(sentence(error)) from None
         sys.exit(_tell(error))
-    print(summary_text(summary, _shown(folder)))
+    except KeyboardInterrupt:
+        _discard(folder)
+        raise
+    print(summary_text(summary, shlex.quote(_shown(folder))))
     return float(summary["regret"])
 
 

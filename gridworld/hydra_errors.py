@@ -62,6 +62,10 @@ def _unknown_choice(message: str) -> str:
 def _suggestion(facts: str) -> str:
     if "Ambiguous value" in facts:
         return "; to run one job for each of the values, add -m"
+    if "is not in struct" in facts:
+        return (
+            "; entries of a dictionary are added one by one: +agent.policy_kwargs.optimizer_kwargs.eps=1e-5"
+        )
     unknown = re.search(r"Key '([^']*)' not in '([^']*)'", facts)
     schema = getattr(schemas, unknown.group(2), None) if unknown else None
     if unknown is None or not dataclasses.is_dataclass(schema):

@@ -174,12 +174,13 @@ def _read(layout: str | PathLike[str]) -> Layout:
         # A row may end in blanks or \r\n; far more than that is no map, and is not read.
         with path.open("rb") as file:
             raw = file.read(4 * MAX_CELLS + 1)
-    except (FileNotFoundError, ValueError, OSError) as error:
-        if isinstance(error, FileNotFoundError | ValueError | NotADirectoryError):
-            reason = f"neither a shipped layout ({', '.join(shipped_layouts())}) nor a file"
-        else:
-            reason = f"the map cannot be read ({error.strerror}); give a readable text file"
-        raise InputError(f"layout {given!r}: {reason}") from None
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        shipped = ", ".join(shipped_layouts())
+        raise InputError(f"layout {given!r}: neither a shipped layout ({shipped}) nor a file") from None
+    except OSError as error:
+        raise InputError(
+            f"layout {given!r}: the map cannot be read ({error.strerror}); give a readable text file"
+        ) from None
     if len(raw) > 4 * MAX_CELLS:
         raise InputError(f"{given}: the map is too large; at most {MAX_CELLS} cells fit")
     try:

@@ -55,7 +55,7 @@ class Run:
         self.manifest: dict[str, Any] = {}
 
     def start(self, config: dict[str, Any], layout_text: str, overrides: list[str]) -> None:
-        """Write the manifest of a run that begins now."""
+        """Write the manifest of a run that begins now. Raises `InputError` if the folder has one."""
         self.manifest = {
             "status": "running",
             "started": _now(),
@@ -71,6 +71,12 @@ class Run:
             "layout": layout_text.split("\n"),
             "config": config,
         }
+        try:
+            self.manifest_file.open("x").close()  # of two runs that start at once, one gets the folder
+        except FileExistsError:
+            raise InputError(
+                f"{self.folder}: holds a run already; give every run a folder of its own"
+            ) from None
         write_json(self.manifest_file, self.manifest)
 
     def end(self, status: str, error: str | None = None) -> None:
@@ -105,7 +111,7 @@ def open_run(folder: Path) -> Run:
 def check_new(folder: Path) -> None:
     """Raise `InputError` unless a run can be written to `folder`: it can be made and holds no run yet."""
     if (folder / MANIFEST).exists():
-        raise InputError(f"{folder}: holds a run already; choose another folder with hydra.run.dir=...")
+        raise InputError(f"{folder}: holds a run already; choose another folder")
     existing = folder
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent

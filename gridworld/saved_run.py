@@ -16,11 +16,13 @@ from gridworld.chain import one_hot_policy
 from gridworld.config import AGENT_SCHEMAS, AgentConfig, TrainConfig, check
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge
-from gridworld.layout import Layout, load, parse
+from gridworld.layout import CLASSIC, Layout, load, parse
 from gridworld.mdp import FloatArray, Mdp
 from gridworld.observations import make_observation
 from gridworld.run import Run, open_run
 from gridworld.training import make_mdp, make_seat
+
+_LIBRARIES = ("torch.nn.", "torch.optim.", "stable_baselines3.", "sb3_contrib.")
 
 
 class SavedRun:
@@ -30,7 +32,9 @@ class SavedRun:
         self.run: Run = open_run(folder)
         manifest = self.run.manifest
         self.config = read_config(manifest["config"], str(self.run.manifest_file))
+        self.config.device = "cpu"  # where it was trained is no reason to need the same machine
         check(self.config)
+        _check_imports(dataclasses.asdict(self.config.agent), str(self.run.manifest_file))
         family(self.config.agent).check(self.config)
         self.mdp: Mdp = make_mdp(self.config.env, self._trained_layout(manifest["layout"]))
 
@@ -45,7 +49,8 @@ class SavedRun:
         """The judge of its own world, or of another map of the same size."""
         mdp = self.mdp
         if layout is not None:
-            world, trained = load(layout, *_size(mdp.layout)), mdp.layout
+            trained = mdp.layout
+            world = load(layout, *_size(trained)) if layout == CLASSIC else load(layout)
             if _size(world) != _size(trained):
                 raise InputError(
                     f"layout {world.name}: is {world.num_rows}x{world.num_cols}, the agent was trained on "
@@ -64,6 +69,15 @@ class SavedRun:
         )
         agent.load(self.run.model_file)
         return agent.beliefs()
+
+
+def _check_imports(agent: dict[str, Any], where: str) -> None:
+    """Refuse an import path that leads out of the libraries an agent is made of."""
+    for key, value in agent.items():
+        if isinstance(value, dict):
+            _check_imports(value, where)
+        elif key.endswith(("_class", "_fn")) and isinstance(value, str) and not value.startswith(_LIBRARIES):
+            raise InputError(f"{where}: {key}={value!r} is not imported; it must begin with {_LIBRARIES}")
 
 
 def choose_policy(beliefs: Beliefs, kind: str) -> FloatArray:

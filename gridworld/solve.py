@@ -12,20 +12,19 @@ Reinforcement Learning, 2nd ed., 2018, chapter 4.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
 
-from gridworld.chain import Chain, can_reach, check_gamma, one_hot_policy
+from gridworld.chain import Chain, check_gamma, one_hot_policy
 from gridworld.errors import InputError
 from gridworld.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 # Two actions whose values agree to this relative precision are equally good. Rounding stays far below it.
 TIE = 1e-9
 
-_SWEEP_TOLERANCE = 1e-3  # with discounting, sweeps need only find a good policy; the rest is solved exactly
-_UNDISCOUNTED_TOLERANCE = 1e-15
+_SWEEP_TOLERANCE = 1e-3  # sweeps need only find a good policy; the rest is solved exactly
+_NEARLY_ONE = 1 - 1e-8  # one step more costs ten times as much as what counts as a tie
 _IMPROVEMENT = 1e-11
 
 
@@ -43,21 +42,27 @@ class Solution:
 def value_iteration(mdp: Mdp, gamma: float) -> Solution:
     """V*, Q* and all optimal actions.
 
-    Value iteration from V = 0 finds the policy; with γ < 1, policy iteration from there then makes values
-    and ties exact up to rounding. Raises `InputError` where no finite optimum exists (γ = 1 and a positive
-    step reward). With γ = 1 and a negative step reward, a cell from which no end can be reached has V = -inf.
+    Value iteration from V = 0 finds a good policy; policy iteration from there makes values and ties exact
+    up to rounding. γ = 1 is taken as the limit of discounting (Blackwell's optimality): of two ways to the
+    same return the shorter one, and never one that puts the end off for ever. Raises `InputError` where no
+    finite optimum exists (γ = 1 and a positive step reward). With γ = 1 and a negative step reward, a cell
+    from which no end can be reached has V = -inf.
     """
     gamma = check_gamma(gamma)
-    if gamma == 1 and mdp.step_reward > 0:
+    if gamma < 1:
+        return _discounted(mdp, gamma)
+    if mdp.step_reward > 0:
         raise InputError(
             f"gamma=1 with step_reward={mdp.step_reward}: the return grows without end; "
             "take a gamma below 1 or a step_reward of at most 0"
         )
-    v = _sweep(mdp, gamma)
-    q = _backup(mdp, v, gamma)
-    if gamma == 1:
-        return Solution(gamma, v, q, q >= (v - TIE * np.abs(v))[:, None], np.abs(v))
-    greedy, seen = np.argmax(q, axis=1), set()
+    limit = _discounted(mdp, _NEARLY_ONE)
+    v, scale = Chain(mdp, one_hot_policy(np.argmax(limit.optimal, axis=1))).value_and_scale(1.0)
+    return Solution(1.0, v, _backup(mdp, v, 1.0), limit.optimal, scale)
+
+
+def _discounted(mdp: Mdp, gamma: float) -> Solution:
+    greedy, seen = np.argmax(_backup(mdp, _sweep(mdp, gamma), gamma), axis=1), set()
     while True:
         v, scale = Chain(mdp, one_hot_policy(greedy)).value_and_scale(gamma)
         q = _backup(mdp, v, gamma)
@@ -84,7 +89,8 @@ def _backup(
     target = reward + gamma * v[mdp.next_state[states]]
     if target.shape[2] == 1:
         return target[:, :, 0]
-    q: FloatArray = np.einsum("sak,sak->sa", mdp.probability[states], target)
+    possible = mdp.probability[states] > 0  # with γ = 1 an impossible outcome may be worth -inf
+    q: FloatArray = np.einsum("sak,sak->sa", mdp.probability[states], np.where(possible, target, 0.0))
     return q
 
 
@@ -98,26 +104,16 @@ def _sweep(mdp: Mdp, gamma: float) -> FloatArray:
 
     Changes are measured relative to the value, so the wave of a far goal is followed to the last cell,
     however small the discounted value has become there. Measured so, a value that fades away to 0 never
-    comes to rest; with γ < 1 the waves from all ends have long passed when sweeping stops.
+    comes to rest; sweeping stops when the waves from all ends have long passed.
     """
-    tolerance = _UNDISCOUNTED_TOLERANCE if gamma == 1 else _SWEEP_TOLERANCE
     v = np.zeros(mdp.num_states)
     playing = ~(mdp.terminal | mdp.wall)
-    if gamma == 1 and mdp.step_reward < 0:
-        can_end = can_reach(mdp, np.ones(mdp.next_state.shape, dtype=np.bool_), mdp.terminal)
-        v[playing & ~can_end] = -np.inf
-        playing &= can_end
     active = np.flatnonzero(playing)
-    sweeps = (
-        itertools.count()
-        if gamma == 1
-        else range(100 + 2 * max(_farthest(mdp, ends) for ends in (mdp.goal, mdp.trap)))
-    )
-    for _ in sweeps:
+    for _ in range(100 + 2 * max(_farthest(mdp, ends) for ends in (mdp.goal, mdp.trap))):
         if not active.size:
             break
         new = _backup(mdp, v, gamma, active).max(axis=1)
-        changed = active[np.abs(new - v[active]) > tolerance * np.abs(new)]
+        changed = active[np.abs(new - v[active]) > _SWEEP_TOLERANCE * np.abs(new)]
         v[active] = new
         affected = np.zeros(mdp.num_states, dtype=np.bool_)
         affected[changed] = True

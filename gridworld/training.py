@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import signal
 import threading
 import time
@@ -132,8 +133,8 @@ def _learn(config: TrainConfig, run: Run, judge: Judge, agent: Agent, log: _Log)
         curve.evaluate(steps, last=True)
         agent.save(run.model_file)
         summary = _summarise(config, curve, steps, seconds)
+        write_json(run.summary_file, _plain(summary))
         _record(config, run, judge.mdp, curve, events, steps)
-        write_json(run.summary_file, summary)
         succeeded = True
     finally:
         curve.close()
@@ -141,6 +142,13 @@ def _learn(config: TrainConfig, run: Run, judge: Judge, agent: Agent, log: _Log)
             events.end_session(succeeded)
             events.close()
     return summary
+
+
+def _plain(content: Any) -> Any:
+    """The same with null for what JSON has no number for: an endless walk at γ = 1 is worth -inf."""
+    if isinstance(content, dict):
+        return {key: _plain(value) for key, value in content.items()}
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def _timed_learning(config: TrainConfig, agent: Agent, curve: Curve) -> tuple[int, float]:

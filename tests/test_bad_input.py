@@ -74,6 +74,8 @@ TRAIN = [
     ("+agent.learning_rat=1", "agent.learning_rat: there is no such key; did you mean learning_rate"),
     ("agent.policy_kwargs.netarch=[8]", "Key 'netarch' not in 'PolicyKwargs'; did you mean net_arch?"),
     ("agent.algorithm=PPO", "agent.algorithm=PPO: these are the settings of DQN"),
+    ("agent.policy_kwargs.net_arch={{pi:[8],vf:[8]}}", "DQN has one network"),
+    ("agent.policy_kwargs.optimizer_kwargs={{eps:1e-5}}", "added one by one: +agent.policy"),
     ("agent.family=tf", "agent.family=tf: there is no such family"),
     ("recording.cell_size=100000", "too large to draw"),
     ("recording.fps=0", "recording.fps=0: must be from 1 to 100"),
@@ -116,7 +118,7 @@ def test_a_used_folder_is_refused_and_left_alone(tmp_path: Path) -> None:
     (tmp_path / "used" / "manifest.json").write_text("{}")
     done = script("train.py", "hydra.run.dir=used", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "error: used: holds a run already; choose another folder with hydra.run.dir=...\n"
+    assert done.stderr == "error: used: holds a run already; choose another folder\n"
     assert [path.name for path in (tmp_path / "used").iterdir()] == ["manifest.json"]
 
 
@@ -147,7 +149,7 @@ def test_divergence_is_told_and_marked(tmp_path: Path) -> None:
     [
         ("evaluate.py", "nowhere", "nowhere: no such folder"),
         ("evaluate.py", ".", "not a run's folder, it has no manifest.json"),
-        ("evaluate.py", ". --episodes 0", "--episodes 0: must be at least 1"),
+        ("evaluate.py", ". --episodes 0", "--episodes 0: must be from 1 to"),
         ("evaluate.py", ". --render human", "there is no display"),
         ("evaluate.py", "", "the following arguments are required: run"),
         ("record.py", "nowhere", "nowhere: no such folder"),

@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from oracle import maps
 
 from gridworld.chain import one_hot_policy
 from gridworld.evaluation import Judge, play_episode
-from gridworld.layout import load, parse
+from gridworld.layout import load, parse, shipped_layouts
 from gridworld.mdp import compile_mdp
 
 CLASSIC = Judge(compile_mdp(load("classic")), 0.99, 100)
@@ -84,3 +87,22 @@ def test_shares_have_intervals_even_without_a_hit() -> None:
     assert best.goal.low == pytest.approx(0.963, abs=1e-3)  # Wilson: 1 / (1 + 1.96² / 100)
     assert (best.trap.mean, best.trap.low) == pytest.approx((0, 0))
     assert best.trap.high == pytest.approx(0.037, abs=1e-3)
+
+
+@pytest.mark.parametrize("layout", shipped_layouts())
+@pytest.mark.parametrize("gamma", [0.9, 1.0])
+@pytest.mark.parametrize("slip", [0.0, 0.5, 1.0])
+def test_the_optimal_policy_earns_its_own_certificate(layout: str, gamma: float, slip: float) -> None:
+    for step_reward in (0.0, -0.1):
+        judge = Judge(compile_mdp(load(layout), slip, step_reward), gamma, 200)
+        assert judge.solution.optimal.any(axis=1).all()
+        assert judge.score(judge.optimal_policy()).certified
+        if slip == 0 and step_reward == 0:
+            assert judge.optimum.goal == 1  # it gets there, and does not put it off for ever
+
+
+@given(world=maps(), slip=st.sampled_from([0.0, 0.1, 0.5, 1.0]), step=st.sampled_from([0.0, -0.07, -0.25]))
+def test_undiscounted_optima_end_and_certify(world: list[str], slip: float, step: float) -> None:
+    mdp = compile_mdp(parse("\n".join(world), "random"), slip, step, 0.8, -0.19)
+    judge = Judge(mdp, 1.0, 100)
+    assert judge.score(judge.optimal_policy()).certified

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from support import SHORT, configure, train_in
 from gridworld.agents import Beliefs
 from gridworld.chain import one_hot_policy
 from gridworld.curve import Curve
+from gridworld.errors import InputError
 from gridworld.evaluation import Judge
 from gridworld.observations import one_hot
 from gridworld.saved_run import SavedRun
@@ -121,10 +123,12 @@ class Scripted:
     def __init__(self, optimal: np.ndarray, pattern: list[bool]) -> None:
         self.optimal = optimal
         self.pattern = iter(pattern)
+        self.calls = 0
 
     def beliefs(self) -> Beliefs:
         greedy = self.optimal if next(self.pattern) else np.zeros_like(self.optimal)
-        return Beliefs(greedy, one_hot_policy(greedy), np.zeros(len(greedy)))
+        self.calls += 1
+        return Beliefs(greedy, one_hot_policy(greedy), np.full(len(greedy), float(self.calls)))
 
 
 def follow(pattern: list[bool], tmp_path: Path, *overrides: str) -> tuple[Curve, list[bool]]:
@@ -156,3 +160,43 @@ def test_a_policy_that_walks_in_circles_is_reported_not_waited_for(tmp_path: Pat
     assert curve.beliefs is not None
     assert curve.greedy.outcome.timeout == 1
     assert curve.judge.endless_cells(one_hot_policy(curve.beliefs.greedy)) == [(0, 0)]
+
+
+def test_one_policy_earns_one_certificate_however_often_it_is_met(tmp_path: Path) -> None:
+    summary = train_in(tmp_path, "agent=ppo", "evaluation.every=128", "evaluation.stop_after=3")
+    with (tmp_path / "curve.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["certified"] == "1"]
+    assert len({row["sampled_value"] for row in rows[-200:]}) >= 3
+    assert int(summary["timesteps"]) < int(summary["total_timesteps"])
+
+
+def test_dqn_is_scored_as_random_as_it_acts_before_learning(tmp_path: Path) -> None:
+    train_in(tmp_path, *SHORT["dqn"])
+    with (tmp_path / "curve.csv").open(newline="") as file:
+        first = next(csv.DictReader(file))
+    judge = Judge(make_mdp(configure().env), 0.99, 100)
+    assert float(first["sampled_value"]) == pytest.approx(judge.score(np.full((30, 4), 0.25)).value)
+
+
+def test_an_endless_walk_at_gamma_1_is_summarised(tmp_path: Path) -> None:
+    train_in(tmp_path, *SHORT["dqn"], "env=cliff", "evaluation.gamma=1", "total_timesteps=400")
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["value"] is None or summary["timeout_probability"] == 0
+
+
+def test_of_two_runs_in_one_folder_the_second_is_refused(tmp_path: Path) -> None:
+    train_in(tmp_path, *SHORT["dqn"])
+    before = (tmp_path / "model.zip").read_bytes()
+    with pytest.raises(InputError, match="holds a run already"):
+        train_in(tmp_path, *SHORT["dqn"], "seed=1")
+    assert (tmp_path / "model.zip").read_bytes() == before
+
+
+def test_a_manifest_cannot_import_what_it_likes(tmp_path: Path) -> None:
+    train_in(tmp_path, *SHORT["dqn"])
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    manifest["config"]["agent"]["policy_kwargs"]["activation_fn"] = "this.Foo"
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match=r"activation_fn='this\.Foo' is not imported"):
+        SavedRun(tmp_path)
+    assert "this" not in sys.modules

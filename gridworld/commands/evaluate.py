@@ -16,6 +16,7 @@ from gridworld.render import has_display
 from gridworld.saved_run import SavedRun, choose_policy
 from gridworld.summary import circles_text
 
+_MOST_EPISODES = 1_000_000
 _LABELS = (
     "value",
     "goal probability",
@@ -29,8 +30,8 @@ _LABELS = (
 def main(arguments: Sequence[str]) -> None:
     """Print the scores."""
     options = _parser().parse_args(arguments)
-    if options.episodes < 1:
-        raise InputError(f"--episodes {options.episodes}: must be at least 1")
+    if not 1 <= options.episodes <= _MOST_EPISODES:
+        raise InputError(f"--episodes {options.episodes}: must be from 1 to {_MOST_EPISODES}")
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: must be at least 0")
     if options.render == "human" and not has_display():

@@ -38,6 +38,7 @@ class SB3Agent:
         torch.set_num_threads(seat.threads)
         self.config = config
         self.observation = seat.observation
+        self._loaded = False
         self.model = make_model(config, seat)
         writers = [] if seat.write_scalars is None else [_ScalarsOnly(seat.write_scalars)]
         self.model.set_logger(Logger(folder=None, output_formats=list(writers)))
@@ -68,9 +69,16 @@ class SB3Agent:
         greedy = np.argmax(scores, axis=1)
         if isinstance(self.model.policy, ActorCriticPolicy):
             return Beliefs(greedy, scores, values)
-        epsilon = float(getattr(self.model, "exploration_rate", 0.0))
+        epsilon = self._exploration_rate()
         sampled = (1 - epsilon) * one_hot_policy(greedy) + epsilon / scores.shape[1]
         return Beliefs(greedy, sampled, values, q=scores)
+
+    def _exploration_rate(self) -> float:
+        """DQN's; SB3 acts at random until learning starts, while its own attribute still says 0."""
+        warmup = getattr(self.model, "learning_starts", 0)
+        if not self._loaded and self.model.num_timesteps < max(warmup, 1):
+            return 1.0
+        return float(getattr(self.model, "exploration_rate", 0.0))
 
     def _forward(self, states: IntArray) -> tuple[Tensor, Tensor]:
         """Action probabilities or Q values (n, A), and values (n,), of these states."""
@@ -101,6 +109,7 @@ class SB3Agent:
             _, parameters, _ = load_from_zip_file(path, device=self.model.device, load_data=False)
             self.model.set_parameters(parameters, exact_match=True, device=self.model.device)
             with zipfile.ZipFile(path) as archive:
+                self._loaded = True
                 rate = json.loads(archive.read("data")).get("exploration_rate")
             if isinstance(rate, float):
                 self.model.exploration_rate = rate  # type: ignore[attr-defined]

@@ -62,6 +62,11 @@ def make_model(config: SB3Config, seat: Seat) -> BaseAlgorithm:
             device=device,
             **arguments,
         )
+    except MemoryError:
+        raise InputError(
+            f"agent={config.name}: its buffers do not fit into memory; take a smaller agent.buffer_size, "
+            "agent.n_steps or n_envs, or another observation"
+        ) from None
     except (AssertionError, ValueError, TypeError, RuntimeError) as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         raise InputError(f"agent={config.name}: SB3 cannot build it: {lines[0]}") from error
@@ -136,7 +141,11 @@ def _policy_kwargs(given: PolicyKwargs) -> dict[str, Any]:
 
 def _is_net_arch(value: Any) -> bool:
     if isinstance(value, dict):
-        return all(key in ("pi", "vf") and _is_net_arch(layers) for key, layers in value.items())
+        return value.keys() <= {"pi", "vf"} and all(_is_widths(layers) for layers in value.values())
+    return _is_widths(value)
+
+
+def _is_widths(value: Any) -> bool:
     return isinstance(value, list) and all(type(width) is int and width > 0 for width in value)
 
 

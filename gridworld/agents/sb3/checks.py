@@ -78,6 +78,10 @@ def _check_dqn(agent: DQNConfig, config: TrainConfig) -> None:
             f"agent.learning_starts={agent.learning_starts}: nothing would be learned; "
             f"must be below total_timesteps={config.total_timesteps}"
         )
+    if isinstance(agent.policy_kwargs.net_arch, dict):
+        raise InputError(
+            "agent.policy_kwargs.net_arch: DQN has one network; must be layer widths, e.g. [64,64]"
+        )
     within("agent.tau", agent.tau, 0, 1)
     _check_train_freq(agent.train_freq, config.n_envs)
     at_least("agent.gradient_steps", agent.gradient_steps, -1)
