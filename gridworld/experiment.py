@@ -119,6 +119,7 @@ def run_job(settings: DictConfig) -> float:
 
 
 def register_schemas() -> None:
+    """Tell Hydra the schemas of `config.py`, and OmegaConf the functions that `conf/` uses."""
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
     for name, schema in AGENT_SCHEMAS.items():

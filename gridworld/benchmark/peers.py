@@ -1,17 +1,16 @@
 """Peers that live in an environment of their own, since their dependencies would not go with ours.
 
-`NAVIX_PYTHON` names a Python that has NAVIX: `python -m venv navix && navix/bin/pip install navix`, then
-`NAVIX_PYTHON=navix/bin/python python scripts/benchmark.py`.
+`NAVIX_PYTHON` and `SBX_PYTHON` name a Python that has NAVIX, or SBX (SB3 in JAX); the README says how to make
+one. A peer without a Python stands in the table as not measured.
 """
 
 from __future__ import annotations
 
 import os
 import subprocess
+from pathlib import Path
 
-_VARIABLE = "NAVIX_PYTHON"
-
-# NAVIX's own PPO, compiled; the second of two runs is timed, when nothing is left to compile.
+# NAVIX's own PPO on Empty-5x5, compiled; the second of two runs is timed, when nothing is left to compile.
 _NAVIX = """
 import time, jax, jax.numpy as jnp, navix
 from navix import observations
@@ -35,17 +34,49 @@ for seed in range(2):
 print(settings.budget / seconds)
 """
 
+# SBX's defaults on SB3's own batch of one-hot GridWorlds; again the second part is timed.
+_SBX = """
+import sys, time, gymnasium
+import gridworld, sbx
+from stable_baselines3.common.env_util import make_vec_env
+algorithm, count = sys.argv[1], int(sys.argv[2])
+wrapped = lambda: gridworld.OneHotObservation(gymnasium.make("GridWorld-v0"))
+model = getattr(sbx, algorithm)("MlpPolicy", make_vec_env(wrapped, n_envs=count), seed=0)
+model.learn(2048 * count)
+started, before = time.perf_counter(), model.num_timesteps
+model.learn(2048 * count, reset_num_timesteps=False)
+print((model.num_timesteps - before) / (time.perf_counter() - started))
+"""
 
-def why_no_navix() -> str:
-    """Why NAVIX is not measured, or nothing where it is."""
-    if _VARIABLE in os.environ:
-        return ""
-    return f"not measured, {_VARIABLE} names no Python that has it (README, Speed)"
+
+def why_not(peer: str) -> str:
+    """Why this peer, NAVIX or SBX, is not measured; nothing where it is."""
+    variable = _variable(peer)
+    return "" if variable in os.environ else f"not measured, {variable} names no Python that has it"
 
 
-def navix_steps_per_second() -> float:
-    """Environment steps a second of NAVIX's PPO on Empty-5x5, 1024 environments x 32 steps."""
+def navix() -> float:
+    """Environment steps a second of NAVIX's PPO, 1024 environments x 32 steps."""
+    return _run("NAVIX", _NAVIX)
+
+
+def sbx(algorithm: str, num_envs: int) -> float:
+    """Environment steps a second of SBX's PPO or DQN."""
+    return _run("SBX", _SBX, algorithm, str(num_envs))
+
+
+def _variable(peer: str) -> str:
+    return f"{peer}_PYTHON"
+
+
+def _run(peer: str, script: str, *arguments: str) -> float:
     done = subprocess.run(
-        [os.environ[_VARIABLE], "-c", _NAVIX], capture_output=True, text=True, check=True, timeout=600
+        [os.environ[_variable(peer)], "-c", script, *arguments],
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+        capture_output=True,
+        text=True,
+        timeout=600,
     )
+    if done.returncode:
+        raise RuntimeError(f"{peer}: {done.stderr}")
     return float(done.stdout.split()[-1])

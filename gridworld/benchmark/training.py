@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -15,8 +16,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from gridworld.agents.sb3.tabulated_dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated_ppo import TabulatedPPO
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
+from gridworld.benchmark import peers
 from gridworld.benchmark.measure import Comparison, Scale
-from gridworld.benchmark.peers import navix_steps_per_second, why_no_navix
 from gridworld.observations import OneHotObservation, one_hot
 from gridworld.vector_env import GridWorldVectorEnv
 
@@ -52,14 +53,13 @@ def rows(scale: Scale) -> Iterator[Comparison]:
         _TABLE, "the same", ppo, "stock SB3, defaults, 8 envs in DummyVecEnv", as_people_write_it(PPO, 8)
     )
     large = learner(TabulatedPPO, 1024, 4 * scale.steps, **PPO_LARGE)
-    absent = why_no_navix()
     yield Comparison(
         _TABLE,
         "PPO, 1024 envs x 32, batch 8192, 4 epochs",
         large,
         "NAVIX's compiled PPO, 1024 x 32, Empty-5x5",
-        None if absent else navix_steps_per_second,
-        absent,
+        None if peers.why_not("NAVIX") else peers.navix,
+        peers.why_not("NAVIX"),
     )
     yield Comparison(
         _TABLE,
@@ -69,6 +69,15 @@ def rows(scale: Scale) -> Iterator[Comparison]:
         learner(DQN, 64, scale.steps, **DQN_BATCH),
     )
     yield Comparison(_TABLE, "the same", dqn, "stock SB3, defaults, one env", as_people_write_it(DQN, 1))
+    for name, ours, num_envs in (("PPO", ppo, 8), ("DQN", dqn, 1)):
+        yield Comparison(
+            _TABLE,
+            f"the same {name}",
+            ours,
+            f"SBX's {name}, defaults, {num_envs} envs in DummyVecEnv",
+            None if peers.why_not("SBX") else partial(peers.sbx, name, num_envs),
+            peers.why_not("SBX"),
+        )
     for name, ours, algorithm, settings in (
         ("PPO", ppo, TabulatedPPO, PPO_SMALL),
         ("DQN", dqn, TabulatedDQN, DQN_BATCH),
