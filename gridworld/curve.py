@@ -134,8 +134,8 @@ class Curve:
         return (self._evaluations - 1) % self._map_every == 0
 
     def _write(self, step: int, greedy: Score, sampled: Score) -> None:
-        row: dict[str, Any] = {"step": step, **_columns(greedy)}
-        row |= {f"sampled_{name}": value for name, value in _columns(sampled).items()}
+        row: dict[str, Any] = {"step": step, **greedy.numbers()}
+        row |= {f"sampled_{name}": value for name, value in sampled.numbers().items()}
         if self._rows is None:
             self._rows = csv.DictWriter(self._file, fieldnames=list(row), lineterminator="\n")
             self._rows.writeheader()
@@ -151,18 +151,5 @@ class Curve:
             f"{GREEDY}/optimal_length": self.judge.optimum.expected_length,
         }
         for group, score in ((GREEDY, greedy), (SAMPLED, sampled)):
-            tags |= {f"{group}/{name}": float(value) for name, value in _columns(score).items()}
+            tags |= {f"{group}/{name}": float(value) for name, value in score.numbers().items()}
         return tags
-
-
-def _columns(score: Score) -> dict[str, float | int]:
-    return {
-        "value": score.value,
-        "regret": score.regret,
-        "certified": int(score.certified),
-        "goal_probability": score.outcome.goal,
-        "trap_probability": score.outcome.trap,
-        "timeout_probability": score.outcome.timeout,
-        "return": score.outcome.expected_return,
-        "length": score.outcome.expected_length,
-    }

@@ -8,6 +8,7 @@ import secrets
 import shlex
 import shutil
 import sys
+import threading
 from pathlib import Path
 from typing import Any, cast
 
@@ -27,7 +28,7 @@ from gridworld.manual import manual
 from gridworld.run import MANIFEST, Run, check_new
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
-_jobs_begun: list[int] = []  # numbers of this process's jobs
+_job_begun = threading.Event()  # set once this process has come to a job
 _LONGEST_NAME = 100  # characters of a job's folder
 
 
@@ -71,7 +72,7 @@ def main(conf: Path) -> None:
         hydra.main(version_base="1.3", config_path=str(conf), config_name="train")(run_job)()
     except Exception as error:
         # Until a job begins, whatever goes wrong is the command line's or a yaml file's fault.
-        mistake = isinstance(error, CompactHydraException) or not _jobs_begun
+        mistake = isinstance(error, CompactHydraException) or not _job_begun.is_set()
         if asked_for_traceback or not mistake:
             raise
         sys.exit(_tell(error))
@@ -91,7 +92,7 @@ def compose(conf: Path, overrides: list[str]) -> TrainConfig:
 def run_job(settings: DictConfig) -> float:
     """One training run with its summary on standard output; returns the final regret, for sweepers."""
     context = HydraConfig.get()
-    _jobs_begun.append(context.job.num if context.mode is RunMode.MULTIRUN else 0)
+    _job_begun.set()
     folder = Path(context.runtime.output_dir)
     overrides = cast("list[str]", OmegaConf.to_container(context.overrides.task))
     try:

@@ -5,12 +5,27 @@ A module has `main(arguments)`, which `run` calls with what stands on the comman
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from gridworld.errors import EXIT_CODE, InputError
 
 Main = Callable[[Sequence[str]], None]
+
+
+def parser_for_a_run(prog: str, about: str | None) -> argparse.ArgumentParser:
+    """A parser with what every look at a finished run asks for: its folder, and which of its policies."""
+    parser = argparse.ArgumentParser(prog=prog, description=about)
+    parser.add_argument("run", type=Path, help="the run's folder, e.g. runs/2026-...")
+    parser.add_argument(
+        "--policy",
+        choices=("greedy", "sampled"),
+        default="greedy",
+        help="the best action, or the distribution it explores with",
+    )
+    return parser
 
 
 def run(main: Main) -> None:

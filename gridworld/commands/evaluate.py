@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
-import numpy as np
-
+from gridworld.commands import parser_for_a_run
 from gridworld.env import GridWorldEnv
 from gridworld.errors import InputError
-from gridworld.evaluation import Judge, Sampled, Score
+from gridworld.evaluation import Judge, Sampled, Score, play_episode
 from gridworld.mdp import FloatArray
 from gridworld.render import has_display
 from gridworld.saved_run import SavedRun, choose_policy
@@ -51,15 +49,8 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="evaluate.py", description=__doc__)
-    parser.add_argument("run", type=Path, help="the run's folder, e.g. runs/2026-...")
+    parser = parser_for_a_run("evaluate.py", __doc__)
     parser.add_argument("--layout", help="score it on another map of the same size: a name or a file")
-    parser.add_argument(
-        "--policy",
-        choices=("greedy", "sampled"),
-        default="greedy",
-        help="the best action, or the distribution it explores with",
-    )
     parser.add_argument("--episodes", type=int, default=1000, help="episodes to sample (default 1000)")
     parser.add_argument("--seed", type=int, default=0, help="of the sampled episodes (default 0)")
     parser.add_argument("--render", choices=("human",), help="first show one episode in a window")
@@ -91,14 +82,11 @@ def _verdict(judge: Judge, policy: FloatArray, score: Score) -> str:
 
 def _show(judge: Judge, policy: FloatArray, seed: int) -> None:
     """One episode in a window."""
+    states = play_episode(judge.mdp, policy, judge.max_episode_steps, seed)
     env = GridWorldEnv(render_mode="human", **judge.mdp.settings())
-    actions = np.random.default_rng(seed)
-    state, _ = env.reset(seed=seed)
     try:
-        for _ in range(judge.max_episode_steps):
-            row = policy[state]
-            state, _, terminated, _, _ = env.step(int(actions.choice(len(row), p=row)))
-            if terminated:
-                break
+        for state in states:
+            env.state = state
+            env.render()
     finally:
         env.close()

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gridworld import record
+from gridworld.commands import parser_for_a_run
 from gridworld.errors import InputError
 from gridworld.evaluation import play_episode
 from gridworld.render import frame_size
@@ -40,8 +41,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="record.py", description=__doc__)
-    parser.add_argument("run", type=Path, help="the run's folder, e.g. runs/2026-...")
+    parser = parser_for_a_run("record.py", __doc__)
     parser.add_argument(
         "--format",
         nargs="+",
@@ -51,12 +51,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--cell-size", type=int, help="pixels (default 100, less on large maps)")
     parser.add_argument("--fps", type=int, default=4, help="frames a second, 1 to 100 (default 4)")
-    parser.add_argument(
-        "--policy",
-        choices=("greedy", "sampled"),
-        default="greedy",
-        help="the best action, or the distribution it explores with",
-    )
     parser.add_argument("--episodes", type=int, default=1, help="one after the other (default 1)")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode (default 0)")
     parser.add_argument("--out", type=Path, help="the folder to write to (default RUN/recording)")
