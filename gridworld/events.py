@@ -84,21 +84,27 @@ class EventWriter:
 
     def charts(self, title: str, charts: Mapping[str, Sequence[str]]) -> None:
         """Charts of several tags each, for the Custom Scalars tab: {chart title: tags}."""
-        category = layout_pb2.Category(
-            title=title,
-            chart=[
+        self._layout(
+            title,
+            [
                 layout_pb2.Chart(title=name, multiline=layout_pb2.MultilineChartContent(tag=tags))
                 for name, tags in charts.items()
             ],
         )
-        content = layout_pb2.Layout(category=[category]).SerializeToString()
-        plugin = SummaryMetadata.PluginData(plugin_name=layout_metadata.PLUGIN_NAME)
-        value = Summary.Value(
-            tag=layout_metadata.CONFIG_SUMMARY_TAG,
-            metadata=SummaryMetadata(plugin_data=plugin),
-            tensor=TensorProto(dtype=DT_STRING, string_val=[content], tensor_shape=TensorShapeProto()),
+
+    def bands(self, title: str, bands: Mapping[str, tuple[str, str, str]]) -> None:
+        """Charts with a band around a line, for the same tab: {chart title: tags of value, low and high}."""
+        series = layout_pb2.MarginChartContent.Series
+        self._layout(
+            title,
+            [
+                layout_pb2.Chart(
+                    title=name,
+                    margin=layout_pb2.MarginChartContent(series=[series(value=value, lower=low, upper=high)]),
+                )
+                for name, (value, low, high) in bands.items()
+            ],
         )
-        self._add(Summary(value=[value]), 0)
 
     def flush(self) -> None:
         """Bring everything to the file."""
@@ -107,6 +113,17 @@ class EventWriter:
     def close(self) -> None:
         """Flush and close the file."""
         self._writer.close()
+
+    def _layout(self, title: str, charts: Sequence[layout_pb2.Chart]) -> None:
+        category = layout_pb2.Category(title=title, chart=charts)
+        content = layout_pb2.Layout(category=[category]).SerializeToString()
+        plugin = SummaryMetadata.PluginData(plugin_name=layout_metadata.PLUGIN_NAME)
+        value = Summary.Value(
+            tag=layout_metadata.CONFIG_SUMMARY_TAG,
+            metadata=SummaryMetadata(plugin_data=plugin),
+            tensor=TensorProto(dtype=DT_STRING, string_val=[content], tensor_shape=TensorShapeProto()),
+        )
+        self._add(Summary(value=[value]), 0)
 
     def _add(self, summary: Summary, step: int) -> None:
         self._writer.add_event(Event(wall_time=time.time(), step=step, summary=summary))

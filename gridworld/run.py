@@ -27,6 +27,8 @@ from gridworld.errors import InputError
 from gridworld.files import write_json
 
 MANIFEST = "manifest.json"
+CURVE = "curve.csv"
+SUMMARY = "summary.json"
 PACKAGES = (
     "gridworld",
     "gymnasium",
@@ -48,8 +50,8 @@ class Run:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.manifest_file = folder / MANIFEST
-        self.curve_file = folder / "curve.csv"
-        self.summary_file = folder / "summary.json"
+        self.curve_file = folder / CURVE
+        self.summary_file = folder / SUMMARY
         self.model_file = folder / "model.zip"
         self.frames_folder = folder / "frames"
         self.manifest: dict[str, Any] = {}

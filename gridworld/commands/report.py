@@ -1,0 +1,75 @@
+"""Put many runs side by side: statistics over seeds with intervals, curves and tables, as one page.
+
+RUNS are folders of runs, of sweeps, or any above them. The exit code is 0 if every run found is counted, 1 if
+the report was written but names something to look into (a run that is unfinished, damaged or contradicts
+another), 2 if there was nothing to report.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import webbrowser
+from collections.abc import Sequence
+from pathlib import Path
+
+from gridworld.errors import InputError
+from gridworld.report.report import Report, gather
+from gridworld.report.writing import MARKERS, check_markers, check_out, write_readme, write_report
+
+_MOST_TOLD = 20  # sentences on standard error; the page has them all
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Write the report and name it."""
+    options = _parser().parse_args(arguments)
+    if options.seed < 0:
+        raise InputError(f"--seed {options.seed}: must be at least 0")
+    out = options.out or _usual_out(options.runs)
+    check_out(out)
+    if options.readme is not None:
+        check_markers(options.readme)
+    report = gather(options.runs, options.seed)
+    page = write_report(report, out)
+    if options.readme is not None:
+        write_readme(report, options.readme)
+    _tell(report)
+    print(page)
+    if options.open and not webbrowser.open(page.absolute().as_uri()):
+        print(f"--open: there is no browser here; open {page} in yours", file=sys.stderr)
+    if not report.complete:
+        sys.exit(1)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="report.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUNS", help="folders, searched for runs")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        help="the report's folder (default: report/ in the one folder given, else runs/report)",
+    )
+    parser.add_argument("--open", action="store_true", help="show the page in the browser")
+    parser.add_argument(
+        "--readme",
+        type=Path,
+        help=f"also put the results into this Markdown file, between its lines {' and '.join(MARKERS)}",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the bootstrap (default 0)")
+    return parser
+
+
+def _usual_out(runs: Sequence[Path]) -> Path:
+    return runs[0] / "report" if len(runs) == 1 and runs[0].is_dir() else Path("runs/report")
+
+
+def _tell(report: Report) -> None:
+    sentences = report.sentences()
+    for sentence in sentences[:_MOST_TOLD]:
+        print(f"warning: {sentence}", file=sys.stderr)
+    if len(sentences) > _MOST_TOLD:
+        print(f"warning: and {len(sentences) - _MOST_TOLD} more, all in the report", file=sys.stderr)
+    for note in (*report.study.notes, *report.notes):
+        print(f"note: {note}", file=sys.stderr)

@@ -1,0 +1,9 @@
+"""What many runs say together: statistics over seeds, as one page, as tables and for TensorBoard.
+
+    find -> reading -> grouping -> analysis -> {figures, tables} -> {page, writing, aggregate}
+
+The statistics are those of R. Agarwal, M. Schwarzer, P. S. Castro, A. Courville and M. G. Bellemare, "Deep
+Reinforcement Learning at the Edge of the Statistical Precipice", NeurIPS 2021: interquartile means,
+stratified bootstrap intervals, probabilities of improvement. See `statistics.py`. rliable, the authors' own
+library, cannot be imported beside pandas 3 (its dependency arch fails); scipy has what is needed.
+"""

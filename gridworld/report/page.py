@@ -1,0 +1,213 @@
+"""The report as one page: no script, no network, nothing beside it."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from markupsafe import Markup
+from PIL import Image
+
+from gridworld.report import tables
+from gridworld.report.analysis import METRICS, Comparison, Result, TaskAnalysis
+from gridworld.report.figures import task_figures
+from gridworld.report.report import Report
+from gridworld.report.scene import DARK, LIGHT, Scene, Style, styles
+from gridworld.report.statistics import RESAMPLES, Share
+from gridworld.report.svg import to_svg
+from gridworld.report.table import Cell, Table, interval_text, main_text, number
+
+_PICTURE = "policy.png"
+_LARGEST_PICTURE = 4 * 2**20  # bytes
+_MOST_PIXELS = 4_000_000
+_PICTURE_WIDTH = 480  # pixels
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image to embed."""
+
+    uri: str
+    width: int
+    height: int
+    caption: str
+
+
+def figures(report: Report) -> dict[str, list[Scene]]:
+    """The figures by task, in the agents' colours."""
+    look = styles(report.study.agents)
+    return {task.task: list(task_figures(task, look)) for task in report.tasks}
+
+
+def render(report: Report, scenes: dict[str, list[Scene]]) -> str:
+    """The page's text."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("gridworld.report", "."),
+        autoescape=True,  # a run's folder is data: names in it may hold anything
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    look = styles(report.study.agents)
+    return environment.get_template("page.html.j2").render(
+        title="Evidence",
+        headline="Which agent solves which task",
+        lead=_lead(report),
+        answers=[_answer(task) for task in report.tasks],
+        answer=tables.answer_table(report.study, report.tasks),
+        problems=report.problems,
+        warnings=[*report.study.warnings, *_doubts(report)],
+        notes=[*report.study.notes, *report.notes],
+        tasks=[_task(task, scenes[task.task], look) for task in report.tasks],
+        overall=tables.overall_table(report.overall) if report.overall else None,
+        overall_improvements=_improvements(report.overall.comparisons, "all tasks") if report.overall else [],
+        unusable=tables.unusable_table(report.unusable),
+        runs=tables.runs_table(report.study),
+        settings=tables.settings_table(report.study),
+        resamples=f"{RESAMPLES:,}",
+        provenance=_provenance(report),
+        light=LIGHT,
+        dark=DARK,
+        styles=look,
+        main_text=main_text,
+        interval_text=interval_text,
+        share_of=_share_of,
+        is_text=_is_text,
+    )
+
+
+def improvements(task: TaskAnalysis) -> list[Table]:
+    """Tables of who beats whom."""
+    return _improvements(task.comparisons, task.task)
+
+
+def _improvements(comparisons: Sequence[Comparison], name: str) -> list[Table]:
+    found = (tables.improvement_table(comparisons, metric.key, name) for metric in METRICS)
+    return [table for table in found if table is not None]
+
+
+def _task(task: TaskAnalysis, scenes: Sequence[Scene], look: dict[str, Style]) -> dict[str, Any]:
+    run = task.results[0].group.runs[0]
+    pictures = (_picture(result) for result in task.results)
+    return {
+        "title": task.task,
+        "facts": _facts(task),
+        "figures": [Markup(to_svg(scene)) for scene in scenes],
+        "table": tables.task_table(task),
+        "improvements": improvements(task),
+        "pictures": [picture for picture in pictures if picture is not None],
+        "layout": run.layout,
+    }
+
+
+def _facts(task: TaskAnalysis) -> str:
+    run, world = task.results[0].group.runs[0], task.world
+    told = [f"Optimal value {number(world.optimal_value)} at a discount of {run.gamma:g}"]
+    if world.problem:
+        told.append(world.problem)
+    if math.isfinite(world.random_value):
+        told.append(
+            f"optimal return {number(world.optimal_return)}; a uniformly random policy has the value "
+            f"{number(world.random_value)} and the return {number(world.random_return)}"
+        )
+    names = ("slip", "step_reward", "goal_reward", "trap_reward", "max_episode_steps")
+    told.append(", ".join(f"{name}={run.world[name]}" for name in names if name in run.world))
+    return ". ".join(told) + "."
+
+
+def _lead(report: Report) -> str:
+    runs = sum(len(group.runs) for group in report.study.groups)
+    counts = (
+        (runs, "run"),
+        (len(report.study.agents), "agent"),
+        (len(report.study.tasks), "task"),
+    )
+    return ", ".join(f"{count} {name}{'s' if count > 1 else ''}" for count, name in counts) + _days(report)
+
+
+def _days(report: Report) -> str:
+    days = sorted({run.started for group in report.study.groups for run in group.runs if run.started})
+    return "" if not days else f", {days[0]}" if len(days) == 1 else f", {days[0]} to {days[-1]}"
+
+
+def _answer(task: TaskAnalysis) -> str:
+    ranked = sorted(
+        task.results, key=lambda result: (-result.certified.count / result.certified.total, _first(result))
+    )
+    told = [_verdict(result) for result in ranked]
+    return f"On {task.task}, " + "; ".join(told) + "."
+
+
+def _verdict(result: Result) -> str:
+    share, agent = result.certified, result.group.agent
+    if share.count == 0:
+        regret = number(result.estimates["regret", "iqm"].point)
+        return f"{agent} is certified on none of {share.total} seeds (IQM of the regret {regret})"
+    seeds = (
+        f"all {share.total} seeds" if share.count == share.total else f"{share.count} of {share.total} seeds"
+    )
+    if share.total == 1:
+        seeds = "its one seed"
+    return f"{agent} is certified optimal on {seeds}{_after(result)}"
+
+
+def _after(result: Result) -> str:
+    cell = tables.estimate(result, "steps", "median")
+    return (
+        ""
+        if cell is None or math.isinf(cell.interval.point)
+        else f", by step {main_text(cell)} in the median"
+    )
+
+
+def _first(result: Result) -> float:
+    return result.estimates["steps", "median"].point
+
+
+def _doubts(report: Report) -> list[str]:
+    return [f"{task.task}: {task.world.problem}." for task in report.tasks if task.world.problem]
+
+
+def _provenance(report: Report) -> str:
+    versions = sorted({run.version for group in report.study.groups for run in group.runs})
+    return f"The runs were written by gridworld {', '.join(versions)}. Bootstrap seed {report.seed}."
+
+
+def _share_of(cell: Cell) -> float | None:
+    return round(100 * cell.count / cell.total, 1) if isinstance(cell, Share) else None
+
+
+def _is_text(table: Table, index: int) -> bool:
+    return bool(table.rows) and all(isinstance(row[index], str) for row in table.rows)
+
+
+def _picture(result: Result) -> Picture | None:
+    """The map of the run with the median regret, small and encoded anew; None where there is none."""
+    ranked = sorted(result.group.runs, key=lambda run: (run.curve["regret"][-1], run.seed))
+    run = ranked[(len(ranked) - 1) // 2]
+    caption = f"{result.group.agent}, seed {run.seed}, regret {number(float(run.curve['regret'][-1]))}"
+    return embed(run.folder / _PICTURE, caption)
+
+
+def embed(path: Path, caption: str) -> Picture | None:
+    """An image file within bounds, as PNG in a data URI."""
+    try:
+        if path.stat().st_size > _LARGEST_PICTURE:
+            return None
+        with Image.open(path, formats=["PNG"]) as image:
+            if image.width * image.height > _MOST_PIXELS:
+                return None
+            small = image.convert("RGB")
+    except (OSError, ValueError, SyntaxError):  # what Pillow raises for a damaged file
+        return None
+    small.thumbnail((_PICTURE_WIDTH, 2 * _PICTURE_WIDTH), Image.Resampling.LANCZOS)
+    buffer = io.BytesIO()
+    small.quantize(128, dither=Image.Dither.NONE).save(buffer, format="PNG", optimize=True)
+    uri = "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    return Picture(uri, small.width, small.height, caption)

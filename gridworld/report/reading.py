@@ -1,0 +1,249 @@
+"""One run's folder as evidence. The folder is data: JSON and CSV, read within bounds, nothing imported."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gridworld.errors import InputError
+from gridworld.mdp import FloatArray
+from gridworld.run import CURVE, MANIFEST, SUMMARY
+
+_LARGEST_JSON = 4 * 2**20  # bytes
+_LARGEST_CSV = 64 * 2**20
+_LONGEST_NAME = 80  # characters
+
+REQUIRED = ("step", "value", "regret", "certified", "goal_probability", "return")
+SAMPLED_RETURN = "sampled_return"
+ONLINE = "online_return"  # undiscounted, of the training episodes ended since the row before; may be empty
+_OPTIONAL = (SAMPLED_RETURN, ONLINE)
+
+Settings = Mapping[str, str]  # flat: {"agent.gamma": "0.9"}
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """A finished run, as far as the statistics need it."""
+
+    folder: Path
+    agent: str  # its name in the settings
+    env: str  # the map's name
+    seed: int
+    settings: Settings  # all of them
+    world: Mapping[str, Any]  # env.* as the manifest has it
+    layout: str  # the map's text
+    gamma: float  # of the evaluation
+    optimal_value: float
+    seconds: float  # of training
+    started: str
+    version: str  # of this package, "?" where the manifest does not say
+    curve: Mapping[
+        str, FloatArray
+    ]  # REQUIRED, and those of the optional columns that the file has; (evaluations,)
+
+    @property
+    def steps(self) -> int:
+        """Environment steps at the last evaluation."""
+        return int(self.curve["step"][-1])
+
+    @property
+    def certified(self) -> bool:
+        """Whether the final greedy policy is optimal."""
+        return bool(self.curve["certified"][-1])
+
+    @property
+    def first_certified_step(self) -> float:
+        """Environment steps at the first certificate, infinite where there was none."""
+        hits = np.flatnonzero(self.curve["certified"])
+        return float(self.curve["step"][hits[0]]) if len(hits) else math.inf
+
+
+@dataclass(frozen=True)
+class Unusable:
+    """A run that is in no statistic, and why; the reason begins with its folder."""
+
+    folder: Path
+    reason: str
+    agent: str | None = None  # where the manifest tells
+    env: str | None = None
+
+
+def read(folder: Path) -> Evidence | Unusable:
+    """The run in `folder`, or the reason why it cannot be used."""
+    agent = env = None
+    try:
+        manifest = _object(folder / MANIFEST)
+        agent, env = _peek(manifest, "agent", "name"), _peek(manifest, "env", "layout")
+        _check_ended(folder, manifest)
+        return _evidence(folder, manifest)
+    except InputError as error:
+        return Unusable(folder, str(error), agent, env)
+
+
+def _evidence(folder: Path, manifest: dict[str, Any]) -> Evidence:
+    where = folder / MANIFEST
+    config, layout = manifest.get("config"), manifest.get("layout")
+    if not isinstance(config, dict) or not isinstance(config.get("env"), dict):
+        raise InputError(f"{where}: has no settings under config; is it of another version?")
+    if not (isinstance(layout, list) and all(isinstance(line, str) for line in layout)):
+        raise InputError(f"{where}: layout must be a list of the map's rows; is it of another version?")
+    summary = _object(folder / SUMMARY)
+    curve = _curve(folder / CURVE)
+    seed = config.get("seed")
+    if not isinstance(seed, int) or isinstance(seed, bool):
+        raise InputError(f"{where}: config.seed={seed!r} must be a whole number")
+    evidence = Evidence(
+        folder=folder,
+        agent=_text(config.get("agent"), "name", f"{where}: config.agent"),
+        env=_text(summary, "env", str(folder / SUMMARY)),
+        seed=seed,
+        settings=dict(flat(config)),
+        world=config["env"],
+        layout="\n".join(layout),
+        gamma=_number(config.get("evaluation"), "gamma", f"{where}: config.evaluation"),
+        optimal_value=_number(summary, "optimal_value", str(folder / SUMMARY)),
+        seconds=_number(summary, "train_seconds", str(folder / SUMMARY)),
+        started=str(manifest.get("started", ""))[:10],
+        version=str((manifest.get("versions") or {}).get("gridworld", "?"))[:_LONGEST_NAME],
+        curve=curve,
+    )
+    _check_agreement(evidence, summary)
+    return evidence
+
+
+def _check_ended(folder: Path, manifest: dict[str, Any]) -> None:
+    status = manifest.get("status")
+    if status == "finished":
+        return
+    told = manifest.get("error")
+    why = f": {' '.join(str(told).split())[:300]}" if told else ""
+    if status == "running":
+        why = ": it is still going on, or was killed"
+    raise InputError(
+        f"{folder}: this run is {str(status)[:_LONGEST_NAME]!r}, not finished{why}{_reached(folder)}"
+    )
+
+
+def _reached(folder: Path) -> str:
+    try:
+        return f" (last evaluated after {int(_curve(folder / CURVE)['step'][-1]):,} steps)"
+    except InputError:
+        return ""
+
+
+def _check_agreement(run: Evidence, summary: Mapping[str, Any]) -> None:
+    """The last row and the summary tell of the same policy, unless one of the files is of another run."""
+    last = run.curve["regret"][-1]
+    told = summary.get("regret")
+    same = told is None and not math.isfinite(last)
+    if isinstance(told, int | float):
+        same = math.isclose(told, last, rel_tol=1e-9, abs_tol=1e-12)
+    if not same or summary.get("certified") != run.certified or summary.get("timesteps") != run.steps:
+        raise InputError(
+            f"{run.folder}: {CURVE} ends at step {run.steps:,} with regret {last:.6g}, {SUMMARY} "
+            "says otherwise; one of them was changed or cut off"
+        )
+
+
+def _object(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(_bounded(path, _LARGEST_JSON))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is no JSON, it was changed or cut off ({error})") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: holds no JSON object")
+    return content
+
+
+def _bounded(path: Path, most: int) -> str:
+    try:
+        if not path.is_file():
+            raise InputError(f"{path.parent}: has no {path.name}")
+        if path.stat().st_size > most:
+            raise InputError(f"{path}: is larger than {most / 2**20:.0f} MiB")
+        return path.read_text("utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: cannot be read, it is no UTF-8 text") from None
+
+
+def _curve(path: Path) -> dict[str, FloatArray]:
+    lines = _bounded(path, _LARGEST_CSV).splitlines()
+    try:
+        rows = list(csv.reader(lines))
+    except csv.Error as error:
+        raise InputError(f"{path}: is no CSV ({error})") from None
+    if len(rows) < 2:
+        raise InputError(f"{path}: has no row")
+    header = rows[0]
+    if missing := [name for name in REQUIRED if name not in header]:
+        raise InputError(f"{path}: has no column {', '.join(missing)}; is it of another version?")
+    for number, row in enumerate(rows[1:], start=2):
+        if len(row) != len(header):
+            raise InputError(f"{path}: line {number} has {len(row)} of {len(header)} columns, it was cut off")
+    curve = {
+        name: _column(path, name, header, rows[1:]) for name in (*REQUIRED, *_OPTIONAL) if name in header
+    }
+    if (np.diff(curve["step"]) <= 0).any() or not np.isfinite(curve["step"]).all():
+        raise InputError(f"{path}: the steps do not rise from row to row")
+    curve["regret"] = np.maximum(0.0, curve["regret"])  # below zero is rounding
+    return curve
+
+
+def _column(path: Path, name: str, header: list[str], rows: list[list[str]]) -> FloatArray:
+    index = header.index(name)
+    values = np.empty(len(rows))
+    for number, row in enumerate(rows):
+        text = row[index]
+        try:
+            value = float(text) if text or name != ONLINE else math.nan
+        except ValueError:
+            raise InputError(f"{path}: line {number + 2}: {name}={text[:40]!r} is no number") from None
+        if math.isnan(value) and name != ONLINE:
+            raise InputError(
+                f"{path}: line {number + 2}: {name} is NaN; the run diverged or the file was changed"
+            )
+        values[number] = value
+    return values
+
+
+def flat(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Nested settings with dotted names, their values as JSON."""
+    for key, value in content.items():
+        if isinstance(value, dict) and value:
+            yield from flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+
+
+def _text(content: Any, key: str, where: str) -> str:
+    value = content.get(key) if isinstance(content, dict) else None
+    if not isinstance(value, str) or not value.strip():
+        raise InputError(f"{where}: {key}={value!r} must be a name; is it of another version?")
+    return _printable(value)
+
+
+def _printable(text: str) -> str:
+    return "".join(sign if sign.isprintable() else "?" for sign in text)[:_LONGEST_NAME]
+
+
+def _number(content: Any, key: str, where: str) -> float:
+    value = content.get(key) if isinstance(content, dict) else None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{where}: {key}={value!r} must be a number; is it of another version?")
+    return float(value)
+
+
+def _peek(manifest: dict[str, Any], section: str, key: str) -> str | None:
+    config = manifest.get("config")
+    inner = config.get(section) if isinstance(config, dict) else None
+    value = inner.get(key) if isinstance(inner, dict) else None
+    return _printable(value) if isinstance(value, str) else None

@@ -1,0 +1,149 @@
+"""Statistics over seeds, with intervals.
+
+Interquartile mean (IQM): the mean of what is left when the lowest and the highest quarter are cut off,
+`scipy.stats.trim_mean(x, 0.25)`; ⌊n/4⌋ values at either end, so the plain mean of up to three.
+
+Intervals: the 95 % percentile bootstrap, runs drawn anew within each task (the strata), by
+`scipy.stats.bootstrap`. The same draws serve every point of a curve: what is drawn is runs, not points.
+
+Probability of improvement: P(X > Y) + P(X = Y) / 2 for a random run of either agent, the Mann-Whitney
+statistic over n·m; over several tasks, the mean of the tasks' probabilities.
+
+Infinity is a value like any other: a run that was never certified took infinitely many steps. A median is
+finite as long as fewer than half are infinite, an IQM as long as no more than the upper quarter is.
+
+References: R. Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS
+2021; H. B. Mann and D. R. Whitney, Annals of Mathematical Statistics 18, 1947; E. B. Wilson, Journal of the
+American Statistical Association 22, 1927.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.stats
+
+from gridworld.mdp import FloatArray
+
+LEVEL = 0.95
+RESAMPLES = 2000
+TRIMMED = 0.25  # of the values, at either end
+
+_FAR = 1e200  # stands in for infinity while sums and differences are taken; whatever it touches is infinite
+_INFINITE = 1e100
+
+_LARGEST_BATCH = 4_000_000  # numbers that one batch of resamples may hold, 32 MB
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A point estimate and its 95 % interval; NaN bounds where one run allows none."""
+
+    point: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Share:
+    """How many of how many, with Wilson's interval for the share."""
+
+    count: int
+    total: int
+    low: float
+    high: float
+
+
+Statistic = Callable[..., FloatArray]  # (*samples, axis=-1); samples (..., n)
+
+
+def mean(*samples: FloatArray, axis: int = -1) -> FloatArray:
+    """Of all samples together."""
+    return np.asarray(np.mean(np.concatenate(samples, axis=axis), axis=axis))
+
+
+def median(*samples: FloatArray, axis: int = -1) -> FloatArray:
+    """Of all samples together."""
+    return np.asarray(np.median(np.concatenate(samples, axis=axis), axis=axis))
+
+
+def iqm(*samples: FloatArray, axis: int = -1) -> FloatArray:
+    """Interquartile mean of all samples together."""
+    return np.asarray(scipy.stats.trim_mean(np.concatenate(samples, axis=axis), TRIMMED, axis=axis))
+
+
+def share(count: int, total: int) -> Share:
+    """Wilson's interval stays honest where none, or every one, is a hit."""
+    bounds = scipy.stats.binomtest(count, total).proportion_ci(LEVEL, method="wilson")
+    return Share(count, total, float(bounds.low), float(bounds.high))
+
+
+def bands(
+    statistic: Statistic, samples: Sequence[FloatArray], seed: int, resamples: int = RESAMPLES
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Point, low and high of a statistic, each (...), from one sample (..., n) for every stratum."""
+    finite = [np.clip(sample, -_FAR, _FAR) for sample in samples]
+    point = statistic(*finite, axis=-1)
+    if min(sample.shape[-1] for sample in finite) < 2:
+        unknown = np.full(point.shape, math.nan)
+        return _extended(point), unknown, unknown
+    size = sum(sample.size for sample in finite)
+    answer = scipy.stats.bootstrap(
+        finite,
+        statistic,
+        axis=-1,
+        n_resamples=resamples,
+        confidence_level=LEVEL,
+        method="percentile",
+        vectorized=True,
+        paired=False,
+        batch=max(1, _LARGEST_BATCH // size),
+        rng=np.random.default_rng(seed),
+    ).confidence_interval
+    return _extended(point), _extended(answer.low), _extended(answer.high)
+
+
+def interval(statistic: Statistic, samples: Sequence[FloatArray], seed: int) -> Interval:
+    """A statistic of one sample (n,) for every stratum, with its interval."""
+    return Interval(*(float(number) for number in bands(statistic, samples, seed)))
+
+
+def improvement(pairs: Sequence[tuple[FloatArray, FloatArray]], seed: int) -> Interval:
+    """The probability that a run of the first agent has the greater number; a pair of samples a task."""
+    samples = [sample for pair in pairs for sample in pair]
+
+    def mean_probability(*drawn: FloatArray, axis: int = -1) -> FloatArray:
+        by_task = zip(drawn[::2], drawn[1::2], strict=True)
+        return np.asarray(np.mean([_probability(one, other) for one, other in by_task], axis=0))
+
+    size = sum(len(first) * len(second) for first, second in pairs)
+    return interval(_sized(mean_probability, size), samples, seed)
+
+
+def _sized(statistic: Statistic, size: int) -> Statistic:
+    """Marks a statistic whose work grows with pairs, not values; keeps the batches small all the same."""
+    step = max(1, _LARGEST_BATCH // size)
+
+    def in_parts(*samples: FloatArray, axis: int = -1) -> FloatArray:
+        if samples[0].ndim == 1:
+            return statistic(*samples, axis=axis)
+        parts = range(0, len(samples[0]), step)
+        return np.concatenate([statistic(*(s[i : i + step] for s in samples), axis=axis) for i in parts])
+
+    return in_parts
+
+
+def _probability(first: FloatArray, second: FloatArray) -> FloatArray:
+    """(..., n) against (..., m): the share of pairs that the first wins, ties counted half."""
+    one, other = first[..., :, None], second[..., None, :]
+    wins = (one > other).mean(axis=(-2, -1))
+    return np.asarray(wins + (one == other).mean(axis=(-2, -1)) / 2)
+
+
+def _extended(numbers: FloatArray) -> FloatArray:
+    """Back to infinities."""
+    numbers = np.asarray(numbers, dtype=np.float64)
+    return np.where(np.abs(numbers) > _INFINITE, np.copysign(math.inf, numbers), numbers)

@@ -1,0 +1,135 @@
+"""A table, written as HTML by the page, as Markdown to be read and as CSV to be computed with."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+from gridworld.report.statistics import Interval, Share
+
+NOTHING = "\N{EN DASH}"
+_MINUS = "\N{MINUS SIGN}"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An interval with the way its numbers are told."""
+
+    interval: Interval
+    form: Callable[[float], str]
+
+
+Cell = str | float | int | None | Share | Estimate
+
+
+@dataclass(frozen=True)
+class Table:
+    """`columns` are headings; every row has a cell for each."""
+
+    name: str  # of its files
+    caption: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+
+
+def number(value: float) -> str:
+    """Four digits; what is infinite or unknown is told so."""
+    if math.isnan(value):
+        return NOTHING
+    if math.isinf(value):
+        return "∞" if value > 0 else f"{_MINUS}∞"
+    if value == 0:
+        return "0"
+    text = f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}" if abs(value) >= 1e-4 else f"{value:.1e}"
+    return text.replace("-", _MINUS)
+
+
+def steps_up_to(bound: float) -> Callable[[float], str]:
+    """Tells an infinite number of steps as more than those that were given."""
+    return lambda value: f"> {bound:,.0f}" if math.isinf(value) else number(round(value))
+
+
+def main_text(cell: Cell) -> str:
+    """The cell without its interval."""
+    match cell:
+        case None:
+            return NOTHING
+        case str():
+            return cell
+        case Share(count, total, _, _):
+            return f"{count} / {total}"
+        case Estimate(interval, form):
+            return form(interval.point)
+        case int():
+            return f"{cell:,}"
+        case float():
+            return number(cell)
+
+
+def interval_text(cell: Cell) -> str:
+    """The interval of a cell, or nothing."""
+    match cell:
+        case Share(_, _, low, high):
+            return f"[{100 * low:.0f} %, {100 * high:.0f} %]"
+        case Estimate(interval, form) if not math.isnan(interval.low):
+            return f"[{form(interval.low)}, {form(interval.high)}]"
+        case _:
+            return ""
+
+
+def to_markdown(table: Table) -> str:
+    """A pipe table; numbers stand to the right."""
+    is_text = [all(isinstance(row[i], str) for row in table.rows) for i in range(len(table.columns))]
+    lines = [_piped(table.columns), _piped("---" if text else "---:" for text in is_text)]
+    lines += [
+        _piped(f"{main_text(cell)} {interval_text(cell)}".strip() for cell in row) for row in table.rows
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def to_csv(table: Table) -> str:
+    """Plain numbers; an interval takes three columns, a share four."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    kinds = [_kind([row[index] for row in table.rows]) for index in range(len(table.columns))]
+    writer.writerow(
+        heading + suffix
+        for heading, kind in zip(table.columns, kinds, strict=True)
+        for suffix in _SUFFIXES.get(kind, ("",))
+    )
+    for row in table.rows:
+        writer.writerow(value for cell, kind in zip(row, kinds, strict=True) for value in _values(cell, kind))
+    return out.getvalue()
+
+
+_SUFFIXES: dict[type | None, tuple[str, ...]] = {
+    Estimate: ("", " low", " high"),
+    Share: ("", " of", " low", " high"),
+}
+
+
+def _kind(cells: Sequence[Cell]) -> type | None:
+    return next((type(cell) for cell in cells if isinstance(cell, Estimate | Share)), None)
+
+
+def _values(cell: Cell, kind: type | None) -> Iterator[object]:
+    match cell:
+        case Estimate(interval, _):
+            yield from (_plain(value) for value in (interval.point, interval.low, interval.high))
+        case Share(count, total, low, high):
+            yield from (count, total, _plain(low), _plain(high))
+        case None:
+            yield from ("" for _ in _SUFFIXES.get(kind, ("",)))
+        case _:
+            yield _plain(cell) if isinstance(cell, float) else cell
+
+
+def _plain(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.10g}"
+
+
+def _piped(cells: Sequence[str] | Iterator[str]) -> str:
+    return "| " + " | ".join(cell.replace("\\", "\\\\").replace("|", "\\|") for cell in cells) + " |"
