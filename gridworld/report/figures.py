@@ -96,11 +96,11 @@ def _curves(
     shapes += [
         Text((x(tick), bottom + 16), compact(tick), "muted", SMALL, "middle") for tick in ticks(0, x.high, 5)
     ]
-    shapes += _levels(levels, x, y)
     for agent, band in curves:
         shapes.append(_area(band, styles[agent], x, y))
     for agent, band in curves:
         shapes += _line(band, styles[agent], x, y)
+    shapes += _levels(levels, x, y)
     shapes.append(Text((WIDTH - _RIGHT, bottom + 32), "environment steps", "muted", SMALL, "end"))
     return Scene(name, title, description, WIDTH, bottom + 40, shapes)
 
@@ -108,8 +108,8 @@ def _curves(
 def _levels(levels: Mapping[str, float], x: Axis, y: Axis) -> Iterator[Shape]:
     for name, level in levels.items():
         if math.isfinite(level) and y.low <= level <= y.high:
-            yield Line([(x.start, y(level)), (x.end, y(level))], "ink", 1.2, (4.0, 3.0))
-            yield Text((x.end - 2, y(level) - 5), name, "muted", SMALL, "end")
+            yield Line([(x.start, y(level)), (x.end, y(level))], "ink", 1.0, (4.0, 4.0))
+            yield Text((x.end - 2, y(level) - 5), name, "muted", SMALL, "end", halo=True)
 
 
 def _area(band: Band, style: Style, x: Axis, y: Axis) -> Shape:

@@ -99,26 +99,26 @@ def _task(task: TaskAnalysis, scenes: Sequence[Scene], look: dict[str, Style]) -
         "title": task.task,
         "facts": _facts(task),
         "figures": [Markup(to_svg(scene)) for scene in scenes],
-        "table": tables.task_table(task),
+        "tables": [tables.task_table(task), tables.scores_table(task)],
         "improvements": improvements(task),
         "pictures": [picture for picture in pictures if picture is not None],
         "layout": run.layout,
     }
 
 
-def _facts(task: TaskAnalysis) -> str:
+def _facts(task: TaskAnalysis) -> list[str]:
     run, world = task.results[0].group.runs[0], task.world
-    told = [f"Optimal value {number(world.optimal_value)} at a discount of {run.gamma:g}"]
-    if world.problem:
-        told.append(world.problem)
+    told = [f"Optimum: value {number(world.optimal_value)} at a discount of {run.gamma:g}"]
     if math.isfinite(world.random_value):
+        told[0] += f", return {number(world.optimal_return)}"
         told.append(
-            f"optimal return {number(world.optimal_return)}; a uniformly random policy has the value "
-            f"{number(world.random_value)} and the return {number(world.random_return)}"
+            f"Uniformly random policy: value {number(world.random_value)}, "
+            f"return {number(world.random_return)}"
         )
     names = ("slip", "step_reward", "goal_reward", "trap_reward", "max_episode_steps")
-    told.append(", ".join(f"{name}={run.world[name]}" for name in names if name in run.world))
-    return ". ".join(told) + "."
+    settings = ((name.replace("_", " "), run.settings.get(f"env.{name}")) for name in names)
+    told.append("World: " + ", ".join(f"{name} {value}" for name, value in settings if value is not None))
+    return [f"{sentence}." for sentence in told]
 
 
 def _lead(report: Report) -> str:

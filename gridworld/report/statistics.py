@@ -32,8 +32,8 @@ LEVEL = 0.95
 RESAMPLES = 2000
 TRIMMED = 0.25  # of the values, at either end
 
-_FAR = 1e200  # stands in for infinity while sums and differences are taken; whatever it touches is infinite
-_INFINITE = 1e100
+_FAR = 1e100  # stands in for infinity while sums and differences are taken; whatever it touches is infinite
+_INFINITE = 1e90
 
 _LARGEST_BATCH = 4_000_000  # numbers that one batch of resamples may hold, 32 MB
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from gridworld.report.analysis import BY_KEY, Comparison, Overall, Result, TaskAnalysis
 from gridworld.report.grouping import Study, differing, learning_key
@@ -11,7 +11,7 @@ from gridworld.report.reading import Unusable
 from gridworld.report.statistics import Share
 from gridworld.report.table import Cell, Estimate, Table, number, steps_up_to
 
-_EXTRA = (
+_SCORES = (
     "optimality",
     "value",
     "return",
@@ -30,28 +30,40 @@ def results_table(tasks: Sequence[TaskAnalysis]) -> Table:
         for task in tasks
         for result in task.results
     ]
-    columns = ["task", "agent", "seeds certified"]
-    columns += ["regret, IQM", "regret, median", "steps to certificate, IQM", "steps to certificate, median"]
+    columns = ["task", "agent", "seeds certified", *(_heading(*which) for which in shown)]
     return Table("results", "Certified seeds, exact regret and steps, with 95 % intervals", columns, rows)
 
 
 def task_table(task: TaskAnalysis) -> Table:
-    """Everything about a task; columns that no run has numbers for are left out."""
-    columns: list[tuple[str, Callable[[Result], Cell]]] = [
-        ("agent", lambda result: result.group.agent),
-        ("certified at the end", lambda result: result.certified),
-        ("ever certified", lambda result: result.ever),
-        *(
-            (f"{BY_KEY[key].title}, {_SHORT[s]}", _of(key, s))
-            for key in ("regret", "steps")
-            for s in ("iqm", "median")
-        ),
-        *((f"{BY_KEY[key].title}, mean", _of(key, "mean")) for key in _EXTRA if _present(task, key)),
+    """How near to the optimum, how soon."""
+    shown = [(key, statistic) for key in ("regret", "steps") for statistic in ("iqm", "median")]
+    columns = ["agent", "certified at the end", "ever certified", *(_heading(*which) for which in shown)]
+    rows: list[list[Cell]] = [
+        [result.group.agent, result.certified, result.ever, *(estimate(result, *which) for which in shown)]
+        for result in task.results
     ]
-    rows = [[of(result) for _, of in columns] for result in task.results]
-    return Table(task.task, f"Results on {task.task}", [heading for heading, _ in columns], rows)
+    return Table(task.task, f"Results on {task.task}", columns, rows)
 
 
+def scores_table(task: TaskAnalysis) -> Table:
+    """Means of everything else that the runs have numbers for."""
+    keys = [key for key in _SCORES if any(len(result.samples[key]) for result in task.results)]
+    rows: list[list[Cell]] = [
+        [result.group.agent, *(estimate(result, key, "mean") for key in keys)] for result in task.results
+    ]
+    return Table(
+        f"{task.task} scores",
+        f"Means over seeds on {task.task}, of the greedy policy where nothing else is said",
+        ["agent", *(BY_KEY[key].title for key in keys)],
+        rows,
+    )
+
+
+def _heading(key: str, statistic: str) -> str:
+    return f"{_HEADINGS[key]}, {_SHORT[statistic]}"
+
+
+_HEADINGS = {"regret": "regret", "steps": "steps to certificate"}
 _SHORT = {"iqm": "IQM", "median": "median"}
 
 
@@ -61,14 +73,6 @@ def estimate(result: Result, key: str, statistic: str) -> Estimate | None:
     if found is None:
         return None
     return Estimate(found, steps_up_to(result.shortest_uncertified) if key == "steps" else number)
-
-
-def _of(key: str, statistic: str) -> Callable[[Result], Cell]:
-    return lambda result: estimate(result, key, statistic)
-
-
-def _present(task: TaskAnalysis, key: str) -> bool:
-    return any(len(result.samples[key]) for result in task.results)
 
 
 def improvement_table(comparisons: Sequence[Comparison], metric: str, name: str) -> Table | None:

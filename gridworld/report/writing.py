@@ -96,6 +96,7 @@ def _tables(report: Report) -> Iterator[Table]:
     yield tables.settings_table(report.study)
     for task in report.tasks:
         yield tables.task_table(task)
+        yield tables.scores_table(task)
         yield from improvements(task)
     if report.overall is not None:
         yield tables.overall_table(report.overall)
