@@ -1,9 +1,7 @@
 """What a real TensorBoard serves of a run, and what a real browser shows of it."""
 
 import json
-import os
 import re
-import shutil
 import subprocess
 import sys
 import urllib.request
@@ -12,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from browser import chromium
 from support import SHORT, train_in
 
 from gridworld.curve import CHARTS
@@ -105,23 +104,9 @@ def test_custom_scalars_group_the_curves(served: str) -> None:
 
 
 def test_a_browser_shows_it(served: str, tmp_path: Path) -> None:
-    missing = [name for name in ("chromium", "chromedriver") if shutil.which(name) is None]
-    if missing and not os.environ.get("GRIDWORLD_REQUIRE_BROWSER"):
-        pytest.skip(f"not installed: {' and '.join(missing)} (Debian: chromium, chromium-driver)")
-    from selenium import webdriver
-    from selenium.webdriver.chrome.service import Service
-    from selenium.webdriver.support.ui import WebDriverWait
+    with chromium(tmp_path / "profile") as browser:
+        from selenium.webdriver.support.ui import WebDriverWait
 
-    options = webdriver.ChromeOptions()
-    options.binary_location = str(shutil.which("chromium"))
-    for argument in (
-        *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
-        *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-        *(f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1400,1000"),
-    ):
-        options.add_argument(argument)
-    browser = webdriver.Chrome(options=options, service=Service(str(shutil.which("chromedriver"))))
-    try:
         for page, expected in (
             ("timeseries", ["dqn_run", "ppo_run", "/goal_probability", "/optimal_goal_probability"]),
             ("images", ["dqn_run", "policy", "episode"]),
@@ -132,5 +117,3 @@ def test_a_browser_shows_it(served: str, tmp_path: Path) -> None:
                 lambda b, words=expected: all(word in b.execute_script(PAGE_TEXT) for word in words)
             )
             browser.save_screenshot(str(tmp_path / f"{page}.png"))
-    finally:
-        browser.quit()

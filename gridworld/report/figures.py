@@ -97,7 +97,7 @@ def _curves(
         Text((x(tick), bottom + 16), compact(tick), "muted", SMALL, "middle") for tick in ticks(0, x.high, 5)
     ]
     for agent, band in curves:
-        shapes.append(_area(band, styles[agent], x, y))
+        shapes += _area(band, styles[agent], x, y)
     for agent, band in curves:
         shapes += _line(band, styles[agent], x, y)
     shapes += _levels(levels, x, y)
@@ -112,11 +112,12 @@ def _levels(levels: Mapping[str, float], x: Axis, y: Axis) -> Iterator[Shape]:
             yield Text((x.end - 2, y(level) - 5), name, "muted", SMALL, "end", halo=True)
 
 
-def _area(band: Band, style: Style, x: Axis, y: Axis) -> Shape:
+def _area(band: Band, style: Style, x: Axis, y: Axis) -> Iterator[Shape]:
+    if np.isnan(band.low).any():
+        return  # one seed has no interval
     high = steps_like(band.steps.tolist(), band.high.tolist(), x, y)
     low = steps_like(band.steps.tolist(), band.low.tolist(), x, y)
-    drawn = not np.isnan(band.low).any()  # one seed has no interval
-    return Area([*high, *reversed(low)] if drawn else [], style.paint)
+    yield Area([*high, *reversed(low)], style.paint)
 
 
 def _line(band: Band, style: Style, x: Axis, y: Axis) -> Iterator[Shape]:

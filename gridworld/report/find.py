@@ -11,19 +11,18 @@ from gridworld.run import CURVE, MANIFEST
 
 def find_runs(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
     """Run folders in order of their names, each once, and a sentence for every path without one."""
-    seen: set[tuple[int, int]] = set()
-    folders: list[Path] = []
-    problems = []
+    folders: dict[tuple[int, int], Path] = {}
+    problems: list[str] = []
     for path in paths:
         if problem := _problem(path):
             problems.append(problem)
             continue
-        met_before = _identity(path) in seen
-        found = sorted(_below(path, seen, problems))
-        folders += found
-        if not found and not met_before:
+        found = sorted(_below(path, problems))
+        for folder in found:
+            folders.setdefault(_identity(folder), folder)
+        if not found:
             problems.append(f"{path}: holds no run, there is no {MANIFEST} in it or below it")
-    return folders, problems
+    return list(folders.values()), list(dict.fromkeys(problems))
 
 
 def _problem(path: Path) -> str | None:
@@ -34,8 +33,9 @@ def _problem(path: Path) -> str | None:
     return f"{path}: no such folder; give the folder of a run, of a sweep, or one above them"
 
 
-def _below(top: Path, seen: set[tuple[int, int]], problems: list[str]) -> Iterator[Path]:
+def _below(top: Path, problems: list[str]) -> Iterator[Path]:
     """Symbolic links are followed, but no real folder is entered twice, so a loop of links ends."""
+    seen: set[tuple[int, int]] = set()
     waiting = [top]
     while waiting:
         folder = waiting.pop()
@@ -44,13 +44,20 @@ def _below(top: Path, seen: set[tuple[int, int]], problems: list[str]) -> Iterat
                 continue
             seen.add(identity)
             with os.scandir(folder) as entries:
-                names = [(entry.name, entry.is_dir()) for entry in entries]
+                names = sorted(((entry.name, _is_folder(entry)) for entry in entries), reverse=True)
         except OSError as error:
             problems.append(f"{folder}: cannot be searched ({error.strerror})")
             continue
         if any(name in (MANIFEST, CURVE) and not is_folder for name, is_folder in names):
             yield folder
         waiting += [folder / name for name, is_folder in names if is_folder]
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    try:
+        return entry.is_dir()
+    except OSError:  # a link to itself
+        return False
 
 
 def _identity(folder: Path) -> tuple[int, int]:

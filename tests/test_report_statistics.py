@@ -1,0 +1,117 @@
+"""The report's statistics against naive computation and known numbers."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gridworld.report import statistics
+from gridworld.report.statistics import bands, improvement, interval, iqm, mean, median, share
+
+numbers = st.floats(-100, 100).map(lambda x: round(x, 2))
+samples = st.lists(numbers, min_size=1, max_size=30)
+
+
+def test_iqm_of_known_lists() -> None:
+    assert iqm(np.array([1.0, 2.0, 3.0, 4.0])) == 2.5
+    assert iqm(np.array([0.0, 0.0, 10.0, 20.0, 1000.0, -1000.0, 30.0, 40.0])) == 15.0
+    assert iqm(np.array([1.0, 2.0, 6.0])) == 3.0  # nothing to cut off
+    assert iqm(np.array([0.0, 100.0]), np.array([1.0, 3.0])) == 2.0  # both together
+
+
+@given(samples)
+def test_iqm_is_the_mean_of_the_middle(values: list[float]) -> None:
+    cut = len(values) // 4
+    middle = sorted(values)[cut : len(values) - cut]
+    assert iqm(np.array(values)) == pytest.approx(sum(middle) / len(middle), abs=1e-9)
+
+
+def test_infinity_is_a_number_like_any_other() -> None:
+    inf = math.inf
+    assert interval(median, [np.array([1.0, 2.0, inf])], 0).point == 2.0
+    assert interval(median, [np.array([1.0, 2.0, inf, inf])], 0).point == inf  # half were not reached
+    assert interval(iqm, [np.array([1.0, 2.0, 3.0, inf])], 0).point == 2.5  # one quarter is cut off
+    assert interval(iqm, [np.array([1.0, 2.0, inf, inf])], 0).point == inf
+    told = interval(iqm, [np.array([1.0, 2.0, 3.0, inf])], 0)
+    assert 1.0 <= told.low <= told.point <= told.high == inf
+    assert interval(mean, [np.array([-inf, -inf])], 0).point == -inf
+    nowhere = interval(median, [np.array([inf, inf, inf])], 0)
+    assert (nowhere.point, nowhere.low, nowhere.high) == (inf, inf, inf)
+
+
+def test_one_run_has_no_interval() -> None:
+    told = interval(mean, [np.array([3.0])], 0)
+    assert told.point == 3.0
+    assert math.isnan(told.low)
+    assert math.isnan(told.high)
+
+
+def test_the_bootstrap_covers_the_truth_about_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(0)
+    trials = rng.normal(5.0, 2.0, (400, 40))
+    _, low, high = bands(mean, [trials], seed=1, resamples=500)
+    assert 0.91 <= np.mean((low <= 5.0) & (high >= 5.0)) <= 0.97
+    # The width is that of the normal theory, up to the bootstrap's factor √(1 - 1/n).
+    assert np.mean(high - low) == pytest.approx(2 * 1.96 * 2 / math.sqrt(40), rel=0.05)
+
+
+def test_the_bootstrap_is_stratified() -> None:
+    """Pooled resampling of 0s and 1s would spread; within strata there is nothing to draw."""
+    told = interval(mean, [np.zeros(6), np.ones(6)], 0)
+    assert (told.point, told.low, told.high) == (0.5, 0.5, 0.5)
+
+
+def test_points_of_a_curve_share_their_draws() -> None:
+    values = np.random.default_rng(0).random(12)
+    _, low, high = bands(iqm, [np.stack([values, values])], seed=0)
+    assert low[0] == low[1]
+    assert high[0] == high[1]
+    again = bands(iqm, [np.stack([values, values])], seed=0)
+    assert np.array_equal(again[1], low)
+    assert not np.array_equal(bands(iqm, [values], seed=1)[1], low[0])
+
+
+@given(samples, samples)
+def test_improvement_counts_pairs_with_ties_as_half(first: list[float], second: list[float]) -> None:
+    wins = sum(1.0 if x > y else 0.5 if x == y else 0.0 for x in first for y in second)
+    probability, _, _ = bands(
+        lambda x, y, axis: statistics._probability(x, y), [np.array(first), np.array(second)], 0, 10
+    )
+    assert probability == pytest.approx(wins / (len(first) * len(second)))
+
+
+def test_improvement_over_tasks_is_the_mean_over_tasks() -> None:
+    easy = (np.array([1.0, 1.0, 1.0]), np.array([0.0, 0.0]))
+    even = (np.array([2.0, 2.0]), np.array([2.0, 2.0, 2.0, 2.0]))
+    assert improvement([easy], 0) == statistics.Interval(1.0, 1.0, 1.0)
+    assert improvement([even], 0) == statistics.Interval(0.5, 0.5, 0.5)
+    assert improvement([easy, even], 0) == statistics.Interval(0.75, 0.75, 0.75)
+    never = np.array([-math.inf, -math.inf])
+    assert improvement([(never, never)], 0).point == 0.5
+    assert improvement([(np.array([-5.0, -7.0]), never)], 0).point == 1.0
+
+
+def test_improvement_does_not_depend_on_how_it_is_split_into_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    pair = rng.integers(0, 5, 15).astype(float), rng.integers(1, 6, 11).astype(float)
+    whole = improvement([pair], 0)
+    monkeypatch.setattr(statistics, "_LARGEST_BATCH", 1000)
+    parts = improvement([pair], 0)
+    assert (
+        parts.point
+        == whole.point
+        == pytest.approx(np.mean(np.greater.outer(*pair) + np.equal.outer(*pair) / 2))
+    )
+    assert 0 <= parts.low < parts.point < parts.high <= 1
+
+
+def test_wilsons_interval() -> None:
+    z, n, p = 1.959964, 20, 0.95
+    middle = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    told = share(19, 20)
+    assert (told.low, told.high) == pytest.approx((middle - half, middle + half), abs=1e-6)
+    assert share(0, 5).low == 0.0 < share(0, 5).high
+    assert share(5, 5).high == 1.0 > share(5, 5).low
