@@ -17,7 +17,6 @@ from gridworld.report.statistics import Interval, Share
 from gridworld.report.world import Reference, reference
 
 GRID_POINTS = 101  # of a curve, from step 0 to the end of the task's longest run
-_DIGITS = 9  # after the point: two ways to compute one regret differ later than that
 
 
 @dataclass(frozen=True)
@@ -32,17 +31,12 @@ class Metric:
     compared: bool = False  # between agents, as a probability of improvement
 
 
-def final_regret(run: Evidence, _: Reference) -> float:
-    """Exactly 0 for a certified policy, so that two of them are a tie."""
-    return 0.0 if run.certified else round(float(run.curve["regret"][-1]), _DIGITS)
-
-
 def optimality(run: Evidence, world: Reference) -> float:
     """1 for the optimum, 0 for the uniformly random policy; below 0 is worse than that."""
     span = world.optimal_value - world.random_value
     if not (math.isfinite(span) and span > 0):
         return math.nan
-    return 1.0 - final_regret(run, world) / span
+    return 1.0 - run.regret / span
 
 
 def online_return(run: Evidence, last: float = 1.0) -> float:
@@ -59,7 +53,7 @@ def _last(column: str) -> Callable[[Evidence, Reference], float]:
 
 
 METRICS = (
-    Metric("regret", "final regret", final_regret, ("iqm", "median", "mean"), -1, compared=True),
+    Metric("regret", "final regret", lambda run, _: run.regret, ("iqm", "median", "mean"), -1, compared=True),
     Metric(
         "steps",
         "steps to the first certificate",

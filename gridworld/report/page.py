@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from PIL import Image
 from gridworld.report import tables
 from gridworld.report.analysis import METRICS, Comparison, Result, TaskAnalysis
 from gridworld.report.figures import task_figures
+from gridworld.report.reading import Unusable
 from gridworld.report.report import Report
 from gridworld.report.scene import DARK, LIGHT, Scene, Style, styles
 from gridworld.report.statistics import RESAMPLES, Share
@@ -59,7 +61,7 @@ def render(report: Report, scenes: dict[str, list[Scene]]) -> str:
         title="Evidence",
         headline="Which agent solves which task",
         lead=_lead(report),
-        answers=[_answer(task) for task in report.tasks],
+        answers=[_answer(task, report.unusable) for task in report.tasks],
         answer=tables.answer_table(report.study, report.tasks),
         problems=report.problems,
         warnings=[*report.study.warnings, *_doubts(report)],
@@ -136,11 +138,17 @@ def _days(report: Report) -> str:
     return "" if not days else f", {days[0]}" if len(days) == 1 else f", {days[0]} to {days[-1]}"
 
 
-def _answer(task: TaskAnalysis) -> str:
+def _answer(task: TaskAnalysis, unusable: Sequence[Unusable]) -> str:
     ranked = sorted(
         task.results, key=lambda result: (-result.certified.count / result.certified.total, _first(result))
     )
     told = [_verdict(result) for result in ranked]
+    layout = task.results[0].group.runs[0].settings.get("env.layout")
+    missing = Counter(run.agent for run in unusable if run.env == layout and run.agent is not None)
+    told += [
+        f"{count} {'run' if count == 1 else 'runs'} of {agent} not counted"
+        for agent, count in sorted(missing.items())
+    ]
     return f"On {task.task}, " + "; ".join(told) + "."
 
 
@@ -189,9 +197,10 @@ def _is_text(table: Table, index: int) -> bool:
 
 def _picture(result: Result) -> Picture | None:
     """The map of the run with the median regret, small and encoded anew; None where there is none."""
-    ranked = sorted(result.group.runs, key=lambda run: (run.curve["regret"][-1], run.seed))
+    ranked = sorted(result.group.runs, key=lambda run: (run.regret, run.seed))
     run = ranked[(len(ranked) - 1) // 2]
-    caption = f"{result.group.agent}, seed {run.seed}, regret {number(float(run.curve['regret'][-1]))}"
+    verdict = "certified optimal" if run.certified else f"regret {number(run.regret)}"
+    caption = f"{result.group.agent}, seed {run.seed}: {verdict}"
     return embed(run.folder / _PICTURE, caption)
 
 

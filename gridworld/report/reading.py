@@ -19,6 +19,7 @@ from gridworld.run import CURVE, MANIFEST, SUMMARY
 _LARGEST_JSON = 4 * 2**20  # bytes
 _LARGEST_CSV = 64 * 2**20
 _LONGEST_NAME = 80  # characters
+_DIGITS = 9  # after the point: two ways to compute one regret differ later than that
 
 REQUIRED = ("step", "value", "regret", "certified", "goal_probability", "return")
 SAMPLED_RETURN = "sampled_return"
@@ -57,6 +58,11 @@ class Evidence:
     def certified(self) -> bool:
         """Whether the final greedy policy is optimal."""
         return bool(self.curve["certified"][-1])
+
+    @property
+    def regret(self) -> float:
+        """Of the final greedy policy; exactly 0 for a certified one, so that two of them are a tie."""
+        return 0.0 if self.certified else round(float(self.curve["regret"][-1]), _DIGITS)
 
     @property
     def first_certified_step(self) -> float:

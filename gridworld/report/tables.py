@@ -9,7 +9,7 @@ from gridworld.report.analysis import BY_KEY, Comparison, Overall, Result, TaskA
 from gridworld.report.grouping import Study, differing, learning_key
 from gridworld.report.reading import Unusable
 from gridworld.report.statistics import Share
-from gridworld.report.table import Cell, Estimate, Table, number, steps_up_to
+from gridworld.report.table import NOTHING, Cell, Estimate, Table, number, steps_up_to
 
 _SCORES = (
     "optimality",
@@ -127,7 +127,7 @@ def runs_table(study: Study) -> Table:
                     group.agent,
                     run.seed,
                     "yes" if run.certified else "no",
-                    float(run.curve["regret"][-1]),
+                    run.regret,
                     int(first) if math.isfinite(first) else None,
                     run.steps,
                     run.seconds,
@@ -150,8 +150,8 @@ def runs_table(study: Study) -> Table:
 
 def unusable_table(unusable: Sequence[Unusable]) -> Table:
     """A row for each run that is not."""
-    rows: list[list[Cell]] = [[run.agent, run.env, str(run.folder), run.reason] for run in unusable]
-    return Table("not counted", "Runs that are not counted", ["agent", "task", "folder", "reason"], rows)
+    rows: list[list[Cell]] = [[run.agent or NOTHING, run.env or NOTHING, run.reason] for run in unusable]
+    return Table("not counted", "Runs that are not counted", ["agent", "task", "reason"], rows)
 
 
 def settings_table(study: Study) -> Table:
