@@ -113,34 +113,33 @@ def interval(statistic: Statistic, samples: Sequence[FloatArray], seed: int) -> 
 
 def improvement(pairs: Sequence[tuple[FloatArray, FloatArray]], seed: int) -> Interval:
     """The probability that a run of the first agent has the greater number; a pair of samples a task."""
-    samples = [sample for pair in pairs for sample in pair]
+    wins = [_wins(first, second) for first, second in pairs]
 
     def mean_probability(*drawn: FloatArray, axis: int = -1) -> FloatArray:
-        by_task = zip(drawn[::2], drawn[1::2], strict=True)
-        return np.asarray(np.mean([_probability(one, other) for one, other in by_task], axis=0))
+        by_task = zip(wins, drawn[::2], drawn[1::2], strict=True)
+        return np.asarray(np.mean([_share_won(*of_task) for of_task in by_task], axis=0))
 
-    size = sum(len(first) * len(second) for first, second in pairs)
-    return interval(_sized(mean_probability, size), samples, seed)
-
-
-def _sized(statistic: Statistic, size: int) -> Statistic:
-    """Marks a statistic whose work grows with pairs, not values; keeps the batches small all the same."""
-    step = max(1, _LARGEST_BATCH // size)
-
-    def in_parts(*samples: FloatArray, axis: int = -1) -> FloatArray:
-        if samples[0].ndim == 1:
-            return statistic(*samples, axis=axis)
-        parts = range(0, len(samples[0]), step)
-        return np.concatenate([statistic(*(s[i : i + step] for s in samples), axis=axis) for i in parts])
-
-    return in_parts
+    places = [np.arange(len(sample), dtype=np.float64) for pair in pairs for sample in pair]
+    return interval(mean_probability, places, seed)
 
 
-def _probability(first: FloatArray, second: FloatArray) -> FloatArray:
-    """(..., n) against (..., m): the share of pairs that the first wins, ties counted half."""
-    one, other = first[..., :, None], second[..., None, :]
-    wins = (one > other).mean(axis=(-2, -1))
-    return np.asarray(wins + (one == other).mean(axis=(-2, -1)) / 2)
+def _wins(first: FloatArray, second: FloatArray) -> FloatArray:
+    """(n, m): 1 where the first is greater, 1/2 for a tie."""
+    return 0.5 * np.greater.outer(first, second) + 0.5 * np.greater_equal.outer(first, second)
+
+
+def _share_won(wins: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
+    """The share of pairs won among runs drawn by their places, (..., n) and (..., m)."""
+    won = ((_times_drawn(first) @ wins) * _times_drawn(second)).sum(axis=-1)
+    return np.asarray(won / wins.size)
+
+
+def _times_drawn(places: FloatArray) -> FloatArray:
+    """(..., n) places to (..., n), how often each was drawn: the work is a matrix product then, not pairs."""
+    count = places.shape[-1]
+    rows = places.reshape(-1, count).astype(np.int64)
+    offsets = count * np.arange(len(rows))[:, None]
+    return np.bincount((rows + offsets).ravel(), minlength=rows.size).reshape(places.shape).astype(np.float64)
 
 
 def _extended(numbers: FloatArray) -> FloatArray:
