@@ -135,6 +135,20 @@ def test_estimates_are_those_of_the_runs(tmp_path: Path) -> None:
     assert "> 20,000" in table
 
 
+def test_a_walk_without_end_that_costs_infinitely_much_is_told(tmp_path: Path) -> None:
+    """At γ = 1 with a cost for every step, standing still is worth -inf."""
+    maker = Maker("agent=ppo", "env=aima_4x3", "evaluation.gamma=1")
+    for seed, at in enumerate((3000, 5000, math.inf, math.inf)):
+        maker.write(tmp_path / str(seed), seed, at, regret=math.inf)
+        in_json(tmp_path / str(seed), "summary.json", regret=0.0 if at < math.inf else None)
+    (task,) = gather([tmp_path]).tasks
+    estimates = task.results[0].estimates
+    assert estimates["regret", "iqm"].point == estimates["regret", "median"].point == math.inf
+    assert estimates["value", "mean"].point == -math.inf
+    assert task.results[0].regret.point[0] == math.inf
+    assert ",inf," in (report_of(tmp_path) / "tables" / "results.csv").read_text()
+
+
 def test_sarsa_is_seen_above_q_learning_on_line(tmp_path: Path) -> None:
     (_, cliff, _) = gather([sweep(tmp_path / "runs", 6)]).tasks
     probability = {
