@@ -70,7 +70,7 @@ def update(q: FloatArray, visits: IntArray, pairs: IntArray, targets: FloatArray
 
 
 def _groups(pairs: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """The order (n,) that brings equal pairs together without changing theirs; each group's start and length."""
+    """The order (n,) that brings equal pairs together, first come first; each group's start and length."""
     order = np.argsort(pairs, kind="stable")
     arranged = pairs[order]
     new = np.empty(len(pairs), dtype=np.bool_)

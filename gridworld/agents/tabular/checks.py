@@ -41,7 +41,8 @@ def _check_control(agent: TabularControlConfig) -> None:
     size, _ = parse_schedule("agent.learning_rate", agent.learning_rate)
     if not 0 < size <= 1:
         raise InputError(
-            f"agent.learning_rate={agent.learning_rate}: a step towards the target must be above 0 and at most 1"
+            f"agent.learning_rate={agent.learning_rate}: a step towards the target must be "
+            "above 0 and at most 1"
         )
     within("agent.learning_rate_power", agent.learning_rate_power, 0, 1)
     if not math.isfinite(agent.initial_value):

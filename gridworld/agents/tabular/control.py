@@ -13,8 +13,8 @@ is no end: its target looks at the state where it was cut, where SARSA draws an 
 SARSA draws a' before the update, the others act after it, as in the book. How a batch of environments
 updates one table is told in `gridworld.agents.tabular.batch_update`.
 
-References: C. Watkins, Learning from delayed rewards, 1989, and with P. Dayan, Q-learning, Machine Learning 8,
-1992; G. Rummery and M. Niranjan, On-line Q-learning using connectionist systems, 1994; H. van Seijen,
+References: C. Watkins, Learning from delayed rewards, 1989, and with P. Dayan, Q-learning, Machine Learning
+8, 1992; G. Rummery and M. Niranjan, On-line Q-learning using connectionist systems, 1994; H. van Seijen,
 H. van Hasselt, S. Whiteson and M. Wiering, A theoretical and empirical analysis of expected Sarsa, 2009;
 R. Sutton and A. Barto, Reinforcement Learning, 2nd ed., 2018, sections 6.4 to 6.6.
 """
@@ -61,6 +61,7 @@ class TabularControl:
 
     def learn(self, total_timesteps: int, on_step: Callable[[int], bool]) -> None:
         envs, gamma, is_sarsa = self._seat.envs, self.config.gamma, self.config.algorithm == "sarsa"
+        q, visits = self.q.reshape(-1), self.visits.reshape(-1)  # flat views
         episodes = Episodes(envs.num_envs, self.config.stats_window_size)
         log = _Log(self, episodes)
         states, _ = envs.reset(seed=self._seat.seed)
@@ -76,17 +77,19 @@ class TabularControl:
             episodes.add(rewards, over)
 
             if is_sarsa:
-                next_actions = self._act(reached)
-                targets = rewards + gamma * self.q[reached, next_actions]
-                if over.size:
-                    next_actions[over] = self._act(following[over])
+                actions_there = self._act(reached)
+                targets = rewards + gamma * self.q[reached, actions_there]
             else:
                 rows, index = rows_of(self.q, reached)
                 targets = rewards + gamma * self._value(rows, self.exploration_rate)[index]
-            error = update(
-                self.q.reshape(-1), self.visits.reshape(-1), states * NUM_ACTIONS + actions, targets, step_size
-            )
-            actions = next_actions if is_sarsa else self._act(following)
+            error = update(q, visits, states * NUM_ACTIONS + actions, targets, step_size)
+
+            if is_sarsa:
+                actions = actions_there
+                if over.size:
+                    actions[over] = self._act(following[over])
+            else:
+                actions = self._act(following)
             states = following
             log.add(error, step_size, steps)
             goes_on = on_step(steps)
@@ -95,7 +98,7 @@ class TabularControl:
         return draw_actions(self.q, self.exploration_rate, states, self._random.random(len(states)))
 
     def _epsilon(self, progress: float) -> float:
-        """ε after that share of training: from the initial to the final one, linearly over a fraction of it."""
+        """ε after that share of training: linear over the configured fraction of it, then the final one."""
         start, end = self.config.exploration_initial_eps, self.config.exploration_final_eps
         return start + (end - start) * min(progress / self.config.exploration_fraction, 1.0)
 

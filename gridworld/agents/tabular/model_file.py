@@ -28,20 +28,22 @@ def write_model(path: Path, algorithm: str, arrays: Mapping[str, NDArray[Any]]) 
     """Write the arrays and whose they are, whole or not at all."""
     # A file object, since numpy would add .npz to a path.
     with replacing(path) as part, part.open("wb") as file:
-        np.savez(file, **{_ALGORITHM: np.array(algorithm)}, **arrays)
+        named: dict[str, Any] = {_ALGORITHM: np.array(algorithm), **arrays}
+        np.savez(file, **named)
 
 
 def read_model(path: Path, algorithm: str, like: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """The arrays of these names, with the types and shapes of `like`. Raises `InputError` for anything else."""
+    """The arrays named, typed and shaped as in `like`. Raises `InputError` for anything else."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             found = {name: archive[name] for name in archive.files}
     except _DAMAGED as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: not a model of {algorithm} that can be read ({reason})") from None
     if found.keys() != {_ALGORITHM, *like}:
         raise InputError(
-            f"{path}: not a model of {algorithm}: must hold {sorted([_ALGORITHM, *like])}, holds {sorted(found)}"
+            f"{path}: not a model of {algorithm}: must hold {sorted([_ALGORITHM, *like])}, "
+            f"holds {sorted(found)}"
         )
     written_by = str(found.pop(_ALGORITHM))
     if written_by != algorithm:

@@ -28,8 +28,8 @@ class Optimum:
         if not np.isfinite(solution.q).all():
             row, col = divmod(int(np.argmin(solution.v)), mdp.layout.num_cols)
             raise InputError(
-                f"agent.gamma={config.gamma}: from row {row + 1}, column {col + 1} no end can be reached, which "
-                "costs without end; take a gamma below 1"
+                f"agent.gamma={config.gamma}: from row {row + 1}, column {col + 1} no end can be reached, "
+                "which costs without end; take a gamma below 1"
             )
         self._algorithm = config.algorithm
         self.q: FloatArray = solution.q

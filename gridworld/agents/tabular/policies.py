@@ -14,7 +14,8 @@ from gridworld.mdp import FloatArray, IntArray
 def epsilon_greedy(q: FloatArray, epsilon: float) -> FloatArray:
     """π(a | s) (..., A) from Q (..., A)."""
     best = q == q.max(axis=-1, keepdims=True)
-    return epsilon / q.shape[-1] + (1 - epsilon) * best / best.sum(axis=-1, keepdims=True)
+    policy: FloatArray = epsilon / q.shape[-1] + (1 - epsilon) * best / best.sum(axis=-1, keepdims=True)
+    return policy
 
 
 def best_value(q: FloatArray, epsilon: float) -> FloatArray:
