@@ -9,6 +9,7 @@ Reference: M. L. Puterman, Markov Decision Processes, 1994, chapter 6 and append
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,17 +75,28 @@ class Chain:
         positive_int("max_steps", max_steps)
         live = ~self.mdp.terminal
         told = np.stack([live, self.reward], axis=1)  # summed over an episode: its length and return
-        backwards, mass = self.transition.T, self.mdp.start
+        mass: FloatArray = self.mdp.start
         total, steps = np.zeros(2), 0
         while steps < max_steps and mass[live].any():
-            visits = np.empty((min(_STEPS_AT_ONCE, max_steps - steps), len(mass)))
-            for row in visits:
-                row[:] = mass
-                mass = backwards @ mass
-            total += np.einsum("ts,sn->n", visits, told)
-            steps += len(visits)
+            visits = self._visits(mass, min(_STEPS_AT_ONCE, max_steps - steps))
+            total += visits[:-1].sum(axis=0) @ told
+            steps += len(visits) - 1
+            mass = visits[-1]
         goal, trap = float(mass[self.mdp.goal].sum()), float(mass[self.mdp.trap].sum())
         return Outcome(goal, trap, float(mass[live].sum()), float(total[1]), float(total[0]))
+
+    def _visits(self, mass: FloatArray, steps: int) -> FloatArray:
+        """(steps + 1, S), the distribution over states from `mass` on, step by step."""
+        visits = np.empty((steps + 1, len(mass)))
+        visits[0] = mass
+        if isinstance(self.transition, np.ndarray):
+            for before, after in itertools.pairwise(visits):
+                before.dot(self.transition, out=after)
+        else:
+            backwards = self.transition.T
+            for before, after in itertools.pairwise(visits):
+                after[:] = backwards @ before
+        return visits
 
     def endless_states(self) -> IntArray:
         """States, ascending, that a started episode may come to walk in for ever; empty if it always ends.

@@ -14,6 +14,7 @@ from gridworld.errors import InputError
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
 Schedule = Union[int, float, str]  # noqa: UP007
+LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end, as RL Zoo writes it
 
 
 @dataclass
@@ -74,6 +75,7 @@ class AgentConfig:
 
     name: str = "???"
     family: str = "???"
+    algorithm: str = "???"
 
 
 @dataclass
@@ -107,7 +109,6 @@ class SB3Config(AgentConfig):
     """An algorithm of Stable-Baselines3: `algorithm` is its class, the other fields are its arguments."""
 
     family: str = "sb3"
-    algorithm: str = "???"
     engine: str = "tabulated"  # the network runs once per state; stock: SB3's own loop, once per sample
     log_interval: int = 1  # of SB3's learn(): episodes for DQN, iterations for PPO
     policy: str = "MlpPolicy"
@@ -168,6 +169,60 @@ class PPOConfig(SB3Config):
 
 
 @dataclass
+class TabularConfig(AgentConfig):
+    """An agent that keeps a table over the states."""
+
+    family: str = "tabular"
+    gamma: float = 0.99
+
+
+@dataclass
+class TabularControlConfig(TabularConfig):
+    """Temporal-difference control. Where Stable-Baselines3 has the same setting, it has the same name."""
+
+    learning_rate: Schedule = 0.1  # step size; a number, or lin_NUMBER to fall linearly to 0
+    learning_rate_power: float = 0.0  # times (visits of the state and action) ** -power
+    initial_value: float = 0.0  # of every action in every state that is no end
+    exploration_fraction: float = 1.0  # of training, in which epsilon falls linearly
+    exploration_initial_eps: float = 1.0
+    exploration_final_eps: float = 0.05
+    stats_window_size: int = 100  # episodes that the means in TensorBoard are taken over
+    log_interval: int = 100  # episodes between two points there
+
+
+@dataclass
+class QLearningConfig(TabularControlConfig):
+    """Watkins's Q-learning."""
+
+    name: str = "q_learning"
+    algorithm: str = "q_learning"
+
+
+@dataclass
+class SarsaConfig(TabularControlConfig):
+    """SARSA."""
+
+    name: str = "sarsa"
+    algorithm: str = "sarsa"
+
+
+@dataclass
+class ExpectedSarsaConfig(TabularControlConfig):
+    """Expected SARSA."""
+
+    name: str = "expected_sarsa"
+    algorithm: str = "expected_sarsa"
+
+
+@dataclass
+class ValueIterationConfig(TabularConfig):
+    """The exact optimum under `gamma`; nothing is trained."""
+
+    name: str = "value_iteration"
+    algorithm: str = "value_iteration"
+
+
+@dataclass
 class TrainConfig:
     """One training run."""
 
@@ -184,7 +239,14 @@ class TrainConfig:
     recording: RecordingConfig = field(default_factory=RecordingConfig)
 
 
-AGENT_SCHEMAS: dict[str, type[AgentConfig]] = {"dqn": DQNConfig, "ppo": PPOConfig}
+AGENT_SCHEMAS: dict[str, type[AgentConfig]] = {
+    "dqn": DQNConfig,
+    "ppo": PPOConfig,
+    "q_learning": QLearningConfig,
+    "sarsa": SarsaConfig,
+    "expected_sarsa": ExpectedSarsaConfig,
+    "value_iteration": ValueIterationConfig,
+}
 
 
 def check(config: TrainConfig) -> None:
@@ -205,6 +267,20 @@ def check(config: TrainConfig) -> None:
     if config.recording.cell_size is not None:
         at_least("recording.cell_size", config.recording.cell_size, 2)
     within("recording.fps", config.recording.fps, 1, 100)
+
+
+def parse_schedule(key: str, value: Schedule) -> tuple[float, bool]:
+    """A rate that is finite and not negative, and whether it falls linearly to 0. Raises `InputError`."""
+    linear = isinstance(value, str) and value.startswith(LINEAR)
+    try:
+        number = float(value.removeprefix(LINEAR) if isinstance(value, str) and linear else value)
+    except ValueError:
+        number = math.nan
+    if not 0 <= number < math.inf or (isinstance(value, str) and not linear):
+        raise InputError(
+            f"{key}={value}: must be a number of at least 0, or {LINEAR}NUMBER for a linear decay"
+        )
+    return number, linear
 
 
 def at_least(key: str, value: float, bound: float) -> None:

@@ -116,7 +116,9 @@ class Curve:
                 f"training diverged: the agent's values are no finite numbers after {step} steps; "
                 "try a smaller agent.learning_rate"
             )
-        self.greedy = greedy = self.judge.score(one_hot_policy(beliefs.greedy))
+        if before is None or self.greedy is None or not np.array_equal(before.greedy, beliefs.greedy):
+            self.greedy = self.judge.score(one_hot_policy(beliefs.greedy))
+        greedy = self.greedy
         self.sampled = self.judge.score(beliefs.sampled)
         self._streak = self._streak + is_new if greedy.certified else 0
         if not greedy.certified:

@@ -1,6 +1,6 @@
-"""The TensorBoard event file of a run: scalars, pictures, hyperparameters and the charts' layout.
+"""What TensorBoard shows of a run: scalars, pictures, hyperparameters and the charts' layout.
 
-Written with TensorBoard's own writer and message types; torch is not needed for it.
+Written with TensorBoard's own message types; torch is not needed for it.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from PIL import Image
-from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.compat.proto.summary_pb2 import Summary, SummaryMetadata
 from tensorboard.compat.proto.tensor_pb2 import TensorProto
 from tensorboard.compat.proto.tensor_shape_pb2 import TensorShapeProto
@@ -19,8 +18,8 @@ from tensorboard.compat.proto.types_pb2 import DT_STRING
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.custom_scalar import metadata as layout_metadata
 from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
-from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
+from gridworld.event_file import EventFile
 from gridworld.render import Frame
 
 # Pixels that pictures have in TensorBoard. It scales by skipping pixels: thin lines vanish, text frays.
@@ -34,11 +33,13 @@ class EventWriter:
     """One event file in `folder`. Steps are environment steps."""
 
     def __init__(self, folder: Path) -> None:
-        self._writer = EventFileWriter(str(folder), max_queue_size=1000)
+        self._file = EventFile(folder)
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
         """One point for every tag."""
-        self._add(Summary(value=[Summary.Value(tag=tag, simple_value=v) for tag, v in values.items()]), step)
+        self._file.add(
+            Summary(value=[Summary.Value(tag=tag, simple_value=v) for tag, v in values.items()]), step
+        )
 
     def image(self, tag: str, frame: Frame, step: int) -> None:
         """A picture, as PNG."""
@@ -106,13 +107,9 @@ class EventWriter:
             ],
         )
 
-    def flush(self) -> None:
-        """Bring everything to the file."""
-        self._writer.flush()
-
     def close(self) -> None:
-        """Flush and close the file."""
-        self._writer.close()
+        """No more will be written."""
+        self._file.close()
 
     def _layout(self, title: str, charts: Sequence[layout_pb2.Chart]) -> None:
         category = layout_pb2.Category(title=title, chart=charts)
@@ -123,15 +120,12 @@ class EventWriter:
             metadata=SummaryMetadata(plugin_data=plugin),
             tensor=TensorProto(dtype=DT_STRING, string_val=[content], tensor_shape=TensorShapeProto()),
         )
-        self._add(Summary(value=[value]), 0)
-
-    def _add(self, summary: Summary, step: int) -> None:
-        self._writer.add_event(Event(wall_time=time.time(), step=step, summary=summary))
+        self._file.add(Summary(value=[value]), 0)
 
     def _image(self, tag: str, encoded: bytes, frame: Frame, step: int) -> None:
         height, width = frame.shape[:2]
         picture = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=encoded)
-        self._add(Summary(value=[Summary.Value(tag=tag, image=picture)]), step)
+        self._file.add(Summary(value=[Summary.Value(tag=tag, image=picture)]), step)
 
     def _session(self, tag: str, content: plugin_data_pb2.HParamsPluginData) -> None:
         content.version = metadata.PLUGIN_DATA_VERSION
@@ -139,4 +133,4 @@ class EventWriter:
             plugin_name=metadata.PLUGIN_NAME, content=content.SerializeToString()
         )
         value = Summary.Value(tag=tag, metadata=SummaryMetadata(plugin_data=plugin))
-        self._add(Summary(value=[value]), 0)
+        self._file.add(Summary(value=[value]), 0)

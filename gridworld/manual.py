@@ -17,7 +17,7 @@ Choices:
 
 Keys, with their values: python scripts/train.py --cfg job
   seed, total_timesteps, n_envs, device, threads  the run itself
-  agent.*        the algorithm's own settings, by their names in Stable-Baselines3
+  agent.*        the algorithm's own settings, by their names in Stable-Baselines3 where it has them
   env.*          layout (a name above or a map file), slip, rewards, max_episode_steps
   observation.*  kind, cell_size of images
   evaluation.*   how often the policy is scored exactly, and when to stop
@@ -26,6 +26,8 @@ Keys, with their values: python scripts/train.py --cfg job
   hydra.run.dir  the folder to write to, instead of a new one in runs/
 
 Examples:
+  python scripts/train.py agent=q_learning
+      a table over the states, trained within a second
   python scripts/train.py agent=ppo seed=3
       one run; its folder in runs/ has the model, the curve, the pictures and a summary
   python scripts/train.py agent=dqn env=four_rooms env.slip=0.1 total_timesteps=200000

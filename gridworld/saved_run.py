@@ -89,7 +89,7 @@ def read_config(content: Any, where: str) -> TrainConfig:
     """Settings from a manifest's JSON. Raises `InputError` for anything that the schema does not have."""
     agent = content.get("agent") if isinstance(content, dict) else None
     algorithm = agent.get("algorithm") if isinstance(agent, dict) else None
-    schema = next((s for s in AGENT_SCHEMAS.values() if getattr(s, "algorithm", None) == algorithm), None)
+    schema = next((s for s in AGENT_SCHEMAS.values() if s.algorithm == algorithm), None)
     if schema is None:
         raise InputError(f"{where}: config.agent.algorithm={algorithm!r} is not known here")
     config = _read(TrainConfig, content, f"{where}: config", {AgentConfig: schema})

@@ -20,7 +20,14 @@ SHORT = {
         *("agent.learning_starts=300", "agent.exploration_fraction=1", "agent.log_interval=4"),
     ],
     "ppo": ["agent=ppo", "total_timesteps=2000", "n_envs=16", "agent.n_steps=32", "agent.batch_size=64"],
+    **{
+        agent: [f"agent={agent}", "total_timesteps=2000", "evaluation.every=500", "agent.log_interval=4"]
+        for agent in ("q_learning", "sarsa", "expected_sarsa")
+    },
+    "value_iteration": ["agent=value_iteration"],
 }
+DEEP = ["dqn", "ppo"]  # those of Stable-Baselines3
+LEARNING = [agent for agent in SHORT if agent != "value_iteration"]
 
 
 def configure(*overrides: str) -> TrainConfig:

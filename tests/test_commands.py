@@ -14,9 +14,12 @@ import time
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 from support import CONF, ROOT, SHORT, script
 
-from gridworld.benchmark.measure import Comparison, compare
+import gridworld
+from gridworld.benchmark import whole
+from gridworld.benchmark.measure import QUICK, Comparison, compare
 from gridworld.commands import benchmark, evaluate
 from gridworld.commands import record as record_command
 from gridworld.manual import manual
@@ -226,11 +229,47 @@ def test_a_measurement_compares_pair_by_pair() -> None:
     assert (result.ours, result.theirs, result.ratio) == (2.0, 1.0, 2.0)
 
 
+def test_rl_zoo_is_given_the_same_steps_of_the_same_world(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def row(agent: str) -> Comparison:
+        (found,) = [row for row in whole.rows(QUICK) if row.peer.startswith(f"RL Zoo's {agent}")]
+        return found
+
+    def python(*lines: str) -> None:  # stands in for one that has RL Zoo
+        executable = tmp_path / "python"
+        executable.write_text("\n".join(["#!/bin/sh", *lines, ""]))
+        executable.chmod(0o755)
+        monkeypatch.setenv("RL_ZOO_PYTHON", str(executable))
+
+    python(f'printf "%s\\n" "$PYTHONPATH" "$@" > "{tmp_path}/seen"')
+    theirs = row("ppo").theirs
+    assert theirs is not None
+    assert theirs() > 0
+    path, *words = (tmp_path / "seen").read_text().splitlines()
+    given = dict(zip(words[2::2], words[3::2], strict=True))
+    assert (path, words[:2]) == (str(ROOT), ["-m", "rl_zoo3.train"])
+    assert (given["--algo"], given["--env"], given["--n-timesteps"]) == ("ppo", "GridWorld-v0", "20000")
+    assert "20,000 steps" in row("ppo").name
+    settings = OmegaConf.load(given["--conf-file"])["GridWorld-v0"]
+    assert settings["env_wrapper"] == f"gridworld.{gridworld.OneHotObservation.__name__}"
+
+    python("echo no such algorithm >&2", "exit 1")
+    theirs = row("dqn").theirs
+    assert theirs is not None
+    with pytest.raises(RuntimeError, match="no such algorithm"):
+        theirs()
+
+
 @pytest.mark.slow
-def test_whole_runs_are_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_whole_runs_are_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("RL_ZOO_PYTHON", raising=False)
     benchmark.main(["--quick", "--only", "whole", "--out", str(tmp_path / "benchmark.json")])
     output = capsys.readouterr().out
     assert re.search(r"dqn, median of 1 seeds +0\.\d+", output)
+    assert len(re.findall(r"20,000 steps +[\d.]+ +RL Zoo's .*: not measured, RL_ZOO_PYTHON", output)) == 2
     memory = {
         result["name"]: result["ours"]
         for result in json.loads((tmp_path / "benchmark.json").read_text())["results"]

@@ -6,7 +6,7 @@ import json
 
 import pytest
 import stable_baselines3
-from support import CONF, configure
+from support import CONF, DEEP, configure
 
 from gridworld.agents import family
 from gridworld.config import AGENT_SCHEMAS, TrainConfig, check
@@ -38,7 +38,7 @@ def test_there_is_a_yaml_for_every_layout_and_every_agent() -> None:
     assert {choice for group, choice in CHOICES if group == "agent"} == set(AGENT_SCHEMAS)
 
 
-@pytest.mark.parametrize("name", AGENT_SCHEMAS)
+@pytest.mark.parametrize("name", DEEP)
 def test_the_schema_has_every_constructor_parameter_with_its_default(name: str) -> None:
     config = AGENT_SCHEMAS[name]()
     parameters = inspect.signature(getattr(stable_baselines3, name.upper()).__init__).parameters
@@ -50,7 +50,7 @@ def test_the_schema_has_every_constructor_parameter_with_its_default(name: str) 
             assert getattr(config, key) == ({} if key.endswith("_buffer_kwargs") else default), key
 
 
-@pytest.mark.parametrize("name", AGENT_SCHEMAS)
+@pytest.mark.parametrize("name", DEEP)
 def test_policy_kwargs_has_every_parameter_of_the_policies(name: str) -> None:
     policies = getattr(stable_baselines3, name.upper()).policy_aliases
     for policy in ("MlpPolicy", "CnnPolicy"):
@@ -59,10 +59,16 @@ def test_policy_kwargs_has_every_parameter_of_the_policies(name: str) -> None:
         assert known == parameters - {"observation_space", "action_space", "lr_schedule"}
 
 
-def test_a_manifest_reads_back_the_very_settings() -> None:
-    config = configure(
-        "agent=ppo", "env=cliff", "agent.policy_kwargs.net_arch=[8,8]", "agent.clip_range=lin_0.3"
-    )
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["agent=ppo", "env=cliff", "agent.policy_kwargs.net_arch=[8,8]", "agent.clip_range=lin_0.3"],
+        *([f"agent={name}"] for name in AGENT_SCHEMAS),
+    ],
+    ids=lambda overrides: overrides[0],
+)
+def test_a_manifest_reads_back_the_very_settings(overrides: list[str]) -> None:
+    config = configure(*overrides)
     content = json.loads(json.dumps(dataclasses.asdict(config)))
     assert read_config(content, "manifest") == config
 
@@ -73,6 +79,7 @@ def test_a_manifest_reads_back_the_very_settings() -> None:
         (("seed",), "1", "config.seed='1': must be int"),
         (("seed",), True, "config.seed=True: must be int"),
         (("env", "slip"), None, "config.env.slip=None: must be float"),
+        (("agent", "algorithm"), "q_learning", "config.agent: must have the keys"),
         (("agent", "algorithm"), "os.system", "config.agent.algorithm='os.system' is not known here"),
         (("agent", "surprise"), 1, "config.agent: must have the keys"),
         (("agent",), [], "config.agent.algorithm=None is not known here"),

@@ -145,6 +145,16 @@ def test_ppo_collects_what_stock_would_compute() -> None:
     assert 0 < (~plain).sum() < buffer.rewards.size // 4
 
 
+def test_advantages_are_sb3s_to_the_last_bit() -> None:
+    ours, theirs = twins(TabulatedPPO, PPO, "one_hot", n_steps=STEPS, batch_size=64, gae_lambda=0.9)
+    share_rollout(ours, theirs)
+    last_values, dones = torch.randn(NUM_ENVS), np.arange(NUM_ENVS) % 2 == 0
+    for model in (ours, theirs):
+        model.rollout_buffer.compute_returns_and_advantage(last_values.clone(), dones)
+    for name in ("advantages", "returns"):
+        assert np.array_equal(getattr(ours.rollout_buffer, name), getattr(theirs.rollout_buffer, name))
+
+
 def share_replay(ours: TabulatedDQN, theirs: DQN) -> None:
     frequency = TrainFreq(STEPS, TrainFrequencyUnit.STEP)
     ours.collect_rollouts(ours.env, no_callback(ours), frequency, ours.replay_buffer)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import stable_baselines3
 from PIL import Image
-from support import SHORT, configure, train_in
+from support import DEEP, LEARNING, SHORT, configure, train_in
 
 from gridworld.agents import Beliefs
 from gridworld.chain import one_hot_policy
@@ -60,7 +60,7 @@ def test_a_run_leaves_everything_behind(agent: str, tmp_path: Path) -> None:
     assert Image.open(frames[0]).convert("RGB").size == (800, 700)
 
 
-@pytest.mark.parametrize("agent", SHORT)
+@pytest.mark.parametrize("agent", DEEP)
 def test_the_model_is_an_ordinary_sb3_zip_that_acts_as_evaluated(agent: str, tmp_path: Path) -> None:
     train_in(tmp_path, *SHORT[agent])
     saved = SavedRun(tmp_path)
@@ -73,7 +73,7 @@ def test_the_model_is_an_ordinary_sb3_zip_that_acts_as_evaluated(agent: str, tmp
     assert score.value == pytest.approx(recorded["value"], abs=1e-6)
 
 
-@pytest.mark.parametrize("agent", SHORT)
+@pytest.mark.parametrize("agent", LEARNING)
 def test_the_same_seed_gives_the_same_bits(agent: str, tmp_path: Path) -> None:
     for name, seed in (("one", 5), ("two", 5), ("other", 6)):
         train_in(tmp_path / name, *SHORT[agent], f"seed={seed}", "env.slip=0.1", "recording.frames=false")
@@ -108,7 +108,7 @@ def test_the_curve_has_a_row_per_evaluation(tmp_path: Path) -> None:
     ],
     ids=lambda overrides: overrides[0],
 )
-@pytest.mark.parametrize("agent", SHORT)
+@pytest.mark.parametrize("agent", DEEP)
 def test_settings_run_through(agent: str, overrides: list[str], tmp_path: Path) -> None:
     summary = train_in(tmp_path, *SHORT[agent], *overrides)
     assert 0 <= float(summary["goal_probability"]) <= 1

@@ -82,4 +82,7 @@ def family(config: AgentConfig) -> Family:
         raise InputError(
             f"agent.family={config.family}: there is no such family; there are {', '.join(known)}"
         )
+    own = type(config).family
+    if config.family != own:
+        raise InputError(f"agent.family={config.family}: these are the settings of {own}; choose agent=...")
     return cast("Family", importlib.import_module(f"gridworld.agents.{config.family}"))

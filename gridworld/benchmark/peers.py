@@ -1,7 +1,8 @@
 """Peers that live in an environment of their own, since their dependencies would not go with ours.
 
-`NAVIX_PYTHON` and `SBX_PYTHON` name a Python that has NAVIX, or SBX (SB3 in JAX); the README says how to make
-one. A peer without a Python stands in the table as not measured.
+`NAVIX_PYTHON`, `SBX_PYTHON` and `RL_ZOO_PYTHON` name a Python that has NAVIX, SBX (SB3 in JAX) or RL Zoo
+(SB3's training scripts); the README says how to make one. A peer without a Python stands in the table as not
+measured.
 """
 
 from __future__ import annotations
@@ -48,9 +49,11 @@ model.learn(2048 * count, reset_num_timesteps=False)
 print((model.num_timesteps - before) / (time.perf_counter() - started))
 """
 
+_RL_ZOO_SETTINGS = Path(__file__).with_name("rl_zoo.yml")
+
 
 def why_not(peer: str) -> str:
-    """Why this peer, NAVIX or SBX, is not measured; nothing where it is."""
+    """Why this peer, NAVIX, SBX or RL_ZOO, is not measured; nothing where it is."""
     variable = _variable(peer)
     return "" if variable in os.environ else f"not measured, {variable} names no Python that has it"
 
@@ -65,6 +68,23 @@ def sbx(algorithm: str, num_envs: int) -> float:
     return _run("SBX", _SBX, algorithm, str(num_envs))
 
 
+def rl_zoo(algorithm: str, steps: int) -> list[str]:
+    """RL Zoo's command for GridWorld, to be run in `environment()`; its logs go where it runs.
+
+    RL Zoo has no settings for an environment that it does not know, so its users write a file of them; ours
+    names the observation and leaves the rest at SB3's defaults. One thread, as everywhere here: on all of two
+    busy cores its PPO took six times as long.
+    """
+    words = ["--algo", algorithm, "--env", "GridWorld-v0", "--gym-packages", "gridworld"]
+    words += ["--conf-file", str(_RL_ZOO_SETTINGS), "--n-timesteps", str(steps), "--num-threads", "1"]
+    return [os.environ[_variable("RL_ZOO")], "-m", "rl_zoo3.train", *words, "--device", "cpu", "--seed", "0"]
+
+
+def environment() -> dict[str, str]:
+    """Variables under which a peer's Python, which has this package not installed, finds it."""
+    return {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+
+
 def _variable(peer: str) -> str:
     return f"{peer}_PYTHON"
 
@@ -72,7 +92,7 @@ def _variable(peer: str) -> str:
 def _run(peer: str, script: str, *arguments: str) -> float:
     done = subprocess.run(
         [os.environ[_variable(peer)], "-c", script, *arguments],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+        env=environment(),
         capture_output=True,
         text=True,
         timeout=600,

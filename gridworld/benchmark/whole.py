@@ -1,4 +1,4 @@
-"""Whole runs: seconds to a certificate, whole commands, a sweep, and the memory they take."""
+"""Whole runs: seconds to a certificate, whole commands (RL Zoo's too), a sweep, and the memory they take."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
+from gridworld.benchmark import peers
 from gridworld.benchmark.measure import Comparison, Scale
 
 _SCRIPT = Path(__file__).parents[2] / "scripts" / "train.py"
+_STEPS = 20_000  # of environment, beside RL Zoo
 
 
 def rows(scale: Scale) -> Iterator[Comparison]:
@@ -26,9 +29,18 @@ def rows(scale: Scale) -> Iterator[Comparison]:
         yield Comparison(
             "whole command, seconds",
             f"train.py agent={agent}",
-            lambda agent=agent: _run(_train(f"agent={agent}"))[0],  # type: ignore[misc]
+            partial(_seconds, _train(f"agent={agent}")),
             'python -c "import stable_baselines3"',
-            lambda: _run([sys.executable, "-c", "import stable_baselines3"])[0],
+            partial(_seconds, [sys.executable, "-c", "import stable_baselines3"]),
+        )
+    for agent in ("dqn", "ppo"):
+        yield Comparison(
+            "whole command, seconds",
+            f"train.py agent={agent}, {_STEPS:,} steps",
+            partial(_seconds, _train(f"agent={agent}", f"total_timesteps={_STEPS}")),
+            f"RL Zoo's {agent}, {_STEPS:,} steps, SB3's defaults, one env",
+            None if peers.why_not("RL_ZOO") else partial(_rl_zoo, agent),
+            peers.why_not("RL_ZOO"),
         )
     count = 2 * scale.sweep_seeds
     sweep = _train("-m", "agent=dqn,ppo", f"seed=range({scale.sweep_seeds})")
@@ -60,12 +72,19 @@ sys.exit(done.returncode)
 """
 
 
-def _run(command: list[str]) -> tuple[float, float]:
+def _rl_zoo(agent: str) -> float:
+    return _seconds(peers.rl_zoo(agent, _STEPS), peers.environment())
+
+
+def _seconds(command: list[str], env: Mapping[str, str] | None = None) -> float:
+    return _run(command, env)[0]
+
+
+def _run(command: list[str], env: Mapping[str, str] | None = None) -> tuple[float, float]:
     """Seconds, and peak memory in MB, of a process in a folder of its own."""
+    measured = [sys.executable, "-S", "-c", _MEASURE, *command]
     with tempfile.TemporaryDirectory() as folder:
-        done = subprocess.run(
-            [sys.executable, "-S", "-c", _MEASURE, *command], cwd=folder, capture_output=True, text=True
-        )
+        done = subprocess.run(measured, cwd=folder, env=env, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"{' '.join(command)}: {done.stderr}")
     seconds, peak = map(float, done.stdout.split())

@@ -20,7 +20,7 @@ _TABLES = ("stepping", "training", "whole")
 def main(arguments: Sequence[str]) -> None:
     """Print the tables as they come and write them as JSON."""
     parser = argparse.ArgumentParser(prog="benchmark.py", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a minute: one short repetition of everything")
+    parser.add_argument("--quick", action="store_true", help="minutes: one short repetition of everything")
     parser.add_argument("--only", choices=_TABLES, nargs="+", default=_TABLES, help="some of the tables")
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark.json"), help="where the JSON goes")
     options = parser.parse_args(arguments)

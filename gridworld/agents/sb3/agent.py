@@ -83,8 +83,8 @@ class SB3Agent:
     def _forward(self, states: IntArray) -> tuple[Tensor, Tensor]:
         """Action probabilities or Q values (n, A), and values (n,), of these states."""
         if isinstance(self.model, TabulatedPPO):
-            log_prob, values = self.model.tables(states)
-            return log_prob.exp(), values
+            logits, values = self.model.outputs(states)
+            return logits.softmax(dim=1), values[:, 0]
         if isinstance(self.model, TabulatedDQN):
             q = self.model.q_values(self.model.q_net, states)
             return q, q.max(dim=1).values

@@ -15,12 +15,11 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import LinearSchedule
 
 from gridworld.agents import Seat
-from gridworld.agents.sb3.checks import LINEAR
 from gridworld.agents.sb3.tabulated import why_not
 from gridworld.agents.sb3.tabulated_dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated_ppo import TabulatedPPO
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.config import PolicyKwargs, SB3Config
+from gridworld.config import LINEAR, PolicyKwargs, SB3Config
 from gridworld.errors import InputError
 from gridworld.observations import ObservationTable
 

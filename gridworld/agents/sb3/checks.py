@@ -8,16 +8,15 @@ from gridworld.config import (
     DQNConfig,
     PPOConfig,
     SB3Config,
-    Schedule,
     TrainConfig,
     above_zero,
     at_least,
+    parse_schedule,
     within,
 )
 from gridworld.errors import InputError
 
 ENGINES = ("tabulated", "stock")
-LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end, as RL Zoo writes it
 
 
 def check(config: TrainConfig) -> None:
@@ -31,7 +30,7 @@ def check(config: TrainConfig) -> None:
         )
     if agent.engine not in ENGINES:
         raise InputError(f"agent.engine={agent.engine}: must be {' or '.join(ENGINES)}")
-    check_schedule("agent.learning_rate", agent.learning_rate)
+    parse_schedule("agent.learning_rate", agent.learning_rate)
     at_least("agent.batch_size", agent.batch_size, 1)
     within("agent.gamma", agent.gamma, 0, 1)
     at_least("agent.stats_window_size", agent.stats_window_size, 1)
@@ -49,20 +48,6 @@ def check(config: TrainConfig) -> None:
         _check_dqn(agent, config)
     elif isinstance(agent, PPOConfig):
         _check_ppo(agent, config)
-
-
-def check_schedule(key: str, value: Schedule) -> None:
-    """A rate that is finite and not negative, or lin_ and such a rate."""
-    number: Any = value
-    if isinstance(value, str):
-        try:
-            number = float(value.removeprefix(LINEAR) if value.startswith(LINEAR) else "nan")
-        except ValueError:
-            number = float("nan")
-    if not 0 <= number < float("inf"):
-        raise InputError(
-            f"{key}={value}: must be a number of at least 0, or {LINEAR}NUMBER for a linear decay"
-        )
 
 
 def _check_dqn(agent: DQNConfig, config: TrainConfig) -> None:
@@ -122,9 +107,9 @@ def _check_ppo(agent: PPOConfig, config: TrainConfig) -> None:
             "must be at least 2, or set agent.normalize_advantage=false"
         )
     within("agent.gae_lambda", agent.gae_lambda, 0, 1)
-    check_schedule("agent.clip_range", agent.clip_range)
+    parse_schedule("agent.clip_range", agent.clip_range)
     if agent.clip_range_vf is not None:
-        check_schedule("agent.clip_range_vf", agent.clip_range_vf)
+        parse_schedule("agent.clip_range_vf", agent.clip_range_vf)
     at_least("agent.ent_coef", agent.ent_coef, 0)
     at_least("agent.vf_coef", agent.vf_coef, 0)
     above_zero("agent.max_grad_norm", agent.max_grad_norm)

@@ -16,7 +16,6 @@ layer is a look-up as well, and no matrix of S x S is ever made.
 
 from __future__ import annotations
 
-import inspect
 from typing import Any, cast
 
 import numpy as np
@@ -24,6 +23,7 @@ import torch
 from stable_baselines3.common.policies import BasePolicy
 from torch import Tensor, nn
 
+from gridworld.agents.sb3.descent import ELEMENTWISE
 from gridworld.agents.sb3.vec_env import StateStep
 from gridworld.config import DQNConfig, PPOConfig, SB3Config
 from gridworld.mdp import IntArray
@@ -40,6 +40,9 @@ def why_not(config: SB3Config) -> str | None:
         return f"agent.policy_kwargs.activation_fn={activation} draws at random for every sample"
     if config.policy_kwargs.features_extractor_class is not None:
         return "agent.policy_kwargs.features_extractor_class may keep more than a function of the state"
+    optimizer = config.policy_kwargs.optimizer_class
+    if optimizer not in (None, *(f"torch.optim.{name}" for name in ELEMENTWISE)):
+        return f"agent.policy_kwargs.optimizer_class={optimizer} may look at more than a weight at a time"
     if isinstance(config, DQNConfig):
         if config.replay_buffer_class is not None or config.replay_buffer_kwargs:
             return "agent.replay_buffer_class is not the plain replay buffer"
@@ -105,38 +108,6 @@ def infos_of(step: StateStep, num_envs: int) -> list[dict[str, Any]]:
     for index, info in step.ended.items():
         infos[index] = info
     return infos
-
-
-class Descent:
-    """Steps of an optimiser as SB3 takes them: gradients from zero, clipped by their common norm.
-
-    On networks this small the framework's overhead is the cost. So all gradients are views of one vector,
-    which is cleared, measured and scaled at once, and Adam updates all parameters in one kernel.
-    """
-
-    def __init__(self, optimizer: torch.optim.Optimizer) -> None:
-        self._optimizer = optimizer
-        # Bare of what torch wraps around it for profilers, hooks and the compiler, none of which are here.
-        self._step = inspect.unwrap(type(optimizer).step)
-        self._parameters = [p for group in optimizer.param_groups for p in group["params"]]
-        sizes = [parameter.numel() for parameter in self._parameters]
-        self._gradient = torch.zeros(sum(sizes), device=self._parameters[0].device)
-        parts = torch.split(self._gradient, sizes)
-        self._views = [part.view_as(of) for part, of in zip(parts, self._parameters, strict=True)]
-        if isinstance(optimizer, torch.optim.Adam):
-            for group in optimizer.param_groups:
-                group["fused"], group["foreach"] = True, False
-
-    def step(self, outputs: Tensor, gradient: Tensor | None, max_grad_norm: float) -> None:
-        """One step down a loss, or, from a table of outputs, along the loss's `gradient` there."""
-        self._gradient.zero_()
-        for parameter, view in zip(self._parameters, self._views, strict=True):
-            parameter.grad = view
-        torch.autograd.backward(outputs, gradient)
-        # As torch.nn.utils.clip_grad_norm_ does it.
-        self._gradient *= (max_grad_norm / (self._gradient.norm() + 1e-6)).clamp(max=1.0)
-        with torch.no_grad():
-            self._step(self._optimizer)
 
 
 def smallest_integer(largest: int) -> np.dtype[Any]:

@@ -28,7 +28,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.dqn.policies import QNetwork
 from torch import Tensor
 
-from gridworld.agents.sb3.tabulated import Descent, StateInputs, infos_of, smallest_integer
+from gridworld.agents.sb3.descent import Descent
+from gridworld.agents.sb3.tabulated import StateInputs, infos_of, smallest_integer
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv, StateStep
 from gridworld.mdp import NUM_ACTIONS, IntArray
 
@@ -64,10 +65,11 @@ class StateReplayBuffer(ReplayBuffer):
     def draw(self, batch_size: int) -> tuple[IntArray, IntArray, IntArray, Float32Array, Float32Array]:
         """States, actions, next states, rewards and ends (time-outs are none); the draw is SB3's own."""
         steps = np.random.randint(0, self.buffer_size if self.full else self.pos, size=batch_size)
-        which = steps, np.random.randint(0, high=self.n_envs, size=batch_size)
-        ends = self.dones[which] * (1 - self.timeouts[which])
-        states, following = self.observations[which].astype(np.int64), self.next_observations[which]
-        return states, self.actions[which], following.astype(np.int64), self.rewards[which], ends
+        which = steps * self.n_envs + np.random.randint(0, high=self.n_envs, size=batch_size)
+        ends = self.dones.take(which) * (1 - self.timeouts.take(which))
+        states, following = self.observations.take(which), self.next_observations.take(which)
+        rewards = self.rewards.take(which)
+        return states.astype(np.int64), self.actions.take(which), following.astype(np.int64), rewards, ends
 
 
 class TabulatedDQN(DQN):
@@ -175,11 +177,11 @@ class TabulatedDQN(DQN):
         q = self._all_q() if which is None else self.q_values(self.q_net, which)
         pair = index * NUM_ACTIONS + actions
         error = q.detach().cpu().numpy().ravel()[pair] - targets
-        slope = np.clip(error, -1, 1)
-        gradient = np.bincount(pair, slope, q.numel()).astype(np.float32) / len(pair)
-        self.descent.step(q, torch.as_tensor(gradient, device=self.device).view_as(q), self.max_grad_norm)
+        slope = np.maximum(np.minimum(error, 1), -1)
+        gradient = np.bincount(pair, slope, q.numel()) / len(pair)
+        self.descent.step([q], [gradient], self.max_grad_norm)
         self._q = None
-        return float((slope * (error - slope / 2)).mean())
+        return float(slope @ (error - slope / 2)) / len(pair)
 
     def _best_values(self, states: IntArray) -> Float32Array:
         """max_a Q(s, a) of the target network."""

@@ -1,22 +1,13 @@
 """PPO with the network run once per state.
 
 During a rollout the policy stands still: log-probabilities and values of all states are tables, and a step
-is a few look-ups. In an update, all samples of one (state, action) share one ratio
-ρ = π_θ(a|s) / π_old(a|s). For an advantage A ≥ 0 the clipped surrogate is A · min(ρ, 1+ε), for A < 0 it is
-A · max(ρ, 1-ε). So with A⁺ and A⁻ the sums of a minibatch's positive and negative advantages per pair, and
-n_s the number of samples of a state, their returns' mean m_s and squared deviations from it d_s,
-
-    surrogate = 1/B Σ_(s,a) [ A⁺ min(ρ, 1+ε) + A⁻ max(ρ, 1-ε) ]
-    entropy   = 1/B Σ_s n_s H(π_θ(·|s))
-    squares   = 1/B Σ_s [ n_s (V_θ(s) - m_s)² + d_s ]
-
-which are the means over samples that SB3 takes, term by term; clipping the value's change keeps it a
-function of the state. `gridworld.agents.sb3.tabulated` says why the gradient is the same too.
+is a few look-ups. In an update, a minibatch's loss depends on the network only through its outputs at the
+states, and has its slopes there in closed form (`gridworld.agents.sb3.ppo_loss`); from there they go back
+through the network once. `gridworld.agents.sb3.tabulated` says why that is the gradient of the whole batch.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -31,15 +22,20 @@ from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
-from gridworld.agents.sb3.tabulated import Descent, StateInputs, infos_of
+from gridworld.agents.sb3.descent import Descent
+from gridworld.agents.sb3.ppo_loss import (
+    Losses,
+    Outputs,
+    Weights,
+    log_softmax,
+    losses_and_slopes,
+    sum_up,
+)
+from gridworld.agents.sb3.tabulated import StateInputs, infos_of
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.mdp import NUM_ACTIONS, FloatArray, IntArray
+from gridworld.mdp import BoolArray, IntArray
 
 Float32Array = NDArray[np.float32]
-
-# What `losses` returns, under SB3's names.
-_LOGGED = ("loss", "policy_gradient_loss", "value_loss", "entropy_loss", "approx_kl", "clip_fraction")
-_KL = _LOGGED.index("approx_kl")
 
 
 class StateRolloutBuffer(RolloutBuffer):
@@ -48,17 +44,15 @@ class StateRolloutBuffer(RolloutBuffer):
     def __init__(self, buffer_size: int, observation_space: Any, *arguments: Any, **options: Any) -> None:
         super().__init__(buffer_size, spaces.Discrete(1), *arguments, **options)
 
-
-@dataclass(frozen=True, eq=False)
-class Sums:
-    """A minibatch, summed up. U states occur in it; everything is divided by the number of samples."""
-
-    deviation: float  # of returns from their state's mean, squared
-    positive: Tensor  # (U, A), sum of positive advantages
-    negative: Tensor  # (U, A), sum of negative advantages
-    pairs: Tensor  # (U, A), share of the samples
-    states: Tensor  # (U,), share of the samples
-    mean_return: Tensor  # (U,)
+    def compute_returns_and_advantage(self, last_values: Tensor, dones: BoolArray) -> None:
+        """SB3's own recursion to the last bit, with everything that does not recur done at once."""
+        going_on = 1.0 - np.concatenate([self.episode_starts[1:], dones[None].astype(np.float32)])
+        following = np.concatenate([self.values[1:], last_values.numpy()[None]])
+        self.advantages = self.rewards + self.gamma * following * going_on - self.values
+        carry = self.gamma * self.gae_lambda * going_on
+        for step in range(self.buffer_size - 2, -1, -1):
+            self.advantages[step] += carry[step] * self.advantages[step + 1]
+        self.returns = self.advantages + self.values
 
 
 class TabulatedPPO(PPO):
@@ -73,15 +67,14 @@ class TabulatedPPO(PPO):
         self.policy.set_training_mode(False)  # SB3's networks know no difference; switching takes time
         self.descent = Descent(self.policy.optimizer)
         self.inputs = StateInputs(self.policy, self.env.observation)
-        self._old_log_prob: Float32Array = np.empty(0, dtype=np.float32)  # (S, A), of this rollout's policy
-        self._old_values: Float32Array = np.empty(0, dtype=np.float32)  # (S,)
+        self._old: Outputs  # of all states, from the policy that collected the rollout
 
     def _excluded_save_params(self) -> list[str]:
-        ours = ["rollout_buffer_class", "descent", "inputs", "_old_log_prob", "_old_values"]
+        ours = ["rollout_buffer_class", "descent", "inputs", "_old"]
         return [*super()._excluded_save_params(), *ours]
 
-    def tables(self, states: IntArray | None = None) -> tuple[Tensor, Tensor]:
-        """log π (U, A) and V (U,) of these states (None: all), with their graph."""
+    def outputs(self, states: IntArray | None = None) -> tuple[Tensor, Tensor]:
+        """Logits (U, A) and values (U, 1) of these states (None: all), with their graph."""
         policy, extractor = self.policy, self.policy.mlp_extractor
         nets = (extractor.policy_net, extractor.value_net)
         observations = self.inputs.observations(states, *nets)
@@ -89,7 +82,7 @@ class TabulatedPPO(PPO):
         actor, critic = features if isinstance(features, tuple) else (features, features)
         logits = policy.action_net(self.inputs.latent(nets[0], states, actor))
         values = policy.value_net(self.inputs.latent(nets[1], states, critic))
-        return torch.log_softmax(logits, dim=1), values[:, 0]
+        return logits, values
 
     def collect_rollouts(
         self,
@@ -102,8 +95,7 @@ class TabulatedPPO(PPO):
         rollout_buffer.reset()
         callback.on_rollout_start()
         with torch.no_grad():
-            log_prob, values = (table.cpu().numpy() for table in self.tables())
-        self._old_log_prob, self._old_values = log_prob, values
+            self._old = log_prob, values = _tables(*self.outputs())
         thresholds = np.exp(log_prob).cumsum(axis=1).T[:-1].copy()  # (A - 1, S)
         draws = torch.rand(n_rollout_steps, env.num_envs).numpy()
 
@@ -111,9 +103,8 @@ class TabulatedPPO(PPO):
         taken = np.empty_like(visited)
         states = env.states
         for step in range(n_rollout_steps):
-            actions = np.zeros(env.num_envs, dtype=np.int64)
-            for threshold in thresholds:
-                actions += draws[step] >= threshold[states]
+            beyond = draws[step] >= thresholds.take(states, axis=1)
+            actions = np.add.reduce(beyond, axis=0, dtype=np.int64)
             done = env.step_states(actions)
             rewards, dones, infos = done.rewards, done.dones, infos_of(done, env.num_envs)
             self.num_timesteps += env.num_envs
@@ -147,94 +138,58 @@ class TabulatedPPO(PPO):
             table.swapaxes(0, 1).ravel()
             for table in (buffer.observations, buffer.actions, buffer.advantages, buffer.returns)
         )
-        logged: list[Tensor] = []
+        weights = Weights(clip_range, clip_range_vf, self.ent_coef, self.vf_coef)
+        logged: list[Losses] = []
         goes_on, epoch = True, 0
         while goes_on and epoch < self.n_epochs:
             first = len(logged)
             for batch in _minibatches(len(states), self.batch_size):
                 which, index = self.inputs.distinct(states[batch])
-                sums = self._sum_up(which, index, actions[batch], advantages[batch], returns[batch])
-                losses = self.losses(which, sums, clip_range, clip_range_vf)
-                logged.append(torch.stack(losses).detach())
-                goes_on = self.target_kl is None or logged[-1][_KL].item() <= 1.5 * self.target_kl
+                weighed = self._normalized(advantages[batch])
+                num_states = self.inputs.num_states if which is None else len(which)
+                sums = sum_up(index, actions[batch], weighed, returns[batch], num_states)
+                outputs = self.outputs(which)
+                old = self._old if which is None else Outputs(*(table[which] for table in self._old))
+                losses, *slopes = losses_and_slopes(_tables(*outputs), old, sums, weights)
+                logged.append(losses)
+                goes_on = self.target_kl is None or losses.approx_kl <= 1.5 * self.target_kl
                 if not goes_on:
                     break
-                self.descent.step(losses[0], None, self.max_grad_norm)
+                self.descent.step(outputs, slopes, self.max_grad_norm)
             epoch += 1
         self._n_updates += epoch
-        self._log(torch.stack(logged), first, clip_range, clip_range_vf)
+        self._log(logged, first, weights)
 
     def _clip_ranges(self) -> tuple[float, float | None]:
         progress = self._current_progress_remaining
         clip_range, clip_range_vf = cast(Any, self.clip_range), cast(Any, self.clip_range_vf)
         return clip_range(progress), None if clip_range_vf is None else clip_range_vf(progress)
 
-    def losses(
-        self, states: IntArray | None, sums: Sums, clip_range: float, clip_range_vf: float | None
-    ) -> tuple[Tensor, ...]:
-        """The minibatch's numbers that SB3 logs; the first is the one to descend."""
-        log_prob, values = self.tables(states)
-        rows = slice(None) if states is None else states
-        old_log_prob = torch.as_tensor(self._old_log_prob[rows], device=self.device)
-        log_ratio = log_prob - old_log_prob
-        ratio = log_ratio.exp()
-        gained = sums.positive * ratio.clamp(max=1 + clip_range)
-        lost = sums.negative * ratio.clamp(min=1 - clip_range)
-        policy_loss = -(gained + lost).sum()
-        entropy_loss = (sums.states * (log_prob.exp() * log_prob).sum(dim=1)).sum()
-        if clip_range_vf is not None:
-            old_values = torch.as_tensor(self._old_values[rows], device=self.device)
-            values = old_values + (values - old_values).clamp(-clip_range_vf, clip_range_vf)
-        value_loss = (sums.states * (values - sums.mean_return).square()).sum() + sums.deviation
-        loss = policy_loss + self.ent_coef * entropy_loss + self.vf_coef * value_loss
-        with torch.no_grad():
-            divergence = (sums.pairs * (ratio - 1 - log_ratio)).sum()
-            clipped = (sums.pairs * ((ratio - 1).abs() > clip_range)).sum()
-        return loss, policy_loss, value_loss, entropy_loss, divergence, clipped
+    def _normalized(self, advantages: Float32Array) -> Float32Array:
+        if not self.normalize_advantage or len(advantages) < 2:
+            return advantages
+        normalized: Float32Array = (advantages - advantages.mean()) / (advantages.std(ddof=1) + 1e-8)
+        return normalized
 
-    def _sum_up(
-        self,
-        which: IntArray | None,
-        index: IntArray,
-        actions: IntArray,
-        advantages: Float32Array,
-        returns: Float32Array,
-    ) -> Sums:
-        count = len(index)
-        if self.normalize_advantage and count > 1:
-            advantages = (advantages - advantages.mean()) / (advantages.std(ddof=1) + 1e-8)
-        size = self.inputs.num_states if which is None else len(which)
-        num_actions = NUM_ACTIONS
-        pair = index * num_actions + actions
-
-        def per_pair(weights: FloatArray | Float32Array | None) -> FloatArray:
-            return np.bincount(pair, weights, size * num_actions).reshape(size, num_actions) / count
-
-        pairs = per_pair(None)
-        positive = per_pair(np.maximum(advantages, 0))
-        negative = per_pair(np.minimum(advantages, 0))
-        states = pairs.sum(axis=1)
-        mean_return = np.bincount(index, returns, size) / np.maximum(states * count, 1)
-        deviation = float(np.square(returns - mean_return[index]).mean())
-        tensors = [
-            torch.as_tensor(table.astype(np.float32), device=self.device)
-            for table in (positive, negative, pairs, states, mean_return)
-        ]
-        return Sums(deviation, *tensors)
-
-    def _log(self, logged: Tensor, last_epoch: int, clip_range: float, clip_range_vf: float | None) -> None:
-        """`logged` (updates, 6) are the losses; SB3 reports the divergence of the last epoch alone."""
-        means = dict(zip(_LOGGED, logged.mean(dim=0).tolist(), strict=True))
-        means |= {"approx_kl": logged[last_epoch:, _KL].mean().item(), "loss": logged[-1, 0].item()}
+    def _log(self, logged: list[Losses], last_epoch: int, weights: Weights) -> None:
+        """SB3 reports the divergence of the last epoch alone, and the loss of the last minibatch."""
+        means = Losses(*np.mean(logged, axis=0).tolist())._asdict()
+        means["approx_kl"] = float(np.mean([losses.approx_kl for losses in logged[last_epoch:]]))
+        means["loss"] = logged[-1].loss
         for name, mean in means.items():
             self.logger.record(f"train/{name}", mean)
         buffer = self.rollout_buffer
         variance = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
         self.logger.record("train/explained_variance", variance)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/clip_range", clip_range)
-        if clip_range_vf is not None:
-            self.logger.record("train/clip_range_vf", clip_range_vf)
+        self.logger.record("train/clip_range", weights.clip_range)
+        if weights.clip_range_vf is not None:
+            self.logger.record("train/clip_range_vf", weights.clip_range_vf)
+
+
+def _tables(logits: Tensor, values: Tensor) -> Outputs:
+    """The numbers alone, where the loss works on them."""
+    return Outputs(log_softmax(logits.detach().cpu().numpy()), values.detach().cpu().numpy()[:, 0])
 
 
 def _minibatches(count: int, batch_size: int) -> list[IntArray]:

@@ -1,0 +1,28 @@
+"""Tables over states instead of networks: Q-learning, SARSA, expected SARSA, and the optimum itself.
+
+Nothing here needs more than numpy: a run of these agents never imports torch.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from gridworld.agents.tabular.checks import check
+
+if TYPE_CHECKING:
+    from gridworld.agents import Agent, Seat
+    from gridworld.config import AgentConfig
+
+__all__ = ["build", "check"]
+
+
+def build(config: AgentConfig, seat: Seat) -> Agent:
+    """An agent of the configured algorithm on the seat's environments."""
+    from gridworld.agents.tabular.control import TabularControl
+    from gridworld.agents.tabular.optimum import Optimum
+    from gridworld.config import TabularControlConfig, ValueIterationConfig
+
+    if isinstance(config, ValueIterationConfig):
+        return Optimum(config, seat)
+    assert isinstance(config, TabularControlConfig)
+    return TabularControl(config, seat)

@@ -1,0 +1,55 @@
+"""Settings under which a table would not learn, or not what it says, refused before training."""
+
+from __future__ import annotations
+
+import math
+
+from gridworld.config import (
+    TabularConfig,
+    TabularControlConfig,
+    TrainConfig,
+    above_zero,
+    at_least,
+    parse_schedule,
+    within,
+)
+from gridworld.errors import InputError
+
+
+def check(config: TrainConfig) -> None:
+    """Raise `InputError` for the first setting that could not train as it says."""
+    agent = config.agent
+    assert isinstance(agent, TabularConfig)
+    own = type(agent)().algorithm
+    if agent.algorithm != own:
+        raise InputError(
+            f"agent.algorithm={agent.algorithm}: these are the settings of {own}; choose agent=..."
+        )
+    if config.observation.kind != "none":
+        raise InputError(
+            f"observation={config.observation.kind}: agent={agent.name} keeps a table over the states "
+            "themselves and would never look at it; must be none"
+        )
+    if config.device not in ("cpu", "auto"):
+        raise InputError(f"device={config.device}: agent={agent.name} runs on the processor; must be cpu")
+    within("agent.gamma", agent.gamma, 0, 1)
+    if isinstance(agent, TabularControlConfig):
+        _check_control(agent)
+
+
+def _check_control(agent: TabularControlConfig) -> None:
+    size, _ = parse_schedule("agent.learning_rate", agent.learning_rate)
+    if not 0 < size <= 1:
+        raise InputError(
+            f"agent.learning_rate={agent.learning_rate}: a step towards the target must be "
+            "above 0 and at most 1"
+        )
+    within("agent.learning_rate_power", agent.learning_rate_power, 0, 1)
+    if not math.isfinite(agent.initial_value):
+        raise InputError(f"agent.initial_value={agent.initial_value}: must be a finite number")
+    above_zero("agent.exploration_fraction", agent.exploration_fraction)
+    within("agent.exploration_fraction", agent.exploration_fraction, 0, 1)
+    within("agent.exploration_initial_eps", agent.exploration_initial_eps, 0, 1)
+    within("agent.exploration_final_eps", agent.exploration_final_eps, 0, 1)
+    at_least("agent.stats_window_size", agent.stats_window_size, 1)
+    at_least("agent.log_interval", agent.log_interval, 1)

@@ -1,0 +1,164 @@
+"""Q-learning, SARSA and expected SARSA: temporal-difference control with a table.
+
+After a step from (s, a) to reward r and state s', Q(s, a) moves towards
+
+    Q-learning        r + γ max_b Q(s', b)
+    SARSA             r + γ Q(s', a'),    a' the action that is taken next
+    expected SARSA    r + γ Σ_b π(b | s') Q(s', b),    π the ε-greedy policy of the moment
+
+So Q-learning estimates Q* whatever it does, the other two Q of the policy that they explore with. Q of a
+terminal state is 0 and stays 0, so that nothing follows there. An episode that the step limit cuts off
+is no end: its target looks at the state where it was cut, where SARSA draws an a' for the target alone.
+
+SARSA draws a' before the update, the others act after it, as in the book. How a batch of environments
+updates one table is told in `gridworld.agents.tabular.batch_update`.
+
+References: C. Watkins, Learning from delayed rewards, 1989, and with P. Dayan, Q-learning, Machine Learning
+8, 1992; G. Rummery and M. Niranjan, On-line Q-learning using connectionist systems, 1994; H. van Seijen,
+H. van Hasselt, S. Whiteson and M. Wiering, A theoretical and empirical analysis of expected Sarsa, 2009;
+R. Sutton and A. Barto, Reinforcement Learning, 2nd ed., 2018, sections 6.4 to 6.6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from gridworld.agents import Beliefs, Seat
+from gridworld.agents.tabular.batch_update import StepSize, update
+from gridworld.agents.tabular.episodes import Episodes
+from gridworld.agents.tabular.model_file import read_model, write_model
+from gridworld.agents.tabular.policies import (
+    best_value,
+    draw_actions,
+    epsilon_greedy,
+    expected_value,
+    rows_of,
+)
+from gridworld.config import TabularControlConfig, parse_schedule
+from gridworld.errors import InputError
+from gridworld.mdp import NUM_ACTIONS, FloatArray, IntArray
+
+
+class TabularControl:
+    """One table Q (S, A), learned by the configured algorithm."""
+
+    def __init__(self, config: TabularControlConfig, seat: Seat) -> None:
+        mdp = seat.envs.mdp
+        self.config = config
+        self.q: FloatArray = np.full((mdp.num_states, NUM_ACTIONS), config.initial_value)
+        self.q[mdp.terminal] = 0.0
+        self.visits: IntArray = np.zeros(self.q.shape, dtype=np.int64)  # of each (s, a)
+        self.exploration_rate = config.exploration_initial_eps
+        self._seat = seat
+        self._rate, self._rate_falls = parse_schedule("agent.learning_rate", config.learning_rate)
+        # The environments draw from the seed's own generator; this one is independent of it.
+        self._random = np.random.default_rng(np.random.SeedSequence(seat.seed).spawn(1)[0])
+        # V of the policy whose Q the table is.
+        self._value = best_value if config.algorithm == "q_learning" else expected_value
+
+    def learn(self, total_timesteps: int, on_step: Callable[[int], bool]) -> None:
+        envs, gamma, is_sarsa = self._seat.envs, self.config.gamma, self.config.algorithm == "sarsa"
+        q, visits = self.q.reshape(-1), self.visits.reshape(-1)  # flat views
+        episodes = Episodes(envs.num_envs, self.config.stats_window_size)
+        log = _Log(self, episodes)
+        states, _ = envs.reset(seed=self._seat.seed)
+        actions = self._act(states)
+        steps, goes_on = 0, True
+        while goes_on and steps < total_timesteps:
+            step_size = self._step_size(steps / total_timesteps)
+            following, rewards, _, _, infos = envs.step(actions)
+            steps += envs.num_envs
+            self.exploration_rate = self._epsilon(steps / total_timesteps)
+            over = np.flatnonzero(infos["_final_obs"]) if infos else _NONE
+            reached = infos["final_obs"] if infos else following  # before the reset of what is over
+            episodes.add(rewards, over)
+
+            if is_sarsa:
+                actions_there = self._act(reached)
+                targets = rewards + gamma * self.q[reached, actions_there]
+            else:
+                rows, index = rows_of(self.q, reached)
+                targets = rewards + gamma * self._value(rows, self.exploration_rate)[index]
+            error = update(q, visits, states * NUM_ACTIONS + actions, targets, step_size)
+
+            if is_sarsa:
+                actions = actions_there
+                if over.size:
+                    actions[over] = self._act(following[over])
+            else:
+                actions = self._act(following)
+            states = following
+            log.add(error, step_size, steps)
+            goes_on = on_step(steps)
+
+    def _act(self, states: IntArray) -> IntArray:
+        return draw_actions(self.q, self.exploration_rate, states, self._random.random(len(states)))
+
+    def _epsilon(self, progress: float) -> float:
+        """ε after that share of training: linear over the configured fraction of it, then the final one."""
+        start, end = self.config.exploration_initial_eps, self.config.exploration_final_eps
+        return start + (end - start) * min(progress / self.config.exploration_fraction, 1.0)
+
+    def _step_size(self, progress: float) -> StepSize:
+        rate = self._rate * (1 - progress) if self._rate_falls else self._rate
+        return StepSize(rate, self.config.learning_rate_power)
+
+    def beliefs(self) -> Beliefs:
+        """Of equally good actions, the first is the greedy one; the sampled policy takes any of them."""
+        epsilon = self.exploration_rate
+        return Beliefs(
+            greedy=self.q.argmax(axis=1),
+            sampled=epsilon_greedy(self.q, epsilon),
+            values=self._value(self.q, epsilon),
+            q=self.q.copy(),
+        )
+
+    def save(self, path: Path) -> None:
+        write_model(
+            path,
+            self.config.algorithm,
+            {"q": self.q, "visits": self.visits, "exploration_rate": np.array(self.exploration_rate)},
+        )
+
+    def load(self, path: Path) -> None:
+        like = {"q": self.q, "visits": self.visits, "exploration_rate": np.array(0.0)}
+        arrays = read_model(path, self.config.algorithm, like)
+        epsilon = float(arrays["exploration_rate"])
+        if not 0 <= epsilon <= 1:
+            raise InputError(f"{path}: exploration_rate={epsilon}: must be from 0 to 1")
+        self.q, self.visits, self.exploration_rate = arrays["q"], arrays["visits"], epsilon
+
+
+_NONE: IntArray = np.empty(0, dtype=np.int64)
+
+
+class _Log:
+    """The agent's own curves, under the names that Stable-Baselines3 has for them."""
+
+    def __init__(self, agent: TabularControl, episodes: Episodes) -> None:
+        self._agent = agent
+        self._episodes = episodes
+        self._write = agent._seat.write_scalars
+        self._next = agent.config.log_interval  # episodes
+        self._error, self._updates = 0.0, 0
+
+    def add(self, error: float, step_size: StepSize, steps: int) -> None:
+        """Count an update, and write what there is once enough episodes have ended."""
+        self._error += error
+        self._updates += 1
+        if self._write is None or self._episodes.finished < self._next:
+            return
+        self._next = self._episodes.finished + self._agent.config.log_interval
+        self._write(
+            {
+                **self._episodes.means(),
+                "rollout/exploration_rate": self._agent.exploration_rate,
+                "train/learning_rate": step_size.rate,
+                "train/loss": self._error / self._updates,
+            },
+            steps,
+        )
+        self._error, self._updates = 0.0, 0

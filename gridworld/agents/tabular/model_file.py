@@ -1,0 +1,60 @@
+"""A table's model file: numpy's .npz, a zip of plain arrays, under the name that all runs have for it.
+
+`numpy.load(path)` opens it. Nothing in it is pickled, and nothing pickled is read.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gridworld.errors import InputError
+from gridworld.files import replacing
+
+_ALGORITHM = "algorithm"
+_DAMAGED = (
+    *(OSError, ValueError, TypeError, KeyError, IndexError, EOFError, SyntaxError, MemoryError),
+    *(RuntimeError, zipfile.BadZipFile, zlib.error),
+)
+
+
+def write_model(path: Path, algorithm: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write the arrays and whose they are, whole or not at all."""
+    # A file object, since numpy would add .npz to a path.
+    with replacing(path) as part, part.open("wb") as file:
+        named: dict[str, Any] = {_ALGORITHM: np.array(algorithm), **arrays}
+        np.savez(file, **named)
+
+
+def read_model(path: Path, algorithm: str, like: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """The arrays named, typed and shaped as in `like`. Raises `InputError` for anything else."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            found = {name: archive[name] for name in archive.files}
+    except _DAMAGED as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: not a model of {algorithm} that can be read ({reason})") from None
+    if found.keys() != {_ALGORITHM, *like}:
+        raise InputError(
+            f"{path}: not a model of {algorithm}: must hold {sorted([_ALGORITHM, *like])}, "
+            f"holds {sorted(found)}"
+        )
+    written_by = str(found.pop(_ALGORITHM))
+    if written_by != algorithm:
+        raise InputError(f"{path}: not a model of {algorithm} but of {written_by[:50]}")
+    for name, expected in like.items():
+        array = found[name]
+        if (array.dtype, array.shape) != (expected.dtype, expected.shape):
+            raise InputError(
+                f"{path}: {name} is {array.dtype} {array.shape}; "
+                f"{algorithm} in this world has {expected.dtype} {expected.shape}"
+            )
+        if not np.isfinite(array).all():
+            raise InputError(f"{path}: {name} holds numbers that are not finite")
+    return found
