@@ -24,7 +24,7 @@ def chromium(profile: Path) -> Iterator[Any]:
     for argument in (
         *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
         *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-        *(f"--user-data-dir={profile}", "--window-size=1400,1000"),
+        *(f"--user-data-dir={profile}", "--window-size=1400,2400"),
     ):
         options.add_argument(argument)
     browser = webdriver.Chrome(options=options, service=Service(str(shutil.which("chromedriver"))))

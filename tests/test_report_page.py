@@ -22,7 +22,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
         train_in(runs / f"real{seed}", *SHORT["ppo"], "env=aima_4x3", f"seed={seed}")
     other = Maker("agent=ppo", "env=four_rooms")
     for seed in range(6):
-        other.write(runs / f"faster{seed}", seed, 2000, agent__learning_rate=0.02)
+        other.write(runs / f"faster{seed}", seed, 2000, agent__learning_rate=0.0123)
     manifest = runs / "ppo,classic,4" / "manifest.json"
     manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"status": "failed", "error": "boom"}))
     with pytest.raises(SystemExit):
@@ -59,7 +59,7 @@ def test_a_browser_shows_it(page: Path, tmp_path: Path) -> None:
         ]
         text = browser.execute_script("return document.body.innerText")
         for words in (
-            *("a2c", "dqn", "q_learning", "sarsa", "ppo (agent.learning_rate=0.02)"),
+            *("a2c", "dqn", "q_learning", "sarsa", "ppo (agent.learning_rate=0.0123)"),
             *(
                 "On classic, dqn is certified optimal on all 6 seeds",
                 "1 run of ppo not counted",

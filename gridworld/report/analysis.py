@@ -161,7 +161,7 @@ def analyse(study: Study, seed: int = 0) -> tuple[tuple[TaskAnalysis, ...], Over
 def _task(task: str, groups: list[Group], seed: int) -> TaskAnalysis:
     world = reference(groups[0].runs[0])
     end = max(run.steps for group in groups for run in group.runs)
-    grid = np.round(np.linspace(0, end, GRID_POINTS))
+    grid = np.unique(np.round(np.linspace(0, end, GRID_POINTS)))
     results = tuple(_result(group, world, grid, seed) for group in groups)
     return TaskAnalysis(task, world, results, compare([{r.group.agent: r.samples for r in results}], seed))
 

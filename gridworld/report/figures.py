@@ -126,6 +126,8 @@ def _line(band: Band, style: Style, x: Axis, y: Axis) -> Iterator[Shape]:
     points = steps_like(band.steps[whole].tolist(), band.point[whole].tolist(), x, y)
     if len(points) > 1:
         yield Line(points, style.paint, 2.2, style.dash)
+    else:
+        yield Dot(points[0], 3.5, style.paint)
     if not whole.all():
         rest = ~whole
         rest[max(0, int(whole.sum()) - 1)] = True

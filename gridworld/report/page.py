@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jinja2
 from markupsafe import Markup
-from PIL import Image
 
 from gridworld.report import tables
 from gridworld.report.analysis import METRICS, Comparison, Result, TaskAnalysis
+from gridworld.report.embed import pictures
 from gridworld.report.figures import task_figures
 from gridworld.report.reading import Unusable
 from gridworld.report.report import Report
@@ -24,21 +20,6 @@ from gridworld.report.scene import DARK, LIGHT, Scene, Style, styles
 from gridworld.report.statistics import RESAMPLES, Share
 from gridworld.report.svg import to_svg
 from gridworld.report.table import Cell, Table, interval_text, main_text, number
-
-_PICTURE = "policy.png"
-_LARGEST_PICTURE = 4 * 2**20  # bytes
-_MOST_PIXELS = 4_000_000
-_PICTURE_WIDTH = 480  # pixels
-
-
-@dataclass(frozen=True)
-class Picture:
-    """An image to embed."""
-
-    uri: str
-    width: int
-    height: int
-    caption: str
 
 
 def figures(report: Report) -> dict[str, list[Scene]]:
@@ -96,14 +77,13 @@ def _improvements(comparisons: Sequence[Comparison], name: str) -> list[Table]:
 
 def _task(task: TaskAnalysis, scenes: Sequence[Scene], look: dict[str, Style]) -> dict[str, Any]:
     run = task.results[0].group.runs[0]
-    pictures = (_picture(result) for result in task.results)
     return {
         "title": task.task,
         "facts": _facts(task),
         "figures": [Markup(to_svg(scene)) for scene in scenes],
         "tables": [tables.task_table(task), tables.scores_table(task)],
         "improvements": improvements(task),
-        "pictures": [picture for picture in pictures if picture is not None],
+        "pictures": [found for result in task.results if (found := list(pictures(result)))],
         "layout": run.layout,
     }
 
@@ -193,30 +173,3 @@ def _share_of(cell: Cell) -> float | None:
 
 def _is_text(table: Table, index: int) -> bool:
     return bool(table.rows) and all(isinstance(row[index], str) for row in table.rows)
-
-
-def _picture(result: Result) -> Picture | None:
-    """The map of the run with the median regret, small and encoded anew; None where there is none."""
-    ranked = sorted(result.group.runs, key=lambda run: (run.regret, run.seed))
-    run = ranked[(len(ranked) - 1) // 2]
-    verdict = "certified optimal" if run.certified else f"regret {number(run.regret)}"
-    caption = f"{result.group.agent}, seed {run.seed}: {verdict}"
-    return embed(run.folder / _PICTURE, caption)
-
-
-def embed(path: Path, caption: str) -> Picture | None:
-    """An image file within bounds, as PNG in a data URI."""
-    try:
-        if path.stat().st_size > _LARGEST_PICTURE:
-            return None
-        with Image.open(path, formats=["PNG"]) as image:
-            if image.width * image.height > _MOST_PIXELS:
-                return None
-            small = image.convert("RGB")
-    except (OSError, ValueError, SyntaxError):  # what Pillow raises for a damaged file
-        return None
-    small.thumbnail((_PICTURE_WIDTH, 2 * _PICTURE_WIDTH), Image.Resampling.LANCZOS)
-    buffer = io.BytesIO()
-    small.quantize(128, dither=Image.Dither.NONE).save(buffer, format="PNG", optimize=True)
-    uri = "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
-    return Picture(uri, small.width, small.height, caption)
