@@ -27,6 +27,7 @@ WIDTH = 440.0
 _PLOT_HEIGHT = 190.0
 _ROW = 34.0  # pixels an agent has in a figure of intervals
 _RIGHT = 18.0
+_LEVELS = {"optimum": Style("ink", (5.0, 4.0)), "uniformly random": Style("ink", (1.5, 3.0))}
 
 Styles = Mapping[str, Style]
 
@@ -86,7 +87,9 @@ def _curves(
 ) -> Scene:
     labels = [form(tick) for tick in ticks(*bounds)]
     left = 12 + max(text_width(label, SMALL) for label in labels)
-    names, height = legend([(agent, styles[agent]) for agent, _ in curves], left, WIDTH - _RIGHT, 42)
+    seen = {mark: level for mark, level in levels.items() if bounds[0] <= level <= bounds[1]}
+    entries = [*((agent, styles[agent]) for agent, _ in curves), *((mark, _LEVELS[mark]) for mark in seen)]
+    names, height = legend(entries, left, WIDTH - _RIGHT, 42)
     top = 42 + height
     bottom = top + _PLOT_HEIGHT
     x = Axis(0, max(1.0, *(float(band.steps[-1]) for _, band in curves)), left, WIDTH - _RIGHT)
@@ -100,16 +103,10 @@ def _curves(
         shapes += _area(band, styles[agent], x, y)
     for agent, band in curves:
         shapes += _line(band, styles[agent], x, y)
-    shapes += _levels(levels, x, y)
+    for mark, level in seen.items():
+        shapes.append(Line([(x.start, y(level)), (x.end, y(level))], "ink", 1.0, _LEVELS[mark].dash))
     shapes.append(Text((WIDTH - _RIGHT, bottom + 32), "environment steps", "muted", SMALL, "end"))
     return Scene(name, title, description, WIDTH, bottom + 40, shapes)
-
-
-def _levels(levels: Mapping[str, float], x: Axis, y: Axis) -> Iterator[Shape]:
-    for name, level in levels.items():
-        if math.isfinite(level) and y.low <= level <= y.high:
-            yield Line([(x.start, y(level)), (x.end, y(level))], "ink", 1.0, (4.0, 4.0))
-            yield Text((x.end - 2, y(level) - 5), name, "muted", SMALL, "end", halo=True)
 
 
 def _area(band: Band, style: Style, x: Axis, y: Axis) -> Iterator[Shape]:

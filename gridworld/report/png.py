@@ -46,9 +46,9 @@ def _draw(image: Image.Image, shape: Shape, factor: int) -> None:
                 draw.ellipse(box, outline=_over_paper(paint, opacity), width=round(1.4 * factor))
             else:
                 draw.ellipse(box, fill=_over_paper(paint, opacity))
-        case Text((x, y), text, paint, size, anchor, bold, halo):
+        case Text((x, y), text, paint, size, anchor, bold):
             font = ImageFont.load_default(size * factor)
-            stroke = 2 * factor if halo else round(0.02 * size * factor) if bold else 0
+            stroke = round(0.02 * size * factor) if bold else 0
             draw.text(
                 (x * factor, y * factor),
                 text,
@@ -56,7 +56,7 @@ def _draw(image: Image.Image, shape: Shape, factor: int) -> None:
                 font=font,
                 anchor=_ANCHORS[anchor],
                 stroke_width=stroke,
-                stroke_fill=LIGHT["paper" if halo else paint],
+                stroke_fill=LIGHT[paint],
             )
 
 

@@ -82,7 +82,6 @@ class Text:
     size: float = 12
     anchor: str = "start"
     bold: bool = False
-    halo: bool = False  # of paper, where lines may pass beneath
 
 
 Shape = Line | Area | Dot | Text

@@ -30,10 +30,10 @@ def _shape(shape: Shape) -> str:
         case Dot((x, y), radius, paint, opacity, ring):
             kind = f'class="s-{paint}" fill="none" stroke-width="1.4"' if ring else f'class="f-{paint}"'
             return f'<circle {kind} cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" opacity="{opacity:g}"/>'
-        case Text((x, y), text, paint, size, anchor, bold, halo):
+        case Text((x, y), text, paint, size, anchor, bold):
             weight = ' font-weight="600"' if bold else ""
             return (
-                f'<text class="f-{paint}{" halo" if halo else ""}" x="{x:.1f}" y="{y:.1f}" '
+                f'<text class="f-{paint}" x="{x:.1f}" y="{y:.1f}" '
                 f'font-size="{size:g}" text-anchor="{anchor}"{weight}>{escape(text)}</text>'
             )
 
