@@ -10,7 +10,8 @@ import numpy as np
 
 from gridworld.events import EventWriter
 from gridworld.mdp import FloatArray
-from gridworld.report.analysis import Band, Result, TaskAnalysis
+from gridworld.report.analysis import Result, TaskAnalysis
+from gridworld.report.curves import Band
 
 _PARTS = ("iqm", "low", "high", "mean")
 BANDS = {

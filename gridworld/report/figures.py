@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 
 from gridworld.mdp import FloatArray
-from gridworld.report.analysis import BY_KEY, Band, Result, TaskAnalysis
+from gridworld.report.analysis import Result, TaskAnalysis
 from gridworld.report.chart import (
     SMALL,
     Axis,
@@ -21,6 +21,8 @@ from gridworld.report.chart import (
     ticks,
     vertical_grid,
 )
+from gridworld.report.curves import Band
+from gridworld.report.metrics import BY_KEY
 from gridworld.report.scene import Area, Dot, Line, Scene, Shape, Style, Text, text_width
 
 WIDTH = 440.0

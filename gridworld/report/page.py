@@ -11,9 +11,10 @@ import jinja2
 from markupsafe import Markup
 
 from gridworld.report import tables
-from gridworld.report.analysis import METRICS, Comparison, Result, TaskAnalysis
+from gridworld.report.analysis import Comparison, Result, TaskAnalysis
 from gridworld.report.embed import pictures
 from gridworld.report.figures import task_figures
+from gridworld.report.metrics import METRICS
 from gridworld.report.reading import Unusable
 from gridworld.report.report import Report
 from gridworld.report.scene import DARK, LIGHT, Scene, Style, styles

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from collections.abc import Iterator, Mapping
@@ -14,17 +13,11 @@ import numpy as np
 
 from gridworld.errors import InputError
 from gridworld.mdp import FloatArray
+from gridworld.report.run_files import read_curve, read_object
 from gridworld.run import CURVE, MANIFEST, SUMMARY
 
-_LARGEST_JSON = 4 * 2**20  # bytes
-_LARGEST_CSV = 64 * 2**20
 _LONGEST_NAME = 80  # characters
 _DIGITS = 9  # after the point: two ways to compute one regret differ later than that
-
-REQUIRED = ("step", "value", "regret", "certified", "goal_probability", "return")
-SAMPLED_RETURN = "sampled_return"
-ONLINE = "online_return"  # undiscounted, of the training episodes ended since the row before; may be empty
-_OPTIONAL = (SAMPLED_RETURN, ONLINE)
 
 Settings = Mapping[str, str]  # flat: {"agent.gamma": "0.9"}
 
@@ -85,7 +78,7 @@ def read(folder: Path) -> Evidence | Unusable:
     """The run in `folder`, or the reason why it cannot be used."""
     agent = env = None
     try:
-        manifest = _object(folder / MANIFEST)
+        manifest = read_object(folder / MANIFEST)
         agent, env = _peek(manifest, "agent", "name"), _peek(manifest, "env", "layout")
         _check_ended(folder, manifest)
         return _evidence(folder, manifest)
@@ -100,8 +93,8 @@ def _evidence(folder: Path, manifest: dict[str, Any]) -> Evidence:
         raise InputError(f"{where}: has no settings under config; is it of another version?")
     if not (isinstance(layout, list) and all(isinstance(line, str) for line in layout)):
         raise InputError(f"{where}: layout must be a list of the map's rows; is it of another version?")
-    summary = _object(folder / SUMMARY)
-    curve = _curve(folder / CURVE)
+    summary = read_object(folder / SUMMARY)
+    curve = read_curve(folder / CURVE)
     seed = config.get("seed")
     if not isinstance(seed, int) or isinstance(seed, bool):
         raise InputError(f"{where}: config.seed={seed!r} must be a whole number")
@@ -139,7 +132,7 @@ def _check_ended(folder: Path, manifest: dict[str, Any]) -> None:
 
 def _reached(folder: Path) -> str:
     try:
-        return f" (last evaluated after {int(_curve(folder / CURVE)['step'][-1]):,} steps)"
+        return f" (last evaluated after {int(read_curve(folder / CURVE)['step'][-1]):,} steps)"
     except InputError:
         return ""
 
@@ -156,69 +149,6 @@ def _check_agreement(run: Evidence, summary: Mapping[str, Any]) -> None:
             f"{run.folder}: {CURVE} ends at step {run.steps:,} with regret {last:.6g}, {SUMMARY} "
             "says otherwise; one of them was changed or cut off"
         )
-
-
-def _object(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(_bounded(path, _LARGEST_JSON))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is no JSON, it was changed or cut off ({error})") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: holds no JSON object")
-    return content
-
-
-def _bounded(path: Path, most: int) -> str:
-    try:
-        if not path.is_file():
-            raise InputError(f"{path.parent}: has no {path.name}")
-        if path.stat().st_size > most:
-            raise InputError(f"{path}: is larger than {most / 2**20:.0f} MiB")
-        return path.read_text("utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: cannot be read, it is no UTF-8 text") from None
-
-
-def _curve(path: Path) -> dict[str, FloatArray]:
-    lines = _bounded(path, _LARGEST_CSV).splitlines()
-    try:
-        rows = list(csv.reader(lines))
-    except csv.Error as error:
-        raise InputError(f"{path}: is no CSV ({error})") from None
-    if len(rows) < 2:
-        raise InputError(f"{path}: has no row")
-    header = rows[0]
-    if missing := [name for name in REQUIRED if name not in header]:
-        raise InputError(f"{path}: has no column {', '.join(missing)}; is it of another version?")
-    for number, row in enumerate(rows[1:], start=2):
-        if len(row) != len(header):
-            raise InputError(f"{path}: line {number} has {len(row)} of {len(header)} columns, it was cut off")
-    curve = {
-        name: _column(path, name, header, rows[1:]) for name in (*REQUIRED, *_OPTIONAL) if name in header
-    }
-    if (np.diff(curve["step"]) <= 0).any() or not np.isfinite(curve["step"]).all():
-        raise InputError(f"{path}: the steps do not rise from row to row")
-    curve["regret"] = np.maximum(0.0, curve["regret"])  # below zero is rounding
-    return curve
-
-
-def _column(path: Path, name: str, header: list[str], rows: list[list[str]]) -> FloatArray:
-    index = header.index(name)
-    values = np.empty(len(rows))
-    for number, row in enumerate(rows):
-        text = row[index]
-        try:
-            value = float(text) if text or name != ONLINE else math.nan
-        except ValueError:
-            raise InputError(f"{path}: line {number + 2}: {name}={text[:40]!r} is no number") from None
-        if math.isnan(value) and name != ONLINE:
-            raise InputError(
-                f"{path}: line {number + 2}: {name} is NaN; the run diverged or the file was changed"
-            )
-        values[number] = value
-    return values
 
 
 def flat(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from gridworld.report.analysis import BY_KEY, Comparison, Overall, Result, TaskAnalysis
+from gridworld.report.analysis import Comparison, Overall, Result, TaskAnalysis
 from gridworld.report.grouping import Study, differing, learning_key
+from gridworld.report.metrics import BY_KEY
 from gridworld.report.reading import Unusable
 from gridworld.report.statistics import Share
 from gridworld.report.table import NOTHING, Cell, Estimate, Table, number, steps_up_to
