@@ -120,8 +120,8 @@ def test_a_browser_shows_it(served: str, tmp_path: Path) -> None:
     for argument in (
         *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
         *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-        *(f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1400,1000"),
-    ):
+        *(f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1400,2400"),
+    ):  # high, since cards below the window are not drawn
         options.add_argument(argument)
     browser = webdriver.Chrome(options=options, service=Service(str(shutil.which("chromedriver"))))
     try:
