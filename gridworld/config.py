@@ -106,12 +106,25 @@ class ActorCriticPolicyKwargs(PolicyKwargs):
 
 @dataclass
 class SB3Config(AgentConfig):
-    """An algorithm of Stable-Baselines3: `algorithm` is its class, the other fields are its arguments."""
+    """An algorithm with Stable-Baselines3's interface: `algorithm` is its class."""
 
     family: str = "sb3"
-    engine: str = "tabulated"  # the network runs once per state; stock: SB3's own loop, once per sample
     log_interval: int = 1  # of SB3's learn(): episodes for DQN, iterations for PPO
     policy: str = "MlpPolicy"
+
+
+@dataclass
+class SB3ClassConfig(SB3Config):
+    """Any class of Stable-Baselines3, of sb3-contrib or of one's own, by its import path."""
+
+    arguments: dict[str, Any] = field(default_factory=dict)  # of the class; it keeps its defaults
+
+
+@dataclass
+class SB3CheckedConfig(SB3Config):
+    """A class of Stable-Baselines3 whose arguments are fields here, with their types."""
+
+    engine: str = "tabulated"  # the network runs once per state; stock: SB3's own loop, once per sample
     learning_rate: Schedule = 1e-3  # a number, or lin_NUMBER to fall linearly to 0 at the end of training
     batch_size: int = 64
     gamma: float = 0.99
@@ -120,7 +133,7 @@ class SB3Config(AgentConfig):
 
 
 @dataclass
-class DQNConfig(SB3Config):
+class DQNConfig(SB3CheckedConfig):
     """Arguments of `stable_baselines3.DQN`, with its defaults."""
 
     name: str = "dqn"
@@ -145,7 +158,7 @@ class DQNConfig(SB3Config):
 
 
 @dataclass
-class PPOConfig(SB3Config):
+class PPOConfig(SB3CheckedConfig):
     """Arguments of `stable_baselines3.PPO`, with its defaults."""
 
     name: str = "ppo"
@@ -246,6 +259,7 @@ AGENT_SCHEMAS: dict[str, type[AgentConfig]] = {
     "sarsa": SarsaConfig,
     "expected_sarsa": ExpectedSarsaConfig,
     "value_iteration": ValueIterationConfig,
+    "sb3": SB3ClassConfig,
 }
 
 

@@ -64,7 +64,8 @@ def _suggestion(facts: str) -> str:
         return "; to run one job for each of the values, add -m"
     if "is not in struct" in facts:
         return (
-            "; entries of a dictionary are added one by one: +agent.policy_kwargs.optimizer_kwargs.eps=1e-5"
+            "; a new entry of a dictionary needs a plus: "
+            "+agent.policy_kwargs.optimizer_kwargs.eps=1e-5, +agent.arguments.gamma=0.9"
         )
     unknown = re.search(r"Key '([^']*)' not in '([^']*)'", facts)
     schema = getattr(schemas, unknown.group(2), None) if unknown else None

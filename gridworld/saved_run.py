@@ -13,7 +13,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gridworld.agents import Beliefs, family
 from gridworld.chain import one_hot_policy
-from gridworld.config import AGENT_SCHEMAS, AgentConfig, TrainConfig, check
+from gridworld.config import AGENT_SCHEMAS, AgentConfig, SB3ClassConfig, TrainConfig, check
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge
 from gridworld.layout import CLASSIC, Layout, load, parse
@@ -26,15 +26,19 @@ _LIBRARIES = ("torch.nn.", "torch.optim.", "stable_baselines3.", "sb3_contrib.")
 
 
 class SavedRun:
-    """A finished run. Raises `InputError` where the folder holds none, or not all of one."""
+    """A finished run. Raises `InputError` where the folder holds none, or not all of one.
 
-    def __init__(self, folder: Path) -> None:
+    `trust` lets it import classes that are neither ours nor one of the libraries'.
+    """
+
+    def __init__(self, folder: Path, trust: bool = False) -> None:
         self.run: Run = open_run(folder)
         manifest = self.run.manifest
         self.config = read_config(manifest["config"], str(self.run.manifest_file))
         self.config.device = "cpu"  # where it was trained is no reason to need the same machine
         check(self.config)
-        _check_imports(dataclasses.asdict(self.config.agent), str(self.run.manifest_file))
+        if not trust:
+            _check_imports(dataclasses.asdict(self.config.agent), str(self.run.manifest_file))
         family(self.config.agent).check(self.config)
         self.mdp: Mdp = make_mdp(self.config.env, self._trained_layout(manifest["layout"]))
 
@@ -76,8 +80,16 @@ def _check_imports(agent: dict[str, Any], where: str) -> None:
     for key, value in agent.items():
         if isinstance(value, dict):
             _check_imports(value, where)
-        elif key.endswith(("_class", "_fn")) and isinstance(value, str) and not value.startswith(_LIBRARIES):
-            raise InputError(f"{where}: {key}={value!r} is not imported; it must begin with {_LIBRARIES}")
+        elif _is_foreign(key, value):
+            raise InputError(
+                f"{where}: {key}={value} is from none of {', '.join(_LIBRARIES)}; add --trust to import it "
+                "all the same, if you trust whoever made this run"
+            )
+
+
+def _is_foreign(key: str, value: Any) -> bool:
+    names_a_class = key.endswith(("_class", "_fn")) or key in ("algorithm", "policy")
+    return names_a_class and isinstance(value, str) and "." in value and not value.startswith(_LIBRARIES)
 
 
 def choose_policy(beliefs: Beliefs, kind: str) -> FloatArray:
@@ -88,8 +100,9 @@ def choose_policy(beliefs: Beliefs, kind: str) -> FloatArray:
 def read_config(content: Any, where: str) -> TrainConfig:
     """Settings from a manifest's JSON. Raises `InputError` for anything that the schema does not have."""
     agent = content.get("agent") if isinstance(content, dict) else None
-    algorithm = agent.get("algorithm") if isinstance(agent, dict) else None
-    schema = next((s for s in AGENT_SCHEMAS.values() if s.algorithm == algorithm), None)
+    agent = agent if isinstance(agent, dict) else {}
+    algorithm, any_class = agent.get("algorithm"), SB3ClassConfig if "arguments" in agent else None
+    schema = next((s for s in AGENT_SCHEMAS.values() if s.algorithm == algorithm), any_class)
     if schema is None:
         raise InputError(f"{where}: config.agent.algorithm={algorithm!r} is not known here")
     config = _read(TrainConfig, content, f"{where}: config", {AgentConfig: schema})

@@ -87,7 +87,8 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
-        # Flat tables, indexed by (state * A + action) * K + outcome.
+        # Flat tables, indexed by (state * A + action) * K + outcome. States are in numpy's own index type:
+        # smaller ones save nothing that counts and are converted at every look-up.
         self._num_outcomes = self.mdp.next_state.shape[2]
         self._next_state = self.mdp.next_state.ravel().astype(np.int64)
         self._reward = self.mdp.reward.ravel()
@@ -134,9 +135,9 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         if self._num_outcomes > 1:
             index *= self._num_outcomes
             index += self._slips(starting)
-        state = self._next_state[index]
-        rewards = self._reward[index]
-        terminated = self._terminated[index]
+        state = self._next_state.take(index)
+        rewards = self._reward.take(index)
+        terminated = self._terminated.take(index)
         self._state = state
         self._elapsed += 1
         if starting is not None:

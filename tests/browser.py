@@ -25,7 +25,7 @@ def chromium(profile: Path) -> Iterator[Any]:
         *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
         *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
         *(f"--user-data-dir={profile}", "--window-size=1400,2400"),
-    ):
+    ):  # high, since what is below the window may not be drawn
         options.add_argument(argument)
     browser = webdriver.Chrome(options=options, service=Service(str(shutil.which("chromedriver"))))
     try:

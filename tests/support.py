@@ -20,13 +20,19 @@ SHORT = {
         *("agent.learning_starts=300", "agent.exploration_fraction=1", "agent.log_interval=4"),
     ],
     "ppo": ["agent=ppo", "total_timesteps=2000", "n_envs=16", "agent.n_steps=32", "agent.batch_size=64"],
+    "a2c": ["agent=a2c", "total_timesteps=500", "n_envs=4", "evaluation.every=200"],
+    "qrdqn": ["agent=qrdqn", "total_timesteps=1000", "n_envs=4", "+agent.arguments.learning_starts=500"],
+    "trpo": [
+        *("agent=trpo", "total_timesteps=500", "n_envs=4"),
+        *("agent.arguments.n_steps=32", "agent.arguments.batch_size=64"),
+    ],
     **{
         agent: [f"agent={agent}", "total_timesteps=2000", "evaluation.every=500", "agent.log_interval=4"]
         for agent in ("q_learning", "sarsa", "expected_sarsa")
     },
     "value_iteration": ["agent=value_iteration"],
 }
-DEEP = ["dqn", "ppo"]  # those of Stable-Baselines3
+DEEP = ["dqn", "ppo"]  # those with a tabulated engine
 LEARNING = [agent for agent in SHORT if agent != "value_iteration"]
 
 

@@ -10,7 +10,7 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
-from support import SHORT, configure, train_in
+from support import DEEP, SHORT, configure, train_in
 
 from gridworld import GridWorldVectorEnv
 from gridworld.agents.sb3 import tabulated
@@ -279,7 +279,7 @@ def test_callbacks_schedules_and_files_are_sb3s(
     loaded.learn(200, reset_num_timesteps=False)  # and it goes on training
 
 
-@pytest.mark.parametrize("agent", SHORT)
+@pytest.mark.parametrize("agent", DEEP)
 def test_both_engines_train_and_leave_the_same_kind_of_run(agent: str, tmp_path: Path) -> None:
     runs = [
         train_in(tmp_path / engine, *SHORT[agent], f"agent.engine={engine}")
@@ -308,5 +308,5 @@ def test_what_it_does_not_cover_falls_back_and_says_why(
 
 
 def test_the_default_settings_are_covered(capsys: pytest.CaptureFixture[str]) -> None:
-    for agent in SHORT:
+    for agent in DEEP:
         assert tabulated.why_not(configure(f"agent={agent}").agent) is None  # type: ignore[arg-type]

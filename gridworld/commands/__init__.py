@@ -25,6 +25,9 @@ def parser_for_a_run(prog: str, about: str | None) -> argparse.ArgumentParser:
         default="greedy",
         help="the best action, or the distribution it explores with",
     )
+    parser.add_argument(
+        "--trust", action="store_true", help="import the classes that the run names, wherever they are from"
+    )
     return parser
 
 

@@ -36,7 +36,7 @@ def main(arguments: Sequence[str]) -> None:
         raise InputError(
             "--render human: there is no display to open a window on; set DISPLAY, or use record.py"
         )
-    saved = SavedRun(options.run)
+    saved = SavedRun(options.run, options.trust)
     judge = saved.judge(options.layout)
     policy = choose_policy(saved.beliefs(), options.policy)
     if options.render == "human":

@@ -20,7 +20,7 @@ def main(arguments: Sequence[str]) -> None:
     """Write the files and name them."""
     options = _parser().parse_args(arguments)
     _check(options)
-    saved = SavedRun(options.run)
+    saved = SavedRun(options.run, options.trust)
     if options.cell_size is not None:
         frame_size(saved.mdp, options.cell_size)
     policy = choose_policy(saved.beliefs(), options.policy)

@@ -110,7 +110,7 @@ def _evidence(folder: Path, manifest: dict[str, Any]) -> Evidence:
         optimal_value=_number(summary, "optimal_value", str(folder / SUMMARY)),
         seconds=_number(summary, "train_seconds", str(folder / SUMMARY)),
         started=str(manifest.get("started", ""))[:10],
-        version=str((manifest.get("versions") or {}).get("gridworld", "?"))[:_LONGEST_NAME],
+        version=_version(manifest),
         curve=curve,
     )
     _check_agreement(evidence, summary)
@@ -169,6 +169,11 @@ def _text(content: Any, key: str, where: str) -> str:
 
 def _printable(text: str) -> str:
     return "".join(sign if sign.isprintable() else "?" for sign in text)[:_LONGEST_NAME]
+
+
+def _version(manifest: dict[str, Any]) -> str:
+    versions = manifest.get("versions")
+    return _printable(str(versions.get("gridworld", "?"))) if isinstance(versions, dict) else "?"
 
 
 def _number(content: Any, key: str, where: str) -> float:

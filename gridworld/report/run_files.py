@@ -64,7 +64,7 @@ def read_curve(path: Path) -> dict[str, FloatArray]:
     curve = {
         name: _column(path, name, header, rows[1:]) for name in (*REQUIRED, *_OPTIONAL) if name in header
     }
-    if (np.diff(curve["step"]) <= 0).any() or not np.isfinite(curve["step"]).all():
+    if not np.isfinite(curve["step"]).all() or (np.diff(curve["step"]) <= 0).any():
         raise InputError(f"{path}: the steps do not rise from row to row")
     curve["regret"] = np.maximum(0.0, curve["regret"])  # below zero is rounding
     return curve

@@ -6,26 +6,25 @@ import json
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.distributions import CategoricalDistribution
 from stable_baselines3.common.logger import KVWriter, Logger
-from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.save_util import load_from_zip_file
-from torch import Tensor, nn
+from torch import Tensor
 
 from gridworld.agents import Beliefs, Seat, WriteScalars
 from gridworld.agents.sb3.building import make_model
+from gridworld.agents.sb3.reading import Reading, of_q, read
 from gridworld.agents.sb3.tabulated_dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated_ppo import TabulatedPPO
 from gridworld.chain import one_hot_policy
 from gridworld.config import AgentConfig, SB3Config
 from gridworld.errors import InputError
 from gridworld.files import replacing
-from gridworld.mdp import IntArray
+from gridworld.mdp import FloatArray, IntArray
 
 _CHUNK = 4096  # states a forward pass
 
@@ -62,16 +61,15 @@ class SB3Agent:
     def beliefs(self) -> Beliefs:
         states = np.arange(self.observation.num_states)
         with torch.no_grad():
-            parts = [self._forward(states[start : start + _CHUNK]) for start in range(0, len(states), _CHUNK)]
-        scores, values = (
-            torch.cat(part).cpu().numpy().astype(np.float64) for part in zip(*parts, strict=True)
-        )
-        greedy = np.argmax(scores, axis=1)
-        if isinstance(self.model.policy, ActorCriticPolicy):
-            return Beliefs(greedy, scores, values)
-        epsilon = self._exploration_rate()
-        sampled = (1 - epsilon) * one_hot_policy(greedy) + epsilon / scores.shape[1]
-        return Beliefs(greedy, sampled, values, q=scores)
+            parts = [self._read(states[start : start + _CHUNK]) for start in range(0, len(states), _CHUNK)]
+        values, probabilities, q = (_joined(part) for part in zip(*parts, strict=True))
+        assert values is not None
+        if probabilities is not None:
+            return Beliefs(np.argmax(probabilities, axis=1), probabilities, values)
+        assert q is not None
+        greedy, epsilon = np.argmax(q, axis=1), self._exploration_rate()
+        sampled = (1 - epsilon) * one_hot_policy(greedy) + epsilon / q.shape[1]
+        return Beliefs(greedy, sampled, values, q)
 
     def _exploration_rate(self) -> float:
         """DQN's; SB3 acts at random until learning starts, while its own attribute still says 0."""
@@ -80,23 +78,14 @@ class SB3Agent:
             return 1.0
         return float(getattr(self.model, "exploration_rate", 0.0))
 
-    def _forward(self, states: IntArray) -> tuple[Tensor, Tensor]:
-        """Action probabilities or Q values (n, A), and values (n,), of these states."""
+    def _read(self, states: IntArray) -> Reading:
         if isinstance(self.model, TabulatedPPO):
             logits, values = self.model.outputs(states)
-            return logits.softmax(dim=1), values[:, 0]
+            return Reading(values[:, 0], logits.softmax(dim=1), None)
         if isinstance(self.model, TabulatedDQN):
-            q = self.model.q_values(self.model.q_net, states)
-            return q, q.max(dim=1).values
-        policy = self.model.policy
-        policy.set_training_mode(False)
-        observations, _ = policy.obs_to_tensor(self.observation.rows(states))
-        if isinstance(policy, ActorCriticPolicy):
-            distribution = policy.get_distribution(observations)
-            assert isinstance(distribution, CategoricalDistribution)
-            return distribution.distribution.probs, policy.predict_values(observations)[:, 0]
-        q = cast(nn.Module, policy.q_net)(observations)
-        return q, q.max(dim=1).values
+            return of_q(self.model.q_values(self.model.q_net, states))
+        observations, _ = self.model.policy.obs_to_tensor(self.observation.rows(states))
+        return read(self.model.policy, observations)
 
     def save(self, path: Path) -> None:
         # A file object, since SB3 would add .zip to a path.
@@ -120,6 +109,11 @@ class SB3Agent:
             ) from None
         except Exception as error:  # torch raises pickle errors of its own for a file that is no checkpoint
             raise InputError(f"{path}: not a model file that can be read ({type(error).__name__})") from None
+
+
+def _joined(parts: tuple[Tensor | None, ...]) -> FloatArray | None:
+    tensors = [part for part in parts if part is not None]
+    return torch.cat(tensors).cpu().numpy().astype(np.float64) if tensors else None
 
 
 class _OnStep(BaseCallback):

@@ -7,6 +7,8 @@ from typing import Any
 from gridworld.config import (
     DQNConfig,
     PPOConfig,
+    SB3CheckedConfig,
+    SB3ClassConfig,
     SB3Config,
     TrainConfig,
     above_zero,
@@ -18,11 +20,57 @@ from gridworld.errors import InputError
 
 ENGINES = ("tabulated", "stock")
 
+# Arguments of an SB3 class that are settings of the run, and where they stand.
+_ELSEWHERE = {
+    "policy": "agent.policy",
+    "env": "env",
+    "seed": "seed",
+    "device": "device",
+    "tensorboard_log": "logging.tensorboard",
+    "verbose": "logging.progress",
+}
+
 
 def check(config: TrainConfig) -> None:
     """Raise `InputError` for the first setting that could not train as it says."""
     agent = config.agent
     assert isinstance(agent, SB3Config)
+    at_least("agent.log_interval", agent.log_interval, 1)
+    _check_observation(agent, config.observation.kind)
+    if isinstance(agent, SB3ClassConfig):
+        _check_class(agent)
+    elif isinstance(agent, SB3CheckedConfig):
+        _check_fields(agent, config)
+
+
+def _check_observation(agent: SB3Config, kind: str) -> None:
+    if kind == "image" and agent.policy == "MlpPolicy":
+        raise InputError(
+            "observation=image: agent.policy=MlpPolicy cannot see images; set agent.policy=CnnPolicy"
+        )
+    if kind != "image" and agent.policy == "CnnPolicy":
+        raise InputError(
+            f"observation={kind}: agent.policy=CnnPolicy sees images only; "
+            "set observation=image or agent.policy=MlpPolicy"
+        )
+
+
+def _check_class(agent: SB3ClassConfig) -> None:
+    """What can be told without importing it; building the agent tells the rest."""
+    if "." not in agent.algorithm or not all(part.isidentifier() for part in agent.algorithm.split(".")):
+        raise InputError(
+            f"agent.algorithm={agent.algorithm}: must be the import path of a class, "
+            "e.g. stable_baselines3.A2C"
+        )
+    for name, place in _ELSEWHERE.items():
+        if name in agent.arguments:
+            raise InputError(f"agent.arguments.{name}: is not set here but by {place}=...")
+    gamma = agent.arguments.get("gamma", 0.99)
+    if isinstance(gamma, bool) or not isinstance(gamma, int | float) or not 0 <= gamma <= 1:
+        raise InputError(f"agent.arguments.gamma={gamma}: must be from 0 to 1")
+
+
+def _check_fields(agent: SB3CheckedConfig, config: TrainConfig) -> None:
     own = type(agent)().algorithm
     if agent.algorithm != own:
         raise InputError(
@@ -34,16 +82,6 @@ def check(config: TrainConfig) -> None:
     at_least("agent.batch_size", agent.batch_size, 1)
     within("agent.gamma", agent.gamma, 0, 1)
     at_least("agent.stats_window_size", agent.stats_window_size, 1)
-    at_least("agent.log_interval", agent.log_interval, 1)
-    if config.observation.kind == "image" and agent.policy == "MlpPolicy":
-        raise InputError(
-            "observation=image: agent.policy=MlpPolicy cannot see images; set agent.policy=CnnPolicy"
-        )
-    if config.observation.kind != "image" and agent.policy == "CnnPolicy":
-        raise InputError(
-            f"observation={config.observation.kind}: agent.policy=CnnPolicy sees images only; "
-            "set observation=image or agent.policy=MlpPolicy"
-        )
     if isinstance(agent, DQNConfig):
         _check_dqn(agent, config)
     elif isinstance(agent, PPOConfig):

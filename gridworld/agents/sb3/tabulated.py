@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from gridworld.agents.sb3.descent import ELEMENTWISE
 from gridworld.agents.sb3.vec_env import StateStep
-from gridworld.config import DQNConfig, PPOConfig, SB3Config
+from gridworld.config import DQNConfig, PPOConfig, SB3CheckedConfig
 from gridworld.mdp import IntArray
 from gridworld.observations import ObservationTable
 
@@ -33,7 +33,7 @@ _RANDOM_LAYERS = ("Dropout", "RReLU")
 _FEW_STATES = 1024  # up to here all states are cheaper than finding out which ones a batch holds
 
 
-def why_not(config: SB3Config) -> str | None:
+def why_not(config: SB3CheckedConfig) -> str | None:
     """Why these settings need SB3's own loop, or None where the tabulated one gives the same."""
     activation = config.policy_kwargs.activation_fn or ""
     if any(name in activation for name in _RANDOM_LAYERS):

@@ -14,9 +14,11 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from gridworld.errors import InputError
-from gridworld.mdp import BoolArray, FloatArray
+from gridworld.mdp import NUM_ACTIONS, BoolArray, FloatArray
 from gridworld.observations import ObservationTable
 from gridworld.vector_env import GridWorldVectorEnv, StateArray
+
+_MASKS = "action_masks"  # asked for by agents that respect them; here nothing is ever forbidden
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -114,6 +116,9 @@ class GridWorldVecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         return [getattr(self.envs, attr_name)] * len(list(self._get_indices(indices)))
 
+    def has_attr(self, attr_name: str) -> bool:
+        return attr_name == _MASKS or super().has_attr(attr_name)
+
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise InputError(f"{attr_name}: the batch has one set of attributes; set it for all environments")
@@ -122,6 +127,8 @@ class GridWorldVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
+        if method_name == _MASKS:
+            return [np.ones(NUM_ACTIONS, dtype=np.bool_)] * len(list(self._get_indices(indices)))
         raise InputError(f"{method_name}: the environments of a native batch have no methods of their own")
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:

@@ -41,6 +41,8 @@ from gridworld.config import TabularControlConfig, parse_schedule
 from gridworld.errors import InputError
 from gridworld.mdp import NUM_ACTIONS, FloatArray, IntArray
 
+_NONE: IntArray = np.empty(0, dtype=np.int64)
+
 
 class TabularControl:
     """One table Q (S, A), learned by the configured algorithm."""
@@ -130,9 +132,6 @@ class TabularControl:
         if not 0 <= epsilon <= 1:
             raise InputError(f"{path}: exploration_rate={epsilon}: must be from 0 to 1")
         self.q, self.visits, self.exploration_rate = arrays["q"], arrays["visits"], epsilon
-
-
-_NONE: IntArray = np.empty(0, dtype=np.int64)
 
 
 class _Log:

@@ -1,0 +1,141 @@
+"""From settings to a class and its keyword arguments: classes imported by their paths, schedules made."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import inspect
+import sys
+from typing import Any
+
+import stable_baselines3
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.utils import LinearSchedule
+
+from gridworld.agents.sb3.tabulated import why_not
+from gridworld.agents.sb3.tabulated_dqn import TabulatedDQN
+from gridworld.agents.sb3.tabulated_ppo import TabulatedPPO
+from gridworld.config import SB3CheckedConfig, SB3ClassConfig, SB3Config, parse_schedule
+from gridworld.errors import InputError
+
+Arguments = dict[str, Any]
+
+# Fields of the config that are ours, not arguments of the algorithm's class.
+_OWN_FIELDS = {"name", "family", "algorithm", "engine", "log_interval"}
+_SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
+_PLAIN_TYPES = (bool, int, float, str)
+_KINDS: dict[str, type] = {
+    "activation_fn": torch.nn.Module,
+    "optimizer_class": torch.optim.Optimizer,
+    "features_extractor_class": BaseFeaturesExtractor,
+}
+
+
+def algorithm_and_arguments(config: SB3Config) -> tuple[type[BaseAlgorithm], Arguments]:
+    """The class, and what it takes besides its environments, its seed and its device."""
+    if isinstance(config, SB3ClassConfig):
+        algorithm: type[BaseAlgorithm] = _import("agent.algorithm", config.algorithm, BaseAlgorithm)
+        _check_arguments(config, algorithm)
+        arguments = {**_convert(config.arguments, "agent.arguments."), "policy": config.policy}
+    else:
+        assert isinstance(config, SB3CheckedConfig)
+        algorithm = _with_engine(config)
+        fields = (field.name for field in dataclasses.fields(config) if field.name not in _OWN_FIELDS)
+        arguments = _convert({name: getattr(config, name) for name in fields}, "agent.")
+    arguments["policy"] = _policy(config, algorithm)
+    return algorithm, arguments
+
+
+def _with_engine(config: SB3CheckedConfig) -> type[BaseAlgorithm]:
+    """SB3's own class, or the one that runs the network once per state where that gives the same."""
+    if config.engine == "tabulated":
+        reason = why_not(config)
+        if reason is None:
+            return TabulatedDQN if config.algorithm == "DQN" else TabulatedPPO
+        print(f"engine: stock, since {reason}", file=sys.stderr)
+    algorithm: type[BaseAlgorithm] = getattr(stable_baselines3, config.algorithm)
+    return algorithm
+
+
+def _check_arguments(config: SB3ClassConfig, algorithm: type[BaseAlgorithm]) -> None:
+    """Names, and types where the class says plainly what it wants; SB3 itself looks at neither."""
+    parameters = inspect.signature(algorithm).parameters
+    takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
+    for name, value in config.arguments.items():
+        if name not in parameters and not takes_any:
+            known = ", ".join(key for key in parameters if not key.startswith("_"))
+            raise InputError(
+                f"agent.arguments.{name}: {config.algorithm} has no such argument; it has {known}"
+            )
+        wanted = parameters[name].annotation if name in parameters else None
+        if wanted in _PLAIN_TYPES and not _is_a(value, wanted):
+            raise InputError(f"agent.arguments.{name}={value}: must be {wanted.__name__}")
+
+
+def _is_a(value: Any, kind: type) -> bool:
+    if isinstance(value, bool):
+        return kind is bool
+    return isinstance(value, (int, float) if kind is float else kind)
+
+
+def _policy(config: SB3Config, algorithm: type[BaseAlgorithm]) -> type[BasePolicy]:
+    if config.policy in algorithm.policy_aliases:
+        return algorithm.policy_aliases[config.policy]
+    if "." in config.policy:
+        policy: type[BasePolicy] = _import("agent.policy", config.policy, BasePolicy)
+        return policy
+    known = ", ".join(name for name in algorithm.policy_aliases if name != "MultiInputPolicy")
+    raise InputError(f"agent.policy={config.policy}: {config.algorithm} has {known}")
+
+
+def _convert(given: Arguments, where: str) -> Arguments:
+    """Yaml's plain values as what SB3 takes; `where` names them in messages."""
+    converted = {}
+    for name, value in given.items():
+        if name in _SCHEDULES and isinstance(value, str):
+            value = LinearSchedule(parse_schedule(where + name, value)[0], 0.0, 1.0)
+        elif name == "train_freq" and isinstance(value, list):
+            value = tuple(value)
+        elif name.endswith(("_class", "_fn")) and value is not None:
+            value = _import(where + name, value, _KINDS.get(name, object))
+        elif name == "policy_kwargs":
+            value = _policy_kwargs(value, f"{where}policy_kwargs.")
+        converted[name] = value
+    return converted
+
+
+def _policy_kwargs(given: Any, where: str) -> Arguments:
+    """What was given, the classes imported."""
+    given = dict(given if isinstance(given, dict) else vars(given))
+    arguments = _convert({key: v for key, v in given.items() if v is not None and v != {}}, where)
+    if not _is_net_arch(arguments.get("net_arch", [])):
+        raise InputError(f"{where}net_arch={arguments['net_arch']}: must be layer widths, e.g. [64,64]")
+    return arguments
+
+
+def _is_net_arch(value: Any) -> bool:
+    if isinstance(value, dict):
+        return value.keys() <= {"pi", "vf"} and all(_is_widths(layers) for layers in value.values())
+    return _is_widths(value)
+
+
+def _is_widths(value: Any) -> bool:
+    return isinstance(value, list) and all(type(width) is int and width > 0 for width in value)
+
+
+def _import(where: str, path: Any, kind: type) -> Any:
+    module, _, name = str(path).rpartition(".")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError):
+        found = None
+    if found is None and module == "sb3_contrib":
+        raise InputError(f"{where}={path}: needs sb3-contrib; pip install 'gridworld[contrib]'")
+    if not (inspect.isclass(found) and issubclass(found, kind)):
+        what = "class" if kind is object else f"{kind.__name__} class"
+        example = "stable_baselines3.A2C" if kind is BaseAlgorithm else "torch.nn.ReLU"
+        raise InputError(f"{where}={path}: must be the import path of a {what}, e.g. {example}")
+    return found

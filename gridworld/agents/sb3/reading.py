@@ -1,0 +1,58 @@
+"""What a policy of SB3 says of states: action probabilities or Q values, and values.
+
+Asked for by what a policy can do, not by its class: an actor-critic tells its distribution and its values,
+a value-based one has a network of Q values, or of their quantiles, whose mean they are.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, cast
+
+import torch
+from stable_baselines3.common.policies import BasePolicy
+from torch import Tensor, nn
+
+
+class Reading(NamedTuple):
+    """What is known of n states."""
+
+    values: Tensor  # (n,)
+    probabilities: Tensor | None  # (n, A), of an actor-critic
+    q: Tensor | None  # (n, A), of a value-based agent
+
+
+def why_unreadable(policy: BasePolicy) -> str | None:
+    """Why a policy's choices are no table over states that can be read, or None where they are."""
+    for module in policy.modules():
+        if isinstance(module, nn.RNNBase):
+            return (
+                f"keeps a memory from step to step ({type(module).__name__}), so what it does is not a "
+                "function of the state, and no table of it can be evaluated exactly; take one without"
+            )
+    if _is_actor_critic(policy) or hasattr(policy, "q_net") or hasattr(policy, "quantile_net"):
+        return None
+    return (
+        f"has a policy ({type(policy).__name__}) that tells neither probabilities and values nor Q values "
+        "of a state, so it cannot be evaluated exactly"
+    )
+
+
+def read(policy: BasePolicy, observations: Any) -> Reading:
+    """Ask the policy about a batch of observations, as tensors of its own making."""
+    policy.set_training_mode(False)
+    if _is_actor_critic(policy):
+        asked: Any = policy
+        distribution = asked.get_distribution(observations).distribution
+        return Reading(asked.predict_values(observations)[:, 0], distribution.probs, None)
+    if hasattr(policy, "quantile_net"):
+        return of_q(cast(nn.Module, policy.quantile_net)(observations).mean(dim=1))
+    return of_q(cast(nn.Module, policy.q_net)(observations))
+
+
+def of_q(q: Tensor) -> Reading:
+    """The reading of a value-based agent."""
+    return Reading(torch.max(q, dim=1).values, None, q)
+
+
+def _is_actor_critic(policy: BasePolicy) -> bool:
+    return hasattr(policy, "get_distribution") and hasattr(policy, "predict_values")
