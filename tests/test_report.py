@@ -261,6 +261,14 @@ DAMAGES: dict[str, tuple[Callable[[Path], None], str]] = {
         lambda run: change(run, "curve.csv", lambda text: text.replace("regret", "lack")),
         "has no column regret; is it of another version?",
     ),
+    "certified twice": (
+        lambda run: change(run, "curve.csv", lambda text: re.sub(r"(\n5000,[^,]+,[^,]+),0,", r"\1,2,", text)),
+        "certified must be 0 or 1 in every row",
+    ),
+    "more seconds than a number can hold": (
+        lambda run: in_json(run, "summary.json", train_seconds=10**400),
+        "must be a number",
+    ),
     "null optimum": (
         lambda run: in_json(run, "summary.json", optimal_value=None),
         "optimal_value=None must be a number",

@@ -39,7 +39,9 @@ def online_return(run: Evidence, last: float = 1.0) -> float:
         return math.nan
     weights = np.diff(run.curve["step"], prepend=0.0)
     told = np.isfinite(run.curve[ONLINE]) & (weights > 0) & (run.curve["step"] > (1 - last) * run.steps)
-    return float(np.average(run.curve[ONLINE][told], weights=weights[told])) if told.any() else math.nan
+    if not told.any():
+        return math.nan
+    return float(run.curve[ONLINE][told] @ (weights[told] / weights[told].sum()))
 
 
 def _last(column: str) -> Callable[[Evidence, Reference], float]:

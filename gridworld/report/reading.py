@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from gridworld.report.run_files import read_curve, read_object
 from gridworld.run import CURVE, MANIFEST, SUMMARY
 
 _LONGEST_NAME = 80  # characters
+_LARGEST_NUMBER = sys.float_info.max  # JSON may hold whole numbers beyond it, and infinities
 _DIGITS = 9  # after the point: two ways to compute one regret differ later than that
 
 Settings = Mapping[str, str]  # flat: {"agent.gamma": "0.9"}
@@ -142,7 +144,7 @@ def _check_agreement(run: Evidence, summary: Mapping[str, Any]) -> None:
     last = run.curve["regret"][-1]
     told = summary.get("regret")
     same = told is None and not math.isfinite(last)
-    if isinstance(told, int | float):
+    if isinstance(told, int | float) and abs(told) <= _LARGEST_NUMBER:
         same = math.isclose(told, last, rel_tol=1e-9, abs_tol=1e-12)
     if not same or summary.get("certified") != run.certified or summary.get("timesteps") != run.steps:
         raise InputError(
@@ -178,7 +180,7 @@ def _version(manifest: dict[str, Any]) -> str:
 
 def _number(content: Any, key: str, where: str) -> float:
     value = content.get(key) if isinstance(content, dict) else None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _LARGEST_NUMBER:
         raise InputError(f"{where}: {key}={value!r} must be a number; is it of another version?")
     return float(value)
 

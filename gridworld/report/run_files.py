@@ -66,6 +66,8 @@ def read_curve(path: Path) -> dict[str, FloatArray]:
     }
     if not np.isfinite(curve["step"]).all() or (np.diff(curve["step"]) <= 0).any():
         raise InputError(f"{path}: the steps do not rise from row to row")
+    if not np.isin(curve["certified"], (0, 1)).all():
+        raise InputError(f"{path}: certified must be 0 or 1 in every row")
     curve["regret"] = np.maximum(0.0, curve["regret"])  # below zero is rounding
     return curve
 
