@@ -1,6 +1,7 @@
 """Any class with SB3's interface by yaml alone: sb3-contrib's, and one's own by its import path."""
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -125,3 +126,11 @@ def test_a_finished_run_is_read_back(agent: str, tmp_path: Path, capsys: pytest.
     evaluate([str(tmp_path), "--episodes", "10"])
     shown = capsys.readouterr().out
     assert f"{summary['value']:.4g}" in shown
+
+
+def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "sb3_contrib", None)
+    with pytest.raises(
+        InputError, match=r"agent\.algorithm=sb3_contrib\.QRDQN: needs sb3-contrib; pip install"
+    ):
+        train(configure(*SHORT["qrdqn"]), Run(tmp_path), [])
