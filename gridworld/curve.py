@@ -12,6 +12,7 @@ import numpy as np
 from gridworld.agents import Agent, Beliefs
 from gridworld.chain import one_hot_policy
 from gridworld.config import TrainConfig
+from gridworld.counted_env import CountedVectorEnv
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge, Score
 from gridworld.events import IMAGES_TAB, EventWriter
@@ -20,6 +21,7 @@ from gridworld.progress import Progress
 from gridworld.render import Frame, fitting_cell_size
 
 GREEDY, SAMPLED = "eval", "eval_sampled"  # TensorBoard's groups of the two policies
+ONLINE_RETURN = "online/return"  # of training episodes, exploration and half-learnt policies included
 
 CHARTS = {
     "value": [f"{GREEDY}/value", f"{SAMPLED}/value", f"{GREEDY}/optimal_value"],
@@ -29,6 +31,7 @@ CHARTS = {
         f"{SAMPLED}/goal_probability",
         f"{GREEDY}/optimal_goal_probability",
     ],
+    "return": [ONLINE_RETURN, f"{GREEDY}/return", f"{SAMPLED}/return"],
     "length": [f"{GREEDY}/length", f"{SAMPLED}/length", f"{GREEDY}/optimal_length"],
 }
 
@@ -36,10 +39,18 @@ CHARTS = {
 class Curve:
     """Evaluates an agent every so many environment steps, and at the end.
 
-    Two policies are scored side by side: the greedy one and the one it samples actions from.
+    Two policies are scored side by side: the greedy one and the one it samples actions from. Beside them
+    stands what `envs` counted: the mean return of the training episodes since the evaluation before.
     """
 
-    def __init__(self, judge: Judge, agent: Agent, config: TrainConfig, path: Path) -> None:
+    def __init__(
+        self,
+        judge: Judge,
+        agent: Agent,
+        config: TrainConfig,
+        path: Path,
+        envs: CountedVectorEnv | None = None,
+    ) -> None:
         self.judge = judge
         self.first_certified_step: int | None = None
         self.certified_since_step: int | None = None  # of the streak that still holds
@@ -48,6 +59,7 @@ class Curve:
         self.beliefs: Beliefs | None = None
         self.seconds = 0.0  # spent on evaluation
         self._agent = agent
+        self._envs = envs
         self._every = config.evaluation.every
         self._stop_after = config.evaluation.stop_after
         self._map_every = config.logging.policy_map_every
@@ -136,13 +148,16 @@ class Curve:
     def _write(self, step: int, greedy: Score, sampled: Score) -> None:
         row: dict[str, Any] = {"step": step, **greedy.numbers()}
         row |= {f"sampled_{name}": value for name, value in sampled.numbers().items()}
+        online = None if self._envs is None else self._envs.take_mean_return()
+        row["online_return"] = online  # an empty field where no episode ended
         if self._rows is None:
             self._rows = csv.DictWriter(self._file, fieldnames=list(row), lineterminator="\n")
             self._rows.writeheader()
         self._rows.writerow(row)
         self._file.flush()
         if self._events is not None:
-            self._events.scalars(self._tags(greedy, sampled), step)
+            tags = self._tags(greedy, sampled)
+            self._events.scalars(tags if online is None else {**tags, ONLINE_RETURN: online}, step)
 
     def _tags(self, greedy: Score, sampled: Score) -> dict[str, float]:
         tags = {

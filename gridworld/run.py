@@ -4,6 +4,7 @@
     curve.csv       the learning curve, a row per evaluation
     summary.json    the result
     model.zip       the trained model
+    visits.npy      how often training took each action in each state, (S, A)
     frames/, episode.gif, ...   the final policy's episode
     policy.png      the final policy's values and greedy actions
     .hydra/         the configuration as Hydra composed it
@@ -51,6 +52,7 @@ class Run:
         self.curve_file = folder / "curve.csv"
         self.summary_file = folder / "summary.json"
         self.model_file = folder / "model.zip"
+        self.visits_file = folder / "visits.npy"
         self.frames_folder = folder / "frames"
         self.manifest: dict[str, Any] = {}
 

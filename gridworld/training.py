@@ -16,16 +16,16 @@ from gridworld import record
 from gridworld.agents import Agent, Seat, family
 from gridworld.chain import one_hot_policy
 from gridworld.config import EnvConfig, TrainConfig, check
+from gridworld.counted_env import CountedVectorEnv
 from gridworld.curve import GREEDY, Curve
 from gridworld.evaluation import Judge, Score, play_episode
 from gridworld.events import TIME_SERIES_CARD, EventWriter, HParamValue
-from gridworld.files import write_json
+from gridworld.files import write_array, write_json
 from gridworld.layout import Layout, load
 from gridworld.mdp import Mdp, compile_mdp
 from gridworld.observations import ObservationTable, make_observation
 from gridworld.render import fitting_cell_size, frame_size
 from gridworld.run import Run
-from gridworld.vector_env import GridWorldVectorEnv
 
 HPARAM_METRICS = tuple(
     f"{GREEDY}/{name}" for name in ("value", "regret", "goal_probability", "length", "certified")
@@ -59,12 +59,13 @@ def train(config: TrainConfig, run: Run, overrides: list[str]) -> Summary:
     _check_recording(config, mdp)
     judge = Judge(mdp, config.evaluation.gamma, config.env.max_episode_steps)
     log = _Log()
-    agent = algorithms.build(config.agent, make_seat(config, mdp, observation, log))
+    seat = make_seat(config, mdp, observation, log)
+    agent = algorithms.build(config.agent, seat)
 
     run.start(dataclasses.asdict(config), mdp.layout.text(), overrides)
     try:
         with _signals_raise():
-            summary = _learn(config, run, judge, agent, log)
+            summary = _learn(config, run, judge, agent, seat, log)
     except Interrupted as interruption:
         run.end("interrupted", str(interruption))
         raise
@@ -85,12 +86,7 @@ def make_mdp(env: EnvConfig, layout: Layout | None = None) -> Mdp:
 
 def make_seat(config: TrainConfig, mdp: Mdp, observation: ObservationTable, log: _Log | None = None) -> Seat:
     """Environments and observations for an agent of this configuration."""
-    envs = GridWorldVectorEnv(
-        config.n_envs,
-        max_episode_steps=config.env.max_episode_steps,
-        autoreset_mode="SameStep",
-        **mdp.settings(),
-    )
+    envs = CountedVectorEnv(config.n_envs, max_episode_steps=config.env.max_episode_steps, **mdp.settings())
     return Seat(
         envs,
         observation,
@@ -119,8 +115,8 @@ def _check_recording(config: TrainConfig, mdp: Mdp) -> None:
         frame_size(mdp, wanted.cell_size)
 
 
-def _learn(config: TrainConfig, run: Run, judge: Judge, agent: Agent, log: _Log) -> Summary:
-    curve = Curve(judge, agent, config, run.curve_file)
+def _learn(config: TrainConfig, run: Run, judge: Judge, agent: Agent, seat: Seat, log: _Log) -> Summary:
+    curve = Curve(judge, agent, config, run.curve_file, seat.envs)
     events = EventWriter(run.folder) if config.logging.tensorboard else None
     succeeded = False
     try:
@@ -132,6 +128,7 @@ def _learn(config: TrainConfig, run: Run, judge: Judge, agent: Agent, log: _Log)
         steps, seconds = _timed_learning(config, agent, curve)
         curve.evaluate(steps, last=True)
         agent.save(run.model_file)
+        write_array(run.visits_file, seat.envs.visits)
         summary = _summarise(config, curve, steps, seconds)
         write_json(run.summary_file, _plain(summary))
         _record(config, run, judge.mdp, curve, events, steps)
