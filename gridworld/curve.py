@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
@@ -15,10 +16,8 @@ from gridworld.config import TrainConfig
 from gridworld.counted_env import CountedVectorEnv
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge, Score
-from gridworld.events import IMAGES_TAB, EventWriter
-from gridworld.policy_map import draw_policy_map
+from gridworld.events import EventWriter
 from gridworld.progress import Progress
-from gridworld.render import Frame, fitting_cell_size
 
 GREEDY, SAMPLED = "eval", "eval_sampled"  # TensorBoard's groups of the two policies
 ONLINE_RETURN = "online/return"  # of training episodes, exploration and half-learnt policies included
@@ -62,11 +61,10 @@ class Curve:
         self._envs = envs
         self._every = config.evaluation.every
         self._stop_after = config.evaluation.stop_after
-        self._map_every = config.logging.policy_map_every
         self._events: EventWriter | None = None
+        self._watch: Callable[[int, Beliefs], None] | None = None
         self._step = -1
         self._streak = 0
-        self._evaluations = 0
         self._next = self._every
         self._total = config.total_timesteps
         self._file: IO[str] = path.open("w", newline="", encoding="utf-8")
@@ -80,6 +78,10 @@ class Curve:
         self._events = events
         events.charts("learning curves beside the optimum", CHARTS)
 
+    def watched_by(self, watch: Callable[[int, Beliefs], None]) -> None:
+        """Tell it of every evaluation: the step, and what the agent believes."""
+        self._watch = watch
+
     def on_step(self, step: int) -> bool:
         """Evaluate if it is due; False once the certificate has held for long enough.
 
@@ -90,27 +92,16 @@ class Curve:
             self.evaluate(step)
         return self._stop_after is None or self._streak < self._stop_after
 
-    def evaluate(self, step: int, last: bool = False) -> None:
-        """Score both policies as they are after `step` steps and write a row."""
-        if step != self._step:
-            started = time.perf_counter()
-            self._score(step)
-            self.seconds += time.perf_counter() - started
-        if self._events is not None and self._map_every and (last or self._due_for_map()):
-            cell_size = fitting_cell_size(self.judge.mdp, IMAGES_TAB)
-            self._events.image("policy", self.policy_map(cell_size), step)
-
-    def policy_map(self, cell_size: int | None = None) -> Frame:
-        """A picture of the policy as it was evaluated last."""
-        assert self.beliefs is not None
-        return draw_policy_map(
-            self.judge.mdp,
-            self.beliefs.values,
-            self.beliefs.greedy,
-            self.judge.solution.optimal,
-            caption=f"greedy policy after {self._step:,} steps",
-            cell_size=cell_size,
-        )
+    def evaluate(self, step: int) -> None:
+        """Score both policies as they are after `step` steps and write a row, once a step."""
+        if step == self._step:
+            return
+        started = time.perf_counter()
+        self._score(step)
+        self.seconds += time.perf_counter() - started
+        if self._watch is not None:
+            assert self.beliefs is not None
+            self._watch(step, self.beliefs)
 
     def close(self) -> None:
         """Close the CSV and the progress bar."""
@@ -137,13 +128,9 @@ class Curve:
             self.certified_since_step = step
             if self.first_certified_step is None:
                 self.first_certified_step = step
-        self._evaluations += 1
         self._write(step, greedy, self.sampled)
         note = f"regret {greedy.regret:.3g}, goal {greedy.outcome.goal:.0%}"
         self._progress.update(step, note + (", certified optimal" if greedy.certified else ""))
-
-    def _due_for_map(self) -> bool:
-        return (self._evaluations - 1) % self._map_every == 0
 
     def _write(self, step: int, greedy: Score, sampled: Score) -> None:
         row: dict[str, Any] = {"step": step, **greedy.numbers()}

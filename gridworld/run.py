@@ -5,8 +5,8 @@
     summary.json    the result
     model.zip       the trained model
     visits.npy      how often training took each action in each state, (S, A)
+    policy.png, q_error.png, visits.png, learning.gif   what was learnt, how well, where, and how
     frames/, episode.gif, ...   the final policy's episode
-    policy.png      the final policy's values and greedy actions
     .hydra/         the configuration as Hydra composed it
     events.out...   TensorBoard's event file
 
