@@ -59,13 +59,16 @@ class LoggingConfig:
 
 @dataclass
 class RecordingConfig:
-    """The final policy's episode in pictures."""
+    """Pictures in the run's folder; TensorBoard gets them too."""
 
-    frames: bool = True  # numbered PNGs in frames/
-    gif: bool = True
     policy_map: bool = True  # policy.png, values and greedy actions
-    mp4: bool = False  # needs the extra `video`
-    cell_size: Optional[int] = None  # noqa: UP045  # pixels; null: 100, less on large maps
+    q_error: bool = True  # q_error.png, how far the values are from the true ones
+    visits: bool = True  # visits.png, where training has been
+    learning: bool = True  # learning.gif, the policy over training
+    frames: bool = True  # the final greedy policy's episode as numbered PNGs in frames/
+    gif: bool = True  # that episode as episode.gif
+    mp4: bool = False  # and as episode.mp4, which needs the extra `video`
+    cell_size: Optional[int] = None  # noqa: UP045  # pixels of the episode's; null: 100, less on large maps
     fps: int = 4
 
 
@@ -118,6 +121,11 @@ class SB3ClassConfig(SB3Config):
     """Any class of Stable-Baselines3, of sb3-contrib or of one's own, by its import path."""
 
     arguments: dict[str, Any] = field(default_factory=dict)  # of the class; it keeps its defaults
+
+    @property
+    def gamma(self) -> float:
+        """The discount it learns with; 0.99 is the default of all of SB3's classes."""
+        return float(self.arguments.get("gamma", 0.99))
 
 
 @dataclass

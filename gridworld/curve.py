@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
@@ -12,14 +13,14 @@ import numpy as np
 from gridworld.agents import Agent, Beliefs
 from gridworld.chain import one_hot_policy
 from gridworld.config import TrainConfig
+from gridworld.counted_env import CountedVectorEnv
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge, Score
-from gridworld.events import IMAGES_TAB, EventWriter
-from gridworld.policy_map import draw_policy_map
+from gridworld.events import EventWriter
 from gridworld.progress import Progress
-from gridworld.render import Frame, fitting_cell_size
 
 GREEDY, SAMPLED = "eval", "eval_sampled"  # TensorBoard's groups of the two policies
+ONLINE_RETURN = "online/return"  # of training episodes, exploration and half-learnt policies included
 
 CHARTS = {
     "value": [f"{GREEDY}/value", f"{SAMPLED}/value", f"{GREEDY}/optimal_value"],
@@ -29,6 +30,7 @@ CHARTS = {
         f"{SAMPLED}/goal_probability",
         f"{GREEDY}/optimal_goal_probability",
     ],
+    "return": [ONLINE_RETURN, f"{GREEDY}/return", f"{SAMPLED}/return"],
     "length": [f"{GREEDY}/length", f"{SAMPLED}/length", f"{GREEDY}/optimal_length"],
 }
 
@@ -36,10 +38,18 @@ CHARTS = {
 class Curve:
     """Evaluates an agent every so many environment steps, and at the end.
 
-    Two policies are scored side by side: the greedy one and the one it samples actions from.
+    Two policies are scored side by side: the greedy one and the one it samples actions from. Beside them
+    stands what `envs` counted: the mean return of the training episodes since the evaluation before.
     """
 
-    def __init__(self, judge: Judge, agent: Agent, config: TrainConfig, path: Path) -> None:
+    def __init__(
+        self,
+        judge: Judge,
+        agent: Agent,
+        config: TrainConfig,
+        path: Path,
+        envs: CountedVectorEnv | None = None,
+    ) -> None:
         self.judge = judge
         self.first_certified_step: int | None = None
         self.certified_since_step: int | None = None  # of the streak that still holds
@@ -48,13 +58,13 @@ class Curve:
         self.beliefs: Beliefs | None = None
         self.seconds = 0.0  # spent on evaluation
         self._agent = agent
+        self._envs = envs
         self._every = config.evaluation.every
         self._stop_after = config.evaluation.stop_after
-        self._map_every = config.logging.policy_map_every
         self._events: EventWriter | None = None
+        self._watch: Callable[[int, Beliefs], None] | None = None
         self._step = -1
         self._streak = 0
-        self._evaluations = 0
         self._next = self._every
         self._total = config.total_timesteps
         self._file: IO[str] = path.open("w", newline="", encoding="utf-8")
@@ -68,6 +78,10 @@ class Curve:
         self._events = events
         events.charts("learning curves beside the optimum", CHARTS)
 
+    def watched_by(self, watch: Callable[[int, Beliefs], None]) -> None:
+        """Tell it of every evaluation: the step, and what the agent believes."""
+        self._watch = watch
+
     def on_step(self, step: int) -> bool:
         """Evaluate if it is due; False once the certificate has held for long enough.
 
@@ -78,27 +92,16 @@ class Curve:
             self.evaluate(step)
         return self._stop_after is None or self._streak < self._stop_after
 
-    def evaluate(self, step: int, last: bool = False) -> None:
-        """Score both policies as they are after `step` steps and write a row."""
-        if step != self._step:
-            started = time.perf_counter()
-            self._score(step)
-            self.seconds += time.perf_counter() - started
-        if self._events is not None and self._map_every and (last or self._due_for_map()):
-            cell_size = fitting_cell_size(self.judge.mdp, IMAGES_TAB)
-            self._events.image("policy", self.policy_map(cell_size), step)
-
-    def policy_map(self, cell_size: int | None = None) -> Frame:
-        """A picture of the policy as it was evaluated last."""
-        assert self.beliefs is not None
-        return draw_policy_map(
-            self.judge.mdp,
-            self.beliefs.values,
-            self.beliefs.greedy,
-            self.judge.solution.optimal,
-            caption=f"greedy policy after {self._step:,} steps",
-            cell_size=cell_size,
-        )
+    def evaluate(self, step: int) -> None:
+        """Score both policies as they are after `step` steps and write a row, once a step."""
+        if step == self._step:
+            return
+        started = time.perf_counter()
+        self._score(step)
+        self.seconds += time.perf_counter() - started
+        if self._watch is not None:
+            assert self.beliefs is not None
+            self._watch(step, self.beliefs)
 
     def close(self) -> None:
         """Close the CSV and the progress bar."""
@@ -127,24 +130,23 @@ class Curve:
             self.certified_since_step = step
             if self.first_certified_step is None:
                 self.first_certified_step = step
-        self._evaluations += 1
         self._write(step, greedy, self.sampled)
         note = f"regret {greedy.regret:.3g}, goal {greedy.outcome.goal:.0%}"
         self._progress.update(step, note + (", certified optimal" if greedy.certified else ""))
 
-    def _due_for_map(self) -> bool:
-        return (self._evaluations - 1) % self._map_every == 0
-
     def _write(self, step: int, greedy: Score, sampled: Score) -> None:
         row: dict[str, Any] = {"step": step, **greedy.numbers()}
         row |= {f"sampled_{name}": value for name, value in sampled.numbers().items()}
+        online = None if self._envs is None else self._envs.take_mean_return()
+        row["online_return"] = online  # an empty field where no episode ended
         if self._rows is None:
             self._rows = csv.DictWriter(self._file, fieldnames=list(row), lineterminator="\n")
             self._rows.writeheader()
         self._rows.writerow(row)
         self._file.flush()
         if self._events is not None:
-            self._events.scalars(self._tags(greedy, sampled), step)
+            tags = self._tags(greedy, sampled)
+            self._events.scalars(tags if online is None else {**tags, ONLINE_RETURN: online}, step)
 
     def _tags(self, greedy: Score, sampled: Score) -> dict[str, float]:
         tags = {

@@ -5,12 +5,10 @@ Written with TensorBoard's own message types; torch is not needed for it.
 
 from __future__ import annotations
 
-import io
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from PIL import Image
 from tensorboard.compat.proto.summary_pb2 import Summary, SummaryMetadata
 from tensorboard.compat.proto.tensor_pb2 import TensorProto
 from tensorboard.compat.proto.tensor_shape_pb2 import TensorShapeProto
@@ -20,6 +18,7 @@ from tensorboard.plugins.custom_scalar import metadata as layout_metadata
 from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
 
 from gridworld.event_file import EventFile
+from gridworld.png import encode_png
 from gridworld.render import Frame
 
 # Pixels that pictures have in TensorBoard. It scales by skipping pixels: thin lines vanish, text frays.
@@ -43,13 +42,11 @@ class EventWriter:
 
     def image(self, tag: str, frame: Frame, step: int) -> None:
         """A picture, as PNG."""
-        buffer = io.BytesIO()
-        Image.fromarray(frame).save(buffer, format="PNG", compress_level=1)
-        self._image(tag, buffer.getvalue(), frame, step)
+        self._image(tag, encode_png(frame), (frame.shape[1], frame.shape[0]), step)
 
-    def animation(self, tag: str, gif: bytes, frame: Frame, step: int) -> None:
-        """An encoded GIF whose frames have the size of `frame`; TensorBoard's Images tab plays it."""
-        self._image(tag, gif, frame, step)
+    def animation(self, tag: str, gif: bytes, size: tuple[int, int], step: int) -> None:
+        """An encoded GIF, `size` pixels wide and high; TensorBoard's Images tab plays it."""
+        self._image(tag, gif, size, step)
 
     def hparams(self, values: Mapping[str, HParamValue], metrics: Sequence[str]) -> None:
         """The run's entry in the HParams table; its metrics are scalar tags of this same run."""
@@ -122,8 +119,8 @@ class EventWriter:
         )
         self._file.add(Summary(value=[value]), 0)
 
-    def _image(self, tag: str, encoded: bytes, frame: Frame, step: int) -> None:
-        height, width = frame.shape[:2]
+    def _image(self, tag: str, encoded: bytes, size: tuple[int, int], step: int) -> None:
+        width, height = size
         picture = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=encoded)
         self._file.add(Summary(value=[Summary.Value(tag=tag, image=picture)]), step)
 

@@ -7,7 +7,10 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 
 @contextmanager
@@ -30,3 +33,11 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, content: Any) -> None:
     """Write readable JSON; NaN and infinities are refused with a ValueError, since JSON has none."""
     write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+
+
+def write_array(path: Path, array: NDArray[Any]) -> None:
+    """Write NumPy's own format; `numpy.load` reads it without unpickling anything."""
+    import numpy as np  # here, since `train.py --help` gets by without it
+
+    with replacing(path) as part, part.open("wb") as file:  # given a path, NumPy would add .npy to it
+        np.save(file, array, allow_pickle=False)

@@ -22,7 +22,7 @@ Keys, with their values: python scripts/train.py --cfg job
   observation.*  kind, cell_size of images
   evaluation.*   how often the policy is scored exactly, and when to stop
   logging.*      TensorBoard, pictures of the policy, progress
-  recording.*    PNGs, GIF and MP4 of the final policy's episode
+  recording.*    pictures of what was learnt, and the final policy's episode as PNGs, GIF and MP4
   hydra.run.dir  the folder to write to, instead of a new one in runs/
 
 Examples:
@@ -35,7 +35,7 @@ Examples:
   python scripts/train.py -m agent=dqn,ppo seed=0,1,2
       a sweep of six runs, a folder each; look at them with tensorboard --logdir runs
 
-Afterwards: scripts/evaluate.py and scripts/record.py, with a run's folder.
+Afterwards: scripts/evaluate.py, scripts/record.py and scripts/play.py --agent, with a run's folder.
 Hydra's own options: python scripts/train.py --hydra-help
 """
 

@@ -35,6 +35,7 @@ GOAL: Colour = (230, 180, 50)
 AGENT: Colour = (100, 100, 220)
 
 MAX_PIXELS = 64_000_000
+MAX_SIDE = 65_535  # pixels; GIF counts no further, and hardly a viewer does
 
 _log = logging.getLogger("gridworld")
 
@@ -50,10 +51,10 @@ def import_pygame() -> ModuleType:
 def frame_size(mdp: Mdp, cell_size: int = CELL_SIZE) -> tuple[int, int]:
     """Width and height in pixels: the grid and one empty cell of border all round."""
     width, height = (mdp.layout.num_cols + 2) * cell_size, (mdp.layout.num_rows + 2) * cell_size
-    if width * height > MAX_PIXELS:
+    if width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
+        remedy = f"; take a cell_size below {cell_size}" if cell_size > 1 else ""
         raise InputError(
-            f"layout {mdp.layout.name}: a frame of {width} x {height} pixels is too large to draw; "
-            f"take a cell_size below {cell_size}"
+            f"layout {mdp.layout.name}: a frame of {width} x {height} pixels is too large to draw{remedy}"
         )
     return width, height
 
@@ -61,7 +62,7 @@ def frame_size(mdp: Mdp, cell_size: int = CELL_SIZE) -> tuple[int, int]:
 def fitting_cell_size(mdp: Mdp, longest_side: int, largest: int = CELL_SIZE) -> int:
     """The cell size with which a frame's longest side is about `longest_side`, at most `largest`."""
     cells = max(mdp.layout.num_rows, mdp.layout.num_cols) + 2
-    return max(2, min(largest, longest_side // cells))
+    return max(2 if 2 * cells <= MAX_SIDE else 1, min(largest, longest_side // cells))
 
 
 def draw_frame(mdp: Mdp, state: int | None, cell_size: int = CELL_SIZE) -> Frame:
@@ -87,9 +88,14 @@ def draw_world(surface: Any, mdp: Mdp, state: int | None, cell_size: int = CELL_
     draw_grid(surface, mdp, cell_size)
     draw_terminals(surface, mdp, cell_size)
     if state is not None:
-        row, col = divmod(state, mdp.layout.num_cols)
-        inset, side = round(0.2 * cell_size), round(0.6 * cell_size)
-        surface.fill(AGENT, ((col + 1) * cell_size + inset, (row + 1) * cell_size + inset, side, side))
+        surface.fill(AGENT, agent_box(mdp, state, cell_size))
+
+
+def agent_box(mdp: Mdp, state: int, cell_size: int = CELL_SIZE) -> tuple[int, int, int, int]:
+    """Left, top, width and height of the agent's square, in pixels."""
+    row, col = divmod(state, mdp.layout.num_cols)
+    inset, side = round(0.2 * cell_size), round(0.6 * cell_size)
+    return (col + 1) * cell_size + inset, (row + 1) * cell_size + inset, side, side
 
 
 def fill_cell(surface: Any, cell: Cell, colour: Colour, cell_size: int) -> None:

@@ -4,8 +4,9 @@
     curve.csv       the learning curve, a row per evaluation
     summary.json    the result
     model.zip       the trained model
+    visits.npy      how often training took each action in each state, (S, A)
+    policy.png, q_error.png, visits.png, learning.gif   what was learnt, how well, where, and how
     frames/, episode.gif, ...   the final policy's episode
-    policy.png      the final policy's values and greedy actions
     .hydra/         the configuration as Hydra composed it
     events.out...   TensorBoard's event file
 
@@ -53,6 +54,7 @@ class Run:
         self.curve_file = folder / CURVE
         self.summary_file = folder / SUMMARY
         self.model_file = folder / "model.zip"
+        self.visits_file = folder / "visits.npy"
         self.frames_folder = folder / "frames"
         self.manifest: dict[str, Any] = {}
 

@@ -26,6 +26,7 @@ TIE = 1e-9
 _SWEEP_TOLERANCE = 1e-3  # sweeps need only find a good policy; the rest is solved exactly
 _NEARLY_ONE = 1 - 1e-8  # one step more costs ten times as much as what counts as a tie
 _IMPROVEMENT = 1e-11
+_NOTHING = 1e-290  # a value that has faded so far is 0: the smallest numbers of all never get smaller
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +70,7 @@ def _discounted(mdp: Mdp, gamma: float) -> Solution:
         q_scale = _backup(mdp, scale, gamma, magnitude=True)
         best = np.argmax(q, axis=1)
         gain = _pick(q, best) - _pick(q, greedy)
-        better = gain > _IMPROVEMENT * np.maximum(_pick(q_scale, best), _pick(q_scale, greedy))
+        better = gain > _NOTHING + _IMPROVEMENT * np.maximum(_pick(q_scale, best), _pick(q_scale, greedy))
         seen.add(greedy.tobytes())
         greedy = np.where(better, best, greedy)
         if greedy.tobytes() in seen:  # no better action anywhere; by rounding, perhaps one met before
@@ -113,7 +114,7 @@ def _sweep(mdp: Mdp, gamma: float) -> FloatArray:
         if not active.size:
             break
         new = _backup(mdp, v, gamma, active).max(axis=1)
-        changed = active[np.abs(new - v[active]) > _SWEEP_TOLERANCE * np.abs(new)]
+        changed = active[np.abs(new - v[active]) > _NOTHING + _SWEEP_TOLERANCE * np.abs(new)]
         v[active] = new
         affected = np.zeros(mdp.num_states, dtype=np.bool_)
         affected[changed] = True

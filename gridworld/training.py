@@ -12,28 +12,23 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-from gridworld import record
 from gridworld.agents import Agent, Seat, family
 from gridworld.chain import one_hot_policy
 from gridworld.config import EnvConfig, TrainConfig, check
+from gridworld.counted_env import CountedVectorEnv
 from gridworld.curve import GREEDY, Curve
-from gridworld.evaluation import Judge, Score, play_episode
-from gridworld.events import TIME_SERIES_CARD, EventWriter, HParamValue
-from gridworld.files import write_json
+from gridworld.evaluation import Judge, Score
+from gridworld.events import EventWriter, HParamValue
+from gridworld.files import write_array, write_json
 from gridworld.layout import Layout, load
 from gridworld.mdp import Mdp, compile_mdp
 from gridworld.observations import ObservationTable, make_observation
-from gridworld.render import fitting_cell_size, frame_size
+from gridworld.pictures import Pictures, check_recording
 from gridworld.run import Run
-from gridworld.vector_env import GridWorldVectorEnv
 
 HPARAM_METRICS = tuple(
     f"{GREEDY}/{name}" for name in ("value", "regret", "goal_probability", "length", "certified")
 )
-MOST_FRAMES = 500  # of an episode that finds no end; by then a greedy one goes round in circles
-EPISODE_GIF = "episode.gif"
-EPISODE_MP4 = "episode.mp4"
-POLICY_PNG = "policy.png"
 
 Summary = dict[str, Any]
 
@@ -56,15 +51,16 @@ def train(config: TrainConfig, run: Run, overrides: list[str]) -> Summary:
     algorithms.check(config)
     mdp = make_mdp(config.env)
     observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
-    _check_recording(config, mdp)
+    check_recording(config, mdp)
     judge = Judge(mdp, config.evaluation.gamma, config.env.max_episode_steps)
     log = _Log()
-    agent = algorithms.build(config.agent, make_seat(config, mdp, observation, log))
+    seat = make_seat(config, mdp, observation, log)
+    agent = algorithms.build(config.agent, seat)
 
     run.start(dataclasses.asdict(config), mdp.layout.text(), overrides)
     try:
         with _signals_raise():
-            summary = _learn(config, run, judge, agent, log)
+            summary = _learn(config, run, judge, agent, seat, log)
     except Interrupted as interruption:
         run.end("interrupted", str(interruption))
         raise
@@ -85,12 +81,7 @@ def make_mdp(env: EnvConfig, layout: Layout | None = None) -> Mdp:
 
 def make_seat(config: TrainConfig, mdp: Mdp, observation: ObservationTable, log: _Log | None = None) -> Seat:
     """Environments and observations for an agent of this configuration."""
-    envs = GridWorldVectorEnv(
-        config.n_envs,
-        max_episode_steps=config.env.max_episode_steps,
-        autoreset_mode="SameStep",
-        **mdp.settings(),
-    )
+    envs = CountedVectorEnv(config.n_envs, max_episode_steps=config.env.max_episode_steps, **mdp.settings())
     return Seat(
         envs,
         observation,
@@ -111,16 +102,8 @@ class _Log:
             self.events.scalars(values, step)
 
 
-def _check_recording(config: TrainConfig, mdp: Mdp) -> None:
-    wanted = config.recording
-    if wanted.mp4:
-        record.require_video()
-    if (wanted.frames or wanted.gif or wanted.mp4) and wanted.cell_size is not None:
-        frame_size(mdp, wanted.cell_size)
-
-
-def _learn(config: TrainConfig, run: Run, judge: Judge, agent: Agent, log: _Log) -> Summary:
-    curve = Curve(judge, agent, config, run.curve_file)
+def _learn(config: TrainConfig, run: Run, judge: Judge, agent: Agent, seat: Seat, log: _Log) -> Summary:
+    curve = Curve(judge, agent, config, run.curve_file, seat.envs)
     events = EventWriter(run.folder) if config.logging.tensorboard else None
     succeeded = False
     try:
@@ -128,13 +111,17 @@ def _learn(config: TrainConfig, run: Run, judge: Judge, agent: Agent, log: _Log)
             log.events = events
             events.hparams(hparams(config), HPARAM_METRICS)
             curve.log_to(events)
+        pictures = Pictures(config, run, judge, events)
+        curve.watched_by(pictures.see)
         curve.evaluate(0)
         steps, seconds = _timed_learning(config, agent, curve)
-        curve.evaluate(steps, last=True)
+        curve.evaluate(steps)
         agent.save(run.model_file)
+        write_array(run.visits_file, seat.envs.visits)
         summary = _summarise(config, curve, steps, seconds)
         write_json(run.summary_file, _plain(summary))
-        _record(config, run, judge.mdp, curve, events, steps)
+        assert curve.beliefs is not None
+        pictures.finish(steps, curve.beliefs, seat.envs.visits)
         succeeded = True
     finally:
         curve.close()
@@ -195,29 +182,6 @@ def _summarise(config: TrainConfig, curve: Curve, steps: int, seconds: float) ->
 def _scores(score: Score) -> dict[str, float]:
     """A score as the summary's fields; the certificate stands there once, for the greedy policy."""
     return {name: number for name, number in score.numbers().items() if name != "certified"}
-
-
-def _record(
-    config: TrainConfig, run: Run, mdp: Mdp, curve: Curve, events: EventWriter | None, steps: int
-) -> None:
-    wanted = config.recording
-    if wanted.policy_map:
-        record.save_png(curve.policy_map(), run.folder / POLICY_PNG)
-    if not (wanted.frames or wanted.gif or wanted.mp4):
-        return
-    assert curve.beliefs is not None
-    policy = one_hot_policy(curve.beliefs.greedy)
-    states = play_episode(mdp, policy, config.env.max_episode_steps, config.seed)[:MOST_FRAMES]
-    frames = record.draw_states(mdp, states, wanted.cell_size)
-    if wanted.frames:
-        record.save_pngs(frames, run.frames_folder)
-    if wanted.gif:
-        record.save_animation(frames, run.folder / EPISODE_GIF, wanted.fps)
-    if wanted.gif and events is not None:
-        small = record.draw_states(mdp, states, fitting_cell_size(mdp, TIME_SERIES_CARD))
-        events.animation("episode", record.encode_gif(small, wanted.fps), small[0], steps)
-    if wanted.mp4:
-        record.save_mp4(frames, run.folder / EPISODE_MP4, wanted.fps)
 
 
 def hparams(config: TrainConfig) -> dict[str, HParamValue]:

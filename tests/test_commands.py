@@ -13,6 +13,7 @@ import termios
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from omegaconf import OmegaConf
 from support import CONF, ROOT, SHORT, script
@@ -22,6 +23,7 @@ from gridworld.benchmark import whole
 from gridworld.benchmark.measure import QUICK, Comparison, compare
 from gridworld.commands import benchmark, evaluate
 from gridworld.commands import record as record_command
+from gridworld.errors import InputError
 from gridworld.manual import manual
 
 
@@ -181,6 +183,28 @@ def test_record_writes_every_format_it_names(
     assert [path.name for path in named] == ["frames", "episode.gif", "episode.apng", "episode.mp4"]
     assert all(path.exists() for path in named)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {path.name for path in named}
+
+
+def test_record_draws_the_maps_again(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    maps = ["policy", "q_error", "visits"]
+    record_command.main([str(finished), "--format", *maps, "--out", str(tmp_path)])
+    assert [Path(line).name for line in capsys.readouterr().out.splitlines()] == [f"{m}.png" for m in maps]
+    for name in maps:
+        assert (tmp_path / f"{name}.png").read_bytes() == (finished / f"{name}.png").read_bytes()
+
+    copy = tmp_path / "copy"
+    subprocess.run(["cp", "-r", str(finished), str(copy)], check=True)
+    for content, words in ((b"", "no counts of visits"), (None, "no counts"), ("other", "for every cell")):
+        (copy / "visits.npy").unlink(missing_ok=True)
+        if content == "other":
+            np.save(copy / "visits.npy", np.zeros((3, 4), dtype=int))
+        elif content is not None:
+            (copy / "visits.npy").write_bytes(content)
+        with pytest.raises(InputError, match=words):
+            record_command.main([str(copy), "--format", "visits"])
+    assert not (copy / "recording").exists()
 
 
 def test_a_run_whose_files_were_damaged_is_refused(finished: Path, tmp_path: Path) -> None:

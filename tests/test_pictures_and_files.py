@@ -1,4 +1,4 @@
-"""Recordings keep every pixel, pictures of a policy show what they say, and files are written whole."""
+"""Recordings keep every pixel, and files are written whole."""
 
 import contextlib
 import io
@@ -11,11 +11,11 @@ from PIL import Image
 from gridworld import record
 from gridworld.errors import InputError
 from gridworld.files import replacing, write_json
+from gridworld.film import automatic_cell_size, film_of_frames, film_of_states
 from gridworld.layout import load, parse
 from gridworld.mdp import compile_mdp
-from gridworld.policy_map import DISAGREES, draw_policy_map, viridis
-from gridworld.render import WALL
-from gridworld.solve import value_iteration
+from gridworld.png import encode_png
+from gridworld.render import draw_frame
 
 CLASSIC = compile_mdp(load("classic"))
 WALK = np.array([0, 1, 1, 2, 3, 4, 5, 11, 17, 16])
@@ -32,85 +32,91 @@ def frames_of(image: Image.Image) -> list[tuple[np.ndarray, float]]:
 @pytest.mark.parametrize("encode", [record.encode_gif, record.encode_apng])
 @pytest.mark.parametrize("fps", [1, 4, 25])
 def test_animations_are_exact_and_last_as_long_as_they_should(encode, fps: int) -> None:
-    frames = record.draw_states(CLASSIC, WALK, cell_size=20)
-    shown = frames_of(Image.open(io.BytesIO(encode(frames, fps))))
-    distinct = [frame for frame, before in zip(frames, [None, *frames], strict=False) if frame is not before]
+    shown = frames_of(Image.open(io.BytesIO(encode(film_of_states(CLASSIC, WALK, cell_size=20), fps))))
+    distinct = [state for state, before in zip(WALK, [None, *WALK], strict=False) if state != before]
     assert len(shown) == len(distinct)  # a repeated frame is shown for longer
-    assert all(np.array_equal(got, frame) for (got, _), frame in zip(shown, distinct, strict=True))
-    held = len(frames) + 4  # the last frame rests
+    for (got, _), state in zip(shown, distinct, strict=True):
+        assert np.array_equal(got, draw_frame(CLASSIC, int(state), 20))
+    held = len(WALK) + 4  # the last frame rests
     assert sum(duration for _, duration in shown) == pytest.approx(1000 * held / fps, abs=1)
+
+
+def test_a_gif_holds_any_film_exactly() -> None:
+    """Frames that differ anywhere, nowhere, or everywhere, and last longer than one picture of a GIF can."""
+    chance = np.random.default_rng(0)
+    palette = chance.integers(256, size=(200, 3), dtype=np.uint8)
+    frames = [palette[chance.integers(200, size=(23, 31))]]
+    for _ in range(12):
+        frame = frames[-1].copy()
+        top, left = chance.integers(23), chance.integers(31)
+        frame[top : top + chance.integers(5), left : left + chance.integers(9)] = palette[
+            chance.integers(200)
+        ]
+        frames.append(frame)
+    shown = frames_of(Image.open(io.BytesIO(record.encode_gif(film_of_frames(frames), 20))))
+    assert len(shown) == len(frames)
+    assert all(np.array_equal(got, frame) for (got, _), frame in zip(shown, frames, strict=True))
+    assert sum(duration for _, duration in shown) == (len(frames) + 4) * 50
+
+    still = film_of_states(CLASSIC, np.zeros(1500, dtype=int), cell_size=4)
+    lasting = Image.open(io.BytesIO(record.encode_gif(still, 1)))
+    assert sum(duration for _, duration in frames_of(lasting)) == 1504 * 1000
+
+
+def test_a_film_has_one_palette() -> None:
+    noise = np.random.default_rng(0).integers(256, size=(40, 40, 3), dtype=np.uint8)
+    with pytest.raises(InputError, match="more than 256 colours"):
+        film_of_frames([noise])
+
+
+def test_png_is_exact() -> None:
+    noise = np.random.default_rng(0).integers(256, size=(13, 17, 3), dtype=np.uint8)
+    for frame in (noise, draw_frame(CLASSIC, 0, 20), noise[:1, :1]):
+        image = Image.open(io.BytesIO(encode_png(frame)))
+        image.load()  # checks the sums
+        assert image.mode == "RGB"
+        assert np.array_equal(np.array(image), frame)
 
 
 def test_pngs_are_numbered_exact_and_replace_what_was_there(tmp_path: Path) -> None:
     folder = tmp_path / "frames"
-    record.save_pngs(record.draw_states(CLASSIC, WALK, 20), folder)
-    record.save_pngs(record.draw_states(CLASSIC, WALK[:3], 20), folder)
+    record.save_pngs(film_of_states(CLASSIC, WALK, 20), folder)
+    record.save_pngs(film_of_states(CLASSIC, WALK[:3], 20), folder)
     assert sorted(path.name for path in folder.iterdir()) == ["0000.png", "0001.png", "0002.png"]
     assert [path.name for path in tmp_path.iterdir()] == ["frames"]
-    for path, frame in zip(sorted(folder.iterdir()), record.draw_states(CLASSIC, WALK[:3], 20), strict=True):
-        assert np.array_equal(np.array(Image.open(path).convert("RGB")), frame)
+    for path, state in zip(sorted(folder.iterdir()), WALK[:3], strict=True):
+        assert np.array_equal(np.array(Image.open(path).convert("RGB")), draw_frame(CLASSIC, int(state), 20))
 
 
-def test_more_than_256_colours_survive() -> None:
-    noise = np.random.default_rng(0).integers(256, size=(40, 40, 3), dtype=np.uint8)
-    shown = frames_of(Image.open(io.BytesIO(record.encode_apng([noise, noise[::-1].copy()], 10))))
-    assert np.array_equal(shown[0][0], noise)
+def test_films_that_memory_or_a_player_could_not_hold_are_refused() -> None:
+    large = film_of_states(CLASSIC, WALK, 500)
+    record.check_size(large, ["png", "gif", "apng"])
+    with pytest.raises(InputError, match="mp4: 4000 x 3500 pixels are too many for a video"):
+        record.check_size(large, ["mp4"])
+    long = film_of_states(CLASSIC, np.tile(WALK, 5), 500)
+    with pytest.raises(InputError, match="apng: 50 pictures of 4000 x 3500 pixels are too many"):
+        record.check_size(long, ["apng"])
 
 
 def test_mp4_has_even_sides_and_every_frame(tmp_path: Path) -> None:
     av = pytest.importorskip("av", reason="PyAV is not installed (extra `video`)")
     layout = parse("S.\n.G\n.T", "odd")
-    frames = record.draw_states(compile_mdp(layout), np.array([0, 1, 3]), cell_size=13)
-    assert frames[0].shape == (65, 52, 3)
-    record.save_animation(frames, tmp_path / "episode.mp4", 5)
+    mdp = compile_mdp(layout)
+    record.save_animation(film_of_states(mdp, np.array([0, 1, 3]), cell_size=13), tmp_path / "episode.mp4", 5)
     with av.open(str(tmp_path / "episode.mp4")) as video:
         stream = video.streams.video[0]
         assert (stream.width, stream.height) == (52, 66)
         assert stream.average_rate == 5
         pictures = [frame.to_ndarray(format="rgb24") for frame in video.decode(stream)]
     assert len(pictures) == 3 + 4
-    assert np.abs(pictures[0][:65].astype(int) - frames[0]).mean() < 3
+    assert draw_frame(mdp, 0, 13).shape == (65, 52, 3)
+    assert np.abs(pictures[0][:65].astype(int) - draw_frame(mdp, 0, 13)).mean() < 3
 
 
 def test_large_maps_get_smaller_cells() -> None:
-    assert record.automatic_cell_size(CLASSIC) == 100
+    assert automatic_cell_size(CLASSIC) == 100
     wide = compile_mdp(parse("S" + "." * 98 + "G", "wide"))
-    assert record.automatic_cell_size(wide) == 9
-
-
-@pytest.mark.parametrize("name", ["classic", "four_rooms", "maze", "aima_4x3"])
-def test_policy_map_colours_cells_by_value_and_frames_mistakes(name: str) -> None:
-    mdp = compile_mdp(load(name))
-    best = value_iteration(mdp, 0.99)
-    greedy = np.argmax(best.optimal, axis=1)
-    cell = min(64, 640 // (max(mdp.layout.num_rows, mdp.layout.num_cols) + 2))
-    wrong = int(mdp.start_states[0])
-    frame = draw_policy_map(mdp, best.v, greedy, best.optimal, "all right")
-    assert not (frame == DISAGREES).all(axis=2).any()
-
-    greedy[wrong] = int(np.argmin(best.optimal[wrong]))
-    frame = draw_policy_map(mdp, best.v, greedy, best.optimal, "one wrong")
-    shown = ~(mdp.terminal | mdp.wall)
-    low, high = best.v[shown].min(), best.v[shown].max()
-    for state, (row, col) in enumerate(mdp.layout.cells()):
-        y, x = (row + 1) * cell, (col + 1) * cell
-        corner = tuple(frame[y + cell // 6, x + cell // 6])
-        if mdp.wall[state]:
-            assert corner == WALL
-        elif shown[state]:
-            assert corner == viridis((best.v[state] - low) / (high - low))
-        framed = (frame[y : y + cell, x : x + cell] == DISAGREES).all(axis=2).any()
-        assert framed == (state == wrong)
-
-
-def test_policy_map_of_one_value_and_of_a_large_world() -> None:
-    flat = np.zeros(30)
-    draw_policy_map(CLASSIC, flat, np.zeros(30, dtype=int), np.ones((30, 4), dtype=bool))
-    large = compile_mdp(parse("S" + "." * 198 + "G\n" + ("." * 200 + "\n") * 199, "large"))
-    states = large.num_states
-    everything = np.ones((states, 4), dtype=bool)
-    frame = draw_policy_map(large, np.arange(states) / states, np.zeros(states, dtype=int), everything)
-    assert frame.shape == (808, 808, 3)
+    assert automatic_cell_size(wide) == 9
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:

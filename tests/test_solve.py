@@ -266,3 +266,13 @@ def test_what_is_no_policy_is_refused(policy, mistake):
     ):
         with pytest.raises(InputError, match=mistake):
             use()
+
+
+def test_a_value_may_fade_to_nothing_on_the_way() -> None:
+    """The smallest float times 0.9 is itself again: no policy should be improved for its sake."""
+    best = solve.value_iteration(compile_mdp(parse("S" + "." * 9000 + "G", "corridor")), 0.9)
+    distance = 9000 - np.arange(6000, 9001)
+    assert best.v[6000:9001] == pytest.approx(0.9**distance, rel=1e-9)
+    assert best.v[0] == 0
+    assert best.optimal[0].all()
+    assert best.optimal[6000:9001].sum() == 3001  # to the right, and nothing else

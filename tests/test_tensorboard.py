@@ -68,7 +68,7 @@ def test_scalars_stand_beside_their_optimum(served: str) -> None:
             assert f"eval_sampled/{tag}" in names
         for tag in ("optimal_value", "optimal_goal_probability", "optimal_length"):
             assert f"eval/{tag}" in names
-        own = {"train/loss", "rollout/ep_rew_mean", "rollout/ep_len_mean"}
+        own = {"train/loss", "rollout/ep_rew_mean", "rollout/ep_len_mean", "online/return"}
         assert own <= names.keys() or run == "value_iteration_run", run
     points = ask(served, "data/plugin/scalars/scalars?run=dqn_run&tag=eval%2Foptimal_value")
     assert [point[1] for point in points] == [0, 512, 1024, 1536, 2048]
@@ -77,12 +77,14 @@ def test_scalars_stand_beside_their_optimum(served: str) -> None:
 
 def test_the_policy_develops_and_the_episode_moves(served: str) -> None:
     tags = ask(served, "data/plugin/images/tags")
-    assert tags["dqn_run"].keys() == {"policy", "episode"}
+    assert tags["dqn_run"].keys() == {"policy", "q_error", "visits", "learning", "episode"}
     images = ask(served, "data/plugin/images/images?run=dqn_run&tag=policy&sample=0")
     assert [image["step"] for image in images] == [0, 2048]
-    query = ask(served, "data/plugin/images/images?run=dqn_run&tag=episode&sample=0")[0]["query"]
-    with urllib.request.urlopen(f"{served}data/plugin/images/individualImage?{query}", timeout=30) as answer:
-        assert answer.read(6) == b"GIF89a"
+    for tag in ("episode", "learning"):
+        query = ask(served, f"data/plugin/images/images?run=dqn_run&tag={tag}&sample=0")[0]["query"]
+        address = f"{served}data/plugin/images/individualImage?{query}"
+        with urllib.request.urlopen(address, timeout=30) as answer:
+            assert answer.read(6) == b"GIF89a"
 
 
 def test_the_hparams_table_has_settings_and_metrics(served: str) -> None:
@@ -112,7 +114,7 @@ def test_a_browser_shows_it(served: str, tmp_path: Path) -> None:
 
         for page, expected in (
             ("timeseries", ["dqn_run", "ppo_run", "/goal_probability", "/optimal_goal_probability"]),
-            ("images", ["dqn_run", "policy", "episode"]),
+            ("images", ["dqn_run", "policy", "q_error", "visits", "learning", "episode"]),
             ("hparams", ["agent.name", "env.layout", "eval/regret"]),
         ):
             browser.get(f"{served}#{page}")

@@ -20,7 +20,10 @@ from gridworld.observations import one_hot
 from gridworld.saved_run import SavedRun
 from gridworld.training import make_mdp
 
-FILES = {"manifest.json", "curve.csv", "model.zip", "summary.json", "frames", "episode.gif", "policy.png"}
+FILES = {
+    *("manifest.json", "curve.csv", "model.zip", "summary.json", "visits.npy"),
+    *("policy.png", "q_error.png", "visits.png", "learning.gif", "frames", "episode.gif"),
+}
 SUMMARY = {
     "agent",
     "seed",

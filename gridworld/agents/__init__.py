@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
+from gridworld.counted_env import CountedVectorEnv
 from gridworld.errors import InputError
 from gridworld.mdp import FloatArray, IntArray
 from gridworld.observations import ObservationTable
-from gridworld.vector_env import GridWorldVectorEnv
 
 if TYPE_CHECKING:
     from gridworld.config import AgentConfig, TrainConfig
@@ -40,7 +40,7 @@ class Beliefs:
 class Seat:
     """Where an agent learns: its environments, what it sees of them, and its sources of chance."""
 
-    envs: GridWorldVectorEnv  # autoreset in the same step
+    envs: CountedVectorEnv  # autoreset in the same step
     observation: ObservationTable
     seed: int
     device: str

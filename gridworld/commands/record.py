@@ -1,19 +1,25 @@
-"""Export episodes of a finished run as pictures: numbered PNGs, GIF, APNG, MP4."""
+"""Draw a finished run: its episodes as numbered PNGs, GIF, APNG or MP4, and maps of what it learnt."""
 
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from gridworld import record
+from gridworld.agents import Beliefs
 from gridworld.commands import parser_for_a_run
 from gridworld.errors import InputError
 from gridworld.evaluation import play_episode
+from gridworld.film import Film, film_of_states
+from gridworld.pictures import MapMaker, agent_gamma
 from gridworld.render import frame_size
 from gridworld.saved_run import SavedRun, choose_policy
+
+MAPS = ("policy", "q_error", "visits")
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -23,21 +29,24 @@ def main(arguments: Sequence[str]) -> None:
     saved = SavedRun(options.run, options.trust)
     if options.cell_size is not None:
         frame_size(saved.mdp, options.cell_size)
-    policy = choose_policy(saved.beliefs(), options.policy)
-    episodes = [
-        play_episode(saved.mdp, policy, saved.config.env.max_episode_steps, options.seed + index)
-        for index in range(options.episodes)
-    ]
-    frames = record.draw_states(saved.mdp, np.concatenate(episodes), options.cell_size)
+    formats = list(dict.fromkeys(options.format))
+    visits = _visits(saved) if "visits" in formats else np.zeros((0, 0), dtype=np.int64)
+    beliefs = saved.beliefs()
+    film = _film(saved, beliefs, options)
+    record.check_size(film, formats)
     folder: Path = options.out or options.run / "recording"
     folder.mkdir(parents=True, exist_ok=True)
-    for kind in dict.fromkeys(options.format):
+    for kind in formats:
         if kind == "png":
-            record.save_pngs(frames, folder / "frames")
-            print(folder / "frames")
+            path = folder / "frames"
+            record.save_pngs(film, path)
+        elif kind in MAPS:
+            path = folder / f"{kind}.png"
+            _save_map(kind, saved, beliefs, visits, path, options.cell_size)
         else:
-            record.save_animation(frames, folder / f"episode.{kind}", options.fps)
-            print(folder / f"episode.{kind}")
+            path = folder / f"episode.{kind}"
+            record.save_animation(film, path, options.fps)
+        print(path)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -45,11 +54,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--format",
         nargs="+",
-        choices=record.FORMATS,
+        choices=(*record.FORMATS, *MAPS),
         default=["png", "gif"],
-        help="one or more of png gif apng mp4 (default png gif; mp4 needs the extra `video`)",
+        help="one or more of png gif apng mp4 for episodes, policy q_error visits for maps "
+        "(default png gif; mp4 needs the extra `video`)",
     )
-    parser.add_argument("--cell-size", type=int, help="pixels (default 100, less on large maps)")
+    parser.add_argument(
+        "--cell-size", type=int, help="pixels (default 100, 80 in maps, less on large worlds)"
+    )
     parser.add_argument("--fps", type=int, default=4, help="frames a second, 1 to 100 (default 4)")
     parser.add_argument("--episodes", type=int, default=1, help="one after the other (default 1)")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode (default 0)")
@@ -68,3 +80,50 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError(f"--cell-size {options.cell_size}: must be at least 2 pixels")
     if "mp4" in options.format:
         record.require_video()
+
+
+def _film(saved: SavedRun, beliefs: Beliefs, options: argparse.Namespace) -> Film:
+    policy = choose_policy(beliefs, options.policy)
+    limit = saved.config.env.max_episode_steps
+    episodes = [
+        play_episode(saved.mdp, policy, limit, options.seed + index) for index in range(options.episodes)
+    ]
+    return film_of_states(saved.mdp, np.concatenate(episodes), options.cell_size)
+
+
+def _save_map(
+    kind: str,
+    saved: SavedRun,
+    beliefs: Beliefs,
+    visits: np.ndarray[tuple[int, ...], np.dtype[np.int64]],
+    path: Path,
+    cell_size: int | None,
+) -> None:
+    maps = MapMaker(saved.judge(), agent_gamma(saved.config.agent, saved.config.evaluation.gamma))
+    if kind == "visits":
+        draw = maps.visits(visits)
+    else:
+        draw = (maps.policy if kind == "policy" else maps.error)(beliefs, _steps(saved))
+    record.save_png(draw(cell_size), path)
+
+
+def _steps(saved: SavedRun) -> int:
+    """How long it was trained."""
+    path = saved.run.summary_file
+    try:
+        return int(json.loads(path.read_text("utf-8"))["timesteps"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: not the summary of a run ({type(error).__name__})") from None
+
+
+def _visits(saved: SavedRun) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+    """(S, A), as training counted them."""
+    path = saved.run.visits_file
+    try:
+        visits = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError):
+        raise InputError(f"{path}: no counts of visits that can be read") from None
+    if visits.shape != saved.mdp.neighbour.shape or visits.dtype.kind not in "iu" or (visits < 0).any():
+        raise InputError(f"{path}: must be counts for every cell and action of this run's world")
+    counts: np.ndarray[tuple[int, ...], np.dtype[np.int64]] = visits.astype(np.int64)
+    return counts

@@ -1,0 +1,123 @@
+"""Play a world with the arrow keys, alone or beside a trained agent, and see how far you are from optimal."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from gridworld import render as drawing
+from gridworld.chain import one_hot_policy
+from gridworld.config import EnvConfig, EvaluationConfig
+from gridworld.errors import InputError
+from gridworld.evaluation import Judge
+from gridworld.play import Game, Key, draw
+from gridworld.saved_run import SavedRun
+from gridworld.training import make_mdp
+
+_WIDEST_BOARD = 800  # pixels; two boards share twice 640
+_FPS = 30
+_TICKS = 5  # frames between two steps of an agent that walks on alone
+_WORLD = ("num_rows", "num_cols", "slip", "step_reward", "goal_reward", "trap_reward")
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Open the window and play until it is closed."""
+    options = _parser().parse_args(arguments)
+    _check(options)
+    game = _game(options)
+    mdp, boards = game.person.judge.mdp, len(game.players)
+    cell_size = options.cell_size or drawing.fitting_cell_size(mdp, _WIDEST_BOARD if boards == 1 else 640)
+    drawing.frame_size(mdp, cell_size)
+    if not drawing.has_display():
+        raise InputError("play.py: there is no display to open a window on; set DISPLAY")
+    play(game, cell_size)
+
+
+def play(game: Game, cell_size: int) -> None:
+    """Show the game and hand on the keys, until somebody quits. Tells every finished episode's verdict."""
+    pygame = drawing.import_pygame()
+    keys = {
+        pygame.K_UP: Key.UP,
+        pygame.K_RIGHT: Key.RIGHT,
+        pygame.K_DOWN: Key.DOWN,
+        pygame.K_LEFT: Key.LEFT,
+        pygame.K_r: Key.RESTART,
+        pygame.K_q: Key.QUIT,
+        pygame.K_ESCAPE: Key.QUIT,
+    }
+    pygame.display.init()
+    window: Any = None
+    clock, passed, told = pygame.time.Clock(), 0, False
+    try:
+        while not game.quit:
+            frame = draw(game, cell_size)
+            size = (frame.shape[1], frame.shape[0])
+            if window is None:
+                window = pygame.display.set_mode(size)
+                pygame.display.set_caption(f"GridWorld: {game.person.judge.mdp.layout.name}")
+            window.blit(pygame.image.frombuffer(frame, size, "RGB"), (0, 0))
+            pygame.display.flip()
+            clock.tick(_FPS)
+            for event in pygame.event.get():
+                if event.type == pygame.QUIT:
+                    game.press(Key.QUIT)
+                elif event.type == pygame.KEYDOWN and event.key in keys:
+                    game.press(keys[event.key])
+            passed += 1
+            if passed % _TICKS == 0:
+                game.tick()
+            if game.over and not told:
+                for player in game.players:
+                    print(f"{player.standing()}; {player.verdict()}", flush=True)
+            told = game.over
+    finally:
+        pygame.quit()
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="play.py", description=__doc__)
+    parser.add_argument("--layout", help="a shipped map's name or a map file (default classic)")
+    parser.add_argument("--num-rows", type=int, help="of the layout classic (default 5)")
+    parser.add_argument("--num-cols", type=int, help="of the layout classic (default 6)")
+    parser.add_argument("--slip", type=float, help="probability of slipping aside (default 0)")
+    parser.add_argument("--step-reward", type=float, help="paid for every step (default 0)")
+    parser.add_argument("--goal-reward", type=float, help="paid for entering a goal (default 1)")
+    parser.add_argument("--trap-reward", type=float, help="paid for entering a trap (default -1)")
+    parser.add_argument("--gamma", type=float, help="discount of returns, 0 to 1 (default 0.99)")
+    parser.add_argument("--seed", type=int, default=0, help="of starts and slips (default 0)")
+    parser.add_argument("--cell-size", type=int, help="pixels (default 100, less on large maps)")
+    parser.add_argument(
+        "--agent", type=Path, metavar="RUN", help="a finished run: its agent plays beside you, in its world"
+    )
+    return parser
+
+
+def _check(options: argparse.Namespace) -> None:
+    if options.seed < 0:
+        raise InputError(f"--seed {options.seed}: must be at least 0")
+    if options.cell_size is not None and options.cell_size < 8:
+        raise InputError(f"--cell-size {options.cell_size}: must be at least 8 pixels")
+
+
+def _game(options: argparse.Namespace) -> Game:
+    """A world of these options; with an agent, of its run's settings where an option is not given."""
+    given = {name: getattr(options, name) for name in _WORLD if getattr(options, name) is not None}
+    if options.agent is None:
+        if options.layout is not None:
+            given["layout"] = options.layout
+        gamma = EvaluationConfig().gamma if options.gamma is None else options.gamma
+        env = EnvConfig(**given)
+        return Game(Judge(make_mdp(env), gamma, env.max_episode_steps), options.seed)
+    if "num_rows" in given or "num_cols" in given:
+        raise InputError("--num-rows, --num-cols: with --agent, the world has the size it was trained on")
+    saved = SavedRun(options.agent)
+    layout = saved.judge(options.layout).mdp.layout
+    config = saved.config
+    mdp = make_mdp(dataclasses.replace(config.env, **given), layout)
+    gamma = config.evaluation.gamma if options.gamma is None else options.gamma
+    policy = one_hot_policy(saved.beliefs().greedy)
+    judge = Judge(mdp, gamma, config.env.max_episode_steps)
+    return Game(judge, options.seed, policy, config.agent.name, config.env.max_episode_steps)

@@ -1,0 +1,71 @@
+"""What training did is counted step by step, as a naive tally of the same walk has it."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import SHORT, train_in
+
+from gridworld.counted_env import CountedVectorEnv
+from gridworld.vector_env import GridWorldVectorEnv
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.int32, np.uint8])
+@pytest.mark.parametrize(
+    "settings",
+    [{"slip": 0.3, "step_reward": -0.1}, {"layout": "maze", "max_episode_steps": 7, "step_reward": -1}],
+    ids=["slippery", "cut"],
+)
+def test_visits_and_returns_are_those_of_a_naive_tally(settings: dict, dtype: type) -> None:
+    num_envs, steps = 5, 400
+    counted = CountedVectorEnv(num_envs, **settings)
+    plain = GridWorldVectorEnv(num_envs, autoreset_mode="SameStep", **settings)
+    counted.reset(seed=3)
+    states, _ = plain.reset(seed=3)
+    visits = np.zeros((plain.mdp.num_states, 4), dtype=int)
+    under_way, ended = [0.0] * num_envs, []
+    actions = np.random.default_rng(0).integers(4, size=(steps, num_envs)).astype(dtype)
+    for chosen in actions:
+        for state, action in zip(states, chosen, strict=True):
+            visits[state, action] += 1
+        states, rewards, terminated, truncated, _ = plain.step(chosen)
+        for index in range(num_envs):
+            under_way[index] += rewards[index]
+            if terminated[index] or truncated[index]:
+                ended.append(under_way[index])
+                under_way[index] = 0.0
+        assert np.array_equal(counted.step(chosen)[0], states)  # counting changes nothing
+    assert len(ended) > 20
+    assert np.array_equal(counted.visits, visits)
+    assert counted.take_mean_return() == pytest.approx(np.mean(ended))
+    assert counted.take_mean_return() is None
+
+
+def test_an_episode_given_up_is_not_one_that_ended() -> None:
+    envs = CountedVectorEnv(2, step_reward=-1, max_episode_steps=3)
+    envs.reset()
+    envs.step(np.array([0, 0]))
+    envs.reset(options={"reset_mask": np.array([True, False])})
+    envs.step(np.array([0, 0]))
+    envs.step(np.array([0, 0]))  # the second environment's third step
+    assert envs.take_mean_return() == -3
+    envs.step(np.array([0, 0]))  # the first one's
+    assert envs.take_mean_return() == -3
+
+
+@pytest.mark.parametrize("agent", SHORT)
+def test_a_run_tells_what_training_brought_and_where_it_was(agent: str, tmp_path: Path) -> None:
+    overrides = ["env.max_episode_steps=40", "env.step_reward=-1", "env.trap_reward=0", "env.goal_reward=0"]
+    summary = train_in(tmp_path, *SHORT[agent], "evaluation.every=32", "n_envs=16", *overrides)
+    visits = np.load(tmp_path / "visits.npy", allow_pickle=False)
+    assert visits.shape == (30, 4)
+    assert visits.sum() == summary["timesteps"]
+    assert not visits[[16, 22, 15, 10]].any()  # nobody acts where it is over
+
+    with (tmp_path / "curve.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert rows[0]["online_return"] == ""  # before the first step, no episode has ended
+    told = [float(row["online_return"]) for row in rows if row["online_return"]]
+    assert len(told) > 5
+    assert all(-40 <= value <= -1 for value in told)  # minus the episode's length
