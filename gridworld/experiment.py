@@ -115,7 +115,7 @@ def run_job(settings: DictConfig) -> float:
     except KeyboardInterrupt:
         _discard(folder)
         raise
-    print(summary_text(summary, shlex.quote(_shown(folder))))
+    _say(summary_text(summary, shlex.quote(_shown(folder))))
     return float(summary["regret"])
 
 
@@ -133,6 +133,14 @@ def _slug(text: Any) -> str:
     """Letters, digits and a few safe signs, of bounded length, for a folder's name."""
     name = re.sub(r"[^A-Za-z0-9_.,=+-]+", "-", Path(str(text)).stem if "/" in str(text) else str(text))
     return name.strip("-.")[:_LONGEST_NAME] or "run"
+
+
+def _say(text: str) -> None:
+    """Print it, if anybody still reads: with `| head`, a reader may have left. The files are written."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _tell(error: Exception) -> int:

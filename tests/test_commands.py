@@ -316,3 +316,16 @@ def test_training_commands_never_import_torchs_compiler(tmp_path: Path) -> None:
         timeout=60,
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_a_reader_that_leaves_does_not_end_a_run_badly(tmp_path: Path) -> None:
+    words = [*SHORT["q_learning"], "hydra.run.dir=run"]
+    command = [sys.executable, str(ROOT / "scripts" / "train.py"), *words]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        told = process.stderr.read()
+    assert process.returncode == 0, told
+    assert b"Traceback" not in told
+    assert json.loads((tmp_path / "run" / "manifest.json").read_text())["status"] == "finished"

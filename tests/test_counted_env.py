@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import SHORT, train_in
+from support import LEARNING, SHORT, train_in
 
 from gridworld.counted_env import CountedVectorEnv
 from gridworld.vector_env import GridWorldVectorEnv
@@ -54,10 +54,13 @@ def test_an_episode_given_up_is_not_one_that_ended() -> None:
     assert envs.take_mean_return() == -3
 
 
-@pytest.mark.parametrize("agent", SHORT)
+@pytest.mark.parametrize("agent", LEARNING)
 def test_a_run_tells_what_training_brought_and_where_it_was(agent: str, tmp_path: Path) -> None:
-    overrides = ["env.max_episode_steps=40", "env.step_reward=-1", "env.trap_reward=0", "env.goal_reward=0"]
-    summary = train_in(tmp_path, *SHORT[agent], "evaluation.every=32", "n_envs=16", *overrides)
+    rewards = ["env.step_reward=-1", "env.trap_reward=0", "env.goal_reward=0"]
+    overrides = ["total_timesteps=2000", "env.max_episode_steps=40", *rewards]
+    summary = train_in(
+        tmp_path, *SHORT[agent], "evaluation.every=32", "n_envs=16", *overrides, "total_timesteps=2000"
+    )
     visits = np.load(tmp_path / "visits.npy", allow_pickle=False)
     assert visits.shape == (30, 4)
     assert visits.sum() == summary["timesteps"]

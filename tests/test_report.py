@@ -73,7 +73,7 @@ def test_real_runs_are_reported(tmp_path: Path) -> None:
             assert float(row["regret"]) == pytest.approx(summary["regret"])
             assert row["first certificate"] == str(summary["first_certified_step"] or "")
     page = (folder / "report.html").read_text()
-    assert page.count('src="data:image/png;base64,') == 2  # the policy of a median seed for each agent
+    assert page.count('src="data:image/png;base64,') == 2 * 3  # a median seed's maps for each agent
 
 
 def test_runs_that_differ_are_reported_apart_and_the_report_says_so(tmp_path: Path) -> None:

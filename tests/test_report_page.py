@@ -69,7 +69,7 @@ def test_a_browser_shows_it(page: Path, tmp_path: Path) -> None:
         ):
             assert words in text, words
         images = browser.execute_script("return [...document.images].map(i => [i.complete, i.naturalWidth])")
-        assert len(images) == 1
+        assert len(images) == 4  # the one run with pictures: policy, error, visits, learning
         assert all(complete and width > 100 for complete, width in images)
         drawn = browser.execute_script(
             "return [...document.querySelectorAll('figure svg')].map(s => [s.getBoundingClientRect().height,"
