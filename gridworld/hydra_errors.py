@@ -62,7 +62,8 @@ def _unknown_choice(message: str) -> str:
     fact = f"{missing.group(1).replace('/', '=', 1)}: there is no such choice"
     if len(choices) <= _LISTED:
         return f"{fact}; there are {', '.join(choices)}"
-    near = [choice for choice in choices if choice.startswith(name)] or difflib.get_close_matches(name, choices)
+    near = [choice for choice in choices if choice.startswith(name)]
+    near = near or difflib.get_close_matches(name, choices)
     hint = f"; close to it are {', '.join(near)}" if near else ""
     return f"{fact}{hint}; --help lists them all"
 

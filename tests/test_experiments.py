@@ -1,4 +1,4 @@
-"""The recipes: one for every agent on every task, each of them runs, and the command line has the last word."""
+"""The recipes: one for every agent on every task, each of them runs, the command line has the last word."""
 
 import csv
 import inspect
