@@ -16,6 +16,8 @@ from omegaconf import DictConfig, OmegaConf
 from gridworld import config as schemas
 from gridworld.errors import InputError
 
+_LISTED = 16  # choices of a group at most; more are told apart by their names
+
 
 def sentence(error: BaseException) -> str:
     """The exception's facts on one line."""
@@ -55,8 +57,15 @@ def _unknown_choice(message: str) -> str:
     missing = re.search(r"Could not find '([^']*)'", message)
     group = re.search(r"Available options in '([^']*)':((?:\n\t\S+)*)", message)
     assert missing is not None
-    choices = ", ".join(group.group(2).split()) if group else ""
-    return f"{missing.group(1).replace('/', '=', 1)}: there is no such choice; there are {choices}"
+    choices = group.group(2).split() if group else []
+    name = missing.group(1).rpartition("/")[2]
+    fact = f"{missing.group(1).replace('/', '=', 1)}: there is no such choice"
+    if len(choices) <= _LISTED:
+        return f"{fact}; there are {', '.join(choices)}"
+    near = [choice for choice in choices if choice.startswith(name)]
+    near = near or difflib.get_close_matches(name, choices)
+    hint = f"; close to it are {', '.join(near)}" if near else ""
+    return f"{fact}{hint}; --help lists them all"
 
 
 def _suggestion(facts: str) -> str:

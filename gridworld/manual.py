@@ -5,7 +5,10 @@ Hydra's generic help takes twice as long, since it loads every configuration to 
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
+
+EXPERIMENTS = "experiment"  # the group of recipes
 
 _TEXT = """\
 Train an agent on a GridWorld whose optimum is known exactly.
@@ -34,6 +37,10 @@ Examples:
       another world, slippery, and more time
   python scripts/train.py -m agent=dqn,ppo seed=0,1,2
       a sweep of six runs, a folder each; look at them with tensorboard --logdir runs
+  python scripts/train.py experiment=cliff_dqn
+      a recipe: that agent and that task, with settings that were tuned for them
+  python scripts/train.py -m 'experiment=glob(cliff_*)' seed='range(20)'
+      every recipe of a task, with twenty seeds each
 
 Afterwards: scripts/evaluate.py, scripts/record.py and scripts/play.py --agent, with a run's folder.
 Hydra's own options: python scripts/train.py --hydra-help
@@ -49,8 +56,31 @@ def _choices(conf: Path) -> list[str]:
     lines = []
     for group in sorted(folder for folder in conf.iterdir() if folder.is_dir()):
         lines.append(f"  {group.name}=...")
-        for file in sorted(group.glob("*.yaml")):
-            comments = [line[2:] for line in file.read_text("utf-8").splitlines() if line.startswith("# ")]
-            about = next((comment for comment in comments if not comment.startswith("@package")), "")
-            lines.append(f"    {file.stem:<16} {about}")
+        files = sorted(group.glob("*.yaml"))
+        lines += _recipes(conf, files) if group.name == EXPERIMENTS else map(_choice, files)
+    return lines
+
+
+def _choice(file: Path) -> str:
+    comments = [line[2:] for line in file.read_text("utf-8").splitlines() if line.startswith("# ")]
+    about = next((comment for comment in comments if not comment.startswith("@package")), "")
+    return f"    {file.stem:<16} {about}"
+
+
+def _recipes(conf: Path, files: list[Path]) -> list[str]:
+    """Recipes are named TASK_AGENT; a line or two per task, since there are too many for one each."""
+    tasks = sorted((file.stem for file in (conf / "env").glob("*.yaml")), key=len, reverse=True)
+    agents: dict[str, list[str]] = {}
+    for file in files:
+        task = next((task for task in tasks if file.stem.startswith(f"{task}_")), "")
+        agents.setdefault(task, []).append(file.stem.removeprefix(f"{task}_"))
+    lines = []
+    for task, names in agents.items():
+        text = textwrap.fill(
+            f"{task + '_...' if task else '':<20} {', '.join(names)}",
+            width=100,
+            initial_indent="    ",
+            subsequent_indent=" " * 25,
+        )
+        lines += text.splitlines()
     return lines

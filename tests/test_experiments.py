@@ -1,0 +1,120 @@
+"""The recipes: one for every agent on every task, each of them runs, the command line has the last word."""
+
+import csv
+import inspect
+import statistics
+from pathlib import Path
+
+import pytest
+import stable_baselines3
+from support import CONF, configure, train_in
+
+from gridworld.agents.sb3.arguments import algorithm_and_arguments
+from gridworld.manual import manual
+
+TASKS = ("aima_4x3", "classic", "cliff", "four_rooms", "frozen_lake_4x4", "maze")
+AGENTS = sorted(file.stem for file in (CONF / "agent").glob("*.yaml"))
+RECIPES = sorted(file.stem for file in (CONF / "experiment").glob("*.yaml"))
+NO_FILES = (
+    *("recording.frames=false", "recording.gif=false", "recording.policy_map=false"),
+    *("logging.tensorboard=false", "logging.progress=false"),
+)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_agent_has_a_recipe_for_the_task(task: str) -> None:
+    everywhere = [agent for agent in AGENTS if not agent.endswith("_sb3_defaults")]
+    assert {f"{task}_{agent}" for agent in everywhere} <= set(RECIPES)
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_a_recipe_trains_as_its_name_says(recipe: str, tmp_path: Path) -> None:
+    """Long enough for a first update: past learning_starts, and through a rollout."""
+    summary = train_in(tmp_path, f"experiment={recipe}", "total_timesteps=200", *NO_FILES)
+    config = configure(f"experiment={recipe}")
+    assert recipe == f"{config.env.layout}_{config.agent.name}"
+    assert summary["timesteps"] == 0 or int(summary["timesteps"]) >= 200
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_a_recipe_tells_what_comes_of_it(recipe: str) -> None:
+    header, result, *_ = (CONF / "experiment" / f"{recipe}.yaml").read_text("utf-8").splitlines()
+    assert header == "# @package _global_"
+    assert result.startswith("# ")
+    assert any(word in result for word in ("certified", "regret"))
+
+
+def test_the_command_line_beats_the_recipe_and_the_recipe_the_agent() -> None:
+    recipe = configure("experiment=cliff_dqn")
+    assert configure("agent=dqn").agent.gamma == 0.9
+    assert recipe.agent.gamma == 0.99
+    assert configure("experiment=cliff_dqn", "agent.gamma=0.5").agent.gamma == 0.5
+    assert configure("agent.gamma=0.5", "experiment=cliff_dqn").agent.gamma == 0.5
+    assert configure("experiment=cliff_dqn", "env.slip=0.25").env.slip == 0.25
+    assert recipe.total_timesteps != configure("agent=dqn").total_timesteps
+    assert recipe.agent.learning_rate == configure("agent=dqn").agent.learning_rate  # it says nothing of that
+
+
+def test_the_command_line_chooses_over_the_recipe() -> None:
+    config = configure("experiment=cliff_q_learning", "agent=sarsa", "env=maze")
+    assert (config.agent.name, config.env.layout) == ("sarsa", "maze")
+    assert config.agent.initial_value == 0  # its values stay
+    assert configure("experiment=cliff_dqn", "observation=coordinates").observation.kind == "coordinates"
+    assert configure("experiment=cliff_q_learning").observation.kind == "none"  # as the agent chooses
+
+
+def test_no_recipe_is_the_default() -> None:
+    assert configure("~experiment") == configure()
+
+
+def test_the_manual_has_a_line_per_task() -> None:
+    _, shown = manual(CONF).split("experiment=...\n", 1)
+    shown = shown.split("observation=...")[0]
+    assert max(map(len, shown.splitlines())) <= 100
+    found = set()
+    for word in shown.replace(",", "").split():
+        if word.endswith("_..."):
+            task = word.removesuffix("...")
+        else:
+            found.add(task + word)
+    assert found == set(RECIPES)
+
+
+@pytest.mark.parametrize("name", ["dqn", "ppo", "a2c"])
+def test_the_default_settings_are_the_librarys_own(name: str) -> None:
+    config = configure(f"experiment=classic_{name}_sb3_defaults")
+    arguments = algorithm_and_arguments(config.agent)[1]
+    parameters = inspect.signature(getattr(stable_baselines3, name.upper()).__init__).parameters
+    for key, value in arguments.items():
+        if key not in ("policy", "policy_kwargs", "optimize_memory_usage"):
+            assert value == parameters[key].default or not value, key
+    assert config.n_envs == 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("task", ["cliff", "four_rooms"])
+def test_q_learning_is_certified(task: str, seed: int, tmp_path: Path) -> None:
+    summary = train_in(tmp_path, f"experiment={task}_q_learning", f"seed={seed}", *NO_FILES)
+    assert summary["certified"]
+    assert int(summary["certified_since_step"]) < int(summary["total_timesteps"])
+
+
+@pytest.mark.slow
+def test_on_the_cliff_sarsa_earns_more_while_q_learning_finds_the_optimum(tmp_path: Path) -> None:
+    """Sutton & Barto, example 6.6: what the policy that explores earns, in the second half of training."""
+    earned: dict[str, list[float]] = {"q_learning": [], "sarsa": []}
+    for agent, means in earned.items():
+        for seed in range(10):
+            folder = tmp_path / f"{agent}{seed}"
+            summary = train_in(
+                folder,
+                *(f"experiment=cliff_{agent}_textbook", f"seed={seed}"),
+                *("total_timesteps=15000", "evaluation.every=1000", *NO_FILES),
+            )
+            assert summary["certified"] == (agent == "q_learning")
+            with (folder / "curve.csv").open() as file:
+                rows = list(csv.DictReader(file))
+            late = [float(row["sampled_return"]) for row in rows[len(rows) // 2 :]]
+            means.append(sum(late) / len(late))
+    assert min(earned["sarsa"]) > max(earned["q_learning"])
+    assert statistics.mean(earned["sarsa"]) > statistics.mean(earned["q_learning"]) + 5
