@@ -46,7 +46,7 @@ class Scale:
         low, high = self.low, self.high
         if self.logarithmic:
             values, low, high = np.log(np.maximum(values, low)), np.log(low), np.log(high)
-        level = (values - low) / (high - low) if high > low else np.full(np.shape(values), 0.5)
+        level = (values - low) / (high - low) if high > low else np.zeros(np.shape(values))
         steps = np.rint(np.clip(level, 0.0, 1.0) * (len(self.ramp) - 1))
         colours: ColourArray = self.ramp[steps.astype(np.intp)]
         return colours

@@ -76,6 +76,18 @@ A2C = "stable_baselines3.A2C"
         (A2C, ["+agent.arguments.n_steps=many"], "agent.arguments.n_steps=many: must be int"),
         (A2C, ["+agent.arguments.ent_coef=true"], "agent.arguments.ent_coef=True: must be float"),
         (A2C, ["agent.arguments.gamma=2"], "agent.arguments.gamma=2: must be from 0 to 1"),
+        (A2C, ["+agent.arguments.n_steps=0"], "agent.arguments.n_steps=0: must be at least 1"),
+        (A2C, ["+agent.arguments.ent_coef=nan"], "agent.arguments.ent_coef=nan: must be a finite number"),
+        (
+            "sb3_contrib.TRPO",
+            ["+agent.arguments.batch_size=-1"],
+            "batch_size=-1: must be at least 1",
+        ),
+        (
+            "sb3_contrib.QRDQN",
+            ["+agent.arguments.train_freq=0"],
+            "train_freq=0: must be a whole number",
+        ),
         (A2C, ["+agent.arguments.seed=2"], "agent.arguments.seed: is not set here but by seed="),
         (A2C, ["+agent.arguments.learning_rate=fast"], "agent.arguments.learning_rate=fast: must be a numb"),
     ],

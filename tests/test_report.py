@@ -392,7 +392,7 @@ def test_names_out_of_a_folder_stay_text(maker: Maker, tmp_path: Path) -> None:
     assert "&lt;script&gt;alert(1)" in page
     assert sorted(path.name for path in tmp_path.iterdir()) == ["0", "1", "report"]
     table = (folder / "tables" / "results.md").read_text().splitlines()
-    assert {len(re.findall(r"(?<!\\)\|", line)) for line in table[2:]} == {8}
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in table[2:]} == {7}
 
 
 # ---- what is written -----------------------------------------------------------------------------------
@@ -581,3 +581,20 @@ def test_pictures_are_embedded_within_bounds(maker: Maker, tmp_path: Path) -> No
         ("png", "480", "267", "ppo, seed 1, certified optimal: policy"),
         ("gif", "40", "30", "ppo, seed 1, certified optimal: policy while it learnt"),
     ]
+
+
+def test_a_curve_that_lost_its_beginning_is_named_and_the_rest_is_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = tmp_path / "runs"
+    maker = Maker("agent=dqn")
+    for seed in range(3):
+        maker.write(runs / f"run{seed}", seed, 2000)
+    lines = (runs / "run0" / "curve.csv").read_text().splitlines(keepends=True)
+    (runs / "run0" / "curve.csv").write_text("".join([lines[0], *lines[2:]]))
+    with pytest.raises(SystemExit) as end:
+        command.main([str(runs)])
+    assert end.value.code == 1
+    assert "does not begin at step 0" in capsys.readouterr().err
+    row = rows_of(runs / "report" / "tables" / "results.csv")[0]
+    assert row["seeds certified of"] == "2"

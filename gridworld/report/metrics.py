@@ -34,11 +34,11 @@ def optimality(run: Evidence, world: Reference) -> float:
 
 
 def online_return(run: Evidence, last: float = 1.0) -> float:
-    """Mean return of the last part's training episodes, each row weighted by the steps it stands for."""
+    """Mean return of the last part's training episodes, each row weighted by its steps in that part."""
     if ONLINE not in run.curve:
         return math.nan
-    weights = np.diff(run.curve["step"], prepend=0.0)
-    told = np.isfinite(run.curve[ONLINE]) & (weights > 0) & (run.curve["step"] > (1 - last) * run.steps)
+    weights = np.diff(np.maximum(run.curve["step"], (1 - last) * run.steps), prepend=(1 - last) * run.steps)
+    told = np.isfinite(run.curve[ONLINE]) & (weights > 0)
     if not told.any():
         return math.nan
     return float(run.curve[ONLINE][told] @ (weights[told] / weights[told].sum()))

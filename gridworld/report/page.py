@@ -143,6 +143,8 @@ def _verdict(result: Result) -> str:
     )
     if share.total == 1:
         seeds = "its one seed"
+    if result.ever.count > share.count:  # a certificate can be lost again
+        return f"{agent} ends certified optimal on {seeds}, and was so at some time on {result.ever.count}"
     return f"{agent} is certified optimal on {seeds}{_after(result)}"
 
 

@@ -24,8 +24,9 @@ _OPTIONAL = (SAMPLED_RETURN, ONLINE)
 
 def read_object(path: Path) -> dict[str, Any]:
     """A JSON object."""
+    text = _bounded(path, _LARGEST_JSON)
     try:
-        content = json.loads(_bounded(path, _LARGEST_JSON))
+        content = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is no JSON, it was changed or cut off ({error})") from None
     if not isinstance(content, dict):
@@ -66,6 +67,8 @@ def read_curve(path: Path) -> dict[str, FloatArray]:
     }
     if not np.isfinite(curve["step"]).all() or (np.diff(curve["step"]) <= 0).any():
         raise InputError(f"{path}: the steps do not rise from row to row")
+    if curve["step"][0] != 0:
+        raise InputError(f"{path}: does not begin at step 0, rows were taken out")
     if not np.isin(curve["certified"], (0, 1)).all():
         raise InputError(f"{path}: certified must be 0 or 1 in every row")
     curve["regret"] = np.maximum(0.0, curve["regret"])  # below zero is rounding

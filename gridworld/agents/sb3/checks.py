@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from gridworld.config import (
@@ -18,6 +19,11 @@ from gridworld.config import (
 )
 from gridworld.errors import InputError
 
+# Arguments that count something, by the names that SB3 and sb3-contrib give them.
+_COUNTS = (
+    *("n_steps", "batch_size", "sub_sampling_factor", "n_epochs", "n_critic_updates", "cg_max_steps"),
+    *("buffer_size", "target_update_interval", "stats_window_size", "n_quantiles"),
+)
 ENGINES = ("tabulated", "stock")
 
 # Arguments of an SB3 class that are settings of the run, and where they stand.
@@ -38,7 +44,7 @@ def check(config: TrainConfig) -> None:
     at_least("agent.log_interval", agent.log_interval, 1)
     _check_observation(agent, config.observation.kind)
     if isinstance(agent, SB3ClassConfig):
-        _check_class(agent)
+        _check_class(agent, config.n_envs)
     elif isinstance(agent, SB3CheckedConfig):
         _check_fields(agent, config)
 
@@ -55,7 +61,7 @@ def _check_observation(agent: SB3Config, kind: str) -> None:
         )
 
 
-def _check_class(agent: SB3ClassConfig) -> None:
+def _check_class(agent: SB3ClassConfig, n_envs: int) -> None:
     """What can be told without importing it; building the agent tells the rest."""
     if "." not in agent.algorithm or not all(part.isidentifier() for part in agent.algorithm.split(".")):
         raise InputError(
@@ -65,6 +71,9 @@ def _check_class(agent: SB3ClassConfig) -> None:
     for name, place in _ELSEWHERE.items():
         if name in agent.arguments:
             raise InputError(f"agent.arguments.{name}: is not set here but by {place}=...")
+    _check_numbers("agent.arguments", agent.arguments)
+    if "train_freq" in agent.arguments:
+        _check_train_freq("agent.arguments.train_freq", agent.arguments["train_freq"], n_envs)
     gamma = agent.arguments.get("gamma", 0.99)
     if isinstance(gamma, bool) or not isinstance(gamma, int | float) or not 0 <= gamma <= 1:
         raise InputError(f"agent.arguments.gamma={gamma}: must be from 0 to 1")
@@ -106,7 +115,7 @@ def _check_dqn(agent: DQNConfig, config: TrainConfig) -> None:
             "agent.policy_kwargs.net_arch: DQN has one network; must be layer widths, e.g. [64,64]"
         )
     within("agent.tau", agent.tau, 0, 1)
-    _check_train_freq(agent.train_freq, config.n_envs)
+    _check_train_freq("agent.train_freq", agent.train_freq, config.n_envs)
     at_least("agent.gradient_steps", agent.gradient_steps, -1)
     at_least("agent.n_steps", agent.n_steps, 1)
     at_least("agent.target_update_interval", agent.target_update_interval, 1)
@@ -117,15 +126,24 @@ def _check_dqn(agent: DQNConfig, config: TrainConfig) -> None:
     above_zero("agent.max_grad_norm", agent.max_grad_norm)
 
 
-def _check_train_freq(value: Any, n_envs: int) -> None:
+def _check_numbers(where: str, content: dict[str, Any]) -> None:
+    """What no algorithm can use, however its class is written: counts below 1, numbers that are none."""
+    for name, value in content.items():
+        if isinstance(value, dict):
+            _check_numbers(f"{where}.{name}", value)
+        elif isinstance(value, float) and not math.isfinite(value):
+            raise InputError(f"{where}.{name}={value}: must be a finite number")
+        elif name in _COUNTS and isinstance(value, int):
+            at_least(f"{where}.{name}", value, 1)
+
+
+def _check_train_freq(key: str, value: Any, n_envs: int) -> None:
     count, unit = value if isinstance(value, list | tuple) and len(value) == 2 else (value, "step")
     if isinstance(count, bool) or not isinstance(count, int) or count < 1 or unit not in ("step", "episode"):
-        raise InputError(
-            f"agent.train_freq={value}: must be a whole number of at least 1, or [N,step] or [N,episode]"
-        )
+        raise InputError(f"{key}={value}: must be a whole number of at least 1, or [N,step] or [N,episode]")
     if unit == "episode" and n_envs > 1:
         raise InputError(
-            f"agent.train_freq={value}: SB3 counts episodes with one environment only; "
+            f"{key}={value}: SB3 counts episodes with one environment only; "
             f"set n_envs=1 (it is {n_envs}) or count steps"
         )
 
