@@ -117,7 +117,7 @@ class Curve:
         if not (np.isfinite(beliefs.values).all() and np.isfinite(beliefs.sampled).all()):
             raise InputError(
                 f"training diverged: the agent's values are no finite numbers after {step} steps; "
-                "try a smaller agent.learning_rate"
+                "try a smaller learning rate"
             )
         if before is None or self.greedy is None or not np.array_equal(before.greedy, beliefs.greedy):
             self.greedy = self.judge.score(one_hot_policy(beliefs.greedy))

@@ -52,7 +52,7 @@ class SB3Agent:
                 raise
             raise InputError(
                 f"agent={self.config.name}: training diverged, the network's weights are no finite numbers "
-                f"after {self.model.num_timesteps} steps; try a smaller agent.learning_rate"
+                f"after {self.model.num_timesteps} steps; try a smaller learning rate"
             ) from error
 
     def _is_finite(self) -> bool:
