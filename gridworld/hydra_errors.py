@@ -56,7 +56,7 @@ def _unknown_choice(message: str) -> str:
     group = re.search(r"Available options in '([^']*)':((?:\n\t\S+)*)", message)
     assert missing is not None
     choices = ", ".join(group.group(2).split()) if group else ""
-    return f"{missing.group(1).replace('/', '=', 1)}: there is no such choice; there are {choices}"
+    return f"{'='.join(missing.group(1).rsplit('/', 1))}: there is no such choice; there are {choices}"
 
 
 def _suggestion(facts: str) -> str:
