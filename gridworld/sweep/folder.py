@@ -84,9 +84,11 @@ class SweepFolder:
     def add(self, jobs: Sequence[Job], words: Sequence[str]) -> list[Entry]:
         """Note what is asked for; returns the jobs' entries, new ones with a folder of their own."""
         taken = {entry.job.lower() for entry in self.entries.values()}
+        lines = [e.overrides for e in self.entries.values()] + [job.overrides for job in jobs]
+        common = set(lines[0]).intersection(*lines)
         for job in jobs:
             if job.hash not in self.entries:
-                name = folder_name(job, taken)
+                name = folder_name(job, taken, common)
                 taken.add(name.lower())
                 self.entries[job.hash] = Entry(name, job.hash, job.overrides)
         self._save(words)

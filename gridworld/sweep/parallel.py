@@ -23,6 +23,7 @@ from omegaconf import DictConfig, open_dict
 
 _SECONDS_BETWEEN_LOOKS = 0.2
 _GRACE_SECONDS = 3.0  # to close the files
+_parent_died = threading.Event()
 
 
 def launch(
@@ -48,13 +49,18 @@ def _run(state: bytes, overrides: list[str], number: int) -> JobReturn:
     with open_dict(config):
         config.hydra.job.id = f"{config.hydra.job.name}_{number}"
         config.hydra.job.num = number
-    result = run_job(
-        hydra_context=context,
-        task_function=task,
-        config=config,
-        job_dir_key="hydra.sweep.dir",
-        job_subdir_key="hydra.sweep.subdir",
-    )
+    try:
+        result = run_job(
+            hydra_context=context,
+            task_function=task,
+            config=config,
+            job_dir_key="hydra.sweep.dir",
+            job_subdir_key="hydra.sweep.subdir",
+        )
+    except SystemExit:
+        if _parent_died.is_set():
+            os._exit(1)  # nobody is there to take the result; waiting for that would take seconds
+        raise
     result.cfg = result.hydra_cfg = None  # nobody asks for them, and they would pile up
     return result
 
@@ -77,6 +83,7 @@ def _end_with(parent: int) -> None:
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(_SECONDS_BETWEEN_LOOKS)
+        _parent_died.set()
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(_GRACE_SECONDS)
         os._exit(1)

@@ -115,13 +115,13 @@ def _hash(config: TrainConfig, layout: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def folder_name(job: Job, taken: Collection[str]) -> str:
+def folder_name(job: Job, taken: Collection[str], common: Collection[str] = ()) -> str:
     """What makes the job different, as a folder's name that is not `taken` (in lower case).
 
-    First choice are the swept settings, then all of them; where neither is short enough and free, a piece
-    of the hash goes in. The seed always stays.
+    First choice are the swept settings, then all but those that are `common` to the sweep's jobs; where
+    neither is short enough and free, a piece of the hash goes in. The seed always stays.
     """
-    for lines in (job.swept or job.overrides, job.overrides):
+    for lines in (job.swept or job.overrides, [line for line in job.overrides if line not in common]):
         name = ",".join(map(_slug, lines)) or "job"
         if len(name) <= _LONGEST_NAME and name.lower() not in taken:
             return name

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 
 from gridworld.sweep.progress import duration
@@ -26,8 +26,13 @@ def tell_start(folder: Path, rows: Sequence[Row], to_run: int) -> None:
     print(f"sweep {shown(folder)}: {counts_text(rows)}; {to_run} to run", file=sys.stderr, flush=True)
 
 
-def tell_end(folder: Path, rows: Sequence[Row], seconds: float, stopped: str) -> None:
-    """How every job stands, each failure with its reason, and how to go on where there is more to do."""
+def tell_end(
+    folder: Path, rows: Sequence[Row], seconds: float, stopped: str, mistakes: Container[str]
+) -> None:
+    """How the jobs stand, each failure with its reason, and how to go on where there is more to do.
+
+    Those in `mistakes` would fail again.
+    """
     print(f"sweep {shown(folder)}: {counts_text(rows)}, in {duration(seconds)}")
     print(f"  jobs: {shown(folder / JOBS_CSV)}\n  curves: tensorboard --logdir {shown(folder)}", flush=True)
     failed = [row for row in rows if row.status == FAILED]
@@ -39,10 +44,10 @@ def tell_end(folder: Path, rows: Sequence[Row], seconds: float, stopped: str) ->
         print(f"  and {len(failed) - _MOST_FAILURES} more; {JOBS_CSV} has all", file=sys.stderr)
     if stopped:
         print(f"{stopped}; go on with: {command(folder)}", file=sys.stderr)
-    elif failed:
+    elif any(row.job not in mistakes for row in failed):
         retry = "hydra.sweeper.retry_failed=true"
         print(f"to try them again: {command(folder, retry)}", file=sys.stderr)
-    elif any(row.status != DONE for row in rows):
+    elif any(row.status not in (DONE, FAILED) for row in rows):
         print(f"the rest runs elsewhere; to see how it goes: {command(folder)}", file=sys.stderr)
     sys.stderr.flush()
 

@@ -60,8 +60,7 @@ def run_sweep(
         entries = folder.add(jobs, words)
         mistakes = {entry.job: job.mistake for entry, job in zip(entries, jobs, strict=True) if job.mistake}
         sweep = _Sweep(folder, entries, launcher)
-        to_do = sweep.to_do(mistakes, settings.retry_failed)
-        code = sweep.run(to_do, any(job.progress for job in jobs))
+        code = sweep.run(mistakes, settings.retry_failed, any(job.progress for job in jobs))
     if code:
         raise SystemExit(code)
 
@@ -82,7 +81,7 @@ class _Sweep:
         self._launcher = launcher
         self._table = Table(folder.path)
 
-    def to_do(self, mistakes: dict[str, str], retry_failed: bool) -> list[Entry]:
+    def _to_do(self, mistakes: dict[str, str], retry_failed: bool) -> list[Entry]:
         """The jobs to run now. Those with a mistake are noted as failed."""
         rows = self._put_right()
         for job, mistake in mistakes.items():
@@ -91,8 +90,9 @@ class _Sweep:
         statuses = {PENDING, INTERRUPTED} | ({FAILED} if retry_failed else set())
         return [e for e in self._entries if rows[e.job].status in statuses and e.job not in mistakes]
 
-    def run(self, to_do: list[Entry], progress: bool) -> int:
-        """Launch, report; the exit code that tells how it went."""
+    def run(self, mistakes: dict[str, str], retry_failed: bool, progress: bool) -> int:
+        """Launch what is to do, and report; returns the exit code that tells how it went."""
+        to_do = self._to_do(mistakes, retry_failed)
         started = time.monotonic()
         names = [entry.job for entry in self._entries]
         rows = self._table.read()
@@ -109,7 +109,7 @@ class _Sweep:
             _exit_within(_STOP_WITHIN, code)
         rows = self._put_right()
         asked = [rows[name] for name in names]
-        report.tell_end(self._folder.path, asked, time.monotonic() - started, stopped)
+        report.tell_end(self._folder.path, asked, time.monotonic() - started, stopped, mistakes)
         return code or int(any(row.status != DONE for row in asked))
 
     def _launch(self, to_do: list[Entry]) -> None:
