@@ -16,6 +16,7 @@ import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
+from hydra.core.utils import JobReturn
 from hydra.errors import CompactHydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
@@ -39,6 +40,10 @@ class JobError(CompactHydraException):
 
 class RefuseUsedFolders(Callback):
     """Looks at the output folder before Hydra writes to it, and ends the program if it cannot be used."""
+
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
+        """Let go of the configurations that a launcher would keep of every job until the sweep ends."""
+        job_return.cfg = job_return.hydra_cfg = None
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         try:

@@ -21,7 +21,7 @@ from gridworld.lock import is_locked
 KILLS = int(os.environ.get("GRIDWORLD_KILLS", "4"))
 JOBS = int(os.environ.get("GRIDWORLD_KILLED_JOBS", "12"))
 WORDS = (
-    *("-m", "agent=q_learning,dqn,sarsa", f"seed=range({JOBS // 3})", "total_timesteps=6000"),
+    *("-m", "agent=q_learning,dqn,sarsa", f"seed=range({JOBS // 3})", "total_timesteps=20000"),
     *("recording.gif=false", "hydra.sweep.dir=sweep"),
 )
 OF_THE_CLOCK = ("train_seconds", "evaluation_seconds")
@@ -34,9 +34,13 @@ def test_a_sweep_that_is_killed_comes_to_the_same(tmp_path: Path) -> None:
         folder.mkdir()
     chance = random.Random(0)
     done: dict[str, bytes] = {}
+    at_work = 0
     for kill in range(KILLS):
-        kill_after(chance.uniform(0.5, 6.0), killed, ("basic", "joblib")[kill % 2])
+        launcher, latest = (("basic", 4.0), ("joblib", 8.0))[kill % 2]  # whose workers take a while to begin
+        at_work += kill_after(chance.uniform(0.5, latest), killed, launcher)
         done = check_what_is_left(killed / "sweep", done)
+        print(f"kill {kill}: {len(done)} done")
+    assert at_work > KILLS / 2  # the others came too late
     last = script("train.py", *WORDS, cwd=killed)
     assert last.returncode == 0, last.stderr
     assert check_what_is_left(killed / "sweep", done).keys() == results(killed / "sweep").keys()
@@ -47,11 +51,14 @@ def test_a_sweep_that_is_killed_comes_to_the_same(tmp_path: Path) -> None:
     assert list((killed / "sweep").rglob(".*.part")) == []
 
 
-def kill_after(seconds: float, cwd: Path, launcher: str) -> None:
+def kill_after(seconds: float, cwd: Path, launcher: str) -> bool:
+    """Whether it was still running."""
     command = [sys.executable, str(ROOT / "scripts" / "train.py"), *WORDS, f"hydra/launcher={launcher}"]
     with subprocess.Popen(command, cwd=cwd, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         time.sleep(seconds)
+        at_work = process.poll() is None
         process.kill()
+    return at_work
 
 
 def check_what_is_left(sweep: Path, before: dict[str, bytes]) -> dict[str, bytes]:
