@@ -8,6 +8,7 @@ once.
 from __future__ import annotations
 
 import functools
+import gc
 import os
 import signal
 import threading
@@ -62,7 +63,15 @@ def _run(state: bytes, overrides: list[str], number: int) -> JobReturn:
             os._exit(1)  # nobody is there to take the result; waiting for that would take seconds
         raise
     result.cfg = result.hydra_cfg = None  # nobody asks for them, and they would pile up
+    _spare_the_collector()
     return result
+
+
+@functools.cache
+def _spare_the_collector() -> None:
+    """Once, after the first job: loky collects garbage every second, which need not walk through torch."""
+    gc.collect()
+    gc.freeze()
 
 
 @functools.lru_cache(maxsize=1)
