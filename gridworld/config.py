@@ -260,6 +260,25 @@ class TrainConfig:
     recording: RecordingConfig = field(default_factory=RecordingConfig)
 
 
+@dataclass
+class SweepConfig:
+    """How `-m` runs its jobs; `hydra.sweeper` on the command line."""
+
+    _target_: str = "hydra_plugins.gridworld_sweeper.GridWorldSweeper"
+    retry_failed: bool = False  # run again what failed
+    stop_at_first_failure: bool = False  # leave the rest for later
+    extend: bool = False  # use the folder of a sweep that shares no job with this one
+    max_jobs: int = 10_000  # more are taken for a slip
+
+
+@dataclass
+class JoblibConfig:
+    """`hydra/launcher=joblib`: a sweep's jobs side by side on this machine; `hydra.launcher` there."""
+
+    _target_: str = "hydra_plugins.gridworld_sweeper.JoblibLauncher"
+    n_jobs: int = -1  # workers; -1 for one on each core
+
+
 AGENT_SCHEMAS: dict[str, type[AgentConfig]] = {
     "dqn": DQNConfig,
     "ppo": PPOConfig,

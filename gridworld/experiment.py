@@ -15,17 +15,19 @@ from typing import Any, cast
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.plugins import Plugins
+from hydra.core.utils import JobReturn
 from hydra.errors import CompactHydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gridworld.config import AGENT_SCHEMAS, TrainConfig
+from gridworld.config import AGENT_SCHEMAS, JoblibConfig, SweepConfig, TrainConfig
 from gridworld.errors import EXIT_CODE, InputError
 from gridworld.hydra_errors import refuse_added_keys, sentence
 from gridworld.manual import manual
-from gridworld.run import MANIFEST, Run, check_new
+from gridworld.run import MANIFEST, SWEEP_JSON, Run, check_new
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 _job_begun = threading.Event()  # set once this process has come to a job
@@ -39,23 +41,13 @@ class JobError(CompactHydraException):
 class RefuseUsedFolders(Callback):
     """Looks at the output folder before Hydra writes to it, and ends the program if it cannot be used."""
 
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
+        """Let go of the configurations that a launcher would keep of every job until the sweep ends."""
+        job_return.cfg = job_return.hydra_cfg = None
+
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        self._refuse(lambda: check_new(Path(config.hydra.run.dir)))
-
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        folder = Path(config.hydra.sweep.dir)
-
-        def check() -> None:
-            check_new(folder)
-            for manifest in sorted(folder.glob(f"*/{MANIFEST}")):
-                check_new(manifest.parent)
-
-        self._refuse(check)
-
-    @staticmethod
-    def _refuse(check: Any) -> None:
         try:
-            check()
+            check_new(Path(config.hydra.run.dir))
         except (InputError, OSError, OmegaConfBaseException) as error:
             sys.exit(_tell(error))
 
@@ -86,6 +78,12 @@ def compose(conf: Path, overrides: list[str]) -> TrainConfig:
     register_schemas()
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf)):
         settings = hydra.compose(config_name="train", overrides=overrides)
+    return to_config(settings)
+
+
+def to_config(settings: DictConfig) -> TrainConfig:
+    """Hydra's settings as the dataclasses that everything below here takes. Raises `InputError`."""
+    refuse_added_keys(settings)
     return cast(TrainConfig, OmegaConf.to_object(settings))
 
 
@@ -96,8 +94,11 @@ def run_job(settings: DictConfig) -> float:
     folder = Path(context.runtime.output_dir)
     overrides = cast("list[str]", OmegaConf.to_container(context.overrides.task))
     try:
-        refuse_added_keys(settings)
-        config = cast(TrainConfig, OmegaConf.to_object(settings))
+        config = to_config(settings)
+        if context.mode is RunMode.MULTIRUN and (folder.parent / SWEEP_JSON).exists():
+            from gridworld.sweep.job import run_in_sweep
+
+            return run_in_sweep(config, folder, overrides, context.sweeper.stop_at_first_failure)
         from gridworld.summary import summary_text
         from gridworld.training import Interrupted, train
 
@@ -123,6 +124,9 @@ def register_schemas() -> None:
     """Tell Hydra the schemas of `config.py`, and OmegaConf the functions that `conf/` uses."""
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
+    store.store(group="hydra/sweeper", name="gridworld", node=SweepConfig)
+    Plugins.instance()  # looks for plugins first, so that ours is `joblib` even beside hydra-joblib-launcher
+    store.store(group="hydra/launcher", name="joblib", node=JoblibConfig)
     for name, schema in AGENT_SCHEMAS.items():
         store.store(group="agent/schema", name=name, node=schema)
     OmegaConf.register_new_resolver("slug", _slug, replace=True)

@@ -58,8 +58,8 @@ def _unknown_choice(message: str) -> str:
     group = re.search(r"Available options in '([^']*)':((?:\n\t\S+)*)", message)
     assert missing is not None
     choices = group.group(2).split() if group else []
-    name = missing.group(1).rpartition("/")[2]
-    fact = f"{missing.group(1).replace('/', '=', 1)}: there is no such choice"
+    where, _, name = missing.group(1).rpartition("/")
+    fact = f"{where}={name}: there is no such choice"
     if len(choices) <= _LISTED:
         return f"{fact}; there are {', '.join(choices)}"
     near = [choice for choice in choices if choice.startswith(name)]

@@ -28,6 +28,11 @@ Keys, with their values: python scripts/train.py --cfg job
   recording.*    pictures of what was learnt, and the final policy's episode as PNGs, GIF and MP4
   hydra.run.dir  the folder to write to, instead of a new one in runs/
 
+Sweeps (-m):
+  hydra.sweep.dir        the folder to write to; the same one again runs what is not done yet
+  hydra/launcher=joblib  as many jobs at once as there are cores, or hydra.launcher.n_jobs
+  hydra.sweeper.*        retry_failed, stop_at_first_failure, extend, max_jobs
+
 Examples:
   python scripts/train.py agent=q_learning
       a table over the states, trained within a second
@@ -35,14 +40,15 @@ Examples:
       one run; its folder in runs/ has the model, the curve, the pictures and a summary
   python scripts/train.py agent=dqn env=four_rooms env.slip=0.1 total_timesteps=200000
       another world, slippery, and more time
-  python scripts/train.py -m agent=dqn,ppo seed=0,1,2
-      a sweep of six runs, a folder each; look at them with tensorboard --logdir runs
+  python scripts/train.py -m agent=dqn,ppo "seed=range(20)" hydra.sweep.dir=runs/mine
+      a sweep of forty runs, a folder each; look at them with tensorboard --logdir runs/mine
   python scripts/train.py experiment=cliff_dqn
       a recipe: that agent and that task, with settings that were tuned for them
   python scripts/train.py -m 'experiment=glob(cliff_*)' seed='range(20)'
       every recipe of a task, with twenty seeds each
 
-Afterwards: scripts/evaluate.py, scripts/record.py and scripts/play.py --agent, with a run's folder.
+Afterwards: scripts/evaluate.py, scripts/record.py and scripts/play.py --agent, with a run's folder;
+scripts/jobs.py, with a sweep's.
 Hydra's own options: python scripts/train.py --hydra-help
 """
 

@@ -16,6 +16,7 @@ the map's text.
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import platform
@@ -29,6 +30,7 @@ from gridworld.files import write_json
 
 MANIFEST = "manifest.json"
 CURVE = "curve.csv"
+SWEEP_JSON = "sweep.json"  # a sweep's folder has this instead
 SUMMARY = "summary.json"
 PACKAGES = (
     "gridworld",
@@ -68,7 +70,7 @@ class Run:
             "overrides": overrides,
             "seed": config["seed"],
             "threads": config["threads"],
-            "versions": _versions(),
+            "versions": versions(),
             "git": _git(),
             "platform": platform.platform(),
             "processor": {"machine": platform.machine(), "cores": os.cpu_count()},
@@ -116,22 +118,29 @@ def check_new(folder: Path) -> None:
     """Raise `InputError` unless a run can be written to `folder`: it can be made and holds no run yet."""
     if (folder / MANIFEST).exists():
         raise InputError(f"{folder}: holds a run already; choose another folder")
+    if (folder / SWEEP_JSON).exists():
+        raise InputError(f"{folder}: is the folder of a sweep; choose another hydra.run.dir")
+    check_writable(folder, "hydra.run.dir")
+
+
+def check_writable(folder: Path, key: str) -> None:
+    """Raise `InputError` if the folder that `key` names can neither be made nor written to."""
     existing = folder
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent
     if not existing.is_dir():
-        raise InputError(f"{folder}: cannot be made, {existing} is a file; choose another hydra.run.dir")
+        raise InputError(f"{folder}: cannot be made, {existing} is a file; choose another {key}")
     if not os.access(existing, os.W_OK | os.X_OK):
-        raise InputError(
-            f"{folder}: cannot be written, {existing} is read-only; choose another hydra.run.dir"
-        )
+        raise InputError(f"{folder}: cannot be written, {existing} is read-only; choose another {key}")
 
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
-def _versions() -> dict[str, str | None]:
+@functools.cache  # the code that runs is the code that was imported
+def versions() -> dict[str, str | None]:
+    """Of Python and of every package that has a say in the result."""
     # Imported here, as subprocess below, to keep them out of the way of `train.py --help`.
     from importlib.metadata import PackageNotFoundError, version
 
@@ -144,6 +153,7 @@ def _versions() -> dict[str, str | None]:
     return found
 
 
+@functools.cache
 def _git() -> dict[str, Any] | None:
     """Commit of the source tree and whether it has changes; None outside a git checkout."""
     import subprocess

@@ -7,7 +7,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
@@ -17,6 +17,7 @@ from gridworld.chain import one_hot_policy
 from gridworld.config import EnvConfig, TrainConfig, check
 from gridworld.counted_env import CountedVectorEnv
 from gridworld.curve import GREEDY, Curve
+from gridworld.errors import InputError
 from gridworld.evaluation import Judge, Score
 from gridworld.events import EventWriter, HParamValue
 from gridworld.files import write_array, write_json
@@ -46,16 +47,12 @@ def train(config: TrainConfig, run: Run, overrides: list[str]) -> Summary:
 
     Raises `InputError` for a mistake in the settings, before anything is written, and `Interrupted`.
     """
-    check(config)
-    algorithms = family(config.agent)
-    algorithms.check(config)
-    mdp = make_mdp(config.env)
+    mdp = check_settings(config)
     observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
-    check_recording(config, mdp)
     judge = Judge(mdp, config.evaluation.gamma, config.env.max_episode_steps)
     log = _Log()
     seat = make_seat(config, mdp, observation, log)
-    agent = algorithms.build(config.agent, seat)
+    agent = family(config.agent).build(config.agent, seat)
 
     run.start(dataclasses.asdict(config), mdp.layout.text(), overrides)
     try:
@@ -65,7 +62,7 @@ def train(config: TrainConfig, run: Run, overrides: list[str]) -> Summary:
         run.end("interrupted", str(interruption))
         raise
     except BaseException as error:
-        run.end("failed", f"{type(error).__name__}: {error}")
+        run.end("failed", str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}")
         raise
     run.end("finished")
     return summary
@@ -77,6 +74,18 @@ def make_mdp(env: EnvConfig, layout: Layout | None = None) -> Mdp:
         size = {"num_rows": env.num_rows, "num_cols": env.num_cols}
         layout = load(env.layout, **{name: count for name, count in size.items() if count is not None})
     return compile_mdp(layout, env.slip, env.step_reward, env.goal_reward, env.trap_reward)
+
+
+def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = make_mdp) -> Mdp:
+    """The run's world, once everything is checked that can be without the agent's library.
+
+    `world` makes it, or finds it where many runs share one. Raises `InputError`.
+    """
+    check(config)
+    family(config.agent).check(config)
+    mdp = world(config.env)
+    check_recording(config, mdp)
+    return mdp
 
 
 def make_seat(config: TrainConfig, mdp: Mdp, observation: ObservationTable, log: _Log | None = None) -> Seat:

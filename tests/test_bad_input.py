@@ -1,5 +1,6 @@
 """A mistake on a command line gets one sentence, exit code 2, no traceback, and leaves nothing behind."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -152,12 +153,53 @@ def test_a_folder_under_a_file_is_refused(tmp_path: Path) -> None:
     assert "error: file/run: cannot be made, file is a file" in done.stderr
 
 
-def test_a_used_sweep_folder_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "sweep" / "0_seed=0").mkdir(parents=True)
-    (tmp_path / "sweep" / "0_seed=0" / "manifest.json").write_text("{}")
-    done = script("train.py", "-m", "seed=0", "hydra.sweep.dir=sweep", cwd=tmp_path)
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("seed=range(0)", "seed=range(0): there is nothing in it"),
+        ("seed=range(10001)", "10,001 jobs; if so many are meant, add hydra.sweeper.max_jobs=10001"),
+        ("seed=interval(0,1)", "jobs are made of a list, a,b,c, or of range(start, stop)"),
+        ("seed=-1,-2", "seed=-1: must be at least 0 (2 of 2 jobs cannot run)"),
+        ("seed=0,-1 hydra.sweeper.stop_at_first_failure=true", "(1 of 2 jobs cannot run)"),
+        ("agent=dqn,sarsa_max", "agent=sarsa_max: there is no such choice; there are a2c, a2c_sb3_defaults"),
+        ("total_timesteps=100,often", "total_timesteps=often: Value 'often' of type 'str'"),
+        ("ganma=0,1", "Key 'ganma' not in 'TrainConfig'"),
+        ("hydra.sweeper.retry_fail=true", "did you mean retry_failed?"),
+        ("hydra/launcher=abacus", "hydra/launcher=abacus: there is no such choice; there are basic, joblib"),
+        ("hydra/launcher=joblib hydra.launcher.n_jobs=0", "hydra.launcher.n_jobs=0: must be the number"),
+        ("hydra.sweep.dir=used", "used: is the folder of a single run; choose another hydra.sweep.dir"),
+        ("hydra.sweep.dir=.", "has no sweep.json, but used holds a run already"),
+        ("hydra.sweep.dir=used/manifest.json", "cannot be made, used/manifest.json is a file"),
+        ("hydra.sweep.dir=/proc/sweep", "/proc/sweep: cannot be"),
+    ],
+)
+def test_a_sweep_is_refused_before_it_writes(line: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "used").mkdir()
+    (tmp_path / "used" / "manifest.json").write_text("{}")
+    done = script("train.py", "-m", *line.split(), cwd=tmp_path)
+    assert words in done.stderr.strip().splitlines()[-1]
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "Traceback" not in done.stderr
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["manifest.json"]
+
+
+def test_a_launcher_that_is_not_installed_names_its_extra(tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text("import sys; sys.modules['joblib'] = None\n")
+    path = f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
+    line = ["-m", "seed=0,1", "hydra/launcher=joblib"]
+    done = script("train.py", *line, cwd=tmp_path, PYTHONPATH=path)
     assert done.returncode == 2
-    assert "sweep/0_seed=0: holds a run already" in done.stderr
+    assert done.stderr == (
+        "error: hydra/launcher=joblib: joblib is not installed; pip install 'gridworld[sweep]'\n"
+    )
+
+
+def test_a_sweeps_folder_is_no_runs(tmp_path: Path) -> None:
+    (tmp_path / "sweep").mkdir()
+    (tmp_path / "sweep" / "sweep.json").write_text("{}")
+    done = script("train.py", "hydra.run.dir=sweep", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == "error: sweep: is the folder of a sweep; choose another hydra.run.dir\n"
 
 
 def test_divergence_is_told_and_marked(tmp_path: Path) -> None:
@@ -190,6 +232,9 @@ def test_divergence_is_told_and_marked(tmp_path: Path) -> None:
         ("play.py", "--cell-size 10000", "too large to draw"),
         ("play.py", "--agent nowhere", "nowhere: no such folder"),
         ("play.py", "--agent nowhere --num-rows 9", "with --agent, the world has the size it was trained on"),
+        ("jobs.py", "nowhere", "nowhere: no such folder; give the folder of a sweep"),
+        ("jobs.py", ".", "not a sweep's folder, it has no sweep.json"),
+        ("jobs.py", ". --status lost", "invalid choice: 'lost'"),
         ("benchmark.py", "--fast", "unrecognized arguments: --fast"),
     ],
 )

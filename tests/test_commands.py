@@ -60,20 +60,6 @@ def test_runs_get_folders_of_their_own_even_in_the_same_second(tmp_path: Path) -
         assert re.fullmatch(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_dqn_my-map.txt_seed0_[0-9a-f]{6}", folder)
 
 
-def test_a_sweep_has_a_folder_per_job_and_survives_a_bad_one(tmp_path: Path) -> None:
-    line = ["-m", "agent=dqn", "seed=0,-1,2", "total_timesteps=1000", "hydra.sweep.dir=sweep"]
-    done = script("train.py", *line, cwd=tmp_path)
-    assert done.returncode == 2
-    assert "error: seed=-1: must be at least 0" in done.stderr
-    assert "Traceback" not in done.stderr
-    jobs = sorted(path.name for path in (tmp_path / "sweep").iterdir() if path.is_dir())
-    assert jobs == [
-        f"{number}_agent=dqn,seed={seed},total_timesteps=1000" for number, seed in ((0, 0), (2, 2))
-    ]
-    for job in jobs:
-        assert json.loads((tmp_path / "sweep" / job / "summary.json").read_text())["seed"] == int(job[0])
-
-
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_a_run_cleanly(number: signal.Signals, code: int, tmp_path: Path) -> None:
     command = [

@@ -1,0 +1,37 @@
+"""Show how the jobs of a sweep stand, and put its jobs.csv right: after a kill, say."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from gridworld.sweep.folder import open_sweep
+from gridworld.sweep.report import counts_text
+from gridworld.sweep.table import STATUSES, Table
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Print a row per job, in the order in which they were asked for, and their number."""
+    options = _parser().parse_args(arguments)
+    folder = open_sweep(options.sweep)
+    table = Table(folder.path)
+    entries = folder.entries.values()
+    may_write = os.access(folder.path, os.W_OK)
+    rows = table.put_right(entries) if may_write else table.look(entries)
+    shown = [row for row in rows.values() if options.status in (None, row.status)]
+    width = max((len(row.job) for row in shown), default=0)
+    for row in shown:
+        seconds = f"{row.seconds:>8} s" if row.seconds else " " * 10
+        regret = f"  regret {float(row.objective):.3g}" if row.objective else ""
+        error = f"  {row.error}" if row.error else ""
+        print(f"{row.job:<{width}}  {row.status:<11}{seconds}{regret}{error}".rstrip())
+    print(counts_text(rows.values()))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="jobs.py", description=__doc__)
+    parser.add_argument("sweep", type=Path, help="the sweep's folder, e.g. runs/mine")
+    parser.add_argument("--status", choices=STATUSES, help="only the jobs that stand like this")
+    return parser

@@ -1,0 +1,144 @@
+"""From a command line to its jobs: `agent=dqn,ppo seed=range(20)` are forty.
+
+Two jobs are the same if the same settings come out, however they were written; the hash of these decides
+what has been done already. Settings that change nothing about the result (logging, recording) stay out of
+it, and the map's text is in it, since a map file can change.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import itertools
+import json
+import math
+import re
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import PurePath
+from typing import Any
+
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+
+from gridworld.config import EnvConfig, TrainConfig
+from gridworld.errors import InputError
+from gridworld.mdp import Mdp
+from gridworld.training import check_settings, make_mdp
+
+_LONGEST_NAME = 100  # characters of a job's folder
+_MOST_VALUES = 1_000_000  # of one key
+_HASH_SHOWN = 6  # characters of the hash in a name that needs it
+_SEED = re.compile(r"\+*seed=")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of a sweep."""
+
+    overrides: tuple[str, ...]
+    swept: tuple[str, ...]  # those of the overrides that were given several values
+    hash: str  # of the settings that matter
+    mistake: str | None  # what is wrong with the settings, as far as it can be known beforehand
+    progress: bool  # whether its user wants to see how far it is
+
+
+def expand(words: Sequence[str], loader: ConfigLoader, most: int) -> list[tuple[list[str], list[str]]]:
+    """(overrides, the swept ones among them) of every job, the last key changing fastest.
+
+    Raises `InputError` for a range of nothing and for more than `most` jobs.
+    """
+    columns: dict[str, tuple[bool, list[str]]] = {}
+    for override in OverridesParser.create(config_loader=loader).parse_overrides(list(words)):
+        key = override.get_key_element()
+        columns.pop(key, None)  # given twice, the last one counts, in its place
+        if override.is_sweep_override():
+            columns[key] = True, [f"{key}={value}" for value in _values(override)]
+        else:
+            columns[key] = False, [str(override.input_line)]
+    count = math.prod(len(lines) for _, lines in columns.values())
+    if count > most:
+        raise InputError(
+            f"{' '.join(words)}: {count:,} jobs; if so many are meant, add hydra.sweeper.max_jobs={count}"
+        )
+    swept = [is_swept for is_swept, _ in columns.values()]
+    return [
+        (list(lines), [line for line, is_swept in zip(lines, swept, strict=True) if is_swept])
+        for lines in itertools.product(*(lines for _, lines in columns.values()))
+    ]
+
+
+def _values(override: Override) -> list[str]:
+    if not override.is_discrete_sweep():
+        raise InputError(f"{override.input_line}: jobs are made of a list, a,b,c, or of range(start, stop)")
+    values = list(itertools.islice(override.sweep_string_iterator(), _MOST_VALUES + 1))
+    if len(values) > _MOST_VALUES:
+        raise InputError(f"{override.input_line}: more than {_MOST_VALUES:,} values; a sweep takes fewer")
+    if not values:
+        raise InputError(f"{override.input_line}: there is nothing in it, so there would be no job")
+    return values
+
+
+def plan(
+    jobs: Iterable[tuple[list[str], list[str]]], configure: Callable[[Sequence[str]], TrainConfig]
+) -> list[Job]:
+    """The jobs, each once, with their hashes. Only mistakes that `configure` finds are raised."""
+    worlds: dict[tuple[Any, ...], Mdp] = {}
+
+    def world(env: EnvConfig) -> Mdp:
+        key = dataclasses.astuple(env)
+        if key not in worlds:
+            worlds[key] = make_mdp(env)
+        return worlds[key]
+
+    planned: dict[str, Job] = {}
+    for overrides, swept in jobs:
+        config = configure(overrides)
+        mistake, layout = None, ""
+        try:
+            layout = check_settings(config, world).layout.text()
+        except InputError as error:
+            mistake = str(error)
+        digest = _hash(config, layout)
+        planned.setdefault(
+            digest, Job(tuple(overrides), tuple(swept), digest, mistake, config.logging.progress)
+        )
+    return list(planned.values())
+
+
+def _hash(config: TrainConfig, layout: str) -> str:
+    content = dataclasses.asdict(config)
+    for without_effect in ("logging", "recording"):
+        del content[without_effect]
+    text = json.dumps([content, layout], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def folder_name(job: Job, taken: Collection[str], common: Collection[str] = ()) -> str:
+    """What makes the job different, as a folder's name that is not `taken` (in lower case).
+
+    First choice are the swept settings, then all but those that are `common` to the sweep's jobs; where
+    neither is short enough and free, a piece of the hash goes in. The seed always stays.
+    """
+    for lines in (job.swept or job.overrides, [line for line in job.overrides if line not in common]):
+        name = ",".join(map(_slug, lines)) or "job"
+        if len(name) <= _LONGEST_NAME and name.lower() not in taken:
+            return name
+    lines = job.swept or job.overrides
+    seed = [_slug(line) for line in lines if _SEED.match(line)]
+    head = ",".join(_slug(line) for line in lines if not _SEED.match(line))
+    for characters in (_HASH_SHOWN, len(job.hash)):
+        ending = ",".join([*seed, job.hash[:characters]])
+        name = ",".join(filter(None, [head[: _LONGEST_NAME - len(ending) - 1].rstrip(",.-"), ending]))
+        if name.lower() not in taken:
+            break
+    return name
+
+
+def _slug(override: str) -> str:
+    """Letters, digits and a few safe signs; of a path, its last part."""
+    key, equals, value = override.partition("=")
+    if "/" in value:
+        value = PurePath(value.strip("'\"")).stem
+    return re.sub(r"[^A-Za-z0-9_.=+-]+", "-", key + equals + value).strip("-.+~")

@@ -1,0 +1,193 @@
+"""A sweep from its command line to its exit code, around whichever of Hydra's launchers runs the jobs."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import Quote, QuotedString
+from hydra.core.utils import JobReturn
+from hydra.plugins.launcher import Launcher
+from omegaconf import DictConfig, open_dict, read_write
+
+from gridworld.config import SweepConfig, TrainConfig
+from gridworld.errors import InputError
+from gridworld.experiment import to_config
+from gridworld.sweep import report
+from gridworld.sweep.folder import Entry, SweepFolder
+from gridworld.sweep.job import StopSweep, mark_failed
+from gridworld.sweep.plan import Job, expand, plan
+from gridworld.sweep.progress import SweepProgress
+from gridworld.sweep.table import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, Row, Table
+
+_ORPHANS_END_WITHIN = 5.0  # seconds; workers of a sweep that was killed
+_SECONDS_BETWEEN_LOOKS = 0.1
+_STOP_WITHIN = 4.0  # seconds after a signal
+
+
+def run_sweep(
+    words: list[str],
+    loader: ConfigLoader,
+    launcher: Launcher,
+    master: DictConfig,
+    settings: SweepConfig,
+) -> None:
+    """Run what is asked for and not done yet. Raises `SystemExit` unless it is all done then.
+
+    `InputError` says that nothing was run or written.
+    """
+    folder = SweepFolder(Path(master.hydra.sweep.dir))
+
+    def configure(overrides: Sequence[str]) -> TrainConfig:
+        config = loader.load_sweep_config(master, list(overrides))
+        HydraConfig.instance().set_config(config)  # settings may refer to it: ${hydra:runtime.cwd}
+        with read_write(config), open_dict(config):
+            del config["hydra"]
+        return to_config(config)
+
+    jobs = plan(expand(words, loader, settings.max_jobs), configure)
+    _refuse_mistakes(jobs, settings)
+    folder.check(jobs, settings.extend)
+    with folder.at_work():
+        entries = folder.add(jobs, words)
+        mistakes = {entry.job: job.mistake for entry, job in zip(entries, jobs, strict=True) if job.mistake}
+        sweep = _Sweep(folder, entries, launcher)
+        code = sweep.run(mistakes, settings.retry_failed, any(job.progress for job in jobs))
+    if code:
+        raise SystemExit(code)
+
+
+def _refuse_mistakes(jobs: Sequence[Job], settings: SweepConfig) -> None:
+    mistaken = [job for job in jobs if job.mistake is not None]
+    if len(mistaken) == len(jobs) or (mistaken and settings.stop_at_first_failure):
+        count = f" ({len(mistaken)} of {len(jobs)} jobs cannot run)" if len(jobs) > 1 else ""
+        raise InputError(f"{mistaken[0].mistake}{count}")
+
+
+class _Sweep:
+    """What is asked for in this folder, and how it stands."""
+
+    def __init__(self, folder: SweepFolder, entries: list[Entry], launcher: Launcher) -> None:
+        self._folder = folder
+        self._entries = entries
+        self._launcher = launcher
+        self._table = Table(folder.path)
+
+    def _to_do(self, mistakes: dict[str, str], retry_failed: bool) -> list[Entry]:
+        """The jobs to run now. Those with a mistake are noted as failed."""
+        rows = self._put_right()
+        for job, mistake in mistakes.items():
+            if rows[job].status != DONE:
+                self._table.set(job, status=FAILED, error=mistake)
+        statuses = {PENDING, INTERRUPTED} | ({FAILED} if retry_failed else set())
+        return [e for e in self._entries if rows[e.job].status in statuses and e.job not in mistakes]
+
+    def run(self, mistakes: dict[str, str], retry_failed: bool, progress: bool) -> int:
+        """Launch what is to do, and report; returns the exit code that tells how it went."""
+        to_do = self._to_do(mistakes, retry_failed)
+        started = time.monotonic()
+        names = [entry.job for entry in self._entries]
+        rows = self._table.read()
+        report.tell_start(self._folder.path, [rows[name] for name in names], len(to_do))
+        stopped, code = "", 0
+        try:
+            with _signals_exit(), SweepProgress(self._table, names, len(names) - len(to_do), progress):
+                self._launch(to_do)
+        except StopSweep:
+            stopped = "stopped at the first failure"
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 1
+            stopped = f"stopped by {signal.Signals(code - 128).name}" if code > 128 else "stopped"
+            _exit_within(_STOP_WITHIN, code)
+        rows = self._put_right()
+        asked = [rows[name] for name in names]
+        report.tell_end(self._folder.path, asked, time.monotonic() - started, stopped, mistakes)
+        return code or int(any(row.status != DONE for row in asked))
+
+    def _launch(self, to_do: list[Entry]) -> None:
+        """Run the jobs; should a launcher lose one's process, the others run all the same."""
+        batches, count = [to_do], 0
+        while batches:
+            batch = batches.pop(0)
+            if not batch:
+                continue
+            try:
+                results = self._launcher.launch([self._line(entry) for entry in batch], count)
+            except Exception as error:
+                batches = self._after_a_crash(batch, error) + batches
+            else:
+                self._settle(batch, results)
+            count += len(batch)
+
+    def _line(self, entry: Entry) -> list[str]:
+        """The job's overrides, and where it is to be."""
+        where = {"dir": str(self._folder.path.absolute()), "subdir": entry.job}
+        quoted = {key: QuotedString(text, Quote.single).with_quotes() for key, text in where.items()}
+        return [*entry.overrides, *(f"hydra.sweep.{key}={text}" for key, text in quoted.items())]
+
+    def _after_a_crash(self, batch: list[Entry], error: Exception) -> list[list[Entry]]:
+        """What is left to launch: first what had not begun, then, one by one, what was running.
+
+        One of the latter took its process along, and perhaps others'. Alone, it shows which.
+        """
+        rows = self._put_right()
+        pending = [entry for entry in batch if rows[entry.job].status == PENDING]
+        died = [entry for entry in batch if rows[entry.job].status == INTERRUPTED]
+        if len(batch) == 1:
+            for entry in pending + died:
+                self._fail(entry, f"its process was lost ({type(error).__name__})")
+            return []
+        if len(pending) == len(batch):
+            raise error  # the launcher itself does not work
+        return [pending, *([entry] for entry in died)]
+
+    def _settle(self, batch: list[Entry], results: Sequence[JobReturn]) -> None:
+        """No job is left without an answer: the launcher has one where the job could give none."""
+        rows = self._table.read()
+        for entry, result in zip(batch, results, strict=True):
+            if rows[entry.job].status in (PENDING, INTERRUPTED):
+                self._fail(entry, f"it did not run ({result._return_value})")
+
+    def _fail(self, entry: Entry, reason: str) -> None:
+        mark_failed(self._folder.path / entry.job, reason)
+        self._table.set(entry.job, status=FAILED, error=reason)
+
+    def _put_right(self) -> dict[str, Row]:
+        """The rows as they are, once workers that lost their sweep have ended."""
+        end = time.monotonic() + _ORPHANS_END_WITHIN
+        entries = self._folder.entries.values()
+        while True:
+            rows = self._table.put_right(entries)
+            if time.monotonic() >= end or all(row.status != RUNNING for row in rows.values()):
+                return rows
+            time.sleep(_SECONDS_BETWEEN_LOOKS)
+
+
+@contextmanager
+def _signals_exit() -> Iterator[None]:
+    """SIGINT and SIGTERM raise `SystemExit`, wherever the program is; it ends soon even so."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        _exit_within(_STOP_WITHIN, 128 + number)
+        raise SystemExit(128 + number)
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _exit_within(seconds: float, code: int) -> None:
+    timer = threading.Timer(seconds, os._exit, (code,))
+    timer.daemon = True
+    timer.start()

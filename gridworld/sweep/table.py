@@ -1,0 +1,130 @@
+"""jobs.csv: a row per job. Whoever starts or ends a job rewrites the table, whole and under a lock.
+
+A process that is killed cannot write its last row; so the table is put right, from the jobs' manifests and
+locks, whenever a sweep starts or ends and whenever it is looked at.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from gridworld.files import write_text
+from gridworld.lock import is_locked, locked
+from gridworld.run import MANIFEST, SUMMARY
+from gridworld.sweep.folder import LOCK, Entry
+
+JOBS_CSV = "jobs.csv"
+TABLE_LOCK = ".jobs.lock"
+PENDING, RUNNING, DONE, FAILED, INTERRUPTED = STATUSES = (
+    "pending",
+    "running",
+    "done",
+    "failed",
+    "interrupted",
+)
+_OF_A_RUN = {"finished": DONE, "failed": FAILED}  # a run's own words; else it was interrupted
+
+
+@dataclass(frozen=True)
+class Row:
+    """How a job stands."""
+
+    job: str  # its folder
+    overrides: str
+    status: str = PENDING
+    seconds: str = ""
+    objective: str = ""  # the final greedy policy's regret
+    error: str = ""  # why it failed, in one line
+
+
+class Table:
+    """The rows of the sweep in `folder`, by job."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.file = folder / JOBS_CSV
+
+    def read(self) -> dict[str, Row]:
+        """As the file has them; one that cannot be read counts as empty, since it can be made again."""
+        names = [field.name for field in dataclasses.fields(Row)]
+        try:
+            lines = list(csv.reader(io.StringIO(self.file.read_text("utf-8"))))
+        except (FileNotFoundError, UnicodeDecodeError, csv.Error):
+            return {}
+        if not lines or lines[0] != names:
+            return {}
+        return {line[0]: Row(*line) for line in lines[1:] if len(line) == len(names)}
+
+    def set(self, job: str, **changes: str) -> None:
+        """Change a job's row."""
+        with locked(self.folder / TABLE_LOCK):
+            rows = self.read()
+            rows[job] = dataclasses.replace(rows.get(job, Row(job, "")), **changes)
+            self._write(rows.values())
+
+    def put_right(self, entries: Iterable[Entry]) -> dict[str, Row]:
+        """Write the rows of these jobs anew, as their folders have it."""
+        with locked(self.folder / TABLE_LOCK):
+            rows = self.look(entries)
+            self._write(rows.values())
+        return rows
+
+    def look(self, entries: Iterable[Entry]) -> dict[str, Row]:
+        """The same without writing."""
+        before = self.read()
+        return {entry.job: self._look_at(entry, before.get(entry.job)) for entry in entries}
+
+    def _look_at(self, entry: Entry, before: Row | None) -> Row:
+        folder = self.folder / entry.job
+        row = Row(entry.job, " ".join(entry.overrides))
+        manifest = read_json(folder / MANIFEST)
+        status = _OF_A_RUN.get(manifest.get("status", ""), INTERRUPTED if manifest else PENDING)
+        if status in (PENDING, INTERRUPTED) and is_locked(folder / LOCK):
+            return dataclasses.replace(row, status=RUNNING)
+        if status == PENDING and before is not None and before.status == FAILED:
+            return dataclasses.replace(before, overrides=row.overrides)  # it never came to a manifest
+        return dataclasses.replace(row, status=status, **outcome(folder, manifest))
+
+    def _write(self, rows: Iterable[Row]) -> None:
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(field.name for field in dataclasses.fields(Row))
+        writer.writerows(dataclasses.astuple(row) for row in rows)
+        write_text(self.file, text.getvalue())
+
+
+def outcome(folder: Path, manifest: dict[str, Any]) -> dict[str, str]:
+    """Seconds, objective and error of a run that ended, as far as it has them."""
+    found = {"error": one_line(manifest.get("error", ""))}
+    try:
+        started, ended = (datetime.fromisoformat(manifest[key]) for key in ("started", "ended"))
+        found["seconds"] = f"{(ended - started).total_seconds():.2f}"
+    except (KeyError, TypeError, ValueError):
+        pass  # it was killed
+    regret = read_json(folder / SUMMARY).get("regret")
+    if isinstance(regret, int | float) and math.isfinite(regret):
+        found["objective"] = repr(regret)
+    return found
+
+
+def one_line(text: Any) -> str:
+    """Without line breaks or other control characters, for a table."""
+    return " ".join("".join(c if c.isprintable() else " " for c in str(text)).split())
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    """The object in a file; empty where there is none."""
+    try:
+        content = json.loads(file.read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
