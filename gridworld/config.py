@@ -14,6 +14,7 @@ from gridworld.errors import InputError
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
 Schedule = Union[int, float, str]  # noqa: UP007
+MISSING = "???"  # OmegaConf's sign for what has to be given
 LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end, as RL Zoo writes it
 
 
@@ -76,9 +77,9 @@ class RecordingConfig:
 class AgentConfig:
     """What all agents share. `family` is the module in gridworld/agents that knows the algorithm."""
 
-    name: str = "???"
-    family: str = "???"
-    algorithm: str = "???"
+    name: str = MISSING
+    family: str = MISSING
+    algorithm: str = MISSING
 
 
 @dataclass
@@ -322,6 +323,14 @@ def parse_schedule(key: str, value: Schedule) -> tuple[float, bool]:
             f"{key}={value}: must be a number of at least 0, or {LINEAR}NUMBER for a linear decay"
         )
     return number, linear
+
+
+def check_exploration(agent: DQNConfig | TabularControlConfig) -> None:
+    """Raise `InputError` unless epsilon goes from one probability to another within training."""
+    above_zero("agent.exploration_fraction", agent.exploration_fraction)
+    within("agent.exploration_fraction", agent.exploration_fraction, 0, 1)
+    within("agent.exploration_initial_eps", agent.exploration_initial_eps, 0, 1)
+    within("agent.exploration_final_eps", agent.exploration_final_eps, 0, 1)
 
 
 def at_least(key: str, value: float, bound: float) -> None:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
+from gridworld.config import MISSING
 from gridworld.counted_env import CountedVectorEnv
 from gridworld.errors import InputError
 from gridworld.mdp import FloatArray, IntArray
@@ -76,13 +77,17 @@ class Family(Protocol):
 
 
 def family(config: AgentConfig) -> Family:
-    """The module of the config's family, imported now. Raises `InputError` where there is none."""
+    """The module of the config's family, imported now.
+
+    Raises `InputError` where there is none, or where the settings are another algorithm's.
+    """
     known = sorted(module.name for module in pkgutil.iter_modules(__path__))
     if config.family not in known:
         raise InputError(
             f"agent.family={config.family}: there is no such family; there are {', '.join(known)}"
         )
-    own = type(config).family
-    if config.family != own:
-        raise InputError(f"agent.family={config.family}: these are the settings of {own}; choose agent=...")
+    for key in ("family", "algorithm"):
+        given, own = getattr(config, key), getattr(type(config), key)
+        if own not in (given, MISSING):
+            raise InputError(f"agent.{key}={given}: these are the settings of {own}; choose agent=...")
     return cast("Family", importlib.import_module(f"gridworld.agents.{config.family}"))

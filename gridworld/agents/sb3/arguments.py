@@ -39,7 +39,7 @@ def algorithm_and_arguments(config: SB3Config) -> tuple[type[BaseAlgorithm], Arg
     if isinstance(config, SB3ClassConfig):
         algorithm: type[BaseAlgorithm] = _import("agent.algorithm", config.algorithm, BaseAlgorithm)
         _check_arguments(config, algorithm)
-        arguments = {**_convert(config.arguments, "agent.arguments."), "policy": config.policy}
+        arguments = _convert(config.arguments, "agent.arguments.")
     else:
         assert isinstance(config, SB3CheckedConfig)
         algorithm = _with_engine(config)

@@ -14,6 +14,7 @@ from gridworld.config import (
     TrainConfig,
     above_zero,
     at_least,
+    check_exploration,
     parse_schedule,
     within,
 )
@@ -80,11 +81,6 @@ def _check_class(agent: SB3ClassConfig, n_envs: int) -> None:
 
 
 def _check_fields(agent: SB3CheckedConfig, config: TrainConfig) -> None:
-    own = type(agent)().algorithm
-    if agent.algorithm != own:
-        raise InputError(
-            f"agent.algorithm={agent.algorithm}: these are the settings of {own}; choose agent=..."
-        )
     if agent.engine not in ENGINES:
         raise InputError(f"agent.engine={agent.engine}: must be {' or '.join(ENGINES)}")
     parse_schedule("agent.learning_rate", agent.learning_rate)
@@ -119,10 +115,7 @@ def _check_dqn(agent: DQNConfig, config: TrainConfig) -> None:
     at_least("agent.gradient_steps", agent.gradient_steps, -1)
     at_least("agent.n_steps", agent.n_steps, 1)
     at_least("agent.target_update_interval", agent.target_update_interval, 1)
-    above_zero("agent.exploration_fraction", agent.exploration_fraction)
-    within("agent.exploration_fraction", agent.exploration_fraction, 0, 1)
-    within("agent.exploration_initial_eps", agent.exploration_initial_eps, 0, 1)
-    within("agent.exploration_final_eps", agent.exploration_final_eps, 0, 1)
+    check_exploration(agent)
     above_zero("agent.max_grad_norm", agent.max_grad_norm)
 
 

@@ -8,8 +8,8 @@ from gridworld.config import (
     TabularConfig,
     TabularControlConfig,
     TrainConfig,
-    above_zero,
     at_least,
+    check_exploration,
     parse_schedule,
     within,
 )
@@ -20,11 +20,6 @@ def check(config: TrainConfig) -> None:
     """Raise `InputError` for the first setting that could not train as it says."""
     agent = config.agent
     assert isinstance(agent, TabularConfig)
-    own = type(agent)().algorithm
-    if agent.algorithm != own:
-        raise InputError(
-            f"agent.algorithm={agent.algorithm}: these are the settings of {own}; choose agent=..."
-        )
     if config.observation.kind != "none":
         raise InputError(
             f"observation={config.observation.kind}: agent={agent.name} keeps a table over the states "
@@ -47,9 +42,6 @@ def _check_control(agent: TabularControlConfig) -> None:
     within("agent.learning_rate_power", agent.learning_rate_power, 0, 1)
     if not math.isfinite(agent.initial_value):
         raise InputError(f"agent.initial_value={agent.initial_value}: must be a finite number")
-    above_zero("agent.exploration_fraction", agent.exploration_fraction)
-    within("agent.exploration_fraction", agent.exploration_fraction, 0, 1)
-    within("agent.exploration_initial_eps", agent.exploration_initial_eps, 0, 1)
-    within("agent.exploration_final_eps", agent.exploration_final_eps, 0, 1)
+    check_exploration(agent)
     at_least("agent.stats_window_size", agent.stats_window_size, 1)
     at_least("agent.log_interval", agent.log_interval, 1)
