@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gridworld import record
 from gridworld.agents import Beliefs
@@ -95,7 +96,7 @@ def _save_map(
     kind: str,
     saved: SavedRun,
     beliefs: Beliefs,
-    visits: np.ndarray[tuple[int, ...], np.dtype[np.int64]],
+    visits: NDArray[np.int64],
     path: Path,
     cell_size: int | None,
 ) -> None:
@@ -116,7 +117,7 @@ def _steps(saved: SavedRun) -> int:
         raise InputError(f"{path}: not the summary of a run ({type(error).__name__})") from None
 
 
-def _visits(saved: SavedRun) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+def _visits(saved: SavedRun) -> NDArray[np.int64]:
     """(S, A), as training counted them."""
     path = saved.run.visits_file
     try:
@@ -125,5 +126,5 @@ def _visits(saved: SavedRun) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
         raise InputError(f"{path}: no counts of visits that can be read") from None
     if visits.shape != saved.mdp.neighbour.shape or visits.dtype.kind not in "iu" or (visits < 0).any():
         raise InputError(f"{path}: must be counts for every cell and action of this run's world")
-    counts: np.ndarray[tuple[int, ...], np.dtype[np.int64]] = visits.astype(np.int64)
+    counts: NDArray[np.int64] = visits.astype(np.int64)
     return counts

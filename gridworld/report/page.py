@@ -20,7 +20,7 @@ from gridworld.report.report import Report
 from gridworld.report.scene import DARK, LIGHT, Scene, Style, styles
 from gridworld.report.statistics import RESAMPLES, Share
 from gridworld.report.svg import to_svg
-from gridworld.report.table import Cell, Table, interval_text, main_text, number
+from gridworld.report.table import Cell, Table, interval_text, is_text, main_text, number
 
 
 def figures(report: Report) -> dict[str, list[Scene]]:
@@ -62,7 +62,7 @@ def render(report: Report, scenes: dict[str, list[Scene]]) -> str:
         main_text=main_text,
         interval_text=interval_text,
         share_of=_share_of,
-        is_text=_is_text,
+        is_text=is_text,
     )
 
 
@@ -172,7 +172,3 @@ def _provenance(report: Report) -> str:
 
 def _share_of(cell: Cell) -> float | None:
     return round(100 * cell.count / cell.total, 1) if isinstance(cell, Share) else None
-
-
-def _is_text(table: Table, index: int) -> bool:
-    return bool(table.rows) and all(isinstance(row[index], str) for row in table.rows)

@@ -80,10 +80,15 @@ def interval_text(cell: Cell) -> str:
             return ""
 
 
+def is_text(table: Table, column: int) -> bool:
+    """Whether a column holds words, which stand to the left; numbers stand to the right."""
+    return bool(table.rows) and all(isinstance(row[column], str) for row in table.rows)
+
+
 def to_markdown(table: Table) -> str:
-    """A pipe table; numbers stand to the right."""
-    is_text = [all(isinstance(row[i], str) for row in table.rows) for i in range(len(table.columns))]
-    lines = [_piped(table.columns), _piped("---" if text else "---:" for text in is_text)]
+    """A pipe table."""
+    sides = ("---" if is_text(table, column) else "---:" for column in range(len(table.columns)))
+    lines = [_piped(table.columns), _piped(sides)]
     lines += [
         _piped(f"{main_text(cell)} {interval_text(cell)}".strip() for cell in row) for row in table.rows
     ]

@@ -11,8 +11,9 @@ import numpy as np
 from gridworld.config import EnvConfig
 from gridworld.evaluation import Judge
 from gridworld.layout import parse
-from gridworld.mdp import compile_mdp
+from gridworld.mdp import NUM_ACTIONS
 from gridworld.report.reading import Evidence
+from gridworld.training import make_mdp
 
 _MOST_CELLS = 100_000  # beyond, solving the world again would take longer than the report
 _TOLERANCE = 1e-6  # relative
@@ -33,7 +34,7 @@ def reference(run: Evidence) -> Reference:
     """Solve the run's world again, from its manifest."""
     try:
         judge = _judge(run)
-        random = judge.score(np.full((judge.mdp.next_state.shape[0], judge.mdp.next_state.shape[1]), 0.25))
+        random = judge.score(np.full(judge.mdp.neighbour.shape, 1 / NUM_ACTIONS))
     except (ValueError, TypeError, ArithmeticError, np.linalg.LinAlgError) as error:
         # Whatever is wrong with another version's world, the runs' own scores are as good as before.
         nan = math.nan
@@ -62,5 +63,4 @@ def _judge(run: Evidence) -> Judge:
         raise ValueError(f"it has more than {_MOST_CELLS:,} cells")
     env = EnvConfig(**run.world)
     layout = parse(run.layout, f"{run.folder}: layout")
-    mdp = compile_mdp(layout, env.slip, env.step_reward, env.goal_reward, env.trap_reward)
-    return Judge(mdp, run.gamma, env.max_episode_steps)
+    return Judge(make_mdp(env, layout), run.gamma, env.max_episode_steps)
