@@ -277,7 +277,35 @@ class JoblibConfig:
     """`hydra/launcher=joblib`: a sweep's jobs side by side on this machine; `hydra.launcher` there."""
 
     _target_: str = "hydra_plugins.gridworld_sweeper.JoblibLauncher"
-    n_jobs: int = -1  # workers; -1 for one on each core
+    n_jobs: int = -1
+
+
+@dataclass
+class SlurmConfig:
+    """`hydra/launcher=slurm`; all but the first two are submitit's, by its names."""
+
+    _target_: str = "hydra_plugins.gridworld_sweeper.SlurmLauncher"
+    jobs_per_task: int = 1
+    array_parallelism: int = 256
+    timeout_min: int = 60
+    signal_delay_s: int = 60
+    cpus_per_task: int = 1
+    mem_gb: Optional[float] = None  # noqa: UP045
+    partition: Optional[str] = None  # noqa: UP045
+    account: Optional[str] = None  # noqa: UP045
+    qos: Optional[str] = None  # noqa: UP045
+    constraint: Optional[str] = None  # noqa: UP045
+    setup: list[str] = field(default_factory=list)
+    more: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class RayConfig:
+    """`hydra/launcher=ray`."""
+
+    _target_: str = "hydra_plugins.gridworld_sweeper.RayLauncher"
+    init: dict[str, Any] = field(default_factory=dict)
+    remote: dict[str, Any] = field(default_factory=dict)
 
 
 AGENT_SCHEMAS: dict[str, type[AgentConfig]] = {
@@ -289,6 +317,9 @@ AGENT_SCHEMAS: dict[str, type[AgentConfig]] = {
     "value_iteration": ValueIterationConfig,
     "sb3": SB3ClassConfig,
 }
+
+
+LAUNCHER_SCHEMAS: dict[str, type] = {"joblib": JoblibConfig, "slurm": SlurmConfig, "ray": RayConfig}
 
 
 def check(config: TrainConfig) -> None:

@@ -15,7 +15,6 @@ from typing import Any, cast
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn
 from hydra.errors import CompactHydraException
 from hydra.experimental.callback import Callback
@@ -23,7 +22,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gridworld.config import AGENT_SCHEMAS, JoblibConfig, SweepConfig, TrainConfig
+from gridworld.config import AGENT_SCHEMAS, LAUNCHER_SCHEMAS, SweepConfig, TrainConfig
 from gridworld.errors import EXIT_CODE, InputError
 from gridworld.hydra_errors import refuse_added_keys, sentence
 from gridworld.manual import manual
@@ -125,8 +124,8 @@ def register_schemas() -> None:
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
     store.store(group="hydra/sweeper", name="gridworld", node=SweepConfig)
-    Plugins.instance()  # looks for plugins first, so that ours is `joblib` even beside hydra-joblib-launcher
-    store.store(group="hydra/launcher", name="joblib", node=JoblibConfig)
+    for name, launcher in LAUNCHER_SCHEMAS.items():
+        store.store(group="hydra/launcher", name=f"{name}_schema", node=launcher)
     for name, schema in AGENT_SCHEMAS.items():
         store.store(group="agent/schema", name=name, node=schema)
     OmegaConf.register_new_resolver("slug", _slug, replace=True)

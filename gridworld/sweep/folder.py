@@ -26,6 +26,7 @@ from gridworld.run import MANIFEST, SWEEP_JSON, check_writable, versions
 from gridworld.sweep.plan import Job, folder_name
 
 LOCK = ".lock"
+STOP = ".stop"  # in the sweep's folder: no more jobs are to begin, wherever they wait
 _FORMAT = 1
 
 
@@ -77,6 +78,7 @@ class SweepFolder:
         with locked(self.path / LOCK, wait=1) as is_ours:
             if not is_ours:
                 raise InputError(f"{self.path}: another process runs this sweep; wait for it or stop it")
+            (self.path / STOP).unlink(missing_ok=True)
             for part in self.path.glob(".*.part"):  # of a process that was killed while writing
                 part.unlink(missing_ok=True)
             yield

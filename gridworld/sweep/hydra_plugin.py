@@ -1,4 +1,4 @@
-"""What Hydra sees of the sweeps: a sweeper and a launcher.
+"""What Hydra sees of the sweeps: a sweeper and launchers.
 
 Installed, this file is `hydra_plugins/gridworld_sweeper.py`: Hydra takes plugins from that namespace only. It
 imports them in every program, so this one is light, and only hands on to the modules beside it.
@@ -6,14 +6,18 @@ imports them in every program, so this one is light, and only hands on to the mo
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hydra.core.utils import JobReturn
 from hydra.plugins.launcher import Launcher
 from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
+
+if TYPE_CHECKING:
+    from gridworld.sweep.worker import Hydra
 
 
 class GridWorldSweeper(Sweeper):
@@ -42,18 +46,50 @@ class GridWorldSweeper(Sweeper):
         run_sweep(arguments, self._loader, self._launcher, self._config, settings)
 
 
-class JoblibLauncher(Launcher):
-    """Runs jobs side by side on this machine; the work is in gridworld/sweep/parallel.py."""
+class _OwnLauncher(Launcher):
+    """What the launchers below have in common."""
 
-    def __init__(self, n_jobs: int) -> None:
-        self._n_jobs = n_jobs
+    def __init__(self, **settings: Any) -> None:
+        self._settings = settings
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Called by Hydra once everything is composed."""
-        self._context, self._task, self._config = hydra_context, task_function, config
+        self._given = hydra_context, task_function, config
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
         """Called by the sweeper."""
+        from gridworld.sweep.worker import Hydra
+
+        return self._launch(Hydra(*self._given), job_overrides, initial_job_idx)
+
+    @abstractmethod
+    def _launch(self, hydra: Hydra, jobs: Sequence[Sequence[str]], first: int) -> Sequence[JobReturn]: ...
+
+
+class JoblibLauncher(_OwnLauncher):
+    """Runs jobs side by side on this machine."""
+
+    def _launch(self, hydra: Hydra, jobs: Sequence[Sequence[str]], first: int) -> Sequence[JobReturn]:
         from gridworld.sweep.parallel import launch
 
-        return launch(self._context, self._task, self._config, self._n_jobs, job_overrides, initial_job_idx)
+        return launch(hydra, self._settings["n_jobs"], jobs, first)
+
+
+class SlurmLauncher(_OwnLauncher):
+    """Runs jobs on a Slurm cluster."""
+
+    def _launch(self, hydra: Hydra, jobs: Sequence[Sequence[str]], first: int) -> Sequence[JobReturn]:
+        from gridworld.config import SlurmConfig
+        from gridworld.sweep.on_slurm import launch
+
+        return launch(hydra, SlurmConfig(**self._settings), jobs, first)
+
+
+class RayLauncher(_OwnLauncher):
+    """Runs jobs on a Ray cluster."""
+
+    def _launch(self, hydra: Hydra, jobs: Sequence[Sequence[str]], first: int) -> Sequence[JobReturn]:
+        from gridworld.config import RayConfig
+        from gridworld.sweep.on_ray import launch
+
+        return launch(hydra, RayConfig(**self._settings), jobs, first)

@@ -1,41 +1,54 @@
-"""Which launcher runs the jobs, and what to install for it."""
+"""Which launcher runs the jobs, what to install for it, and what can be wrong with its settings."""
 
 from __future__ import annotations
 
 import importlib.util
+import shutil
 
 from hydra.core.plugins import Plugins
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
+from gridworld.config import at_least
 from gridworld.errors import InputError
 
+_OURS = "hydra_plugins.gridworld_sweeper."
 # By the class: the package that it needs, and the extra that brings it.
 _NEEDS = {
-    "hydra_plugins.gridworld_sweeper.JoblibLauncher": ("joblib", "sweep"),
-    "hydra_plugins.hydra_submitit_launcher.": ("hydra_plugins.hydra_submitit_launcher", "slurm"),
-    "hydra_plugins.hydra_ray_launcher.": ("hydra_plugins.hydra_ray_launcher", "ray"),
+    f"{_OURS}JoblibLauncher": ("joblib", "sweep"),
+    f"{_OURS}SlurmLauncher": ("submitit", "slurm"),
+    f"{_OURS}RayLauncher": ("ray", "ray"),
 }
+_COMMANDS = {f"{_OURS}SlurmLauncher": ("sbatch", "srun", "squeue", "scancel")}
+_AT_LEAST_ONE = ("jobs_per_task", "array_parallelism", "timeout_min", "cpus_per_task", "signal_delay_s")
 
 
 def make_launcher(context: HydraContext, task: TaskFunction, config: DictConfig) -> Launcher:
-    """The launcher that is configured. Raises `InputError` if it is not installed."""
-    for target, (package, extra) in _NEEDS.items():
-        if str(config.hydra.launcher._target_).startswith(target) and not _is_installed(package):
-            choice = config.hydra.runtime.choices["hydra/launcher"]
+    """The launcher that is configured. Raises `InputError` if it cannot work."""
+    settings = config.hydra.launcher
+    choice = f"hydra/launcher={config.hydra.runtime.choices['hydra/launcher']}"
+    if needed := _NEEDS.get(settings._target_):
+        package, extra = needed
+        if not _is_installed(package):
+            raise InputError(f"{choice}: {package} is not installed; pip install 'gridworld[{extra}]'")
+        missing = [name for name in _COMMANDS.get(settings._target_, ()) if shutil.which(name) is None]
+        if missing:
             raise InputError(
-                f"hydra/launcher={choice}: {package.split('.')[-1]} is not installed; "
-                f"pip install 'gridworld[{extra}]'"
+                f"{choice}: there is no {missing[0]} on this machine; start the sweep on one of the cluster's"
             )
-    n_jobs = config.hydra.launcher.get("n_jobs")
-    if n_jobs == 0:
-        raise InputError("hydra.launcher.n_jobs=0: must be the number of workers, or -1 for one on each core")
+        if settings.get("n_jobs") == 0:
+            raise InputError(
+                "hydra.launcher.n_jobs=0: must be the number of workers, or -1 for one on each core"
+            )
+        for key in _AT_LEAST_ONE:
+            if settings.get(key) is not None:
+                at_least(f"hydra.launcher.{key}", settings[key], 1)
     return Plugins.instance().instantiate_launcher(context, task, config)
 
 
 def _is_installed(package: str) -> bool:
     try:
         return importlib.util.find_spec(package) is not None
-    except ModuleNotFoundError:
+    except (ModuleNotFoundError, ValueError):  # the latter where a test has put None in its place
         return False

@@ -9,7 +9,7 @@ from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 
 from gridworld.sweep.progress import duration
-from gridworld.sweep.table import DONE, FAILED, JOBS_CSV, STATUSES, Row
+from gridworld.sweep.table import DONE, FAILED, JOBS_CSV, RUNNING, STATUSES, Row
 
 _MOST_FAILURES = 50  # in the list on the terminal; jobs.csv has them all
 
@@ -47,8 +47,10 @@ def tell_end(
     elif any(row.job not in mistakes for row in failed):
         retry = "hydra.sweeper.retry_failed=true"
         print(f"to try them again: {command(folder, retry)}", file=sys.stderr)
-    elif any(row.status not in (DONE, FAILED) for row in rows):
+    elif any(row.status == RUNNING for row in rows):
         print(f"the rest runs elsewhere; to see how it goes: {command(folder)}", file=sys.stderr)
+    elif any(row.status not in (DONE, FAILED) for row in rows):
+        print(f"the rest did not come to its end; go on with: {command(folder)}", file=sys.stderr)
     sys.stderr.flush()
 
 

@@ -14,19 +14,20 @@ from types import FrameType
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Quote, QuotedString
-from hydra.core.utils import JobReturn
+from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, open_dict, read_write
 
 from gridworld.config import SweepConfig, TrainConfig
 from gridworld.errors import InputError
 from gridworld.experiment import to_config
+from gridworld.run import MANIFEST
 from gridworld.sweep import report
 from gridworld.sweep.folder import Entry, SweepFolder
 from gridworld.sweep.job import StopSweep, mark_failed
 from gridworld.sweep.plan import Job, expand, plan
 from gridworld.sweep.progress import SweepProgress
-from gridworld.sweep.table import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, Row, Table
+from gridworld.sweep.table import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, Row, Table, read_json
 
 _ORPHANS_END_WITHIN = 5.0  # seconds; workers of a sweep that was killed
 _SECONDS_BETWEEN_LOOKS = 0.1
@@ -150,11 +151,19 @@ class _Sweep:
         return [pending, *([entry] for entry in died)]
 
     def _settle(self, batch: list[Entry], results: Sequence[JobReturn]) -> None:
-        """No job is left without an answer: the launcher has one where the job could give none."""
-        rows = self._table.read()
+        """No job is left without an answer: the launcher has one where the job could give none.
+
+        One that was told to stop, or did not come to its turn, stays as it is for the next start.
+        """
+        lost = any(result.status is JobStatus.UNKNOWN for result in results)
+        rows = self._put_right() if lost else self._table.read()
         for entry, result in zip(batch, results, strict=True):
-            if rows[entry.job].status in (PENDING, INTERRUPTED):
+            if rows[entry.job].status not in (PENDING, INTERRUPTED):
+                continue
+            if result.status is not JobStatus.UNKNOWN:
                 self._fail(entry, f"it did not run ({result._return_value})")
+            elif read_json(self._folder.path / entry.job / MANIFEST).get("status") == "running":
+                self._fail(entry, f"its process was lost ({result._return_value})")
 
     def _fail(self, entry: Entry, reason: str) -> None:
         mark_failed(self._folder.path / entry.job, reason)
