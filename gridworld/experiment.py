@@ -125,7 +125,7 @@ def register_schemas() -> None:
     store.store(name="train_schema", node=TrainConfig)
     store.store(group="hydra/sweeper", name="gridworld", node=SweepConfig)
     for name, launcher in LAUNCHER_SCHEMAS.items():
-        store.store(group="hydra/launcher", name=f"{name}_schema", node=launcher)
+        store.store(group="hydra/launcher/schema", name=name, node=launcher)
     for name, schema in AGENT_SCHEMAS.items():
         store.store(group="agent/schema", name=name, node=schema)
     OmegaConf.register_new_resolver("slug", _slug, replace=True)

@@ -31,6 +31,7 @@ Keys, with their values: python scripts/train.py --cfg job
 Sweeps (-m):
   hydra.sweep.dir        the folder to write to; the same one again runs what is not done yet
   hydra/launcher=joblib  as many jobs at once as there are cores, or hydra.launcher.n_jobs
+  hydra/launcher=slurm   on a cluster, or ray; hydra.launcher.* as in conf/hydra/launcher
   hydra.sweeper.*        retry_failed, stop_at_first_failure, extend, max_jobs
 
 Examples:
@@ -60,8 +61,8 @@ def manual(conf: Path) -> str:
 
 def _choices(conf: Path) -> list[str]:
     lines = []
-    for group in sorted(folder for folder in conf.iterdir() if folder.is_dir()):
-        lines.append(f"  {group.name}=...")
+    for group in sorted({file.parent for file in conf.glob("**/*.yaml")} - {conf}):
+        lines.append(f"  {group.relative_to(conf).as_posix()}=...")
         files = sorted(group.glob("*.yaml"))
         lines += _recipes(conf, files) if group.name == EXPERIMENTS else map(_choice, files)
     return lines

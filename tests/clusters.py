@@ -49,7 +49,7 @@ PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 
 
 @contextmanager
-def slurm(folder: Path) -> Iterator[dict[str, str]]:
+def slurm(folder: Path, variables: dict[str, str]) -> Iterator[dict[str, str]]:
     """The variables of the environment by which its commands find it."""
     search = os.environ["PATH"] + f"{os.pathsep}/usr/sbin"
     missing = [name for name in (*_DAEMONS, "sbatch") if shutil.which(name, path=search) is None]
@@ -78,7 +78,9 @@ def slurm(folder: Path) -> Iterator[dict[str, str]]:
     )
     with ExitStack() as daemons:
         for command in commands:
-            daemons.enter_context(_daemon(command, folder, {**os.environ, **environment, "PATH": search}))
+            daemons.enter_context(
+                _daemon(command, folder, {**os.environ, **environment, **variables, "PATH": search})
+            )
             if command[0] == "munged":
                 wait_for(munge["socket"].exists, "munged's socket")
 
@@ -92,8 +94,8 @@ def slurm(folder: Path) -> Iterator[dict[str, str]]:
 
 
 @contextmanager
-def ray_head(folder: Path) -> Iterator[dict[str, str]]:
-    """The variables of the environment by which a program finds it."""
+def ray_head(folder: Path, variables: dict[str, str]) -> Iterator[dict[str, str]]:
+    """The variables of the environment by which a program finds it. Its workers get `variables`."""
     if importlib.util.find_spec("ray") is None and not os.environ.get("GRIDWORLD_REQUIRE_RAY"):
         pytest.skip("no Ray to test with: pip install 'gridworld[ray]'")
     port, *_ = _free_ports(1)
@@ -105,7 +107,7 @@ def ray_head(folder: Path) -> Iterator[dict[str, str]]:
         *("--object-store-memory=80000000", "--disable-usage-stats", f"--temp-dir={folder}"),
     ]
     environment = {"RAY_ADDRESS": f"127.0.0.1:{port}", **quiet}
-    with _daemon(head, folder, {**os.environ, **quiet}) as process:
+    with _daemon(head, folder, {**os.environ, **quiet, **variables}) as process:
         wait_for(lambda: "--block" in (folder / "ray.out").read_text(), "Ray's head", process)
         yield environment
 

@@ -165,8 +165,13 @@ def test_a_folder_under_a_file_is_refused(tmp_path: Path) -> None:
         ("total_timesteps=100,often", "total_timesteps=often: Value 'often' of type 'str'"),
         ("ganma=0,1", "Key 'ganma' not in 'TrainConfig'"),
         ("hydra.sweeper.retry_fail=true", "did you mean retry_failed?"),
-        ("hydra/launcher=abacus", "hydra/launcher=abacus: there is no such choice; there are basic, joblib"),
+        (
+            "hydra/launcher=abacus",
+            "hydra/launcher=abacus: there is no such choice; there are basic, joblib, ray",
+        ),
         ("hydra/launcher=joblib hydra.launcher.n_jobs=0", "hydra.launcher.n_jobs=0: must be the number"),
+        ("hydra/launcher=slurm hydra.launcher.jobs_per_task=0", "jobs_per_task=0: must be at least 1"),
+        ("hydra/launcher=slurm hydra.launcher.nodes=2", "Key 'nodes' not in 'SlurmConfig'"),
         ("hydra.sweep.dir=used", "used: is the folder of a single run; choose another hydra.sweep.dir"),
         ("hydra.sweep.dir=.", "has no sweep.json, but used holds a run already"),
         ("hydra.sweep.dir=used/manifest.json", "cannot be made, used/manifest.json is a file"),
@@ -183,15 +188,27 @@ def test_a_sweep_is_refused_before_it_writes(line: str, words: str, tmp_path: Pa
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["manifest.json"]
 
 
-def test_a_launcher_that_is_not_installed_names_its_extra(tmp_path: Path) -> None:
-    (tmp_path / "sitecustomize.py").write_text("import sys; sys.modules['joblib'] = None\n")
+@pytest.mark.parametrize(
+    ("launcher", "package", "extra"),
+    [("joblib", "joblib", "sweep"), ("slurm", "submitit", "slurm"), ("ray", "ray", "ray")],
+)
+def test_a_launcher_that_is_not_installed_names_its_extra(
+    launcher: str, package: str, extra: str, tmp_path: Path
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text(f"import sys; sys.modules['{package}'] = None\n")
     path = f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
-    line = ["-m", "seed=0,1", "hydra/launcher=joblib"]
+    line = ["-m", "seed=0,1", f"hydra/launcher={launcher}"]
     done = script("train.py", *line, cwd=tmp_path, PYTHONPATH=path)
     assert done.returncode == 2
     assert done.stderr == (
-        "error: hydra/launcher=joblib: joblib is not installed; pip install 'gridworld[sweep]'\n"
+        f"error: hydra/launcher={launcher}: {package} is not installed; pip install 'gridworld[{extra}]'\n"
     )
+
+
+def test_slurm_is_started_where_it_is(tmp_path: Path) -> None:
+    done = script("train.py", "-m", "seed=0,1", "hydra/launcher=slurm", cwd=tmp_path, PATH=str(tmp_path))
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: hydra/launcher=slurm: there is no sbatch on this machine; start")
 
 
 def test_a_sweeps_folder_is_no_runs(tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ def test_help_is_a_manual_with_every_choice(tmp_path: Path) -> None:
     done = script("train.py", "--help", cwd=tmp_path)
     assert done.returncode == 0
     assert done.stdout.strip() == manual(CONF).strip()
-    for file in CONF.glob("*/*.yaml"):
+    for file in CONF.glob("*/**/*.yaml"):
         if file.parent.name == "experiment":
             continue  # listed by task, see test_experiments.py
         line = next(line for line in done.stdout.splitlines() if line.strip().split(" ")[0] == file.stem)

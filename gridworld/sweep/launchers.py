@@ -32,11 +32,6 @@ def make_launcher(context: HydraContext, task: TaskFunction, config: DictConfig)
         package, extra = needed
         if not _is_installed(package):
             raise InputError(f"{choice}: {package} is not installed; pip install 'gridworld[{extra}]'")
-        missing = [name for name in _COMMANDS.get(settings._target_, ()) if shutil.which(name) is None]
-        if missing:
-            raise InputError(
-                f"{choice}: there is no {missing[0]} on this machine; start the sweep on one of the cluster's"
-            )
         if settings.get("n_jobs") == 0:
             raise InputError(
                 "hydra.launcher.n_jobs=0: must be the number of workers, or -1 for one on each core"
@@ -44,6 +39,11 @@ def make_launcher(context: HydraContext, task: TaskFunction, config: DictConfig)
         for key in _AT_LEAST_ONE:
             if settings.get(key) is not None:
                 at_least(f"hydra.launcher.{key}", settings[key], 1)
+        missing = [name for name in _COMMANDS.get(settings._target_, ()) if shutil.which(name) is None]
+        if missing:
+            raise InputError(
+                f"{choice}: there is no {missing[0]} on this machine; start the sweep on one of the cluster's"
+            )
     return Plugins.instance().instantiate_launcher(context, task, config)
 
 

@@ -1,4 +1,4 @@
-"""Jobs on a Ray cluster, a task each. Ray keeps a worker's process for the next task, and with it its imports.
+"""Jobs on a Ray cluster, a task each. Ray keeps a worker's process, and with it its imports, for the next.
 
 hydra-ray-launcher does the same, but composes all jobs beforehand, sends Hydra's state along with each, and
 does not go together with joblib's present versions.
@@ -7,6 +7,7 @@ does not go together with joblib's present versions.
 from __future__ import annotations
 
 import logging
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +23,7 @@ from gridworld.sweep.job import StopSweep
 from gridworld.sweep.worker import Hydra, run_in_turn
 
 _SECONDS_BETWEEN_LOOKS = 1.0
-_CANCELLED_WITHIN = 2.0  # seconds
+_CANCELLED_WITHIN = 1.0  # seconds
 
 
 def launch(hydra: Hydra, settings: RayConfig, jobs: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
@@ -56,6 +57,7 @@ def _run(state: bytes, sweep: str, job: list[str], number: int) -> list[str]:
 def _connect(settings: RayConfig) -> None:
     if ray.is_initialized():
         return
+    on_sigterm = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(**{"logging_level": logging.WARNING, "log_to_driver": False, **settings.init})
     except (ConnectionError, RuntimeError, ValueError, TypeError) as error:
@@ -64,6 +66,7 @@ def _connect(settings: RayConfig) -> None:
             f"hydra/launcher=ray: no Ray at hydra.launcher.init.address={settings.init.get('address')} "
             f"({first}); start one with 'ray start --head', or let the sweep do it with address=local"
         ) from None
+    signal.signal(signal.SIGTERM, on_sigterm)  # Ray has put its own in its place
 
 
 def _result(task: ray.ObjectRef[list[str]]) -> JobReturn:

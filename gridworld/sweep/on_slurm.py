@@ -39,9 +39,7 @@ _OWN_SETTINGS = {"_target_", "jobs_per_task"}
 _SLURMS_NAMES = {"array_parallelism", "partition", "account", "qos", "constraint", "setup", "signal_delay_s"}
 
 
-def launch(
-    hydra: Hydra, settings: SlurmConfig, jobs: Sequence[Sequence[str]], first: int
-) -> list[JobReturn]:
+def launch(hydra: Hydra, settings: SlurmConfig, jobs: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
     """Run jobs, numbered from `first`; returns what each came to, in order.
 
     Raises `InputError` for what Slurm refuses, and `StopSweep` if a job said so.

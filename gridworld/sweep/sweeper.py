@@ -30,6 +30,7 @@ from gridworld.sweep.progress import SweepProgress
 from gridworld.sweep.table import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, Row, Table, read_json
 
 _ORPHANS_END_WITHIN = 5.0  # seconds; workers of a sweep that was killed
+_STOPPED_END_WITHIN = 2.5  # seconds; those of one that is being stopped
 _SECONDS_BETWEEN_LOOKS = 0.1
 _STOP_WITHIN = 4.0  # seconds after a signal
 
@@ -99,16 +100,20 @@ class _Sweep:
         rows = self._table.read()
         report.tell_start(self._folder.path, [rows[name] for name in names], len(to_do))
         stopped, code = "", 0
+        received: list[int] = []
         try:
-            with _signals_exit(), SweepProgress(self._table, names, len(names) - len(to_do), progress):
+            with (
+                _signals_exit(received),
+                SweepProgress(self._table, names, len(names) - len(to_do), progress),
+            ):
                 self._launch(to_do)
         except StopSweep:
             stopped = "stopped at the first failure"
         except SystemExit as end:
-            code = end.code if isinstance(end.code, int) else 1
+            code = 128 + received[0] if received else end.code if isinstance(end.code, int) else 1
             stopped = f"stopped by {signal.Signals(code - 128).name}" if code > 128 else "stopped"
             _exit_within(_STOP_WITHIN, code)
-        rows = self._put_right()
+        rows = self._put_right(_STOPPED_END_WITHIN if stopped else _ORPHANS_END_WITHIN)
         asked = [rows[name] for name in names]
         report.tell_end(self._folder.path, asked, time.monotonic() - started, stopped, mistakes)
         return code or int(any(row.status != DONE for row in asked))
@@ -169,9 +174,9 @@ class _Sweep:
         mark_failed(self._folder.path / entry.job, reason)
         self._table.set(entry.job, status=FAILED, error=reason)
 
-    def _put_right(self) -> dict[str, Row]:
-        """The rows as they are, once workers that lost their sweep have ended."""
-        end = time.monotonic() + _ORPHANS_END_WITHIN
+    def _put_right(self, within: float = _ORPHANS_END_WITHIN) -> dict[str, Row]:
+        """The rows as they are, once workers that lost their sweep have ended, or after so many seconds."""
+        end = time.monotonic() + within
         entries = self._folder.entries.values()
         while True:
             rows = self._table.put_right(entries)
@@ -181,10 +186,14 @@ class _Sweep:
 
 
 @contextmanager
-def _signals_exit() -> Iterator[None]:
-    """SIGINT and SIGTERM raise `SystemExit`, wherever the program is; it ends soon even so."""
+def _signals_exit(received: list[int]) -> Iterator[None]:
+    """SIGINT and SIGTERM raise `SystemExit`, wherever the program is; it ends soon even so.
+
+    They are noted in `received` too, since what lies in between may change the exception: Ray does.
+    """
 
     def stop(number: int, frame: FrameType | None) -> None:
+        received.append(number)
         _exit_within(_STOP_WITHIN, 128 + number)
         raise SystemExit(128 + number)
 
