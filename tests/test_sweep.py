@@ -10,14 +10,17 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from support import ROOT, script
 
 from gridworld.commands import jobs as jobs_command
 from gridworld.lock import is_locked, locked
 from gridworld.sweep.progress import SweepProgress, duration
-from gridworld.sweep.table import Table
+from gridworld.sweep.table import Row, Table
 
 QUICK = ("agent=q_learning", "total_timesteps=500", "recording.frames=false", "recording.gif=false")
 FOLDER = "hydra.sweep.dir=sweep"
@@ -264,6 +267,20 @@ def test_a_table_that_was_damaged_or_lost_is_made_again(tmp_path: Path) -> None:
             file.write_text(damage)
         jobs_command.main([str(tmp_path / "sweep")])
         assert file.read_text() == before
+
+
+@given(st.lists(st.text('ab,"= 1é', min_size=1, max_size=5), min_size=1, max_size=4, unique=True), st.data())
+def test_a_row_is_changed_and_the_others_are_left_alone(jobs: list[str], data: st.DataObject) -> None:
+    """By the quick way, as the slow one would have it: reading all, and writing all."""
+    texts = st.text('ab,"= é', max_size=5)
+    with TemporaryDirectory() as folder:
+        sweep = Table(Path(folder))
+        expected: dict[str, Row] = {}
+        for _ in range(6):
+            job, error = data.draw(st.sampled_from(jobs)), data.draw(texts)
+            sweep.set(job, status="failed", error=error)
+            expected[job] = Row(job, "", "failed", error=error)
+            assert sweep.read() == expected
 
 
 def test_the_jobs_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

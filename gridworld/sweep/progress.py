@@ -17,6 +17,7 @@ from gridworld.sweep.table import DONE, FAILED, RUNNING, Table
 
 _SECONDS_BETWEEN_LOOKS = 0.5
 _SECONDS_BETWEEN_LINES = 10.0
+_SHARE_OF_TIME = 30  # looking at a long table takes a part of the time in so many
 _CLEAR_TO_END = "\x1b[K"
 
 
@@ -50,12 +51,15 @@ class SweepProgress:
 
     def _watch(self) -> None:
         seen: object = None
-        while not self._stop.wait(_SECONDS_BETWEEN_LOOKS):
+        wait = _SECONDS_BETWEEN_LOOKS
+        while not self._stop.wait(wait):
+            looked = time.monotonic()
             changed = self._table.file.stat().st_mtime_ns
             if changed != seen:
                 seen = changed
                 rows = self._table.read()
                 counts = Counter(rows[job].status for job in self._jobs if job in rows)
+                wait = max(_SECONDS_BETWEEN_LOOKS, _SHARE_OF_TIME * (time.monotonic() - looked))
             self._show(counts)
 
     def _show(self, counts: Counter[str]) -> None:

@@ -55,21 +55,39 @@ class Table:
 
     def read(self) -> dict[str, Row]:
         """As the file has them; one that cannot be read counts as empty, since it can be made again."""
-        names = [field.name for field in dataclasses.fields(Row)]
         try:
             lines = list(csv.reader(io.StringIO(self.file.read_text("utf-8"))))
         except (FileNotFoundError, UnicodeDecodeError, csv.Error):
             return {}
-        if not lines or lines[0] != names:
+        if not lines or lines[0] != _COLUMNS:
             return {}
-        return {line[0]: Row(*line) for line in lines[1:] if len(line) == len(names)}
+        return {line[0]: Row(*line) for line in lines[1:] if len(line) == len(_COLUMNS)}
 
     def set(self, job: str, **changes: str) -> None:
-        """Change a job's row."""
+        """Change a job's row. Other rows are copied as they stand: reading ten thousand takes 0.1 s."""
         with locked(self.folder / TABLE_LOCK):
+            found = self._find(job)
+            if found is not None:
+                text, row, place = found
+                line = _line(dataclasses.astuple(dataclasses.replace(row, **changes)))
+                write_text(self.file, text[: place.start] + line + text[place.stop :])
+                return
             rows = self.read()
             rows[job] = dataclasses.replace(rows.get(job, Row(job, "")), **changes)
             self._write(rows.values())
+
+    def _find(self, job: str) -> tuple[str, Row, slice] | None:
+        """(the file's text, the job's row, where in the text its line is); None if it is not that simple."""
+        try:
+            text = self.file.read_text("utf-8")
+        except (FileNotFoundError, UnicodeDecodeError):
+            return None
+        start = text.find("\n" + _line([job, ""])[:-1]) + 1
+        stop = text.find("\n", start) + 1
+        fields = next(csv.reader([text[start:stop]]), [])
+        if not start or not stop or not text.startswith(_line(_COLUMNS)) or len(fields) != len(_COLUMNS):
+            return None
+        return text, Row(*fields), slice(start, stop)
 
     def put_right(self, entries: Iterable[Entry]) -> dict[str, Row]:
         """Write the rows of these jobs anew, as their folders have it."""
@@ -85,7 +103,7 @@ class Table:
 
     def _look_at(self, entry: Entry, before: Row | None) -> Row:
         folder = self.folder / entry.job
-        row = Row(entry.job, " ".join(entry.overrides))
+        row = Row(entry.job, one_line(" ".join(entry.overrides)))
         manifest = read_json(folder / MANIFEST)
         status = _OF_A_RUN.get(manifest.get("status", ""), INTERRUPTED if manifest else PENDING)
         if status in (PENDING, INTERRUPTED) and is_locked(folder / LOCK):
@@ -95,11 +113,17 @@ class Table:
         return dataclasses.replace(row, status=status, **outcome(folder, manifest))
 
     def _write(self, rows: Iterable[Row]) -> None:
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(field.name for field in dataclasses.fields(Row))
-        writer.writerows(dataclasses.astuple(row) for row in rows)
-        write_text(self.file, text.getvalue())
+        lines = [_line(_COLUMNS), *(_line(dataclasses.astuple(row)) for row in rows)]
+        write_text(self.file, "".join(lines))
+
+
+_COLUMNS = [field.name for field in dataclasses.fields(Row)]
+
+
+def _line(fields: Iterable[str]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow(fields)
+    return text.getvalue()
 
 
 def outcome(folder: Path, manifest: dict[str, Any]) -> dict[str, str]:
