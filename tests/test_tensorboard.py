@@ -6,12 +6,13 @@ import subprocess
 import sys
 import urllib.request
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 from browser import chromium
-from support import SHORT, train_in
+from support import SHORT, script, train_in
 
 from gridworld.curve import CHARTS
 from gridworld.training import HPARAM_METRICS
@@ -28,6 +29,12 @@ walk(document.body);
 return texts.join(" ");
 """
 
+SWEPT = {
+    f"agent={agent},agent.learning_rate={rate},seed={seed}"
+    for agent in ("q_learning", "sarsa")
+    for rate in (0.1, 0.5)
+    for seed in (0, 1)
+}
 SHOWN = {agent: SHORT[agent] for agent in ("dqn", "ppo", "q_learning", "value_iteration")}
 
 
@@ -37,6 +44,24 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     logs = tmp_path_factory.mktemp("logs")
     for agent, overrides in SHOWN.items():
         train_in(logs / f"{agent}_run", *overrides)
+    with tensorboard(logs) as address:
+        yield address
+
+
+@pytest.fixture(scope="module")
+def served_sweep(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of a TensorBoard over a sweep."""
+    logs = tmp_path_factory.mktemp("logs")
+    words = ("-m", "agent=q_learning,sarsa", "agent.learning_rate=0.1,0.5", "seed=0,1", "total_timesteps=500")
+    done = script("train.py", *words, "evaluation.every=200", "hydra.sweep.dir=sweep", cwd=logs)
+    assert done.returncode == 0, done.stderr
+    with tensorboard(logs / "sweep") as address:
+        yield address
+
+
+@contextmanager
+def tensorboard(logs: Path) -> Iterator[str]:
+    """The address of one that runs."""
     command = [sys.executable, "-m", "tensorboard.main", "--logdir", str(logs), "--port", "0"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
@@ -87,19 +112,34 @@ def test_the_policy_develops_and_the_episode_moves(served: str) -> None:
             assert answer.read(6) == b"GIF89a"
 
 
+def hparams_table(address: str) -> list[dict[str, Any]]:
+    question = {
+        "colParams": [{"metric": {"tag": tag}} for tag in HPARAM_METRICS],
+        "allowedStatuses": ["STATUS_SUCCESS"],
+        "startIndex": 0,
+        "sliceSize": 100,
+    }
+    answer = ask(address, "data/plugin/hparams/session_groups", **question)
+    groups: list[dict[str, Any]] = answer["sessionGroups"]
+    return groups
+
+
 def test_the_hparams_table_has_settings_and_metrics(served: str) -> None:
-    groups = ask(
-        served,
-        "data/plugin/hparams/session_groups",
-        colParams=[{"metric": {"tag": tag}} for tag in HPARAM_METRICS],
-        allowedStatuses=["STATUS_SUCCESS"],
-        startIndex=0,
-        sliceSize=10,
-    )["sessionGroups"]
+    groups = hparams_table(served)
     assert {group["hparams"]["agent.name"] for group in groups} == set(SHOWN)
     for group in groups:
         assert group["hparams"]["env.layout"] == "classic"
         assert {value["name"]["tag"] for value in group["metricValues"]} == set(HPARAM_METRICS)
+
+
+def test_a_sweep_has_every_run_by_its_name_with_its_metrics(served_sweep: str) -> None:
+    assert ask(served_sweep, "data/plugin/scalars/tags").keys() == SWEPT
+    groups = hparams_table(served_sweep)
+    assert {session["name"] for group in groups for session in group["sessions"]} == SWEPT
+    for group in groups:
+        assert {value["name"]["tag"] for value in group["metricValues"]} == set(HPARAM_METRICS)
+    charts = ask(served_sweep, "data/plugin/custom_scalars/layout")["category"][0]["chart"]
+    assert {chart["title"]: chart["multiline"]["tag"] for chart in charts} == CHARTS
 
 
 def test_custom_scalars_group_the_curves(served: str) -> None:
@@ -109,16 +149,37 @@ def test_custom_scalars_group_the_curves(served: str) -> None:
 
 
 def test_a_browser_shows_it(served: str, tmp_path: Path) -> None:
-    with chromium(tmp_path / "profile") as browser:
+    shows(
+        served,
+        {
+            "timeseries": ["dqn_run", "ppo_run", "/goal_probability", "/optimal_goal_probability"],
+            "images": ["dqn_run", "policy", "q_error", "visits", "learning", "episode"],
+            "hparams": ["agent.name", "env.layout", "eval/regret"],
+        },
+        tmp_path,
+    )
+
+
+def test_a_browser_shows_a_sweep(served_sweep: str, tmp_path: Path) -> None:
+    shows(
+        served_sweep,
+        {
+            "timeseries": [*SWEPT, "/optimal_goal_probability"],
+            "hparams": ["agent.learning_rate", "q_learning", "sarsa", "eval/regret"],
+            "custom_scalars": [*CHARTS, *SWEPT],
+        },
+        tmp_path,
+    )
+
+
+def shows(address: str, pages: dict[str, list[str]], folder: Path) -> None:
+    """Whether a browser comes to show these words on TensorBoard's pages; leaves pictures of them."""
+    with chromium(folder / "profile") as browser:
         from selenium.webdriver.support.ui import WebDriverWait
 
-        for page, expected in (
-            ("timeseries", ["dqn_run", "ppo_run", "/goal_probability", "/optimal_goal_probability"]),
-            ("images", ["dqn_run", "policy", "q_error", "visits", "learning", "episode"]),
-            ("hparams", ["agent.name", "env.layout", "eval/regret"]),
-        ):
-            browser.get(f"{served}#{page}")
+        for page, expected in pages.items():
+            browser.get(f"{address}#{page}")
             WebDriverWait(browser, 30).until(
                 lambda b, words=expected: all(word in b.execute_script(PAGE_TEXT) for word in words)
             )
-            browser.save_screenshot(str(tmp_path / f"{page}.png"))
+            browser.save_screenshot(str(folder / f"{page}.png"))

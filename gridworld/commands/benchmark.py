@@ -14,7 +14,7 @@ from gridworld.benchmark.measure import FULL, QUICK, Result, Scale, compare, lin
 from gridworld.errors import InputError
 from gridworld.files import write_json
 
-_TABLES = ("stepping", "training", "whole")
+_TABLES = ("stepping", "training", "whole", "files")
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -46,6 +46,10 @@ def _measured(scale: Scale, tables: Sequence[str]) -> Iterator[Result]:
         from gridworld.benchmark import whole
 
         rows.append(whole.rows(scale))
+    if "files" in tables:
+        from gridworld.benchmark import files
+
+        rows.append(files.rows(scale))
     for row in itertools.chain(*rows):
         yield compare(row, scale.repetitions)
 
