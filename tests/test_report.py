@@ -22,10 +22,12 @@ from gridworld.commands import report as command
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge
 from gridworld.report.aggregate import BANDS
+from gridworld.report.chart import clipped_apart
 from gridworld.report.curves import on_grid
 from gridworld.report.metrics import online_return
 from gridworld.report.reading import Evidence, read
 from gridworld.report.report import Report, gather
+from gridworld.report.scene import text_width
 from gridworld.report.writing import MARKERS
 
 
@@ -598,3 +600,13 @@ def test_a_curve_that_lost_its_beginning_is_named_and_the_rest_is_reported(
     assert "does not begin at step 0" in capsys.readouterr().err
     row = rows_of(runs / "report" / "tables" / "results.csv")[0]
     assert row["seeds certified of"] == "2"
+
+
+def test_clipped_labels_are_told_apart() -> None:
+    settings = [(rate, steps) for rate in (0.01, 0.02) for steps in (32, 64)]
+    texts = [f"ppo (agent.learning_rate={rate}, agent.n_steps={steps})" for rate, steps in settings]
+    assert clipped_apart(["dqn", "ppo"], 130, 220, 12) == ["dqn", "ppo"]
+    told = clipped_apart(texts, 130, 220, 12)
+    assert len(set(told)) == 4
+    assert all(text_width(label, 12) <= 220 for label in told)
+    assert told[0] == "…0.01, agent.n_steps=32)"

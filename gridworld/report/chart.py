@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from os.path import commonprefix
 
 from gridworld.report.scene import Line, Points, Shape, Style, Text, text_width
 
@@ -91,6 +92,24 @@ def clipped(text: str, width: float, size: float) -> str:
     """The text, shortened in its middle where it is wider than that."""
     most = max(4, int(width / text_width("x", size)))
     return text if len(text) <= most else f"{text[: most // 2]}…{text[len(text) - (most - most // 2 - 1) :]}"
+
+
+def clipped_apart(texts: Sequence[str], width: float, most: float, size: float) -> list[str]:
+    """Clipped to `width`, or as wide as it takes to tell them apart, up to `most`.
+
+    If that is not enough, what look the same lose the beginning that they share.
+    """
+    told = [clipped(text, width, size) for text in texts]
+    while width < most and len(set(told)) < len(set(texts)):
+        width = min(most, width * 1.1)
+        told = [clipped(text, width, size) for text in texts]
+    out = []
+    for text, short in zip(texts, told, strict=True):
+        same = [other for other, others in zip(texts, told, strict=True) if others == short]
+        shared = commonprefix(same) if len(set(same)) > 1 else ""  # noqa: RUF071  # characters are meant
+        start = max(shared.rfind("="), shared.rfind(" ")) + 1
+        out.append(clipped(f"…{text[start:]}", most, size) if start else short)
+    return out
 
 
 def steps_like(steps: Sequence[float], values: Sequence[float], x: Axis, y: Axis) -> Points:

@@ -13,6 +13,7 @@ from gridworld.report.chart import (
     SMALL,
     Axis,
     clipped,
+    clipped_apart,
     compact,
     horizontal_grid,
     legend,
@@ -145,7 +146,7 @@ def _strip(name: str, task: str, key: str, results: Sequence[Result], styles: St
     results = [result for result in results if len(result.samples[key])]
     finite = np.concatenate([s[np.isfinite(s)] for s in (result.samples[key] for result in results)])
     never = any(not np.isfinite(result.samples[key]).all() for result in results)
-    labels = [clipped(result.group.agent, 130, 12) for result in results]
+    labels = clipped_apart([result.group.agent for result in results], 130, WIDTH / 2, 12)
     left = 16 + max(text_width(label, 12) for label in labels)
     right = WIDTH - (62 if never else 20)
     x = Axis(*_bounds(finite, key), left, right)
