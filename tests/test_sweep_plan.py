@@ -11,7 +11,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
 from hypothesis import given
 from hypothesis import strategies as st
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from support import CONF, configure
 
 from gridworld.errors import InputError
@@ -151,3 +151,8 @@ def test_jobs_are_composed_as_hydra_does_it(loader: ConfigLoaderImpl, overrides:
         theirs = loader.load_sweep_config(master, overrides)
         assert plain(ours) == plain(theirs)
         assert OmegaConf.get_type(ours, "agent") is OmegaConf.get_type(theirs, "agent")
+        settings = quick.load_settings(master, overrides)
+        with open_dict(theirs), read_write(theirs):
+            del theirs["hydra"]
+        assert plain(settings) == plain(theirs)
+        assert OmegaConf.to_object(settings) == OmegaConf.to_object(theirs)

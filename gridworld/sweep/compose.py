@@ -11,9 +11,10 @@ from typing import Any
 
 from hydra._internal.config_loader_impl import ConfigLoaderImpl, get_overrides_dirname
 from hydra.core.config_loader import ConfigLoader
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 _MOST_BASES = 64
 
@@ -24,13 +25,13 @@ class SweepLoader(ConfigLoaderImpl):
     def __init__(self, loader: ConfigLoader) -> None:
         super().__init__(loader.get_search_path())
         self._bases: dict[tuple[str, ...], DictConfig] = {}
+        self._settings: dict[tuple[str, ...], DictConfig] = {}  # of one choice
 
     def load_sweep_config(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
         """The job's whole configuration. Raises Hydra's exceptions for overrides that do not fit."""
-        overrides = OverridesParser.create(config_loader=self).parse_overrides(list(sweep_overrides))
-        choices = [override for override in overrides if self._is_choice(override)]
-        config = copy.deepcopy(self._base(master_config, tuple(str(o.input_line) for o in choices)))
-        self._apply_overrides_to_config([o for o in overrides if o not in choices], config)
+        overrides, choices = self._parse(sweep_overrides)
+        config = copy.deepcopy(self._base(master_config, choices))
+        self._apply_overrides_to_config([o for o in overrides if o.input_line not in choices], config)
         tasks = [override for override in overrides if not override.is_hydra_override()]
         config.hydra.overrides.task = [override.input_line for override in tasks]
         config.hydra.overrides.hydra = [
@@ -43,6 +44,26 @@ class SweepLoader(ConfigLoaderImpl):
         )
         OmegaConf.copy_cache(from_config=master_config, to_config=config)
         return config
+
+    def load_settings(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
+        """The same without `hydra`, which is most of it and takes as much of the time."""
+        overrides, choices = self._parse(sweep_overrides)
+        if choices not in self._settings:
+            settings = copy.deepcopy(self._base(master_config, choices))
+            HydraConfig.instance().set_config(settings)  # settings may refer to it: ${hydra:runtime.cwd}
+            with read_write(settings), open_dict(settings):
+                del settings["hydra"]
+            self._settings = {choices: settings}
+        config = copy.deepcopy(self._settings[choices])
+        values = [o for o in overrides if o.input_line not in choices and not o.is_hydra_override()]
+        self._apply_overrides_to_config(values, config)
+        OmegaConf.copy_cache(from_config=master_config, to_config=config)
+        return config
+
+    def _parse(self, lines: list[str]) -> tuple[list[Override], tuple[str, ...]]:
+        """The overrides, and the words of those that choose a group's file."""
+        overrides = OverridesParser.create(config_loader=self).parse_overrides(list(lines))
+        return overrides, tuple(str(o.input_line) for o in overrides if self._is_choice(o))
 
     def _base(self, master: DictConfig, choices: tuple[str, ...]) -> DictConfig:
         """With the groups chosen and no value changed."""
@@ -57,4 +78,4 @@ class SweepLoader(ConfigLoaderImpl):
         return is_group and not isinstance(override.value(), dict)
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_bases": {}}
+        return self.__dict__ | {"_bases": {}, "_settings": {}}

@@ -11,18 +11,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from hydra.core.config_loader import ConfigLoader
-from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
-from omegaconf import DictConfig, open_dict, read_write
+from omegaconf import DictConfig
 
 from gridworld.config import SweepConfig, TrainConfig
 from gridworld.errors import InputError
 from gridworld.experiment import to_config
 from gridworld.run import MANIFEST
 from gridworld.sweep import report
+from gridworld.sweep.compose import SweepLoader
 from gridworld.sweep.folder import Entry, SweepFolder
 from gridworld.sweep.job import StopSweep, mark_failed
 from gridworld.sweep.plan import Job, expand, plan
@@ -37,7 +36,7 @@ _STOP_WITHIN = 4.0  # seconds after a signal
 
 def run_sweep(
     words: list[str],
-    loader: ConfigLoader,
+    loader: SweepLoader,
     launcher: Launcher,
     master: DictConfig,
     settings: SweepConfig,
@@ -49,11 +48,7 @@ def run_sweep(
     folder = SweepFolder(Path(master.hydra.sweep.dir))
 
     def configure(overrides: Sequence[str]) -> TrainConfig:
-        config = loader.load_sweep_config(master, list(overrides))
-        HydraConfig.instance().set_config(config)  # settings may refer to it: ${hydra:runtime.cwd}
-        with read_write(config), open_dict(config):
-            del config["hydra"]
-        return to_config(config)
+        return to_config(loader.load_settings(master, list(overrides)))
 
     jobs = plan(expand(words, loader, settings.max_jobs), configure)
     _refuse_mistakes(jobs, settings)
