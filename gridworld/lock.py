@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from gridworld.errors import InputError
+
 _SECONDS_BETWEEN_TRIES = 0.02
 
 
@@ -16,11 +18,18 @@ _SECONDS_BETWEEN_TRIES = 0.02
 def locked(path: Path, wait: float | None = None) -> Iterator[bool]:
     """Whether the lock is ours for the block; waits up to `wait` seconds, with None for ever.
 
-    The file is made where there is none, and stays.
+    The file is made where there is none, and stays. Raises `InputError` where the file system has no locks.
     """
     file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
     try:
-        yield _take(file, wait)
+        try:
+            is_ours = _take(file, wait)
+        except OSError as error:
+            raise InputError(
+                f"{path}: this file system has no locks ({error.strerror}); choose a folder on one that has, "
+                "or have it mounted with them (Lustre: -o flock)"
+            ) from None
+        yield is_ours
     finally:
         os.close(file)
 

@@ -1,6 +1,8 @@
 """Sweeps as a user types them: run, come back, widen, fail, stop; the table is right throughout."""
 
 import csv
+import errno
+import fcntl
 import json
 import os
 import signal
@@ -18,6 +20,7 @@ from hypothesis import strategies as st
 from support import ROOT, script
 
 from gridworld.commands import jobs as jobs_command
+from gridworld.errors import InputError
 from gridworld.lock import is_locked, locked
 from gridworld.sweep.progress import SweepProgress, duration
 from gridworld.sweep.table import Row, Table
@@ -243,6 +246,15 @@ def test_a_lock_is_seen_and_ends_with_its_block(tmp_path: Path) -> None:
             assert not is_ours
         assert is_locked(path)
     assert not is_locked(path)
+
+
+def test_a_file_system_without_locks_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(file: int, operation: int) -> None:
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with pytest.raises(InputError, match="no locks"), locked(tmp_path / "lock"):
+        raise AssertionError
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,8 @@
     job.py        one job, in whichever process the launcher chose
     progress.py   the line on the terminal
     sweeper.py    all of it together, between Hydra's command line and Hydra's launcher
+    launchers.py  which launcher runs the jobs, and whether it can
+    worker.py     jobs in a process that a launcher started: parallel.py, on_slurm.py, on_ray.py
     hydra_plugin.py   what Hydra sees of it
 
 Truth lies in the jobs' folders: a run's manifest says how it ended, a lock that dies with its process says
