@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from gridworld.data_files import read_object
 from gridworld.errors import InputError
 from gridworld.mdp import FloatArray
-from gridworld.report.run_files import read_curve, read_object
+from gridworld.report.run_files import read_curve
 from gridworld.run import CURVE, MANIFEST, SUMMARY
 
 _LONGEST_NAME = 80  # characters
