@@ -1,7 +1,7 @@
 """Talking to whoever reads: a terminal, a file, a pipe that may be closed, a locale that knows no UTF-8.
 
 What a command prints is the least of what it does. So nothing that happens to its output ends it: a reader
-that leaves (`| head`), a terminal that is hung up, a disk that is full, or a sign that the locale cannot write,
+that leaves (`| head`), a terminal that is hung up, a full disk, or a sign that the locale cannot write,
 which is then printed as `\\xNN`. And names that come out of files cannot act on the terminal.
 """
 
@@ -36,7 +36,7 @@ def prepare() -> None:
 
 def _prepared(stream: TextIO | None, original: TextIO | None, number: int) -> TextIO:
     if stream is None:  # it was closed before the process began
-        return open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+        return open(os.devnull, "w", encoding="utf-8")
     if stream is not original or not isinstance(stream, io.TextIOWrapper):
         return stream  # somebody has put an own one in its place
     stream.flush()
