@@ -34,6 +34,7 @@ def main(arguments: Sequence[str]) -> None:
         frame_size(saved.mdp, options.cell_size)
     formats = list(dict.fromkeys(options.format))
     visits = _visits(saved) if "visits" in formats else np.zeros((0, 0), dtype=np.int64)
+    steps = _steps(saved) if {"policy", "q_error"} & set(formats) else 0
     beliefs = saved.beliefs()
     film = _film(saved, beliefs, options)
     record.check_size(film, formats)
@@ -46,7 +47,7 @@ def main(arguments: Sequence[str]) -> None:
             record.save_pngs(film, path)
         elif kind in MAPS:
             path = folder / f"{kind}.png"
-            _save_map(kind, saved, beliefs, visits, path, options.cell_size)
+            _save_map(kind, saved, (beliefs, steps, visits), path, options.cell_size)
         else:
             path = folder / f"episode.{kind}"
             record.save_animation(film, path, options.fps)
@@ -100,16 +101,16 @@ def _film(saved: SavedRun, beliefs: Beliefs, options: argparse.Namespace) -> Fil
 def _save_map(
     kind: str,
     saved: SavedRun,
-    beliefs: Beliefs,
-    visits: NDArray[np.int64],
+    learnt: tuple[Beliefs, int, NDArray[np.int64]],
     path: Path,
     cell_size: int | None,
 ) -> None:
+    beliefs, steps, visits = learnt
     maps = MapMaker(saved.judge(), agent_gamma(saved.config.agent, saved.config.evaluation.gamma))
     if kind == "visits":
         draw = maps.visits(visits)
     else:
-        draw = (maps.policy if kind == "policy" else maps.error)(beliefs, _steps(saved))
+        draw = (maps.policy if kind == "policy" else maps.error)(beliefs, steps)
     record.save_png(draw(cell_size), path)
 
 

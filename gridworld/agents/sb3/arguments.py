@@ -11,6 +11,7 @@ from typing import Any
 import stable_baselines3
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import LinearSchedule
@@ -31,6 +32,8 @@ _KINDS: dict[str, type] = {
     "activation_fn": torch.nn.Module,
     "optimizer_class": torch.optim.Optimizer,
     "features_extractor_class": BaseFeaturesExtractor,
+    "replay_buffer_class": BaseBuffer,
+    "rollout_buffer_class": BaseBuffer,
 }
 
 
