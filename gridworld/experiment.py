@@ -9,7 +9,7 @@ import shlex
 import shutil
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,7 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.config import AGENT_SCHEMAS, JoblibConfig, SweepConfig, TrainConfig
 from gridworld.errors import EXIT_CODE, InputError
-from gridworld.hydra_errors import refuse_added_keys, sentence
+from gridworld.hydra_errors import refuse_added_keys, sentence, unreadable_file
 from gridworld.manual import manual
 from gridworld.run import MANIFEST, SWEEP_JSON, Run, check_inside, check_new
 from gridworld.terminal import prepare, tell_error
@@ -99,10 +99,21 @@ def main(conf: Path) -> None:
         mistake = isinstance(error, CompactHydraException) or not _job_begun.is_set()
         if asked_for_traceback or not mistake:
             raise
+        if isinstance(error, UnicodeDecodeError | RecursionError):
+            told = unreadable_file([conf, *_own_folders(sys.argv[1:])])
+            error = error if told is None else InputError(told)
         sys.exit(_tell(error))
     except KeyboardInterrupt:
         print("interrupted before training began", file=sys.stderr)
         sys.exit(130)
+
+
+def _own_folders(words: list[str]) -> Iterator[Path]:
+    """What `--config-dir` names."""
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        option, _, value = word.partition("=")
+        if option in ("--config-dir", "-cd"):
+            yield Path(value or following)
 
 
 def compose(conf: Path, overrides: list[str]) -> TrainConfig:

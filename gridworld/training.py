@@ -45,8 +45,7 @@ class Interrupted(BaseException):
 def make_mdp(env: EnvConfig, layout: Layout | None = None) -> Mdp:
     """The world of these settings; `layout` stands in for the configured map."""
     if layout is None:
-        size = {"num_rows": env.num_rows, "num_cols": env.num_cols}
-        layout = load(env.layout, **{name: count for name, count in size.items() if count is not None})
+        layout = load(env.layout, env.num_rows, env.num_cols)
     return compile_mdp(layout, env.slip, env.step_reward, env.goal_reward, env.trap_reward)
 
 

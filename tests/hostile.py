@@ -209,12 +209,12 @@ def pickle_that_asks_for_memory(run: Path, base: Path) -> None:
 
 @hostile("compressed members", "dqn")
 def zip_bomb(run: Path, base: Path) -> None:
-    seal(run, "model.zip", zipped({"policy.pth": bytes(2**29)}, zipfile.ZIP_DEFLATED))
+    seal(run, "model.zip", zipped({"policy.pth": bytes(2**28)}, zipfile.ZIP_DEFLATED))
 
 
 @hostile("compressed members", "dqn")
 def zip_bomb_inside(run: Path, base: Path) -> None:
-    model(run, policy__pth=torch_file(bytes(2**29), zipfile.ZIP_DEFLATED))
+    model(run, policy__pth=torch_file(bytes(2**28), zipfile.ZIP_DEFLATED))
 
 
 @hostile("members are larger than itself", "dqn")
@@ -313,7 +313,7 @@ def table_of_a_trillion_numbers(run: Path, base: Path) -> None:
 
 @hostile("its members are larger than itself")
 def table_that_is_a_bomb(run: Path, base: Path) -> None:
-    seal(run, "model.zip", zipped({"q.npy": bytes(2**29)}, zipfile.ZIP_DEFLATED))
+    seal(run, "model.zip", zipped({"q.npy": bytes(2**28)}, zipfile.ZIP_DEFLATED))
 
 
 @hostile(FINE)
@@ -430,7 +430,7 @@ def a_replay_of_a_trillion_steps(run: Path, base: Path) -> None:
     agent_has(run, buffer_size=10**13)
 
 
-@hostile("cannot be built", "dqn")
+@hostile("must be layer widths", "dqn")
 def a_network_of_a_trillion_weights(run: Path, base: Path) -> None:
     manifest(run, lambda c: c["config"]["agent"]["policy_kwargs"].update(net_arch=[10**6, 10**6]))
 
