@@ -16,6 +16,7 @@ from gridworld.errors import InputError
 Schedule = Union[int, float, str]  # noqa: UP007
 MISSING = "???"  # OmegaConf's sign for what has to be given
 MOST_ENVS = 2**17  # eight times the largest batch that any measurement here is faster with
+MOST_THREADS = 1024
 MOST_STEPS = 100_000  # of an episode; an evaluation goes through all of them
 LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end, as RL Zoo writes it
 
@@ -302,6 +303,7 @@ def check(config: TrainConfig) -> None:
     at_least("n_envs", config.n_envs, 1)
     at_most("n_envs", config.n_envs, MOST_ENVS)
     at_least("threads", config.threads, 1)
+    at_most("threads", config.threads, MOST_THREADS)
     check_step_limit(config.env)
     at_least("observation.cell_size", config.observation.cell_size, 1)
     at_least("evaluation.every", config.evaluation.every, 1)

@@ -100,7 +100,7 @@ def main(conf: Path) -> None:
         if asked_for_traceback or not mistake:
             raise
         if isinstance(error, UnicodeDecodeError | RecursionError):
-            told = unreadable_file([conf, *_own_folders(sys.argv[1:])])
+            told = unreadable_file(error, [conf, *_own_folders(sys.argv[1:])])
             error = error if told is None else InputError(told)
         sys.exit(_tell(error))
     except KeyboardInterrupt:

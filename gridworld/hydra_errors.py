@@ -45,17 +45,18 @@ def sentence(error: BaseException) -> str:
     return ": ".join(fact.strip().rstrip(".:") for fact in facts) + _suggestion(" ".join(facts))
 
 
-def unreadable_file(folders: Iterable[Path]) -> str | None:
-    """A sentence on the first yaml file that cannot be read at all; Hydra does not tell which one it was."""
+def unreadable_file(error: Exception, folders: Iterable[Path]) -> str | None:
+    """A sentence on the first yaml file that raises such an error; Hydra does not tell which one it was."""
     for file in sorted(file for folder in folders for file in folder.rglob("*.yaml")):
         try:
             OmegaConf.load(file)
-        except UnicodeDecodeError as error:
-            return f"{file}: byte {error.start + 1} is no UTF-8"
-        except RecursionError:
-            return f"{file}: is nested too deeply, or contains itself"
-        except (OSError, YAMLError) as error:
-            return f"{file}: cannot be read ({str(error).splitlines()[0]})"
+        except (UnicodeDecodeError, RecursionError) as found:
+            if isinstance(found, UnicodeDecodeError) and isinstance(error, UnicodeDecodeError):
+                return f"{file}: byte {found.start + 1} is no UTF-8"
+            if isinstance(found, RecursionError) and isinstance(error, RecursionError):
+                return f"{file}: is nested too deeply, or contains itself"
+        except (OSError, YAMLError):
+            continue  # these name their file themselves
     return None
 
 

@@ -154,9 +154,8 @@ def _import(where: str, path: Any, kind: type) -> Any:
     except (ValueError, TypeError):  # no path at all
         found = None
     except Exception as error:  # a module of the user's own may raise anything
-        raise InputError(
-            f"{where}={path}: {module} cannot be imported ({type(error).__name__}: {error})"
-        ) from error
+        told = f"{module} cannot be imported ({type(error).__name__}: {error})"
+        raise InputError(f"{where}={path}: {told}") from error
     if not (inspect.isclass(found) and issubclass(found, kind)):
         what = "class" if kind is object else f"{kind.__name__} class"
         example = "stable_baselines3.A2C" if kind is BaseAlgorithm else "torch.nn.ReLU"
