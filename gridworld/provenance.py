@@ -77,11 +77,15 @@ def versions() -> dict[str, str | None]:
 
 @functools.cache
 def source() -> Source | None:
-    """None outside a git checkout, or where git cannot be asked."""
+    """That of this package; None outside a git checkout, or where git cannot be asked."""
+    return source_of(Path(__file__).parents[1])
+
+
+def source_of(tree: Path) -> Source | None:
+    """That of a folder."""
     import subprocess
     import tempfile
 
-    tree = Path(__file__).parents[1]
     if not (tree / ".git").exists():
         return None
 
@@ -95,11 +99,12 @@ def source() -> Source | None:
         commit = git("rev-parse", "HEAD").decode().strip()
         if not git("status", "--porcelain", "--", *_PARTS):
             return Source(commit, b"")
+        there = [part for part in _PARTS if (tree / part).exists()]  # `add` wants them all to be
         # A copy of the index, to which unknown files are added by name: `diff` then has their content.
         with tempfile.TemporaryDirectory() as folder:
             index = Path(folder) / "index"
             index.write_bytes((tree / git("rev-parse", "--git-path", "index").decode().strip()).read_bytes())
-            git("add", "--intent-to-add", "--all", "--", *_PARTS, GIT_INDEX_FILE=str(index))
+            git("add", "--intent-to-add", "--all", "--", *there, GIT_INDEX_FILE=str(index))
             words = ("diff", "--no-ext-diff", "--no-color", "--binary", "HEAD", "--", *_PARTS)
             diff = git(*words, GIT_INDEX_FILE=str(index))
     except (OSError, ValueError, subprocess.SubprocessError):

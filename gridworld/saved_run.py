@@ -32,6 +32,7 @@ from gridworld.training import make_mdp, make_seat
 
 _LARGEST_HEADER = 2**12  # bytes that NumPy's format has before the numbers
 _LONGEST_NAME = 1000  # characters; a map's name may be a path
+_UNDECODED = frozenset(map(chr, range(0xDC80, 0xDD00)))  # bytes of a path that the locale has no sign for
 _LIBRARIES = ("torch.nn.", "torch.optim.", "stable_baselines3.", "sb3_contrib.")
 
 
@@ -78,7 +79,7 @@ def settings_of(run: Run, trust: bool = False) -> TrainConfig:
     """The checked settings of a run's manifest; `trust` as in `SavedRun`. Raises `InputError`."""
     config = read_config(run.manifest["config"], str(run.manifest_file))
     for key, name in (("agent.name", config.agent.name), ("env.layout", config.env.layout)):
-        if not (name.isprintable() and len(name) <= _LONGEST_NAME):
+        if len(name) > _LONGEST_NAME or not all(sign.isprintable() or sign in _UNDECODED for sign in name):
             raise InputError(f"{run.manifest_file}: config.{key}={name[:80]!r}: must be a plain name")
     try:
         check(config)
