@@ -15,6 +15,9 @@ from gridworld.errors import InputError
 # OmegaConf reads these annotations at run time and knows no `X | None`.
 Schedule = Union[int, float, str]  # noqa: UP007
 MISSING = "???"  # OmegaConf's sign for what has to be given
+MOST_ENVS = 2**17  # eight times the largest batch that any measurement here is faster with
+MOST_THREADS = 1024
+MOST_STEPS = 100_000  # of an episode; an evaluation goes through all of them
 LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end, as RL Zoo writes it
 
 
@@ -329,8 +332,10 @@ def check(config: TrainConfig) -> None:
         raise InputError(f"seed={config.seed}: must be below 2**32")
     at_least("total_timesteps", config.total_timesteps, 1)
     at_least("n_envs", config.n_envs, 1)
+    at_most("n_envs", config.n_envs, MOST_ENVS)
     at_least("threads", config.threads, 1)
-    at_least("env.max_episode_steps", config.env.max_episode_steps, 1)
+    at_most("threads", config.threads, MOST_THREADS)
+    check_step_limit(config.env)
     at_least("observation.cell_size", config.observation.cell_size, 1)
     at_least("evaluation.every", config.evaluation.every, 1)
     within("evaluation.gamma", config.evaluation.gamma, 0, 1)
@@ -340,6 +345,12 @@ def check(config: TrainConfig) -> None:
     if config.recording.cell_size is not None:
         at_least("recording.cell_size", config.recording.cell_size, 2)
     within("recording.fps", config.recording.fps, 1, 100)
+
+
+def check_step_limit(env: EnvConfig) -> None:
+    """Raise `InputError` for one that cannot be, or that an exact evaluation would not come to the end of."""
+    at_least("env.max_episode_steps", env.max_episode_steps, 1)
+    at_most("env.max_episode_steps", env.max_episode_steps, MOST_STEPS)
 
 
 def parse_schedule(key: str, value: Schedule) -> tuple[float, bool]:
@@ -368,6 +379,12 @@ def at_least(key: str, value: float, bound: float) -> None:
     """Refuse a value that is below the bound, infinite or NaN."""
     if not bound <= value < math.inf:
         raise InputError(f"{key}={value}: must be at least {bound}")
+
+
+def at_most(key: str, value: float, bound: float) -> None:
+    """Refuse a value that is above the bound, or NaN."""
+    if not value <= bound:
+        raise InputError(f"{key}={value}: must be at most {bound}")
 
 
 def above_zero(key: str, value: float) -> None:

@@ -19,7 +19,7 @@ from gymnasium import spaces
 
 from gridworld import render as drawing
 from gridworld.errors import InputError
-from gridworld.layout import CLASSIC, Cell, Layout, load, positive_int
+from gridworld.layout import CLASSIC, Cell, Layout, load_by_default_size, positive_int
 from gridworld.mdp import ACTION_NAMES, NUM_ACTIONS, Mdp, compile_mdp
 from gridworld.render import CELL_SIZE, MARGIN, Colour, Frame, Point
 
@@ -77,7 +77,7 @@ class GridWorldEnv(gym.Env[int, int]):
             raise InputError(f"render_mode={render_mode!r}: must be human, rgb_array, ansi or None")
         if isinstance(delay, bool) or not isinstance(delay, Real) or not 0 <= delay < math.inf:
             raise InputError(f"delay={delay!r}: must be a number of seconds, at least 0")
-        world = load(layout, num_rows, num_cols)
+        world = load_by_default_size(layout, num_rows, num_cols)
         self.mdp: Mdp = compile_mdp(world, slip, step_reward, goal_reward, trap_reward)
         self.render_mode = render_mode
         self.delay: float = delay

@@ -12,14 +12,47 @@ import os
 import socket
 import struct
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import google_crc32c
+from google.protobuf.message import DecodeError
 from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.compat.proto.summary_pb2 import Summary
 
+from gridworld.data_files import read_bytes
+from gridworld.errors import InputError
+
+LARGEST = 2**28  # bytes of a file that is read
+_HEADER, _FOOTER = 12, 4  # bytes before and after an event
 _VERSION = "brain.Event:2"
 _MASK_DELTA = 0xA282EAD8
+
+
+def read_scalars(path: Path) -> Iterator[tuple[str, int, float]]:
+    """(tag, step, value) of every scalar, in the order in which they were written.
+
+    Raises `InputError` for a file that is too large, cut off or damaged; a record's length is believed only
+    as far as there are bytes.
+    """
+    content = memoryview(read_bytes(path, LARGEST))
+    start = 0
+    while start < len(content):
+        frame = bytes(content[start : start + _HEADER])
+        if len(frame) < _HEADER or _checksum(frame[:8]) != frame[8:]:
+            raise InputError(f"{path}: is damaged or cut off after {start:,} bytes")
+        end = start + _HEADER + struct.unpack("<Q", frame[:8])[0]
+        record, checksum = bytes(content[start + _HEADER : end]), bytes(content[end : end + _FOOTER])
+        try:
+            if _checksum(record) != checksum:
+                raise DecodeError
+            event = Event.FromString(record)
+        except DecodeError:
+            raise InputError(f"{path}: is damaged or cut off after {start:,} bytes") from None
+        for value in event.summary.value:
+            if value.HasField("simple_value"):
+                yield value.tag, event.step, value.simple_value
+        start = end + _FOOTER
 
 
 class EventFile:

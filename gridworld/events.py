@@ -61,7 +61,8 @@ class EventWriter:
                 start.hparams[name].number_value = value
                 info.type = api_pb2.DATA_TYPE_FLOAT64
             else:
-                start.hparams[name].string_value = str(value)
+                # A name that the locale could not decode has signs that no protocol buffer takes.
+                start.hparams[name].string_value = str(value).encode("utf-8", "backslashreplace").decode()
                 info.type = api_pb2.DATA_TYPE_STRING
             infos.append(info)
         experiment = api_pb2.Experiment(

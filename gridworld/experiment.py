@@ -9,6 +9,7 @@ import shlex
 import shutil
 import sys
 import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,9 +25,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.config import AGENT_SCHEMAS, LAUNCHER_SCHEMAS, SweepConfig, TrainConfig
 from gridworld.errors import EXIT_CODE, InputError
-from gridworld.hydra_errors import refuse_added_keys, sentence
+from gridworld.hydra_errors import refuse_added_keys, sentence, unreadable_file
 from gridworld.manual import manual
-from gridworld.run import MANIFEST, SWEEP_JSON, Run, check_new
+from gridworld.run import MANIFEST, SWEEP_JSON, Run, check_inside, check_new
+from gridworld.terminal import prepare, tell_error
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 _job_begun = threading.Event()  # set once this process has come to a job
@@ -38,21 +40,51 @@ class JobError(CompactHydraException):
 
 
 class RefuseUsedFolders(Callback):
-    """Looks at the output folder before Hydra writes to it, and ends the program if it cannot be used."""
+    """Looks at where Hydra would write before it does, and ends the program if that cannot be."""
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Let go of the configurations that a launcher would keep of every job until the sweep ends."""
         job_return.cfg = job_return.hydra_cfg = None
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        try:
-            check_new(Path(config.hydra.run.dir))
-        except (InputError, OSError, OmegaConfBaseException) as error:
-            sys.exit(_tell(error))
+        _end_unless(lambda: _check_run_folder(config))
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        _end_unless(lambda: _check_sweep_folder(config))
+
+
+def _end_unless(check: Callable[[], None]) -> None:
+    try:
+        check()
+    except (InputError, OSError, OmegaConfBaseException) as error:
+        sys.exit(_tell(error))
+
+
+def _check_run_folder(config: DictConfig) -> None:
+    folder = Path(config.hydra.run.dir)
+    check_inside(folder, "hydra.run.dir")
+    _check_names(config)
+    check_new(folder)
+
+
+def _check_sweep_folder(config: DictConfig) -> None:
+    check_inside(Path(config.hydra.sweep.dir), "hydra.sweep.dir")
+    _check_names(config)
+
+
+def _check_names(config: DictConfig) -> None:
+    """What Hydra puts into the output folder stays in it. Raises `InputError`."""
+    for key, name in (
+        ("hydra.output_subdir", config.hydra.output_subdir),
+        ("hydra.job.name", config.hydra.job.name),  # that of its log file
+    ):
+        if name is not None and (os.sep in name or name in ("", os.curdir, os.pardir)):
+            raise InputError(f"{key}={name}: must be a plain name, without {os.sep}")
 
 
 def main(conf: Path) -> None:
     """Run the command line; `conf` is the folder of the yaml files."""
+    prepare()
     if {"--help", "-h"} & set(sys.argv[1:]):
         print(manual(conf))
         return
@@ -66,10 +98,21 @@ def main(conf: Path) -> None:
         mistake = isinstance(error, CompactHydraException) or not _job_begun.is_set()
         if asked_for_traceback or not mistake:
             raise
+        if isinstance(error, UnicodeDecodeError | RecursionError):
+            told = unreadable_file(error, [conf, *_own_folders(sys.argv[1:])])
+            error = error if told is None else InputError(told)
         sys.exit(_tell(error))
     except KeyboardInterrupt:
         print("interrupted before training began", file=sys.stderr)
         sys.exit(130)
+
+
+def _own_folders(words: list[str]) -> Iterator[Path]:
+    """What `--config-dir` names."""
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        option, _, value = word.partition("=")
+        if option in ("--config-dir", "-cd"):
+            yield Path(value or following)
 
 
 def compose(conf: Path, overrides: list[str]) -> TrainConfig:
@@ -115,7 +158,7 @@ def run_job(settings: DictConfig) -> float:
     except KeyboardInterrupt:
         _discard(folder)
         raise
-    _say(summary_text(summary, shlex.quote(_shown(folder))))
+    print(summary_text(summary, shlex.quote(_shown(folder))))
     return float(summary["regret"])
 
 
@@ -138,16 +181,8 @@ def _slug(text: Any) -> str:
     return name.strip("-.")[:_LONGEST_NAME] or "run"
 
 
-def _say(text: str) -> None:
-    """Print it, if anybody still reads: with `| head`, a reader may have left. The files are written."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
 def _tell(error: Exception) -> int:
-    print(f"error: {sentence(error)}", file=sys.stderr)
+    tell_error(sentence(error))
     return EXIT_CODE
 
 

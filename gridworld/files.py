@@ -15,8 +15,13 @@ if TYPE_CHECKING:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A path beside `path` to write to; it takes `path`'s place if the block ends well, else it is gone."""
+    """A path beside `path` to write to; it takes `path`'s place if the block ends well, else it is gone.
+
+    Neither of them is written through where it is a symbolic link: the one is made anew, the other replaced.
+    """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part.unlink(missing_ok=True)
+    os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666))
     try:
         yield part
         os.replace(part, path)
@@ -28,6 +33,12 @@ def write_text(path: Path, text: str) -> None:
     """Write UTF-8."""
     with replacing(path) as part:
         part.write_text(text, encoding="utf-8")
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write what is encoded already."""
+    with replacing(path) as part:
+        part.write_bytes(content)
 
 
 def write_json(path: Path, content: Any) -> None:

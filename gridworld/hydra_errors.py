@@ -9,9 +9,12 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import re
+from collections.abc import Iterable
+from pathlib import Path
 
 from hydra.errors import OverrideParseException
 from omegaconf import DictConfig, OmegaConf
+from yaml import MarkedYAMLError, YAMLError
 
 from gridworld import config as schemas
 from gridworld.errors import InputError
@@ -24,6 +27,12 @@ def sentence(error: BaseException) -> str:
     message = str(error)
     if isinstance(error, InputError):
         return message
+    if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
+        mark = error.problem_mark
+        return f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}: is no yaml, {error.problem}"
+    if missing := re.search(r"Missing mandatory value: (\S+)", message):
+        key = missing.group(1)
+        return f"{key}: has no value; the yaml that {key.split('.')[0]}=... chooses must give it one"
     if "Could not find" in message and "Available options in" in message:
         return _unknown_choice(message)
     lines = message.splitlines() or [type(error).__name__]
@@ -34,6 +43,21 @@ def sentence(error: BaseException) -> str:
     if isinstance(error, OverrideParseException) and override and override not in facts[0]:
         facts.insert(0, override)
     return ": ".join(fact.strip().rstrip(".:") for fact in facts) + _suggestion(" ".join(facts))
+
+
+def unreadable_file(error: Exception, folders: Iterable[Path]) -> str | None:
+    """A sentence on the first yaml file that raises such an error; Hydra does not tell which one it was."""
+    for file in sorted(file for folder in folders for file in folder.rglob("*.yaml")):
+        try:
+            OmegaConf.load(file)
+        except (UnicodeDecodeError, RecursionError) as found:
+            if isinstance(found, UnicodeDecodeError) and isinstance(error, UnicodeDecodeError):
+                return f"{file}: byte {found.start + 1} is no UTF-8"
+            if isinstance(found, RecursionError) and isinstance(error, RecursionError):
+                return f"{file}: is nested too deeply, or contains itself"
+        except (OSError, YAMLError):
+            continue  # these name their file themselves
+    return None
 
 
 def refuse_added_keys(settings: DictConfig) -> None:

@@ -32,6 +32,7 @@ MAX_CELLS = 512 * 512
 MOVES: tuple[Cell, ...] = ((-1, 0), (0, 1), (1, 0), (0, -1))  # up, right, down, left: action 0, 1, 2, 3
 
 CLASSIC = "classic"
+NUM_ROWS, NUM_COLS = 5, 6  # of classic
 _TILES = "SGT#."
 
 
@@ -72,7 +73,7 @@ class Layout:
         return "\n".join(map("".join, grid))
 
 
-def classic(num_rows: int = 5, num_cols: int = 6) -> Layout:
+def classic(num_rows: int = NUM_ROWS, num_cols: int = NUM_COLS) -> Layout:
     """The GridWorld of the tutorial: start in the corner, a goal with a trap on three of its sides.
 
     Only the cell right of the goal leads into it, so the grid needs a row above and below the traps to walk
@@ -122,25 +123,33 @@ def parse(text: str, name: str) -> Layout:
     )
 
 
-def load(layout: str | PathLike[str] | Layout, num_rows: int = 5, num_cols: int = 6) -> Layout:
+def load(
+    layout: str | PathLike[str] | Layout, num_rows: int | None = None, num_cols: int | None = None
+) -> Layout:
     """The layout of that name (`classic` or a shipped map), or the one in a file, or the one given.
 
-    `num_rows` and `num_cols` size `classic`. A map has its own size: other numbers than the default ones
-    must then agree with it.
+    `num_rows` and `num_cols` size `classic`. A map has its own size; where one is given, it must agree.
     """
     if isinstance(layout, str) and layout == CLASSIC:
-        return classic(num_rows, num_cols)
+        return classic(NUM_ROWS if num_rows is None else num_rows, NUM_COLS if num_cols is None else num_cols)
     loaded = layout if isinstance(layout, Layout) else _read(layout)
-    for what, asked, default, actual in (
-        ("num_rows", num_rows, 5, loaded.num_rows),
-        ("num_cols", num_cols, 6, loaded.num_cols),
+    for what, asked, actual in (
+        ("num_rows", num_rows, loaded.num_rows),
+        ("num_cols", num_cols, loaded.num_cols),
     ):
-        if positive_int(what, asked) not in (default, actual):
+        if asked is not None and positive_int(what, asked) != actual:
             raise InputError(
                 f"{what}={asked}: the map {loaded.name} has {actual}; leave {what} out, "
                 "it only sizes the layout classic"
             )
     return loaded
+
+
+def load_by_default_size(layout: str | PathLike[str] | Layout, num_rows: int, num_cols: int) -> Layout:
+    """The same for callers whose default is classic's own size, so that it may mean that none is given."""
+    rows = None if type(num_rows) is int and num_rows == NUM_ROWS else num_rows
+    cols = None if type(num_cols) is int and num_cols == NUM_COLS else num_cols
+    return load(layout, rows, cols)
 
 
 def shipped_layouts() -> tuple[str, ...]:

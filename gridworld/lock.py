@@ -12,6 +12,7 @@ from pathlib import Path
 from gridworld.errors import InputError
 
 _SECONDS_BETWEEN_TRIES = 0.02
+_FLAGS = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # no link is followed, no pipe waited for
 
 
 @contextmanager
@@ -20,7 +21,7 @@ def locked(path: Path, wait: float | None = None) -> Iterator[bool]:
 
     The file is made where there is none, and stays. Raises `InputError` where the file system has no locks.
     """
-    file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    file = os.open(path, os.O_RDWR | os.O_CREAT | _FLAGS, 0o666)
     try:
         try:
             is_ours = _take(file, wait)
@@ -37,7 +38,7 @@ def locked(path: Path, wait: float | None = None) -> Iterator[bool]:
 def is_locked(path: Path) -> bool:
     """Whether some process holds the lock now."""
     try:
-        file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        file = os.open(path, os.O_RDONLY | _FLAGS)
     except FileNotFoundError:
         return False
     try:

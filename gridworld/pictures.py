@@ -20,6 +20,7 @@ from gridworld.error_map import draw_error_map, value_error
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge, play_episode
 from gridworld.events import IMAGES_TAB, TIME_SERIES_CARD, EventWriter
+from gridworld.files import write_bytes
 from gridworld.film import film_of_states
 from gridworld.history import History
 from gridworld.mdp import Mdp
@@ -150,7 +151,7 @@ class Pictures:
         assert self._history is not None
         film = self._history.film(self._judge)
         content = record.encode_gif(film, self._config.recording.fps)
-        record.save_bytes(content, self._run.folder / LEARNING_GIF)
+        write_bytes(self._run.folder / LEARNING_GIF, content)
         if self._events is not None:
             self._events.animation("learning", content, film.size, step)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from gridworld.errors import InputError
-from gridworld.files import replacing
+from gridworld.files import replacing, write_bytes
 from gridworld.film import Film
 from gridworld.gif import encode_gif as _encode_gif
 from gridworld.png import encode_png
@@ -48,7 +48,7 @@ def save_pngs(film: Film, folder: Path) -> None:
 
 def save_png(frame: Frame, path: Path) -> None:
     """One picture."""
-    save_bytes(encode_png(frame), path)
+    write_bytes(path, encode_png(frame))
 
 
 def encode_gif(film: Film, fps: int) -> bytes:
@@ -112,10 +112,4 @@ def save_animation(film: Film, path: Path, fps: int) -> None:
         save_mp4(film, path, fps)
         return
     encode = {".gif": encode_gif, ".apng": encode_apng}[path.suffix]
-    save_bytes(encode(film, fps), path)
-
-
-def save_bytes(content: bytes, path: Path) -> None:
-    """Write what was encoded."""
-    with replacing(path) as part:
-        part.write_bytes(content)
+    write_bytes(path, encode(film, fps))

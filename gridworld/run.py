@@ -1,6 +1,7 @@
 """A run's folder: its files, its manifest, its status.
 
     manifest.json   what ran, with which versions and settings, from when to when, and how it ended
+    source.diff     what was changed in the source tree since its commit, where anything was
     curve.csv       the learning curve, a row per evaluation
     summary.json    the result
     model.zip       the trained model
@@ -11,40 +12,27 @@
     events.out...   TensorBoard's event file
 
 The manifest alone is enough to build the world and the agent again: it holds the resolved settings and
-the map's text.
+the map's text. Of a finished run it also has the checksums of the files that hold its result.
 """
 
 from __future__ import annotations
 
-import functools
-import json
 import os
-import platform
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from gridworld.data_files import file_sha256, read_object
 from gridworld.errors import InputError
-from gridworld.files import write_json
+from gridworld.files import write_bytes, write_json
+from gridworld.provenance import DIFF, LARGEST_DIFF, describe, source
 
 MANIFEST = "manifest.json"
 CURVE = "curve.csv"
 SWEEP_JSON = "sweep.json"  # a sweep's folder has this instead
 SUMMARY = "summary.json"
-PACKAGES = (
-    "gridworld",
-    "gymnasium",
-    "hydra-core",
-    "numpy",
-    "omegaconf",
-    "pillow",
-    "pygame",
-    "scipy",
-    "stable-baselines3",
-    "tensorboard",
-    "torch",
-)
+LARGEST_RESULT = 2**30  # bytes of a file
 
 
 class Run:
@@ -70,10 +58,7 @@ class Run:
             "overrides": overrides,
             "seed": config["seed"],
             "threads": config["threads"],
-            "versions": versions(),
-            "git": _git(),
-            "platform": platform.platform(),
-            "processor": {"machine": platform.machine(), "cores": os.cpu_count()},
+            **describe(),
             "layout": layout_text.split("\n"),
             "config": config,
         }
@@ -84,13 +69,38 @@ class Run:
                 f"{self.folder}: holds a run already; give every run a folder of its own"
             ) from None
         write_json(self.manifest_file, self.manifest)
+        tree = source()
+        if tree is not None and 0 < len(tree.diff) <= LARGEST_DIFF:
+            write_bytes(self.folder / DIFF, tree.diff)
 
     def end(self, status: str, error: str | None = None) -> None:
         """Record how it ended: finished, interrupted or failed."""
         self.manifest |= {"status": status, "ended": _now()}
         if error is not None:
             self.manifest["error"] = error
+        if status == "finished":
+            self.manifest["sha256"] = {
+                path.name: file_sha256(path, LARGEST_RESULT) for path in self._results() if path.exists()
+            }
         write_json(self.manifest_file, self.manifest)
+
+    def verify(self, path: Path) -> None:
+        """Raise `InputError` unless the file with a part of the result is the one that the run wrote."""
+        sums = self.manifest.get("sha256")
+        noted = sums.get(path.name) if isinstance(sums, dict) else None
+        if noted is None:
+            raise InputError(
+                f"{self.manifest_file}: has no checksum (sha256) of {path.name}; was the run written by "
+                "another version, or the file added to it?"
+            )
+        if file_sha256(path, LARGEST_RESULT) != noted:
+            raise InputError(
+                f"{path}: is not the file that the run wrote, its checksum is not the one in {MANIFEST}; "
+                "it was damaged or changed"
+            )
+
+    def _results(self) -> tuple[Path, ...]:
+        return self.curve_file, self.summary_file, self.model_file, self.visits_file
 
 
 def open_run(folder: Path) -> Run:
@@ -98,29 +108,40 @@ def open_run(folder: Path) -> Run:
     run = Run(folder)
     if not folder.exists():
         raise InputError(f"{folder}: no such folder; give the folder of a run, e.g. one in runs/")
-    if not run.manifest_file.is_file():
+    if not os.path.lexists(run.manifest_file):
         raise InputError(f"{folder}: not a run's folder, it has no {MANIFEST}")
-    try:
-        manifest = json.loads(run.manifest_file.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{run.manifest_file}: cannot be read ({error})") from None
-    if not isinstance(manifest, dict) or not {"status", "config", "layout"} <= manifest.keys():
+    manifest = read_object(run.manifest_file)
+    if not {"status", "config", "layout"} <= manifest.keys():
         raise InputError(f"{run.manifest_file}: not the manifest of a run; it lacks status, config or layout")
     if manifest["status"] != "finished":
         raise InputError(
-            f"{folder}: this run is {manifest['status']!r}; only a finished one can be looked at"
+            f"{folder}: this run is {str(manifest['status'])[:40]!r}; only a finished one can be looked at"
         )
     run.manifest = manifest
     return run
 
 
-def check_new(folder: Path) -> None:
+def check_new(folder: Path, key: str = "hydra.run.dir") -> None:
     """Raise `InputError` unless a run can be written to `folder`: it can be made and holds no run yet."""
     if (folder / MANIFEST).exists():
         raise InputError(f"{folder}: holds a run already; choose another folder")
     if (folder / SWEEP_JSON).exists():
-        raise InputError(f"{folder}: is the folder of a sweep; choose another hydra.run.dir")
-    check_writable(folder, "hydra.run.dir")
+        raise InputError(f"{folder}: is the folder of a sweep; choose another {key}")
+    if used := next(folder.glob(f"*/{MANIFEST}"), None):
+        raise InputError(f"{folder}: holds other runs, {used.parent} for one; name a new folder in it")
+    check_writable(folder, key)
+
+
+def check_inside(path: Path, key: str) -> None:
+    """Raise `InputError` for a relative path that leads out of the current folder, or is that folder."""
+    normal = os.path.normpath(path)
+    if os.path.isabs(normal) or normal.split(os.sep)[0] not in (os.curdir, os.pardir):
+        return
+    if normal == os.curdir:
+        raise InputError(f"{key}={path}: is the current folder; name one in it, e.g. runs/mine")
+    raise InputError(
+        f"{key}={path}: leads out of the current folder; if that is meant, say {os.path.abspath(path)}"
+    )
 
 
 def check_writable(folder: Path, key: str) -> None:
@@ -136,38 +157,3 @@ def check_writable(folder: Path, key: str) -> None:
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
-
-
-@functools.cache  # the code that runs is the code that was imported
-def versions() -> dict[str, str | None]:
-    """Of Python and of every package that has a say in the result."""
-    # Imported here, as subprocess below, to keep them out of the way of `train.py --help`.
-    from importlib.metadata import PackageNotFoundError, version
-
-    found: dict[str, str | None] = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = None
-    return found
-
-
-@functools.cache
-def _git() -> dict[str, Any] | None:
-    """Commit of the source tree and whether it has changes; None outside a git checkout."""
-    import subprocess
-
-    source = Path(__file__).parents[1]
-    if not (source / ".git").exists():
-        return None
-    try:
-        answers = [
-            subprocess.run(
-                ["git", "-C", str(source), *arguments], capture_output=True, text=True, check=True, timeout=10
-            ).stdout.strip()
-            for arguments in (["rev-parse", "HEAD"], ["status", "--porcelain"])
-        ]
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return {"commit": answers[0], "dirty": bool(answers[1])}

@@ -1,19 +1,27 @@
 """A finished run, opened again: its settings, its world and its trained agent.
 
-A run's folder is data. Its settings are JSON, checked field by field against the schema, and its weights
-are read as tensors; nothing in it is unpickled, imported by name without a check, or run.
+A run's folder is data. Its settings are JSON, checked field by field against the schema; an interpolation in
+them is a text like any other. Its map is the text in the manifest, not the file that the settings name. Its
+weights are read as tensors and only if their checksum is the manifest's. Nothing is unpickled, imported by
+name without a check, or run. What a checksum cannot tell is who wrote both: it finds damage, not forgery.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import io
+import math
 import types
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gridworld.agents import Beliefs, family
 from gridworld.chain import one_hot_policy
 from gridworld.config import AGENT_SCHEMAS, AgentConfig, SB3ClassConfig, TrainConfig, check
+from gridworld.data_files import read_bytes
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge
 from gridworld.layout import CLASSIC, Layout, load, parse
@@ -22,6 +30,9 @@ from gridworld.observations import make_observation
 from gridworld.run import Run, open_run
 from gridworld.training import make_mdp, make_seat
 
+_LARGEST_HEADER = 2**12  # bytes that NumPy's format has before the numbers
+_LONGEST_NAME = 1000  # characters; a map's name may be a path
+_UNDECODED = frozenset(map(chr, range(0xDC80, 0xDD00)))  # bytes of a path that the locale has no sign for
 _LIBRARIES = ("torch.nn.", "torch.optim.", "stable_baselines3.", "sb3_contrib.")
 
 
@@ -33,21 +44,9 @@ class SavedRun:
 
     def __init__(self, folder: Path, trust: bool = False) -> None:
         self.run: Run = open_run(folder)
-        manifest = self.run.manifest
-        self.config = read_config(manifest["config"], str(self.run.manifest_file))
+        self.config = settings_of(self.run, trust)
         self.config.device = "cpu"  # where it was trained is no reason to need the same machine
-        check(self.config)
-        if not trust:
-            _check_imports(dataclasses.asdict(self.config.agent), str(self.run.manifest_file))
-        family(self.config.agent).check(self.config)
-        self.mdp: Mdp = make_mdp(self.config.env, self._trained_layout(manifest["layout"]))
-
-    def _trained_layout(self, lines: Any) -> Layout:
-        if not (isinstance(lines, list) and all(isinstance(line, str) for line in lines)):
-            raise InputError(f"{self.run.manifest_file}: layout must be a list of the map's rows")
-        return dataclasses.replace(
-            parse("\n".join(lines), f"{self.run.manifest_file}: layout"), name=self.config.env.layout
-        )
+        self.mdp: Mdp = make_mdp(self.config.env, layout_of(self.run, self.config))
 
     def judge(self, layout: str | None = None) -> Judge:
         """The judge of its own world, or of another map of the same size."""
@@ -68,6 +67,7 @@ class SavedRun:
         observation = make_observation(
             self.mdp, self.config.observation.kind, self.config.observation.cell_size
         )
+        self.run.verify(self.run.model_file)
         agent = family(self.config.agent).build(
             self.config.agent, make_seat(self.config, self.mdp, observation)
         )
@@ -75,16 +75,62 @@ class SavedRun:
         return agent.beliefs()
 
 
-def _check_imports(agent: dict[str, Any], where: str) -> None:
-    """Refuse an import path that leads out of the libraries an agent is made of."""
-    for key, value in agent.items():
-        if isinstance(value, dict):
-            _check_imports(value, where)
-        elif _is_foreign(key, value):
-            raise InputError(
-                f"{where}: {key}={value} is from none of {', '.join(_LIBRARIES)}; add --trust to import it "
-                "all the same, if you trust whoever made this run"
-            )
+def settings_of(run: Run, trust: bool = False) -> TrainConfig:
+    """The checked settings of a run's manifest; `trust` as in `SavedRun`. Raises `InputError`."""
+    config = read_config(run.manifest["config"], str(run.manifest_file))
+    for key, name in (("agent.name", config.agent.name), ("env.layout", config.env.layout)):
+        if len(name) > _LONGEST_NAME or not all(sign.isprintable() or sign in _UNDECODED for sign in name):
+            raise InputError(f"{run.manifest_file}: config.{key}={name[:80]!r}: must be a plain name")
+    try:
+        check(config)
+        if not trust:
+            _check_imports(dataclasses.asdict(config.agent), str(run.manifest_file))
+        family(config.agent).check(config)
+    except RecursionError:
+        raise InputError(f"{run.manifest_file}: config is nested too deeply") from None
+    return config
+
+
+def layout_of(run: Run, config: TrainConfig) -> Layout:
+    """The map that the run was trained on, under the name that its settings have for it."""
+    lines = run.manifest["layout"]
+    if not (isinstance(lines, list) and all(isinstance(line, str) for line in lines)):
+        raise InputError(f"{run.manifest_file}: layout must be a list of the map's rows")
+    return dataclasses.replace(
+        parse("\n".join(lines), f"{run.manifest_file}: layout"), name=config.env.layout
+    )
+
+
+def read_visits(run: Run, shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """The run's counts of visits, (S, A). Raises `InputError`."""
+    path = run.visits_file
+    run.verify(path)
+    content = read_bytes(path, _LARGEST_HEADER + 8 * math.prod(shape))
+    try:
+        visits = np.load(io.BytesIO(content), allow_pickle=False)
+    except (OSError, ValueError, EOFError, MemoryError, SyntaxError):
+        raise InputError(f"{path}: no counts of visits that can be read") from None
+    if not isinstance(visits, np.ndarray) or visits.shape != shape or visits.dtype.kind not in "iu":
+        raise InputError(f"{path}: must be counts for every cell and action of this run's world")
+    counts: NDArray[np.int64] = visits.astype(np.int64)
+    if (counts < 0).any():
+        raise InputError(f"{path}: must be counts for every cell and action of this run's world")
+    return counts
+
+
+def _check_imports(settings: Any, where: str, key: str = "") -> None:
+    """Refuse an import path that leads out of the libraries an agent is made of, however deep it stands."""
+    if isinstance(settings, dict):
+        for name, value in settings.items():
+            _check_imports(value, where, str(name))
+    elif isinstance(settings, list):
+        for value in settings:
+            _check_imports(value, where, key)
+    elif _is_foreign(key, settings):
+        raise InputError(
+            f"{where}: {key}={settings[:80]} is from none of {', '.join(_LIBRARIES)}; add --trust to import "
+            "it all the same, if you trust whoever made this run"
+        )
 
 
 def _is_foreign(key: str, value: Any) -> bool:
@@ -104,7 +150,7 @@ def read_config(content: Any, where: str) -> TrainConfig:
     algorithm, any_class = agent.get("algorithm"), SB3ClassConfig if "arguments" in agent else None
     schema = next((s for s in AGENT_SCHEMAS.values() if s.algorithm == algorithm), any_class)
     if schema is None:
-        raise InputError(f"{where}: config.agent.algorithm={algorithm!r} is not known here")
+        raise InputError(f"{where}: config.agent.algorithm={_shown(algorithm)} is not known here")
     config = _read(TrainConfig, content, f"{where}: config", {AgentConfig: schema})
     assert isinstance(config, TrainConfig)
     return config
@@ -113,8 +159,11 @@ def read_config(content: Any, where: str) -> TrainConfig:
 def _read(schema: type, content: Any, where: str, stand_in: dict[type, type]) -> object:
     hints = get_type_hints(schema)
     if not isinstance(content, dict) or content.keys() != hints.keys():
-        found = sorted(content) if isinstance(content, dict) else type(content).__name__
-        raise InputError(f"{where}: must have the keys {sorted(hints)}, has {found}")
+        if not isinstance(content, dict):
+            raise InputError(f"{where}: must be settings, is {_shown(content)}")
+        odd = sorted(content.keys() ^ hints.keys())[0]
+        fault = "lacks" if odd in hints else "has an unknown key"
+        raise InputError(f"{where}: {fault} {odd[:80]}; was the run written by another version?")
     values = {}
     for name, hint in hints.items():
         kind, value = stand_in.get(hint, hint), content[name]
@@ -124,7 +173,7 @@ def _read(schema: type, content: Any, where: str, stand_in: dict[type, type]) ->
         elif _fits(value, kind):
             values[name] = value
         else:
-            raise InputError(f"{where}.{name}={value!r}: must be {getattr(kind, '__name__', kind)}")
+            raise InputError(f"{where}.{name}={_shown(value)}: must be {getattr(kind, '__name__', kind)}")
     return schema(**values)
 
 
@@ -138,6 +187,11 @@ def _fits(value: Any, hint: Any) -> bool:
     if isinstance(value, bool):
         return kind is bool
     return isinstance(value, (int, float) if kind is float else kind)
+
+
+def _shown(value: Any) -> str:
+    """For a message; what holds others may hold any number of them."""
+    return f"a {type(value).__name__}" if isinstance(value, list | dict) else repr(value)[:80]
 
 
 def _size(layout: Layout) -> tuple[int, int]:

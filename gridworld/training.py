@@ -42,12 +42,22 @@ class Interrupted(BaseException):
         self.exit_code = 128 + signal_number
 
 
-def train(config: TrainConfig, run: Run, overrides: list[str]) -> Summary:
+def make_mdp(env: EnvConfig, layout: Layout | None = None) -> Mdp:
+    """The world of these settings; `layout` stands in for the configured map."""
+    if layout is None:
+        layout = load(env.layout, env.num_rows, env.num_cols)
+    return compile_mdp(layout, env.slip, env.step_reward, env.goal_reward, env.trap_reward)
+
+
+def train(
+    config: TrainConfig, run: Run, overrides: list[str], world: Callable[[EnvConfig], Mdp] = make_mdp
+) -> Summary:
     """Train, evaluate and record as configured; everything it writes goes to the run's folder.
 
-    Raises `InputError` for a mistake in the settings, before anything is written, and `Interrupted`.
+    `world` makes the configured world, or has it at hand. Raises `InputError` for a mistake in the settings,
+    before anything is written, and `Interrupted`.
     """
-    mdp = check_settings(config)
+    mdp = check_settings(config, world)
     observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
     judge = Judge(mdp, config.evaluation.gamma, config.env.max_episode_steps)
     log = _Log()
@@ -66,14 +76,6 @@ def train(config: TrainConfig, run: Run, overrides: list[str]) -> Summary:
         raise
     run.end("finished")
     return summary
-
-
-def make_mdp(env: EnvConfig, layout: Layout | None = None) -> Mdp:
-    """The world of these settings; `layout` stands in for the configured map."""
-    if layout is None:
-        size = {"num_rows": env.num_rows, "num_cols": env.num_cols}
-        layout = load(env.layout, **{name: count for name, count in size.items() if count is not None})
-    return compile_mdp(layout, env.slip, env.step_reward, env.goal_reward, env.trap_reward)
 
 
 def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = make_mdp) -> Mdp:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from gridworld import render as drawing
 from gridworld.errors import InputError
-from gridworld.layout import CLASSIC, Layout, load, positive_int
+from gridworld.layout import CLASSIC, Layout, load_by_default_size, positive_int
 from gridworld.mdp import NUM_ACTIONS, BoolArray, FloatArray, compile_mdp
 from gridworld.render import CELL_SIZE, Frame
 
@@ -77,7 +77,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
             None if max_episode_steps is None else positive_int("max_episode_steps", max_episode_steps)
         )
         self._step_limit = self.max_episode_steps or np.iinfo(np.int64).max
-        world = load(layout, num_rows, num_cols)
+        world = load_by_default_size(layout, num_rows, num_cols)
         self.mdp = compile_mdp(world, slip, step_reward, goal_reward, trap_reward)
         self.render_mode = render_mode
         self.cell_size = positive_int("cell_size", cell_size)

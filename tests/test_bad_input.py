@@ -6,6 +6,19 @@ from pathlib import Path
 import pytest
 from support import script
 
+YAMLS: dict[str, bytes] = {
+    "agent/broken.yaml": b"a: [1\nb: 2\n",
+    "agent/empty.yaml": b"",
+    "agent/binary.yaml": b"\xff\xfe",
+    "agent/endless.yaml": b"a: &a [*a]\n",
+    "agent/mine.yaml": b"# @package _global_\ndefaults:\n  - /agent/schema/sb3@agent\n  - _self_\n"
+    b"agent: {name: mine, algorithm: own_module.Mine}\n",
+    "env/tagged.yaml": b"layout: !!python/object/apply:os.system [ls]\n",
+    "env/misspelt.yaml": b"layuot: cliff\n",
+    "own_module.py": b"1 / 0\n",
+    "needy.py": b"import not_installed\n",
+}
+
 MAPS = {
     "unknown": "S.x\n..G\n",
     "ragged": "S..\n.G\n",
@@ -104,11 +117,56 @@ TRAIN = [
     ("recording.cell_size=100000", "too large to draw"),
     ("recording.fps=0", "recording.fps=0: must be from 1 to 100"),
     ("--frobnicate", "unrecognized arguments: --frobnicate"),
+    (
+        "hydra.run.dir=../../x",
+        "hydra.run.dir=../../x: leads out of the current folder; if that is meant, say /",
+    ),
+    ("hydra.run.dir=runs/../../x", "hydra.run.dir=runs/../../x: leads out of the current folder"),
+    ("hydra.run.dir=.", "hydra.run.dir=.: is the current folder; name one in it, e.g. runs/mine"),
+    ("hydra.output_subdir=../x", "hydra.output_subdir=../x: must be a plain name, without /"),
+    ("hydra.output_subdir=..", "hydra.output_subdir=..: must be a plain name"),
+    ("hydra.job.name=a/b", "hydra.job.name=a/b: must be a plain name, without /"),
+    ("n_envs=1000000000000", "n_envs=1000000000000: must be at most 131072"),
+    ("threads=100000", "threads=100000: must be at most 1024"),
+    ("env.max_episode_steps=1000000", "env.max_episode_steps=1000000: must be at most 100000"),
+    ("env=frozen_lake_4x4 env.num_rows=5", "num_rows=5: the map frozen_lake_4x4 has 4; leave num_rows out"),
+    ("env.layout=frozen_lake_4x4 env.num_cols=6", "num_cols=6: the map frozen_lake_4x4 has 4"),
+    ("--config-dir nowhere", "nowhere' not found"),
+    (
+        "--config-dir {conf} agent=broken",
+        "agent/broken.yaml: line 2, column 2: is no yaml, expected ',' or ']'",
+    ),
+    (
+        "--config-dir={conf} env=tagged",
+        "env/tagged.yaml: line 1, column 9: is no yaml, could not determine a con",
+    ),
+    (
+        "--config-dir {conf} agent=empty",
+        "agent.name: has no value; the yaml that agent=... chooses must give",
+    ),
+    ("--config-dir {conf} agent=binary", "agent/binary.yaml: byte 1 is no UTF-8"),
+    ("--config-dir {conf} agent=endless", "agent/endless.yaml: is nested too deeply, or contains itself"),
+    ("--config-dir {conf} env=misspelt", "In 'env/misspelt': ConfigKeyError raised while composing config"),
 ]
 
 TRAIN_WITH_SB3 = [
     ("agent.policy=TransformerPolicy", "agent.policy=TransformerPolicy: DQN has MlpPolicy, CnnPolicy"),
     ("agent.policy_kwargs.net_arch=[0]", "agent.policy_kwargs.net_arch=[0]: must be layer widths"),
+    (
+        "agent.policy_kwargs.net_arch=[100000]",
+        "must be layer widths, e.g. [64,64]; at most 16 of at most 4096",
+    ),
+    ("agent.replay_buffer_class=torch.nn.ReLU", "must be the import path of a BaseBuffer class"),
+    (
+        "agent=a2c agent.algorithm=nowhere.Mine",
+        "agent.algorithm=nowhere.Mine: there is no module nowhere; is the",
+    ),
+    (
+        "agent=a2c agent.algorithm=stable_baselines3.no.Mine",
+        "there is no module stable_baselines3.no; is the",
+    ),
+    ("--config-dir {conf} agent=mine", "own_module cannot be imported (ZeroDivisionError: division by zero)"),
+    ("--config-dir {conf} agent=mine agent.algorithm=needy.Mine", "needy needs not_installed, which is not"),
     ("agent.policy_kwargs.activation_fn=os.system", "activation_fn=os.system: must be the import path"),
     ("device=cuda:99", "device=cuda:99: torch finds no CUDA device"),
     ("device=abacus", "device=abacus: must be auto, cpu, cuda or cuda:N"),
@@ -126,9 +184,23 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def conf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Yaml files and modules of a user's own, each with a mistake."""
+    folder = tmp_path_factory.mktemp("conf")
+    for name, content in YAMLS.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(content)
+    return folder
+
+
 @pytest.mark.parametrize(("line", "words"), TRAIN + TRAIN_WITH_SB3, ids=lambda value: str(value)[:60])
-def test_train_refuses_before_it_writes(line: str, words: str, maps: Path, tmp_path: Path) -> None:
-    done = script("train.py", *line.format(maps=maps).split(), cwd=tmp_path)
+def test_train_refuses_before_it_writes(
+    line: str, words: str, maps: Path, conf: Path, tmp_path: Path
+) -> None:
+    path = f"{conf}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
+    line = line.format(maps=maps, conf=conf)
+    done = script("train.py", *line.split(), cwd=tmp_path, PYTHONPATH=path)
     sentence = done.stderr.strip().splitlines()[-1]
     assert words in sentence
     assert done.returncode == 2
@@ -173,7 +245,10 @@ def test_a_folder_under_a_file_is_refused(tmp_path: Path) -> None:
         ("hydra/launcher=slurm hydra.launcher.jobs_per_task=0", "jobs_per_task=0: must be at least 1"),
         ("hydra/launcher=slurm hydra.launcher.nodes=2", "Key 'nodes' not in 'SlurmConfig'"),
         ("hydra.sweep.dir=used", "used: is the folder of a single run; choose another hydra.sweep.dir"),
-        ("hydra.sweep.dir=.", "has no sweep.json, but used holds a run already"),
+        ("hydra.sweep.dir=.", "hydra.sweep.dir=.: is the current folder; name one in it, e.g. runs/mine"),
+        ("hydra.sweep.dir=./used/..", "is the current folder; name one in it"),
+        ("hydra.sweep.dir=../x", "hydra.sweep.dir=../x: leads out of the current folder; if that is meant"),
+        ("hydra.job.name=../x", "hydra.job.name=../x: must be a plain name, without /"),
         ("hydra.sweep.dir=used/manifest.json", "cannot be made, used/manifest.json is a file"),
         ("hydra.sweep.dir=/proc/sweep", "/proc/sweep: cannot be"),
     ],
@@ -249,6 +324,16 @@ def test_divergence_is_told_and_marked(tmp_path: Path) -> None:
         ("play.py", "--cell-size 10000", "too large to draw"),
         ("play.py", "--agent nowhere", "nowhere: no such folder"),
         ("play.py", "--agent nowhere --num-rows 9", "with --agent, the world has the size it was trained on"),
+        ("reproduce.py", "nowhere", "nowhere: no such folder"),
+        ("reproduce.py", ".", "not a run's folder, it has no manifest.json"),
+        ("reproduce.py", "", "the following arguments are required: run"),
+        ("reproduce.py", ". --keep", "argument --keep: expected one argument"),
+        ("record.py", ". --out ../x", "--out=../x: leads out of the current folder; if that is meant, say /"),
+        ("report.py", ". --out ../x", "--out=../x: leads out of the current folder; if that is meant, say /"),
+        ("report.py", ". --out .", "--out=.: is the current folder; name one in it"),
+        ("report.py", "nowhere", "nowhere: no such folder; give the folder of a run"),
+        ("report.py", ". --seed -1", "--seed -1: must be at least 0"),
+        ("benchmark.py", "--out ../x.json", "--out=../x.json: leads out of the current folder"),
         ("jobs.py", "nowhere", "nowhere: no such folder; give the folder of a sweep"),
         ("jobs.py", ".", "not a sweep's folder, it has no sweep.json"),
         ("jobs.py", ". --status lost", "invalid choice: 'lost'"),

@@ -184,7 +184,7 @@ def test_record_draws_the_maps_again(
 
     copy = tmp_path / "copy"
     subprocess.run(["cp", "-r", str(finished), str(copy)], check=True)
-    for content, words in ((b"", "no counts of visits"), (None, "no counts"), ("other", "for every cell")):
+    for content, words in ((b"", "is not the file"), (None, "has no visits.npy"), ("other", "is not the")):
         (copy / "visits.npy").unlink(missing_ok=True)
         if content == "other":
             np.save(copy / "visits.npy", np.zeros((3, 4), dtype=int))
@@ -197,10 +197,10 @@ def test_record_draws_the_maps_again(
 
 def test_a_run_whose_files_were_damaged_is_refused(finished: Path, tmp_path: Path) -> None:
     for name, damage, words in (
-        ("model.zip", b"no zip", "model.zip: not a model"),
-        ("model.zip", None, "model.zip: not a model"),
-        ("manifest.json", b"{", "manifest.json: cannot be read"),
-        ("manifest.json", b"[]", "not the manifest of a run"),
+        ("model.zip", b"no zip", "model.zip: is not the file that the run wrote"),
+        ("model.zip", None, "copy: has no model.zip"),
+        ("manifest.json", b"{", "manifest.json: is no JSON, it was changed or cut off"),
+        ("manifest.json", b"[]", "manifest.json: holds no JSON object"),
         ("manifest.json", b"\xff\xfe", "manifest.json: cannot be read"),
     ):
         copy = tmp_path / "copy"

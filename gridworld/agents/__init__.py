@@ -1,9 +1,10 @@
 """Agents: whatever learns. One algorithm family per folder or module; nothing outside knows how it works.
 
-A family is a module `gridworld.agents.<family>` with two functions, found by the `family` of its config:
+A family is a module `gridworld.agents.<family>` with three functions, found by the `family` of its config:
 
     check(config)                    raises InputError for settings that could not train
     build(config, seat) -> Agent     an agent that is ready to learn
+    weights(path, most) -> arrays    what a model file of at most so many bytes holds, by name
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
+
+from numpy.typing import NDArray
 
 from gridworld.config import MISSING
 from gridworld.counted_env import CountedVectorEnv
@@ -69,11 +72,13 @@ class Agent(Protocol):
 
 
 class Family(Protocol):
-    """The two functions of an algorithm family's module."""
+    """The three functions of an algorithm family's module."""
 
     def check(self, config: TrainConfig) -> None: ...
 
     def build(self, config: AgentConfig, seat: Seat) -> Agent: ...
+
+    def weights(self, path: Path, most: int) -> dict[str, NDArray[Any]]: ...
 
 
 def family(config: AgentConfig) -> Family:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gridworld.errors import EXIT_CODE, InputError
+from gridworld.terminal import prepare, tell_error
 
 Main = Callable[[Sequence[str]], None]
 
@@ -33,13 +34,14 @@ def parser_for_a_run(prog: str, about: str | None) -> argparse.ArgumentParser:
 
 def run(main: Main) -> None:
     """Call `main`; a user's mistake ends the program with one sentence and no traceback."""
+    prepare()
     try:
         main(sys.argv[1:])
     except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
+        tell_error(str(error))
         sys.exit(EXIT_CODE)
     except OSError as error:
-        print(f"error: {error.filename or 'file'}: {error.strerror}", file=sys.stderr)
+        tell_error(f"{error.filename or 'file'}: {error.strerror}")
         sys.exit(EXIT_CODE)
     except KeyboardInterrupt:
         sys.exit(130)

@@ -13,6 +13,7 @@ from gridworld.benchmark import stepping
 from gridworld.benchmark.measure import FULL, QUICK, Result, Scale, compare, lines
 from gridworld.errors import InputError
 from gridworld.files import write_json
+from gridworld.run import check_inside
 
 _TABLES = ("stepping", "training", "whole", "files")
 
@@ -24,6 +25,7 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--only", choices=_TABLES, nargs="+", default=_TABLES, help="some of the tables")
     parser.add_argument("--out", type=Path, default=Path("runs/benchmark.json"), help="where the JSON goes")
     options = parser.parse_args(arguments)
+    check_inside(options.out, "--out")
     if not options.out.parent.is_dir():
         raise InputError(f"--out {options.out}: there is no folder {options.out.parent}")
     scale = QUICK if options.quick else FULL

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,12 +12,14 @@ from numpy.typing import NDArray
 from gridworld import record
 from gridworld.agents import Beliefs
 from gridworld.commands import parser_for_a_run
+from gridworld.data_files import check_no_link, read_object
 from gridworld.errors import InputError
 from gridworld.evaluation import play_episode
 from gridworld.film import Film, film_of_states
 from gridworld.pictures import MapMaker, agent_gamma
 from gridworld.render import frame_size
-from gridworld.saved_run import SavedRun, choose_policy
+from gridworld.run import check_inside
+from gridworld.saved_run import SavedRun, choose_policy, read_visits
 
 MAPS = ("policy", "q_error", "visits")
 
@@ -27,23 +28,26 @@ def main(arguments: Sequence[str]) -> None:
     """Write the files and name them."""
     options = _parser().parse_args(arguments)
     _check(options)
+    folder: Path = options.out or options.run / "recording"
     saved = SavedRun(options.run, options.trust)
     if options.cell_size is not None:
         frame_size(saved.mdp, options.cell_size)
     formats = list(dict.fromkeys(options.format))
     visits = _visits(saved) if "visits" in formats else np.zeros((0, 0), dtype=np.int64)
+    steps = _steps(saved) if {"policy", "q_error"} & set(formats) else 0
     beliefs = saved.beliefs()
     film = _film(saved, beliefs, options)
     record.check_size(film, formats)
-    folder: Path = options.out or options.run / "recording"
+    check_no_link(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for kind in formats:
         if kind == "png":
             path = folder / "frames"
+            check_no_link(path)
             record.save_pngs(film, path)
         elif kind in MAPS:
             path = folder / f"{kind}.png"
-            _save_map(kind, saved, beliefs, visits, path, options.cell_size)
+            _save_map(kind, saved, (beliefs, steps, visits), path, options.cell_size)
         else:
             path = folder / f"episode.{kind}"
             record.save_animation(film, path, options.fps)
@@ -79,6 +83,8 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError(f"--seed {options.seed}: must be at least 0")
     if options.cell_size is not None and options.cell_size < 2:
         raise InputError(f"--cell-size {options.cell_size}: must be at least 2 pixels")
+    if options.out is not None:
+        check_inside(options.out, "--out")
     if "mp4" in options.format:
         record.require_video()
 
@@ -95,36 +101,29 @@ def _film(saved: SavedRun, beliefs: Beliefs, options: argparse.Namespace) -> Fil
 def _save_map(
     kind: str,
     saved: SavedRun,
-    beliefs: Beliefs,
-    visits: NDArray[np.int64],
+    learnt: tuple[Beliefs, int, NDArray[np.int64]],
     path: Path,
     cell_size: int | None,
 ) -> None:
+    beliefs, steps, visits = learnt
     maps = MapMaker(saved.judge(), agent_gamma(saved.config.agent, saved.config.evaluation.gamma))
     if kind == "visits":
         draw = maps.visits(visits)
     else:
-        draw = (maps.policy if kind == "policy" else maps.error)(beliefs, _steps(saved))
+        draw = (maps.policy if kind == "policy" else maps.error)(beliefs, steps)
     record.save_png(draw(cell_size), path)
 
 
 def _steps(saved: SavedRun) -> int:
     """How long it was trained."""
     path = saved.run.summary_file
-    try:
-        return int(json.loads(path.read_text("utf-8"))["timesteps"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path}: not the summary of a run ({type(error).__name__})") from None
+    saved.run.verify(path)
+    steps = read_object(path).get("timesteps")
+    if not isinstance(steps, int) or isinstance(steps, bool) or steps < 0:
+        raise InputError(f"{path}: not the summary of a run, timesteps must be a whole number")
+    return steps
 
 
 def _visits(saved: SavedRun) -> NDArray[np.int64]:
     """(S, A), as training counted them."""
-    path = saved.run.visits_file
-    try:
-        visits = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError):
-        raise InputError(f"{path}: no counts of visits that can be read") from None
-    if visits.shape != saved.mdp.neighbour.shape or visits.dtype.kind not in "iu" or (visits < 0).any():
-        raise InputError(f"{path}: must be counts for every cell and action of this run's world")
-    counts: NDArray[np.int64] = visits.astype(np.int64)
-    return counts
+    return read_visits(saved.run, saved.mdp.neighbour.shape)

@@ -16,6 +16,8 @@ from pathlib import Path
 from gridworld.errors import InputError
 from gridworld.report.report import Report, gather
 from gridworld.report.writing import MARKERS, check_markers, check_out, write_readme, write_report
+from gridworld.run import check_inside
+from gridworld.terminal import printable
 
 _MOST_TOLD = 20  # sentences on standard error; the page has them all
 
@@ -25,6 +27,8 @@ def main(arguments: Sequence[str]) -> None:
     options = _parser().parse_args(arguments)
     if options.seed < 0:
         raise InputError(f"--seed {options.seed}: must be at least 0")
+    if options.out is not None:
+        check_inside(options.out, "--out")
     out = options.out or _usual_out(options.runs)
     check_out(out)
     if options.readme is not None:
@@ -68,8 +72,8 @@ def _usual_out(runs: Sequence[Path]) -> Path:
 def _tell(report: Report) -> None:
     sentences = report.sentences()
     for sentence in sentences[:_MOST_TOLD]:
-        print(f"warning: {sentence}", file=sys.stderr)
+        print(f"warning: {printable(sentence)}", file=sys.stderr)
     if len(sentences) > _MOST_TOLD:
         print(f"warning: and {len(sentences) - _MOST_TOLD} more, all in the report", file=sys.stderr)
     for note in (*report.study.notes, *report.notes):
-        print(f"note: {note}", file=sys.stderr)
+        print(f"note: {printable(note)}", file=sys.stderr)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import base64
 import io
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from PIL import Image
 
+from gridworld.data_files import read_bytes
 from gridworld.report.analysis import Result
 from gridworld.report.table import number
 
@@ -51,15 +53,15 @@ def embed(path: Path) -> tuple[str, int, int] | None:
     """Data URI, width and height of a PNG or GIF; None where there is none, or a damaged or huge one."""
     animated = path.suffix == ".gif"
     try:
-        if path.stat().st_size > (_LARGEST_GIF if animated else _LARGEST_PNG):
-            return None
-        with Image.open(path, formats=["GIF" if animated else "PNG"]) as image:
+        content = read_bytes(path, _LARGEST_GIF if animated else _LARGEST_PNG)
+        with Image.open(io.BytesIO(content), formats=["GIF" if animated else "PNG"]) as image:
             if image.width * image.height > _MOST_PIXELS:
                 return None
             if animated:
-                return _uri("gif", path.read_bytes()), image.width, image.height
+                return _uri("gif", content), image.width, image.height
             small = image.convert("RGB")
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # what Pillow raises for such
+    # What Pillow raises for a damaged one; ValueError is ours, too.
+    except (OSError, ValueError, SyntaxError, EOFError, struct.error, Image.DecompressionBombError):
         return None
     small.thumbnail((_WIDTH, 2 * _WIDTH), Image.Resampling.LANCZOS)
     buffer = io.BytesIO()

@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from gridworld.data_files import read_object
 from gridworld.errors import InputError
 from gridworld.mdp import FloatArray
-from gridworld.report.run_files import read_curve, read_object
+from gridworld.report.run_files import read_curve
 from gridworld.run import CURVE, MANIFEST, SUMMARY
+from gridworld.terminal import printable
 
 _LONGEST_NAME = 80  # characters
 _LARGEST_NUMBER = sys.float_info.max  # JSON may hold whole numbers beyond it, and infinities
@@ -159,7 +161,8 @@ def flat(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, st
         if isinstance(value, dict) and value:
             yield from flat(value, f"{prefix}{key}.")
         else:
-            yield prefix + key, value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+            text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+            yield printable(prefix + key), printable(text)
 
 
 def _text(content: Any, key: str, where: str) -> str:

@@ -1,20 +1,19 @@
-"""A run's files, read within bounds. Raises `InputError` with a sentence for whatever is wrong with one."""
+"""A run's learning curve, read within bounds. Raises `InputError` with a sentence for whatever is wrong."""
 
 from __future__ import annotations
 
 import csv
-import json
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from gridworld.data_files import read_text
 from gridworld.errors import InputError
 from gridworld.mdp import FloatArray
 
-_LARGEST_JSON = 4 * 2**20  # bytes
-_LARGEST_CSV = 64 * 2**20
+_LARGEST_CSV = 64 * 2**20  # bytes
+_MOST_COLUMNS = 100
 
 REQUIRED = ("step", "value", "regret", "certified", "goal_probability", "return")
 SAMPLED_RETURN = "sampled_return"
@@ -22,34 +21,11 @@ ONLINE = "online_return"  # undiscounted, of the training episodes ended since t
 _OPTIONAL = (SAMPLED_RETURN, ONLINE)
 
 
-def read_object(path: Path) -> dict[str, Any]:
-    """A JSON object."""
-    text = _bounded(path, _LARGEST_JSON)
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is no JSON, it was changed or cut off ({error})") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: holds no JSON object")
-    return content
-
-
-def _bounded(path: Path, most: int) -> str:
-    try:
-        if not path.is_file():
-            raise InputError(f"{path.parent}: has no {path.name}")
-        if path.stat().st_size > most:
-            raise InputError(f"{path}: is larger than {most / 2**20:.0f} MiB")
-        return path.read_text("utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: cannot be read, it is no UTF-8 text") from None
-
-
 def read_curve(path: Path) -> dict[str, FloatArray]:
     """The columns of a learning curve that are needed, (evaluations,) each."""
-    lines = _bounded(path, _LARGEST_CSV).splitlines()
+    lines = read_text(path, _LARGEST_CSV).splitlines()
+    if lines and lines[0].count(",") >= _MOST_COLUMNS:
+        raise InputError(f"{path}: has more than {_MOST_COLUMNS} columns; is it of another version?")
     try:
         rows = list(csv.reader(lines))
     except csv.Error as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -21,6 +22,9 @@ class Estimate:
     interval: Interval
     form: Callable[[float], str]
 
+
+# Signs with which a name out of a run's folder could be HTML, a link, a row, or the end of a marked place.
+_MARKS = re.compile(r"""[\\|<>&`\[\]*!\n\r]""")
 
 Cell = str | float | int | None | Share | Estimate
 
@@ -90,7 +94,13 @@ def to_markdown(table: Table) -> str:
     sides = ("---" if is_text(table, column) else "---:" for column in range(len(table.columns)))
     lines = [_piped(table.columns), _piped(sides)]
     lines += [
-        _piped(f"{main_text(cell)} {interval_text(cell)}".strip() for cell in row) for row in table.rows
+        _piped(
+            _plain_markdown(cell)
+            if isinstance(cell, str)
+            else f"{main_text(cell)} {interval_text(cell)}".strip()
+            for cell in row
+        )
+        for row in table.rows
     ]
     return "\n".join(lines) + "\n"
 
@@ -137,4 +147,9 @@ def _plain(value: float) -> str:
 
 
 def _piped(cells: Sequence[str] | Iterator[str]) -> str:
-    return "| " + " | ".join(cell.replace("\\", "\\\\").replace("|", "\\|") for cell in cells) + " |"
+    return "| " + " | ".join(cells) + " |"
+
+
+def _plain_markdown(text: str) -> str:
+    """Text that may be anybody's, such that it is shown as it stands."""
+    return _MARKS.sub(lambda found: f"&#{ord(found[0])};", text)

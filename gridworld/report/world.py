@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridworld.config import EnvConfig
+from gridworld.config import EnvConfig, check_step_limit
 from gridworld.evaluation import Judge
 from gridworld.layout import parse
 from gridworld.mdp import NUM_ACTIONS
@@ -62,5 +62,6 @@ def _judge(run: Evidence) -> Judge:
     if len(lines) * max(map(len, lines)) > _MOST_CELLS:
         raise ValueError(f"it has more than {_MOST_CELLS:,} cells")
     env = EnvConfig(**run.world)
+    check_step_limit(env)
     layout = parse(run.layout, f"{run.folder}: layout")
     return Judge(make_mdp(env, layout), run.gamma, env.max_episode_steps)

@@ -28,13 +28,15 @@ MARKERS = "<!-- results -->", "<!-- /results -->"
 
 def check_out(folder: Path) -> None:
     """Raise `InputError` unless a report can be written there: nothing is in the way but an older report."""
+    if folder.is_symlink():
+        raise InputError(f"--out {folder}: is a symbolic link; name the folder itself")
     if folder.is_dir():
         strange = sorted(path.name for path in folder.iterdir() if path.name not in _OURS)
         if strange:
             raise InputError(
                 f"--out {folder}: holds {strange[0]}, which is not part of a report; choose a new folder"
             )
-    elif folder.exists() or folder.is_symlink():
+    elif folder.exists():
         raise InputError(f"--out {folder}: is not a folder; choose a new one")
     existing = next(parent for parent in folder.absolute().parents if parent.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):

@@ -22,7 +22,8 @@ from typing import Any
 from gridworld.errors import InputError
 from gridworld.files import write_json
 from gridworld.lock import locked
-from gridworld.run import MANIFEST, SWEEP_JSON, check_writable, versions
+from gridworld.provenance import versions
+from gridworld.run import MANIFEST, SWEEP_JSON, check_writable
 from gridworld.sweep.plan import Job, folder_name
 
 LOCK = ".lock"

@@ -10,10 +10,15 @@ from typing import TYPE_CHECKING
 from gridworld.agents.sb3.checks import check
 
 if TYPE_CHECKING:
+    from pathlib import Path
+    from typing import Any
+
+    from numpy.typing import NDArray
+
     from gridworld.agents import Agent, Seat
     from gridworld.config import AgentConfig
 
-__all__ = ["build", "check"]
+__all__ = ["build", "check", "weights"]
 
 
 def build(config: AgentConfig, seat: Seat) -> Agent:
@@ -21,3 +26,10 @@ def build(config: AgentConfig, seat: Seat) -> Agent:
     from gridworld.agents.sb3.agent import SB3Agent
 
     return SB3Agent(config, seat)
+
+
+def weights(path: Path, most: int) -> dict[str, NDArray[Any]]:
+    """The tensors of a model file, those of the optimiser too."""
+    from gridworld.agents.sb3.model_file import read_weights
+
+    return read_weights(path, most)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,21 +10,26 @@ import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
-from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.save_util import recursive_getattr
 from torch import Tensor
 
 from gridworld.agents import Beliefs, Seat, WriteScalars
 from gridworld.agents.sb3.building import make_model
+from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters, reason
 from gridworld.agents.sb3.reading import Reading, of_q, read
 from gridworld.agents.sb3.tabulated_dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated_ppo import TabulatedPPO
 from gridworld.chain import one_hot_policy
-from gridworld.config import AgentConfig, SB3Config
+from gridworld.config import AgentConfig, SB3Config, within
 from gridworld.errors import InputError
 from gridworld.files import replacing
 from gridworld.mdp import FloatArray, IntArray
 
 _CHUNK = 4096  # states a forward pass
+# A model file holds the optimiser's numbers beside every weight, and what SB3 pickles: the last
+# observations, say.
+_BYTES_A_BYTE = 16
+_SPARE_BYTES = 64 * 2**20
 
 
 class SB3Agent:
@@ -93,22 +96,26 @@ class SB3Agent:
             self.model.save(file)
 
     def load(self, path: Path) -> None:
-        """Reads tensors (`weights_only`) and one number: nothing in the file is unpickled or run."""
+        """Reads tensors and one number: nothing in the file is unpickled as SB3 would, or run."""
+        own = self.model.get_parameters()
+        modules = [name for name in own if isinstance(recursive_getattr(self.model, name), torch.nn.Module)]
+        expected = flat({name: own[name] for name in modules})
+        most = _SPARE_BYTES + _BYTES_A_BYTE * sum(weights.nbytes for weights in expected.values())
         try:
-            _, parameters, _ = load_from_zip_file(path, device=self.model.device, load_data=False)
-            self.model.set_parameters(parameters, exact_match=True, device=self.model.device)
-            with zipfile.ZipFile(path) as archive:
-                self._loaded = True
-                rate = json.loads(archive.read("data")).get("exploration_rate")
-            if isinstance(rate, float):
-                self.model.exploration_rate = rate  # type: ignore[attr-defined]
-        except (OSError, ValueError, RuntimeError, KeyError, AssertionError, zipfile.BadZipFile) as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            parameters, rate = read_parameters(path, most)
+            found = {name: parameters.get(name, {}) for name in modules}
+            check_weights(flat(found), expected)
+            self.model.set_parameters(found, exact_match=False, device=self.model.device)
+        except InputError:
+            raise
+        except Exception as error:  # zipfile, torch and SB3, each in their way
             raise InputError(
-                f"{path}: not a model of {self.config.name} for this world and observation ({reason})"
+                f"{path}: not a model of {self.config.name} for this world and observation ({reason(error)})"
             ) from None
-        except Exception as error:  # torch raises pickle errors of its own for a file that is no checkpoint
-            raise InputError(f"{path}: not a model file that can be read ({type(error).__name__})") from None
+        self._loaded = True
+        if rate is not None:
+            within(f"{path}: exploration_rate", rate, 0, 1)
+            self.model.exploration_rate = rate  # type: ignore[attr-defined]
 
 
 def _joined(parts: tuple[Tensor | None, ...]) -> FloatArray | None:

@@ -11,6 +11,7 @@ from typing import Any
 import stable_baselines3
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import LinearSchedule
@@ -26,11 +27,14 @@ Arguments = dict[str, Any]
 # Fields of the config that are ours, not arguments of the algorithm's class.
 _OWN_FIELDS = {"name", "family", "algorithm", "engine", "log_interval"}
 _SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
+_MOST_LAYERS, _WIDEST_LAYER = 16, 4096
 _PLAIN_TYPES = (bool, int, float, str)
 _KINDS: dict[str, type] = {
     "activation_fn": torch.nn.Module,
     "optimizer_class": torch.optim.Optimizer,
     "features_extractor_class": BaseFeaturesExtractor,
+    "replay_buffer_class": BaseBuffer,
+    "rollout_buffer_class": BaseBuffer,
 }
 
 
@@ -112,7 +116,10 @@ def _policy_kwargs(given: Any, where: str) -> Arguments:
     given = dict(given if isinstance(given, dict) else vars(given))
     arguments = _convert({key: v for key, v in given.items() if v is not None and v != {}}, where)
     if not _is_net_arch(arguments.get("net_arch", [])):
-        raise InputError(f"{where}net_arch={arguments['net_arch']}: must be layer widths, e.g. [64,64]")
+        raise InputError(
+            f"{where}net_arch={arguments['net_arch']}: must be layer widths, e.g. [64,64]; at most "
+            f"{_MOST_LAYERS} of at most {_WIDEST_LAYER}"
+        )
     return arguments
 
 
@@ -123,17 +130,32 @@ def _is_net_arch(value: Any) -> bool:
 
 
 def _is_widths(value: Any) -> bool:
-    return isinstance(value, list) and all(type(width) is int and width > 0 for width in value)
+    """Of no more and no wider layers than a processor's memory holds, whoever asks for them."""
+    return (
+        isinstance(value, list)
+        and len(value) <= _MOST_LAYERS
+        and all(type(width) is int and 0 < width <= _WIDEST_LAYER for width in value)
+    )
 
 
 def _import(where: str, path: Any, kind: type) -> Any:
     module, _, name = str(path).rpartition(".")
     try:
-        found = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError):
+        found = getattr(importlib.import_module(module), name, None)
+    except ModuleNotFoundError as error:
         found = None
-    if found is None and module == "sb3_contrib":
-        raise InputError(f"{where}={path}: needs sb3-contrib; pip install 'gridworld[contrib]'")
+        if error.name == "sb3_contrib":
+            raise InputError(f"{where}={path}: needs sb3-contrib; pip install 'gridworld[contrib]'") from None
+        if error.name and f"{module}.".startswith(f"{error.name}."):
+            raise InputError(
+                f"{where}={path}: there is no module {error.name}; is the folder that it is in on PYTHONPATH?"
+            ) from None
+        raise InputError(f"{where}={path}: {module} needs {error.name}, which is not installed") from None
+    except (ValueError, TypeError):  # no path at all
+        found = None
+    except Exception as error:  # a module of the user's own may raise anything
+        told = f"{module} cannot be imported ({type(error).__name__}: {error})"
+        raise InputError(f"{where}={path}: {told}") from error
     if not (inspect.isclass(found) and issubclass(found, kind)):
         what = "class" if kind is object else f"{kind.__name__} class"
         example = "stable_baselines3.A2C" if kind is BaseAlgorithm else "torch.nn.ReLU"

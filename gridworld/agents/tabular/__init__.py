@@ -10,10 +10,15 @@ from typing import TYPE_CHECKING
 from gridworld.agents.tabular.checks import check
 
 if TYPE_CHECKING:
+    from pathlib import Path
+    from typing import Any
+
+    from numpy.typing import NDArray
+
     from gridworld.agents import Agent, Seat
     from gridworld.config import AgentConfig
 
-__all__ = ["build", "check"]
+__all__ = ["build", "check", "weights"]
 
 
 def build(config: AgentConfig, seat: Seat) -> Agent:
@@ -26,3 +31,10 @@ def build(config: AgentConfig, seat: Seat) -> Agent:
         return Optimum(config, seat)
     assert isinstance(config, TabularControlConfig)
     return TabularControl(config, seat)
+
+
+def weights(path: Path, most: int) -> dict[str, NDArray[Any]]:
+    """The arrays of a model file."""
+    from gridworld.agents.tabular.model_file import read_arrays
+
+    return read_arrays(path, most)

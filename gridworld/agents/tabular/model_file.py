@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import io
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -14,10 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gridworld.data_files import read_bytes
 from gridworld.errors import InputError
 from gridworld.files import replacing
 
 _ALGORITHM = "algorithm"
+_SPARE_BYTES = 2**20  # for the frames around the arrays
 _DAMAGED = (
     *(OSError, ValueError, TypeError, KeyError, IndexError, EOFError, SyntaxError, MemoryError),
     *(RuntimeError, zipfile.BadZipFile, zlib.error),
@@ -34,16 +37,12 @@ def write_model(path: Path, algorithm: str, arrays: Mapping[str, NDArray[Any]]) 
 
 def read_model(path: Path, algorithm: str, like: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """The arrays named, typed and shaped as in `like`. Raises `InputError` for anything else."""
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            found = {name: archive[name] for name in archive.files}
-    except _DAMAGED as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: not a model of {algorithm} that can be read ({reason})") from None
+    most = _SPARE_BYTES + sum(array.nbytes for array in like.values())
+    found = read_arrays(path, most, algorithm)
     if found.keys() != {_ALGORITHM, *like}:
         raise InputError(
             f"{path}: not a model of {algorithm}: must hold {sorted([_ALGORITHM, *like])}, "
-            f"holds {sorted(found)}"
+            f"holds {sorted(found)[:8]}"
         )
     written_by = str(found.pop(_ALGORITHM))
     if written_by != algorithm:
@@ -58,3 +57,19 @@ def read_model(path: Path, algorithm: str, like: Mapping[str, NDArray[Any]]) -> 
         if not np.isfinite(array).all():
             raise InputError(f"{path}: {name} holds numbers that are not finite")
     return found
+
+
+def read_arrays(path: Path, most: int, algorithm: str = "a table") -> dict[str, NDArray[Any]]:
+    """All arrays of a model file of at most `most` bytes. Raises `InputError`."""
+    content = read_bytes(path, most)
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            infos = archive.infolist()
+            # `numpy.savez` compresses nothing; what is compressed, or there twice, could grow in reading.
+            if sum(info.file_size for info in infos) > len(content) or any(i.compress_type for i in infos):
+                raise ValueError("its members are larger than itself")
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except _DAMAGED as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: not a model of {algorithm} that can be read ({reason})") from None

@@ -1,0 +1,118 @@
+"""Run a finished run again, from its manifest, and tell whether it comes to the same, bit for bit.
+
+First it tells what differs between then and now: commit and uncommitted changes, versions, processor,
+environment variables. Then it trains again, in a temporary folder, and compares the learning curve, the final
+weights, visits, summary and TensorBoard's points. The exit code is 0 if all are identical, 1 if any is not,
+2 if that cannot be told.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import importlib
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gridworld.comparison import Finding, compare
+from gridworld.config import RecordingConfig, TrainConfig
+from gridworld.errors import InputError
+from gridworld.layout import Layout
+from gridworld.provenance import describe, differences
+from gridworld.run import Run, check_inside, check_new, open_run
+from gridworld.saved_run import layout_of, settings_of
+from gridworld.terminal import printable
+from gridworld.training import Interrupted, make_mdp, train
+
+DIFFERENT = 1  # exit code
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Train again and print the comparison. Ends the program with `DIFFERENT` if anything differs."""
+    options = _parser().parse_args(arguments)
+    then = open_run(options.run)
+    config = settings_of(then, options.trust)
+    layout = layout_of(then, config)
+    if options.keep is not None:
+        check_inside(options.keep, "--keep")
+        check_new(options.keep, "--keep")
+    print(f"{options.run}: {config.agent.name} on {config.env.layout}, seed {config.seed}")
+    _tell_environment(list(differences(then.manifest, _here(then.manifest))))
+    try:
+        if options.keep is not None:
+            options.keep.mkdir(parents=True, exist_ok=True)
+            same = _again(then, Run(options.keep), config, layout)
+        else:
+            with tempfile.TemporaryDirectory(prefix="gridworld-") as folder:
+                same = _again(then, Run(Path(folder)), _without_pictures(config), layout)
+    except Interrupted as interruption:
+        print(str(interruption), file=sys.stderr)
+        sys.exit(interruption.exit_code)
+    print("identical" if same else "different")
+    if not same:
+        sys.exit(DIFFERENT)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="reproduce.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", type=Path, help="the run's folder, e.g. runs/2026-...")
+    parser.add_argument(
+        "--keep", type=Path, metavar="FOLDER", help="write the new run there, with its pictures, and keep it"
+    )
+    parser.add_argument(
+        "--trust", action="store_true", help="import the classes that the run names, wherever they are from"
+    )
+    return parser
+
+
+def _again(then: Run, now: Run, config: TrainConfig, layout: Layout) -> bool:
+    """Whether everything is the same."""
+    mdp = make_mdp(config.env, layout)
+    mistake = None
+    try:
+        train(config, now, then.manifest.get("overrides") or [], lambda env: mdp)
+    except InputError as error:
+        if not now.manifest:  # these settings cannot be run here at all
+            raise
+        mistake = str(error)
+    if mistake is not None:
+        print(f"  it did not come to its end this time: {printable(mistake)}")
+        return False
+    findings = list(compare(then, now, config, mdp))
+    for finding in findings:
+        _tell(finding)
+    return all(finding.same for finding in findings)
+
+
+def _here(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """The environment, with what torch says of the processor if the run had torch."""
+    processor = manifest.get("processor")
+    if isinstance(processor, dict) and processor.get("torch") is not None:
+        importlib.import_module("torch")
+    return describe()
+
+
+def _without_pictures(config: TrainConfig) -> TrainConfig:
+    """They are not compared, and need more time than they are worth, or an extra."""
+    wanted = {field.name: False for field in dataclasses.fields(RecordingConfig) if field.type == "bool"}
+    return dataclasses.replace(
+        config,
+        recording=dataclasses.replace(config.recording, **wanted),
+        logging=dataclasses.replace(config.logging, policy_map_every=0),
+    )
+
+
+def _tell_environment(differences: Sequence[str]) -> None:
+    print(f"  {'environment':<20}{'differs' if differences else 'the same'}", flush=True)
+    for line in differences:
+        print(f"    {printable(line)}")
+
+
+def _tell(finding: Finding) -> None:
+    verdict = "identical" if finding.same else "DIFFERENT"
+    print(f"  {finding.part:<20}{verdict}  {printable(finding.told)}")

@@ -1,0 +1,93 @@
+"""Reading files that somebody else may have written: a run's folder is data, whoever it is from.
+
+A file is read only if it is an ordinary one of bounded size: not through a symbolic link, which could lead
+to any file of the reader's, and not a pipe or a device, which need not end. JSON may nest as deep as Python
+reads it. Nothing is resolved, imported or unpickled. Every function raises `InputError` with a sentence.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import io
+import json
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from gridworld.errors import InputError
+
+LARGEST_JSON = 4 * 2**20  # bytes
+
+
+def read_bytes(path: Path, most: int) -> bytes:
+    """The whole content, at most `most` bytes."""
+    with _opened(path, most) as file:
+        return file.read(most)
+
+
+def read_text(path: Path, most: int) -> str:
+    """UTF-8 text of at most `most` bytes."""
+    try:
+        return read_bytes(path, most).decode("utf-8")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: cannot be read, it is no UTF-8 text") from None
+
+
+def read_object(path: Path, most: int = LARGEST_JSON) -> dict[str, Any]:
+    """A JSON object."""
+    text = read_text(path, most)
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is no JSON, it was changed or cut off ({error})") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: holds no JSON object")
+    return content
+
+
+def check_no_link(path: Path) -> None:
+    """Raise `InputError` where writing to `path` would follow a symbolic link out of the folder it is in."""
+    if path.is_symlink():
+        raise InputError(f"{path}: is a symbolic link, which is not written through; remove it")
+
+
+def sha256(content: bytes) -> str:
+    """The checksum as hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def file_sha256(path: Path, most: int) -> str:
+    """That of a file of at most `most` bytes, which is not held in memory."""
+    with _opened(path, most) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@contextmanager
+def _opened(path: Path, most: int) -> Iterator[io.BufferedReader]:
+    # Without O_NONBLOCK, opening a pipe waits for somebody to write into it.
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError:
+        raise InputError(f"{path.parent}: has no {path.name}") from None
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise InputError(f"{path}: is a symbolic link, which is not followed out of a run") from None
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    with open(descriptor, "rb") as file:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise InputError(f"{path}: is no ordinary file")
+        if status.st_size > most:
+            raise InputError(f"{path}: is larger than {_size(most)}")
+        try:
+            yield file
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def _size(count: int) -> str:
+    return f"{count / 2**20:,.0f} MiB" if count >= 2**20 else f"{count:,} bytes"
