@@ -9,6 +9,7 @@ import textwrap
 from pathlib import Path
 
 EXPERIMENTS = "experiment"  # the group of recipes
+SPACES = "tune"  # the group of search spaces, which is tune.py's
 
 _TEXT = """\
 Train an agent on a GridWorld whose optimum is known exactly.
@@ -48,7 +49,7 @@ Examples:
       every recipe of a task, with twenty seeds each
 
 Afterwards: scripts/evaluate.py, scripts/record.py and scripts/play.py --agent, with a run's folder;
-scripts/jobs.py, with a sweep's.
+scripts/jobs.py, with a sweep's. Before: scripts/tune.py finds settings.
 Hydra's own options: python scripts/train.py --hydra-help
 """
 
@@ -60,11 +61,16 @@ def manual(conf: Path) -> str:
 
 def _choices(conf: Path) -> list[str]:
     lines = []
-    for group in sorted(folder for folder in conf.iterdir() if folder.is_dir()):
+    for group in sorted(folder for folder in conf.iterdir() if folder.is_dir() and folder.name != SPACES):
         lines.append(f"  {group.name}=...")
         files = sorted(group.glob("*.yaml"))
-        lines += _recipes(conf, files) if group.name == EXPERIMENTS else map(_choice, files)
+        lines += _recipes(conf, files) if group.name == EXPERIMENTS else choices(group)
     return lines
+
+
+def choices(group: Path) -> list[str]:
+    """A line for each file of a group."""
+    return [_choice(file) for file in sorted(group.glob("*.yaml"))]
 
 
 def _choice(file: Path) -> str:

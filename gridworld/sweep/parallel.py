@@ -11,8 +11,6 @@ import functools
 import gc
 import os
 import signal
-import threading
-import time
 from collections.abc import Sequence
 
 import cloudpickle
@@ -22,9 +20,7 @@ from hydra.types import HydraContext, TaskFunction
 from joblib import Parallel, delayed
 from omegaconf import DictConfig, open_dict
 
-_SECONDS_BETWEEN_LOOKS = 0.2
-_GRACE_SECONDS = 3.0  # to close the files
-_parent_died = threading.Event()
+from gridworld.process import end_with, parent_died
 
 
 def launch(
@@ -59,7 +55,7 @@ def _run(state: bytes, overrides: list[str], number: int) -> JobReturn:
             job_subdir_key="hydra.sweep.subdir",
         )
     except SystemExit:
-        if _parent_died.is_set():
+        if parent_died.is_set():
             os._exit(1)  # nobody is there to take the result; waiting for that would take seconds
         raise
     result.cfg = result.hydra_cfg = None  # nobody asks for them, and they would pile up
@@ -79,22 +75,8 @@ def _arrive(state: bytes) -> tuple[HydraContext, TaskFunction, DictConfig]:
     """Make this process a worker of the sweep whose state this is."""
     parent, singletons, context, task, master = cloudpickle.loads(state)
     if parent != os.getpid():  # which it is when there is one worker only
-        _end_with(parent)
+        end_with(parent)
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent too, which knows what to do
         setup_globals()
         Singleton.set_state(singletons)
     return context, task, master
-
-
-def _end_with(parent: int) -> None:
-    """End soon after the parent, even if that is killed: first as if asked to, then in any case."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(_SECONDS_BETWEEN_LOOKS)
-        _parent_died.set()
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(_GRACE_SECONDS)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True, name="watch on the sweep").start()
