@@ -2,8 +2,8 @@
 
 Overrides compose the configuration to begin from, as for train.py. What is searched stands in a file:
 {spaces}
-The same line again goes on with the study; on several machines, with tune.storage=URL of a database that all reach,
-they work on it together.
+The same line again goes on with the study. On several machines, with tune.storage=URL of a database that all
+reach, they work on it together.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import importlib.util
-import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -70,8 +69,7 @@ def main(arguments: Sequence[str]) -> None:
     except Interrupted as interruption:
         again = shlex.join(["python", *sys.argv])
         print(f"{interruption}; nothing that ended is lost; go on with: {again}", file=sys.stderr)
-        sys.stderr.flush()
-        os._exit(interruption.exit_code)  # whatever a library still waits for
+        sys.exit(interruption.exit_code)
 
 
 def _parser(conf: Path) -> argparse.ArgumentParser:

@@ -24,7 +24,7 @@ _OPTIONAL = (SAMPLED_RETURN, ONLINE)
 
 def read_object(path: Path) -> dict[str, Any]:
     """A JSON object."""
-    text = _bounded(path, _LARGEST_JSON)
+    text = bounded_text(path, _LARGEST_JSON)
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -34,7 +34,8 @@ def read_object(path: Path) -> dict[str, Any]:
     return content
 
 
-def _bounded(path: Path, most: int) -> str:
+def bounded_text(path: Path, most: int = _LARGEST_CSV) -> str:
+    """A file's text."""
     try:
         if not path.is_file():
             raise InputError(f"{path.parent}: has no {path.name}")
@@ -49,7 +50,7 @@ def _bounded(path: Path, most: int) -> str:
 
 def read_curve(path: Path) -> dict[str, FloatArray]:
     """The columns of a learning curve that are needed, (evaluations,) each."""
-    lines = _bounded(path, _LARGEST_CSV).splitlines()
+    lines = bounded_text(path, _LARGEST_CSV).splitlines()
     try:
         rows = list(csv.reader(lines))
     except csv.Error as error:

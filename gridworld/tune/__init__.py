@@ -11,6 +11,6 @@
     confirm.py   the winner beside the configuration it began from, on seeds that neither was chosen by
     recipe.py    the winner as a yaml for train.py
 
-Truth lies in Optuna's storage; the files in the study's folder follow from it. Workers talk to the storage only,
-so it does not matter which machine they are on.
+Truth lies in Optuna's storage; the files in the study's folder follow from it. Workers talk to the storage
+only, so it does not matter which machine they are on.
 """

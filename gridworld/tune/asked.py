@@ -1,7 +1,7 @@
 """Hydra's side of `scripts/tune.py`: a command line as the configuration to begin from and how to search.
 
-Two compositions: what does not say `tune` is composed as train.py would, so that a search begins from the very
-configuration that train.py runs; the rest with conf/tune.yaml.
+Two compositions: what does not say `tune` is composed as train.py would, so that a search begins from the
+very configuration that train.py runs; the rest with conf/tune.yaml.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from gridworld.config import DimensionConfig, TrainConfig, TuneConfig, above_zero, at_least
+from gridworld.config import TrainConfig, TuneConfig, above_zero, at_least
 from gridworld.errors import InputError
 from gridworld.experiment import register_schemas, slug, to_config
 from gridworld.hydra_errors import sentence
@@ -82,7 +82,7 @@ def ask(conf: Path, words: Sequence[str], config_dir: Path | None) -> Asked:
         raise InputError(_sentence(error)) from None
     _check(settings)
     settings = _completed(settings, choices["agent"], base)
-    space = Space(cast("dict[str, DimensionConfig]", settings.space), space_name)
+    space = Space(settings.space, space_name)
     check_settings(base)
     space.check(base)
     if base.seed + settings.seeds + settings.confirm_seeds > _LARGEST_SEED:
@@ -158,7 +158,7 @@ def _check(settings: TuneConfig) -> None:
 def _completed(settings: TuneConfig, agent: str, base: TrainConfig) -> TuneConfig:
     study = settings.study or f"tune_{slug(agent)}_{slug(base.env.layout)}"
     if slug(study) != study:
-        raise InputError(f"tune.study={study}: must be of letters, digits and _.,=+- only, e.g. {slug(study)}")
+        raise InputError(f"tune.study={study}: must be of letters, digits and _.,=+-, e.g. {slug(study)}")
     return dataclasses.replace(settings, study=study, folder=settings.folder or f"runs/{study}")
 
 

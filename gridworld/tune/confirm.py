@@ -1,7 +1,7 @@
 """The winner beside the configuration that the search began from, on seeds that no trial has seen.
 
-The best of many trials on a few seeds owes something to luck. These runs are ordinary ones, with a folder each;
-what is there already is kept.
+The best of many trials on a few seeds owes something to luck. These runs are ordinary ones, with a folder
+each; what is there already is kept.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from gridworld.report import statistics
 from gridworld.report.table import number, steps_up_to
 from gridworld.run import SUMMARY
 from gridworld.sweep.job import JobError, run_in_sweep
-from gridworld.tune.worker import become_worker
+from gridworld.tune.worker import become_worker, is_stopped
 
 CONFIRM = "confirm"  # the runs' folder, in the study's
 
@@ -51,20 +51,22 @@ class Sample:
         told += f"[{100 * self.certified.low:.0f} %, {100 * self.certified.high:.0f} %]"
         median = statistics.interval(statistics.median, [self.steps], 0)
         form = steps_up_to(self.total)
-        return f"{told}, half of the seeds by step {form(median.point)} [{form(median.low)}, {form(median.high)}]"
+        bounds = f"[{form(median.low)}, {form(median.high)}]"
+        return f"{told}, half of the seeds by step {form(median.point)} {bounds}"
 
 
 def jobs(folder: Path, name: str, config: TrainConfig, seeds: Sequence[int]) -> list[Job]:
     """A run on each seed."""
-    return [
-        Job(folder / CONFIRM / f"{name},seed={seed}", dataclasses.replace(config, seed=seed)) for seed in seeds
-    ]
+    runs = folder / CONFIRM
+    return [Job(runs / f"{name},seed={seed}", dataclasses.replace(config, seed=seed)) for seed in seeds]
 
 
-def clear_others(folder: Path, names: Sequence[str]) -> None:
-    """Take away the runs of an earlier winner."""
+def prepare(folder: Path, runs: Sequence[Job]) -> None:
+    """Make room: the runs of an earlier winner go."""
+    (folder / CONFIRM).mkdir(exist_ok=True)
+    names = {job.folder.name for job in runs}
     for path in (folder / CONFIRM).glob("*,seed=*"):
-        if path.name.split(",")[0] not in names:
+        if path.name not in names:
             shutil.rmtree(path, ignore_errors=True)
 
 
@@ -72,6 +74,8 @@ def work(task: Sequence[Job], worker: int, parent: int) -> None:
     """Run what nobody has run yet. Ends with the parent, however that ends."""
     become_worker(parent)
     for job in task:
+        if is_stopped():
+            break
         job.folder.mkdir(parents=True, exist_ok=True)
         try:
             run_in_sweep(job.config, job.folder, [], stop_at_failure=False)

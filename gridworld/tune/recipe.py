@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,20 @@ RECIPE = "winner"
 _NOT_OF_A_RECIPE = ("seed", "device", "threads", "logging", "recording")
 
 
+@dataclass(frozen=True)
+class Source:
+    """Where configurations come from."""
+
+    conf: Path
+    config_dir: Path | None  # the user's own
+
+
 def write_recipe(
-    folder: Path, conf: Path, config_dir: Path | None, choices: Mapping[str, str], config: TrainConfig, about: str
+    folder: Path, source: Source, choices: Mapping[str, str], config: TrainConfig, about: str
 ) -> Path:
     """Write it and make sure that it comes to `config` again; returns its path."""
     overrides = [f"{group}={choice}" for group, choice in choices.items()]
-    bare = without_hydra(compose_in(conf, config_dir, "train", overrides))
+    bare = without_hydra(compose_in(source.conf, source.config_dir, "train", overrides))
     values = _difference(_relevant(bare), _relevant(config))
     lines = ["# @package _global_", f"# {about}", "defaults:"]
     lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
@@ -35,8 +44,8 @@ def write_recipe(
     path = folder / "experiment" / f"{RECIPE}.yaml"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, "\n".join(lines))
-    if config_dir is None:  # else it needs both folders
-        again = without_hydra(compose_in(conf, folder, "train", [f"experiment={RECIPE}"]))
+    if source.config_dir is None:  # else it may need both folders
+        again = without_hydra(compose_in(source.conf, folder, "train", [f"experiment={RECIPE}"]))
         assert _relevant(again) == _relevant(config), f"{path} does not say what the winner is"
     return path
 

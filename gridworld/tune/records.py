@@ -17,15 +17,25 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from gridworld.files import write_json, write_text
+from gridworld.report.tuning import FORMAT, STUDY_JSON, TRIALS_CSV
 from gridworld.run import versions
 from gridworld.tune.asked import Asked
 from gridworld.tune.space import Space
 from gridworld.tune.storage import is_lost
 from gridworld.tune.trial import ERROR, SEEDS
 
-TRIALS_CSV, STUDY_JSON = "trials.csv", "study.json"
-FORMAT = 1
-_FIELDS = ("trial", "status", "score", "certified", "steps", "regret", "seconds", "repeats", "worker", "error")
+_FIELDS = (
+    "trial",
+    "status",
+    "score",
+    "certified",
+    "steps",
+    "regret",
+    "seconds",
+    "repeats",
+    "worker",
+    "error",
+)
 _STATUSES = {
     TrialState.COMPLETE: "done",
     TrialState.PRUNED: "pruned",
@@ -43,7 +53,9 @@ def write_trials(folder: Path, study: optuna.Study, space: Space) -> None:
     for trial in study.get_trials(deepcopy=False):
         values = space.values(trial.params)
         row = _row(trial)
-        writer.writerow([*(row[name] for name in _FIELDS), *(values.get(key, "") for key in space.dimensions)])
+        writer.writerow(
+            [*(row[name] for name in _FIELDS), *(values.get(key, "") for key in space.dimensions)]
+        )
     write_text(folder / TRIALS_CSV, text.getvalue())
 
 

@@ -6,8 +6,8 @@ First the share of seeds that are certified, then how soon. Of n seeds, m missed
     c_i = 1/2 + ρ_i / 2(1 + ρ_i)       not certified, with regret ρ_i at the end
 
 and the trial's score is (m + mean c) / (n + 1). One certified seed more always counts for more than all steps
-together, since the mean stays below 1. Where the share is the same, fewer steps win; where no seed is certified
-yet, less regret, so that a search has something to follow.
+together, since the mean is at most 1. Where the share is the same, fewer steps win; where no seed is
+certified yet, less regret, so that a search has something to follow.
 """
 
 from __future__ import annotations

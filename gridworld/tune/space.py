@@ -4,8 +4,8 @@
     agent.n_epochs: {type: int, low: 2, high: 10}
     agent.policy_kwargs.net_arch: {type: categorical, choices: [[64], [64, 64]]}
 
-A key is one of a run's configuration, or an argument of the agent's class. Before anything runs, both ends of a
-range and every choice of a list are put into the configuration, whose schema refuses what does not fit.
+A key is one of a run's configuration, or an argument of the agent's class. Before anything runs, both ends of
+a range and every choice of a list are put into the configuration, whose schema refuses what does not fit.
 """
 
 from __future__ import annotations
@@ -129,11 +129,11 @@ def _check(key: str, dimension: DimensionConfig) -> None:
     if low is None or high is None or not -math.inf < low < high < math.inf:
         raise InputError(f"{key}: low={low}, high={high} must be two numbers, the first below the second")
     if dimension.log and (low <= 0 or step is not None):
-        raise InputError(f"{key}: log=true needs a positive low and no step; there are low={low}, step={step}")
-    if step is not None and not (0 < step and math.isclose((high - low) / step, round((high - low) / step))):
+        raise InputError(f"{key}: log=true needs a positive low and no step; it has low={low}, step={step}")
+    if step is not None and not (step > 0 and math.isclose((high - low) / step, round((high - low) / step))):
         raise InputError(f"{key}: step={step} must lead from low={low} to high={high}")
     if kind == "int" and not all(number.is_integer() for number in (low, high, step or 1.0)):
-        raise InputError(f"{key}: type=int takes whole numbers; there are low={low}, high={high}, step={step}")
+        raise InputError(f"{key}: type=int takes whole numbers; it has low={low}, high={high}, step={step}")
 
 
 def _extremes(dimension: DimensionConfig) -> Iterator[Any]:

@@ -1,8 +1,8 @@
 """The study in Optuna's storage, where several processes and machines find it.
 
-A worker that runs a trial leaves a sign of life every few seconds. A trial without one for three times as long is
-given up by whichever worker looks next, and put into the queue again. Optuna has that for its relational
-storages, SQLite among them, but not for its journal files; so those are refused.
+A worker that runs a trial leaves a sign of life every few seconds. A trial without one for three times as
+long is given up by the next worker that looks, and put into the queue again. Optuna has that for its
+relational storages, SQLite among them, but not for its journal files and Redis; so those are refused.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ def _pruner(settings: TuneConfig) -> optuna.pruners.BasePruner:
 
 def _compare(name: str, before: dict[str, Any], now: dict[str, Any]) -> None:
     for part, was in before.items():
-        is_now = now.get(part)
+        is_now = now.get(part, {})
         if was == is_now:
             continue
         changed = sorted(key for key in {*was, *is_now} if was.get(key) != is_now.get(key))

@@ -1,8 +1,8 @@
 """One trial: the same settings on one seed after the other, in memory.
 
-After every tenth or so of a seed's budget Optuna is told the score as it would be if each seed, the present one
-included, stayed as it is. So its pruners compare trials at the same point of the same seed, and a trial that is
-behind ends within a curve or between two seeds.
+After every tenth or so of a seed's budget Optuna is told the score as it would be if each seed, the present
+one included, stayed as it is. So its pruners compare trials at the same point of the same seed, and a trial
+that is behind ends within a curve or between two seeds.
 """
 
 from __future__ import annotations

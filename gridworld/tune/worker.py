@@ -10,7 +10,6 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,14 +47,11 @@ class Task:
 def search(task: Task, worker: int, parent: int) -> None:
     """Run trials. Ends with the parent, however that ends."""
     become_worker(parent)
-    import torch
-
     from gridworld.tune.storage import open_study
 
-    torch.set_num_threads(task.objective.base.threads)
     study = open_study(task.settings, task.url, task.name, worker)
     try:
-        while not _stopped.is_set() and time.time() < task.deadline and _next(study, task):
+        while not is_stopped() and time.time() < task.deadline and _next(study, task):
             pass
     except Stopped:
         pass
@@ -67,6 +63,11 @@ def become_worker(parent: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _stop)
     end_with(parent)
+
+
+def is_stopped() -> bool:
+    """Whether this process was asked to end."""
+    return _stopped.is_set()
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
@@ -104,7 +105,6 @@ def _run(trial: Trial, task: Task, turn: ExitStack, begun: list[int]) -> float:
     begun.append(trial.number)
     turn.close()
     trial.set_user_attr("worker", f"{socket.gethostname()}:{os.getpid()}")
-    is_stopped: Callable[[], bool] = _stopped.is_set
     try:
         value = task.objective(trial, is_stopped)
     except optuna.TrialPruned:
