@@ -298,6 +298,8 @@ class TuneConfig:
 
     trials: int = 100
     seeds: int = 3  # a trial's: seed, seed + 1, ...
+    finalists: int = 5  # trials that go on to more seeds, beside what the search began from
+    final_seeds: int = 10  # the next ones, for the finalists
     confirm_seeds: int = 20  # the next ones, for the winner and for what the search began from
     study: Optional[str] = None  # noqa: UP045  # its name; null: of agent and world
     folder: Optional[str] = None  # noqa: UP045  # null: runs/STUDY
@@ -307,6 +309,7 @@ class TuneConfig:
     sampler: str = "tpe"  # or random
     sampler_seed: int = 0
     pruner: str = "median"  # or hyperband, none
+    evaluations: int = 50  # of a seed, at least, to tell apart who is certified sooner
     reports: int = 10  # looks of the pruner at a seed's curve
     stop_after: Optional[int] = 3  # noqa: UP045  # a trial's seed ends at this many certificates in a row
     heartbeat: int = 5  # seconds; a worker silent for three times as long has lost its trial

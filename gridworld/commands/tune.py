@@ -28,7 +28,8 @@ keys, beside all of train.py's (defaults in conf/tune.yaml):
   tune=NAME            another file of conf/tune, or of --config-dir's tune/
   tune.trials          how many, those of earlier calls included (100)
   tune.seeds           of a trial: seed, seed + 1, ... (3)
-  tune.confirm_seeds   the next ones, for the winner and what the search began from (20)
+  tune.finalists       trials that go on (5) to more seeds, tune.final_seeds (10)
+  tune.confirm_seeds   still others, for the winner and what the search began from (20)
   tune.study           its name, by which it is gone on with; tune.folder, its folder (runs/STUDY)
   tune.storage         any database URL of Optuna's (an SQLite file in the folder)
   tune.workers         processes (one on each core); tune.timeout, seconds
@@ -62,10 +63,11 @@ def main(arguments: Sequence[str]) -> None:
         _show(asked)
         return
     from gridworld.training import Interrupted
+    from gridworld.tune.recipe import Source
     from gridworld.tune.study import tune
 
     try:
-        tune(asked, conf, options.config_dir)
+        tune(asked, Source(conf, options.config_dir))
     except Interrupted as interruption:
         again = shlex.join(["python", *sys.argv])
         print(f"{interruption}; nothing that ended is lost; go on with: {again}", file=sys.stderr)

@@ -21,7 +21,7 @@ from gridworld.report.scene import DARK, LIGHT, Scene, Style, styles
 from gridworld.report.statistics import RESAMPLES, Share
 from gridworld.report.svg import to_svg
 from gridworld.report.table import Cell, Table, interval_text, is_text, main_text, number
-from gridworld.report.tuning import Tuning, trials_table, winner_table
+from gridworld.report.tuning import Tuning, finalists_table, trials_table, winner_table
 from gridworld.report.tuning_figures import tuning_figures
 
 
@@ -102,7 +102,7 @@ def _tuning(tuning: Tuning, scenes: Sequence[Scene]) -> dict[str, Any]:
         "facts": [f"Study {tuning.name}, {tuning.counts}.", tuning.sentence],
         "figures": [Markup(to_svg(scene)) for scene in scenes if scene.width == WIDTH],
         "wide": [Markup(to_svg(scene)) for scene in scenes if scene.width > WIDTH],
-        "winner": winner_table(tuning),
+        "tables": [winner_table(tuning), finalists_table(tuning)],
         "trials": trials_table(tuning),
     }
 

@@ -44,6 +44,7 @@ class Tuning:
     began_from: Mapping[str, Any]  # the same keys before; empty where that was outside the space
     space: Mapping[str, Mapping[str, Any]]
     importances: Mapping[str, float]
+    finalists: Sequence[Sequence[Cell]]  # trial, score, certified; the winner first
     trials: Sequence[TrialRow]
 
     @property
@@ -87,6 +88,12 @@ def winner_table(tuning: Tuning) -> Table:
     return Table(f"{tuning.name} winner", caption, ["key", "winner", "began from", "importance"], rows)
 
 
+def finalists_table(tuning: Tuning) -> Table:
+    """The trials that went on to more seeds."""
+    caption = "The finalists, by all of their seeds"
+    return Table(f"{tuning.name} finalists", caption, ["trial", "score", "certified"], tuning.finalists)
+
+
 def trials_table(tuning: Tuning) -> Table:
     """Every trial."""
     columns = ("certified", "steps", "regret", "seconds", "error")
@@ -123,6 +130,10 @@ def _read(folder: Path) -> Tuning:
             values=dict(winner["values"]),
             began_from=dict(content["began_from"] or {}),
             space=space,
+            finalists=[
+                [str(int(each["trial"])), float(each["score"]), f"{each['certified']} / {each['seeds']}"]
+                for each in content["finalists"]
+            ],
             importances={str(key): float(share) for key, share in content["importances"].items()},
             trials=[_trial(row, space) for row in csv.DictReader(io.StringIO(table))],
         )

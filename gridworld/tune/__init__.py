@@ -8,7 +8,9 @@
     worker.py    a process that runs trials until there are enough
     crew.py      several of them, watched
     records.py   trials.csv and study.json: what a reader needs, without Optuna
+    finals.py    the best few again on more seeds, to choose the winner
     confirm.py   the winner beside the configuration it began from, on seeds that neither was chosen by
+    verdict.py   which of the two is better
     recipe.py    the winner as a yaml for train.py
 
 Truth lies in Optuna's storage; the files in the study's folder follow from it. Workers talk to the storage

@@ -7,6 +7,8 @@ very configuration that train.py runs; the rest with conf/tune.yaml.
 from __future__ import annotations
 
 import dataclasses
+import math
+import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -54,14 +56,27 @@ class Asked:
         return Path(str(self.settings.folder))
 
     @property
+    def measured(self) -> TrainConfig:
+        """The configuration to begin from, evaluated often enough; that changes nothing else about it."""
+        evaluation = self.base.evaluation
+        every = min(evaluation.every, math.ceil(self.base.total_timesteps / self.settings.evaluations))
+        return dataclasses.replace(self.base, evaluation=dataclasses.replace(evaluation, every=every))
+
+    @property
     def seeds(self) -> tuple[int, ...]:
         """Of a trial."""
         return tuple(range(self.base.seed, self.base.seed + self.settings.seeds))
 
     @property
-    def held_out(self) -> tuple[int, ...]:
-        """The seeds after those, which no trial sees."""
+    def final_seeds(self) -> range:
+        """Of the finalists."""
         first = self.base.seed + self.settings.seeds
+        return range(first, first + self.settings.final_seeds)
+
+    @property
+    def held_out(self) -> tuple[int, ...]:
+        """The seeds after those, by which nothing is chosen."""
+        first = self.final_seeds.stop
         return tuple(range(first, first + self.settings.confirm_seeds))
 
 
@@ -85,9 +100,10 @@ def ask(conf: Path, words: Sequence[str], config_dir: Path | None) -> Asked:
     space = Space(settings.space, space_name)
     check_settings(base)
     space.check(base)
-    if base.seed + settings.seeds + settings.confirm_seeds > _LARGEST_SEED:
-        raise InputError(f"seed={base.seed}: leaves no room for tune.seeds and tune.confirm_seeds after it")
-    return Asked(base, choices, settings, space)
+    asked = Asked(base, choices, settings, space)
+    if asked.held_out[-1] >= _LARGEST_SEED:
+        raise InputError(f"seed={base.seed}: leaves no room for the other seeds after it, below 2**32")
+    return asked
 
 
 def compose_in(
@@ -137,7 +153,10 @@ def _parse(words: Sequence[str]) -> list[Override]:
 def _check(settings: TuneConfig) -> None:
     at_least("tune.trials", settings.trials, 1)
     at_least("tune.seeds", settings.seeds, 1)
+    at_least("tune.finalists", settings.finalists, 1)
+    at_least("tune.final_seeds", settings.final_seeds, 0)
     at_least("tune.confirm_seeds", settings.confirm_seeds, 2)
+    at_least("tune.evaluations", settings.evaluations, 1)
     at_least("tune.reports", settings.reports, 1)
     at_least("tune.heartbeat", settings.heartbeat, 1)
     at_least("tune.sampler_seed", settings.sampler_seed, 0)
@@ -159,7 +178,9 @@ def _completed(settings: TuneConfig, agent: str, base: TrainConfig) -> TuneConfi
     study = settings.study or f"tune_{slug(agent)}_{slug(base.env.layout)}"
     if slug(study) != study:
         raise InputError(f"tune.study={study}: must be of letters, digits and _.,=+-, e.g. {slug(study)}")
-    return dataclasses.replace(settings, study=study, folder=settings.folder or f"runs/{study}")
+    workers = len(os.sched_getaffinity(0)) if settings.workers == -1 else settings.workers
+    folder = settings.folder or f"runs/{study}"
+    return dataclasses.replace(settings, study=study, folder=folder, workers=workers)
 
 
 def _sentence(error: Exception) -> str:

@@ -52,11 +52,6 @@ def run_crew(work: Work, task: Any, workers: int, look: Callable[[], None]) -> N
             _stop(processes.values())
 
 
-def cores(asked: int) -> int:
-    """The number of workers that is asked for."""
-    return len(os.sched_getaffinity(0)) if asked == -1 else asked
-
-
 def _start(work: Work, task: Any, number: int) -> SpawnProcess:
     process = multiprocessing.get_context("spawn").Process(
         target=work, args=(task, number, os.getpid()), daemon=True

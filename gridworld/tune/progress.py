@@ -29,14 +29,14 @@ class SearchProgress:
         self._before = 0
         self._shown = False
 
-    def begin(self, workers: int) -> None:
+    def begin(self) -> None:
         """The first line."""
         self._before = standing(self._study).ended
         trials = self._asked.settings.trials
         more = f", {self._before} of them there already" if self._before else ""
         print(
             f"study {self._asked.name} in {shown(self._asked.folder)}: {trials} trials of "
-            f"{len(self._asked.seeds)} seeds{more}, {workers} at once",
+            f"{len(self._asked.seeds)} seeds{more}, {self._asked.settings.workers} at once",
             file=sys.stderr,
             flush=True,
         )

@@ -132,7 +132,7 @@ def _check(key: str, dimension: DimensionConfig) -> None:
         raise InputError(f"{key}: log=true needs a positive low and no step; it has low={low}, step={step}")
     if step is not None and not (step > 0 and math.isclose((high - low) / step, round((high - low) / step))):
         raise InputError(f"{key}: step={step} must lead from low={low} to high={high}")
-    if kind == "int" and not all(number.is_integer() for number in (low, high, step or 1.0)):
+    if kind == "int" and not all(float(number).is_integer() for number in (low, high, step or 1.0)):
         raise InputError(f"{key}: type=int takes whole numbers; it has low={low}, high={high}, step={step}")
 
 

@@ -152,7 +152,7 @@ def _pruner(settings: TuneConfig) -> optuna.pruners.BasePruner:
             min_resource=settings.reports, max_resource=settings.reports * settings.seeds
         )
     # Half a seed's budget is given to everybody: until then most have learnt nothing yet.
-    return optuna.pruners.MedianPruner(n_startup_trials=10, n_warmup_steps=settings.reports // 2)
+    return optuna.pruners.MedianPruner(n_warmup_steps=settings.reports // 2)
 
 
 def _compare(name: str, before: dict[str, Any], now: dict[str, Any]) -> None:

@@ -5,22 +5,24 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
+import math
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import optuna
-from optuna.trial import TrialState
 
-from gridworld.config import AgentConfig
+from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.report.tuning import TRIALS_CSV
 from gridworld.run import MANIFEST, SWEEP_JSON, check_writable
 from gridworld.sweep.report import shown
-from gridworld.tune import confirm
+from gridworld.tune import confirm, verdict
 from gridworld.tune.asked import Asked
-from gridworld.tune.crew import cores, run_crew
+from gridworld.tune.crew import run_crew
+from gridworld.tune.finals import Final, Finalist, finalists, missing, ranking
+from gridworld.tune.finals import work as finals_work
 from gridworld.tune.progress import SearchProgress
 from gridworld.tune.recipe import RECIPE, Source, write_recipe
 from gridworld.tune.records import write_study
@@ -30,8 +32,22 @@ from gridworld.tune.trial import Objective
 from gridworld.tune.worker import Task, search
 
 
-def tune(asked: Asked, conf: Path, config_dir: Path | None) -> None:
+def tune(asked: Asked, source: Source) -> None:
     """Run what the study lacks. Raises `InputError`, nothing run, and `Interrupted`."""
+    task = _begin(asked)
+    study = open_study(task.settings, task.url, task.name)
+    progress = SearchProgress(asked, study)
+    try:
+        if standing(study).ended < task.settings.trials:
+            progress.begin()
+            run_crew(search, task, min(task.settings.workers, task.settings.trials), progress.look)
+    finally:
+        progress.end()
+    _conclude(asked, study, source, _finals(asked, study, task))
+
+
+def _begin(asked: Asked) -> Task:
+    """Make the folder and the study, or see that they are of this search."""
     _check_folder(asked.folder)
     settings = asked.settings
     made = not asked.folder.exists()
@@ -44,24 +60,9 @@ def tune(asked: Asked, conf: Path, config_dir: Path | None) -> None:
             with contextlib.suppress(OSError):
                 asked.folder.rmdir()
         raise
-    task = Task(
-        asked.folder,
-        url,
-        asked.name,
-        settings,
-        Objective(asked.base, asked.space, asked.seeds, settings.reports, settings.stop_after),
-        time.time() + (settings.timeout or float("inf")),
-    )
-    study = open_study(settings, url, asked.name)
-    workers = cores(settings.workers)
-    progress = SearchProgress(asked, study)
-    try:
-        if standing(study).ended < settings.trials:
-            progress.begin(workers)
-            run_crew(search, task, min(workers, settings.trials), progress.look)
-    finally:
-        progress.end()
-    _conclude(asked, study, conf, config_dir, workers)
+    objective = Objective(asked.measured, asked.space, asked.seeds, settings.reports, settings.stop_after)
+    deadline = time.time() + (settings.timeout or math.inf)
+    return Task(asked.folder, url, asked.name, settings, objective, deadline)
 
 
 def _check_folder(folder: Path) -> None:
@@ -83,6 +84,7 @@ def _about(asked: Asked) -> dict[str, Any]:
         "objective": {
             "seeds": list(asked.seeds),
             "stop_after": asked.settings.stop_after,
+            "evaluations": asked.settings.evaluations,
             "reports": asked.settings.reports,
         },
     }
@@ -96,45 +98,64 @@ def _flat(content: dict[str, Any], prefix: str = "") -> Any:
             yield prefix + key, value
 
 
-def _conclude(asked: Asked, study: optuna.Study, conf: Path, config_dir: Path | None, workers: int) -> None:
-    """Confirm the winner, write it down, and tell."""
-    if not study.get_trials(deepcopy=False, states=[TrialState.COMPLETE]):
+def _finals(asked: Asked, study: optuna.Study, task: Task) -> list[Finalist]:
+    """The finalists, the winner first."""
+    trials = finalists(study, asked.settings.finalists, asked.space.parameters_of(asked.base))
+    if not trials:
         raise InputError(
             f"{shown(asked.folder)}: none of {standing(study).ended} trials came to an end; "
             f"the reasons are in {TRIALS_CSV}"
         )
-    best = study.best_trial
+    seeds = tuple(asked.final_seeds)
+    if runs := missing(study, trials, seeds):
+        print(
+            f"the {len(trials)} finalists on {len(seeds)} seeds more: {runs} runs",
+            file=sys.stderr,
+            flush=True,
+        )
+        named = tuple((trial.number, asked.space.values(trial.params)) for trial in trials)
+        run_crew(finals_work, Final(task, named, seeds), min(asked.settings.workers, runs), lambda: None)
+    return ranking(study, trials, seeds, asked.base.total_timesteps)
+
+
+def _conclude(asked: Asked, study: optuna.Study, source: Source, ranked: list[Finalist]) -> None:
+    """Confirm the winner, write it down, and tell."""
+    best = study.get_trials(deepcopy=False)[ranked[0].trial]
     values = asked.space.values(best.params)
     is_new = asked.space.parameters_of(asked.base) != best.params
-    tuned = with_values(asked.base, values)
-    tuned = dataclasses.replace(tuned, agent=_named(tuned.agent)) if is_new else asked.base
-    winner = confirm.jobs(asked.folder, f"trial={best.number}", tuned, asked.held_out)
-    began_from = confirm.jobs(asked.folder, "default", asked.base, asked.held_out)
-    verdict = _confirm(asked, winner if is_new else [], began_from, workers)
+    tuned = _tuned(asked.base, values) if is_new else asked.base
+    name = f"trial={best.number}"
+    winner = confirm.jobs(asked.folder, name, _tuned(asked.measured, values), asked.held_out)
+    began_from = confirm.jobs(asked.folder, "default", asked.measured, asked.held_out)
+    confirmed = _confirm(asked, winner if is_new else [], began_from)
     about = f"the best of {standing(study).ended} trials; study.json has what came of it"
-    recipe = write_recipe(asked.folder, Source(conf, config_dir), asked.choices, tuned, about)
-    found = {"trial": best.number, "score": best.value, "values": values}
-    write_study(asked, study, {"winner": found, "confirmation": verdict})
-    _tell(asked, values, verdict["sentence"], recipe)
+    recipe = write_recipe(asked.folder, source, asked.choices, tuned, about)
+    outcome = {
+        "winner": {"trial": best.number, "score": best.value, "values": values},
+        "finalists": [dataclasses.asdict(finalist) for finalist in ranked],
+        "confirmation": confirmed,
+    }
+    write_study(asked, study, outcome)
+    _tell(asked, values, confirmed["sentence"], recipe)
 
 
-def _named(agent: AgentConfig) -> AgentConfig:
-    """So that a report tells it from what it was before."""
-    return dataclasses.replace(agent, name=f"{agent.name}_tuned")
+def _tuned(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
+    """With a name of its own, so that a report tells it from what it was before."""
+    tuned = with_values(config, values)
+    agent = dataclasses.replace(tuned.agent, name=f"{tuned.agent.name}_tuned")
+    return dataclasses.replace(tuned, agent=agent)
 
 
-def _confirm(
-    asked: Asked, winner: list[confirm.Job], began_from: list[confirm.Job], workers: int
-) -> dict[str, Any]:
+def _confirm(asked: Asked, winner: list[confirm.Job], began_from: list[confirm.Job]) -> dict[str, Any]:
     """Run both; without a winner there is nothing to compare."""
     runs = [job for pair in itertools.zip_longest(began_from, winner) for job in pair if job is not None]
     count = len(began_from)
     print(f"{len(runs)} runs on {count} held-out seeds confirm the winner", file=sys.stderr, flush=True)
     confirm.prepare(asked.folder, runs)
-    run_crew(confirm.work, runs, min(workers, len(runs)), lambda: None)
-    before = confirm.sample(began_from)
+    run_crew(confirm.work, runs, min(asked.settings.workers, len(runs)), lambda: None)
+    before = verdict.sample(began_from)
     if winner:
-        return confirm.compare(confirm.sample(winner), before, "the winner")
+        return verdict.compare(verdict.sample(winner), before, "the winner")
     return {
         "verdict": "is",
         "sentence": f"No trial came out better than the settings that the search began from: on {count} "

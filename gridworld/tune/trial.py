@@ -23,12 +23,20 @@ from gridworld.evaluation import Judge
 from gridworld.observations import make_observation
 from gridworld.training import check_settings, make_seat
 from gridworld.tune.score import SeedScore, score
-from gridworld.tune.space import Space, with_values
+from gridworld.tune.space import Space, Values, with_values
 
 if TYPE_CHECKING:
     from optuna.trial import Trial
 
+See = Callable[[float, SeedScore], None]  # (share of the budget, how the seed stands)
+
+IsStopped = Callable[[], bool]
+
 SEEDS, ERROR = "seeds", "error"  # a trial's attributes in the storage
+
+
+def _unseen(share: float, standing: SeedScore) -> None:
+    """Nobody looks."""
 
 
 class Stopped(KeyboardInterrupt):
@@ -45,7 +53,7 @@ class Objective:
     reports: int  # to the pruner, per seed
     stop_after: int | None
 
-    def config(self, values: dict[str, object], seed: int) -> TrainConfig:
+    def config(self, values: Values, seed: int) -> TrainConfig:
         """The run of a trial on a seed."""
         base = self.base
         evaluation = base.evaluation
@@ -55,23 +63,32 @@ class Objective:
         config = dataclasses.replace(base, seed=seed, evaluation=evaluation, logging=quiet)
         return with_values(config, values)
 
-    def __call__(self, trial: Trial, is_stopped: Callable[[], bool]) -> float:
+    def __call__(self, trial: Trial, is_stopped: IsStopped) -> float:
         """The trial's score. Raises what training raises, `TrialPruned` and `Stopped`."""
         values = self.space.suggest(trial)
         ended: list[SeedScore] = []
         for seed in self.seeds:
-            reporter = _Reporter(trial, self, ended, seed)
-            ended.append(_learn(self.config(values, seed), reporter, is_stopped))
+            reporter = _Reporter(trial, self, ended)
+            ended.append(self.learn(values, seed, is_stopped, reporter.at))
             reporter.at(1.0, ended[-1])
             trial.set_user_attr(SEEDS, [dataclasses.asdict(each) for each in ended])
         return score(ended, self.base.total_timesteps, len(self.seeds))
+
+    def learn(
+        self,
+        values: Values,
+        seed: int,
+        is_stopped: IsStopped,
+        see: See = lambda share, standing: None,
+    ) -> SeedScore:
+        """Train on one seed; `see` is told how it stands at every evaluation but the last."""
+        return _learn(self.config(values, seed), see, is_stopped)
 
 
 class _Reporter:
     """Tells Optuna how a seed stands, and ends the trial if Optuna has seen enough."""
 
-    def __init__(self, trial: Trial, objective: Objective, ended: list[SeedScore], seed: int) -> None:
-        self.seed = seed
+    def __init__(self, trial: Trial, objective: Objective, ended: list[SeedScore]) -> None:
         self._trial = trial
         self._ended = list(ended)
         self._total = objective.base.total_timesteps
@@ -92,10 +109,10 @@ class _Reporter:
         if not is_last and self._trial.should_prune():
             import optuna
 
-            raise optuna.TrialPruned(f"at {share:.0%} of seed {self.seed}")
+            raise optuna.TrialPruned(f"at {share:.0%} of seed {standing.seed}")
 
 
-def _learn(config: TrainConfig, reporter: _Reporter, is_stopped: Callable[[], bool]) -> SeedScore:
+def _learn(config: TrainConfig, see: See, is_stopped: IsStopped) -> SeedScore:
     """Train and evaluate as a run would, and keep nothing but the end."""
     mdp = check_settings(config)
     observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
@@ -107,7 +124,7 @@ def _learn(config: TrainConfig, reporter: _Reporter, is_stopped: Callable[[], bo
 
     def standing() -> SeedScore:
         assert curve.greedy is not None
-        return SeedScore(reporter.seed, curve.certified_since_step, curve.greedy.regret)
+        return SeedScore(config.seed, curve.certified_since_step, curve.greedy.regret)
 
     def on_step(done: int) -> bool:
         nonlocal steps
@@ -118,7 +135,7 @@ def _learn(config: TrainConfig, reporter: _Reporter, is_stopped: Callable[[], bo
 
     try:
         curve.evaluate(0)
-        curve.watched_by(lambda step, _: reporter.at(step / config.total_timesteps, standing()))
+        curve.watched_by(lambda step, _: see(step / config.total_timesteps, standing()))
         agent.learn(config.total_timesteps, on_step)
         curve.watched_by(lambda step, _: None)
         curve.evaluate(steps)
