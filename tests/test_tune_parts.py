@@ -131,8 +131,8 @@ def test_a_pruned_trial_spares_its_other_seeds() -> None:
     assert max(study.trials[0].intermediate_values) == 9
 
 
-def study_of(folder: Path, objective: object, trials: int) -> tuple[optuna.Study, Task]:
-    settings = TuneConfig(trials=trials, heartbeat=1)
+def study_of(folder: Path, objective: object, trials: int, sampler: str = "tpe") -> tuple[optuna.Study, Task]:
+    settings = TuneConfig(trials=trials, heartbeat=1, sampler=sampler)
     url = f"sqlite:///{folder / 'study.db'}"
     task = Task(folder, url, "one", settings, objective, math.inf)  # type: ignore[arg-type]
     return open_study(settings, url, "one"), task
@@ -159,6 +159,23 @@ def test_what_fails_is_a_trial_with_its_reason_and_the_study_goes_on(tmp_path: P
     table = (tmp_path / "trials.csv").read_text()
     for reason in ("the objective is NaN", "agent.gamma=2: must be from 0 to 1", "ZeroDivisionError: x"):
         assert reason in table
+
+
+@pytest.mark.parametrize("sampler", ["tpe", "random"])
+def test_a_study_gone_on_with_chooses_as_an_undisturbed_one(tmp_path: Path, sampler: str) -> None:
+    def objective(trial: optuna.Trial, is_stopped: object) -> float:
+        return trial.suggest_float("x", -1, 1) ** 2
+
+    chosen = []
+    for name, parts in (("calm", [14]), ("halting", [3, 12, 14])):
+        (tmp_path / name).mkdir()
+        for trials in parts:
+            study, task = study_of(tmp_path / name, objective, trials, sampler)
+            while _next(study, task):
+                pass
+        chosen.append([trial.params["x"] for trial in study.trials])
+    assert len(set(chosen[0])) == 14
+    assert chosen[0] == chosen[1]
 
 
 def test_training_that_diverges_is_such_a_failure(tmp_path: Path) -> None:

@@ -77,15 +77,11 @@ def open_storage(settings: TuneConfig, url: str) -> RDBStorage:
         raise InputError(f"tune.storage={shown}: cannot be reached ({_first_line(error)})") from None
 
 
-def open_study(settings: TuneConfig, url: str, name: str, worker: int = 0) -> optuna.Study:
+def open_study(settings: TuneConfig, url: str, name: str) -> optuna.Study:
     """The study, made where there is none."""
     storage = open_storage(settings, url)
     with _quiet():
-        # Of the sampler's first, random choices, no worker and no continuation repeats another's.
-        seed = [settings.sampler_seed, worker]
         study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True)
-        seed.append(len(study.get_trials(deepcopy=False)))
-        study.sampler = _sampler(settings, zlib.crc32(repr(seed).encode()))
         study.pruner = _pruner(settings)
     return study
 
@@ -138,10 +134,19 @@ def put_back(study: optuna.Study, number: int) -> None:
         RetryHeartbeatStaleTrialCallback()(study, study.get_trials(deepcopy=True)[number])
 
 
-def _sampler(settings: TuneConfig, seed: int) -> optuna.samplers.BaseSampler:
-    if settings.sampler == "random":
-        return optuna.samplers.RandomSampler(seed=seed)
-    return optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True)
+def seed_sampler(study: optuna.Study, settings: TuneConfig, place: str) -> None:
+    """Give the next trial a source of chance of its own, whichever worker runs it.
+
+    So one worker's study is the same whether it was interrupted or not. `place` tells machines apart.
+    """
+    trials = len(study.get_trials(deepcopy=False))
+    seed = zlib.crc32(repr((settings.sampler_seed, trials, place)).encode())
+    with _quiet():
+        study.sampler = (
+            optuna.samplers.RandomSampler(seed=seed)
+            if settings.sampler == "random"
+            else optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True)
+        )
 
 
 def _pruner(settings: TuneConfig) -> optuna.pruners.BasePruner:

@@ -49,7 +49,7 @@ def search(task: Task, worker: int, parent: int) -> None:
     become_worker(parent)
     from gridworld.tune.storage import open_study
 
-    study = open_study(task.settings, task.url, task.name, worker)
+    study = open_study(task.settings, task.url, task.name)
     try:
         while not is_stopped() and time.time() < task.deadline and _next(study, task):
             pass
@@ -76,7 +76,7 @@ def _stop(number: int, frame: FrameType | None) -> None:
 
 def _next(study: Study, task: Task) -> bool:
     """Run a trial, or wait for those that others run; False once there are enough."""
-    from gridworld.tune.storage import give_up_stale, put_back, standing
+    from gridworld.tune.storage import give_up_stale, put_back, seed_sampler, standing
 
     with ExitStack() as turn:
         turn.enter_context(locked(task.folder / TURN))
@@ -86,6 +86,8 @@ def _next(study: Study, task: Task) -> bool:
             return False
         if now.ended + now.running < task.settings.trials:
             begun: list[int] = []
+            elsewhere = f"{socket.gethostname()}:{task.folder.absolute()}" if task.settings.storage else ""
+            seed_sampler(study, task.settings, elsewhere)
             try:
                 study.optimize(
                     functools.partial(_run, task=task, turn=turn, begun=begun), n_trials=1, catch=(Exception,)
