@@ -47,7 +47,7 @@ def render(report: Report, scenes: dict[str, list[Scene]]) -> str:
         headline="Which agent solves which task",
         lead=_lead(report),
         answers=[
-            *(tuning.sentence for tuning in report.tunings),
+            *(f"{tuning.title}. {tuning.sentence}" for tuning in report.tunings),
             *(_answer(task, report.unusable) for task in report.tasks),
         ],
         answer=tables.answer_table(report.study, report.tasks),
@@ -99,7 +99,7 @@ def _task(task: TaskAnalysis, scenes: Sequence[Scene], look: dict[str, Style]) -
 def _tuning(tuning: Tuning, scenes: Sequence[Scene]) -> dict[str, Any]:
     return {
         "title": tuning.title,
-        "facts": [f"Study {tuning.name}, {tuning.counts}.", tuning.sentence],
+        "facts": [f"Study {tuning.name}, {tuning.counts}."],
         "figures": [Markup(to_svg(scene)) for scene in scenes if scene.width == WIDTH],
         "wide": [Markup(to_svg(scene)) for scene in scenes if scene.width > WIDTH],
         "tables": [winner_table(tuning), finalists_table(tuning)],

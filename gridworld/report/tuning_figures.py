@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from gridworld.report.chart import SMALL, Axis, clipped, compact, horizontal_grid, vertical_grid
+from gridworld.report.chart import SMALL, Axis, clipped, vertical_grid
 from gridworld.report.figures import WIDTH
 from gridworld.report.scene import Dot, Line, Scene, Shape, Text, text_width
 from gridworld.report.tuning import TrialRow, Tuning
@@ -37,9 +37,8 @@ def _history(tuning: Tuning) -> Scene:
     trials = tuning.scored
     left = 48.0
     bottom = _TOP + _HEIGHT
-    highest = max(trial.score for trial in trials)
     x = Axis(0, max(1.0, *(trial.number for trial in trials)), left, WIDTH - _RIGHT)
-    y = Axis(0, 1.05 * highest or 1.0, bottom, _TOP)
+    y = _Logarithmic([trial.score for trial in trials], bottom, _TOP)
     shapes: list[Shape] = [_title("Score by trial", WIDTH)]
     shapes += [
         *_key(left, "c0", "done"),
@@ -47,7 +46,9 @@ def _history(tuning: Tuning) -> Scene:
         Line([(left + 240, 38), (left + 258, 38)], "c1", 2.2),
         Text((left + 264, 42), "best so far", "ink", SMALL),
     ]
-    shapes += horizontal_grid(y, left, WIDTH - _RIGHT, compact)
+    for tick in y.ticks():
+        shapes.append(Line([(left, y(tick)), (WIDTH - _RIGHT, y(tick))], "grid"))
+        shapes.append(Text((left - 6, y(tick) + 4), f"{tick:g}", "muted", SMALL, "end"))
     shapes += vertical_grid(x, _TOP, bottom)
     best = math.inf
     points: list[tuple[float, float]] = []
@@ -67,7 +68,7 @@ def _history(tuning: Tuning) -> Scene:
     return Scene(
         f"{tuning.name} history",
         f"Score by trial, {tuning.title.lower()}",
-        "a dot for each trial, lower is better, and a line for the best so far",
+        "a dot for each trial, on a logarithmic scale, lower is better, and a line for the best so far",
         WIDTH,
         bottom + 40,
         shapes,
@@ -102,9 +103,9 @@ def _parallel(tuning: Tuning, done: Sequence[TrialRow]) -> Scene:
     bold = max(1, round(_BEST * len(ranked)))
     keys = list(tuning.space)
     bottom = _TOP + 220
-    scores = Axis(ranked[0].score, max(ranked[-1].score, ranked[0].score + 1e-9), bottom, _TOP)
+    scores = _Logarithmic([trial.score for trial in ranked], bottom, _TOP)
     places = [40 + (WIDE - 80) * index / len(keys) for index in range(len(keys) + 1)]
-    shapes: list[Shape] = [_title("What the best tenth of the finished trials chose", WIDE)]
+    shapes: list[Shape] = [_title("What the best tenth of the finished trials chose, and the winner", WIDE)]
     scales = [_scale(tuning.space[key], bottom) for key in keys]
 
     def points(trial: TrialRow) -> list[tuple[float, float]]:
@@ -113,9 +114,9 @@ def _parallel(tuning: Tuning, done: Sequence[TrialRow]) -> Scene:
         return list(zip(places, heights, strict=True))
 
     shapes += [Line(points(trial), "muted", 0.5) for trial in ranked[bold:]]
-    shapes += [Line(points(trial), "c0", 1.6) for trial in ranked[1:bold]]
-    shapes.append(Line(points(ranked[0]), "c1", 2.6))
-    ends = [(f"{scores.low:.3f}", bottom), (f"{scores.high:.3f}", _TOP)]
+    shapes += [Line(points(trial), "c0", 1.6) for trial in ranked[:bold]]
+    shapes += [Line(points(trial), "c1", 2.6) for trial in ranked if trial.number == tuning.winner]
+    ends = [(f"{tick:g}", scores(tick)) for tick in scores.ticks()]
     for index, (place, name, marks) in enumerate(
         zip(places, ["score", *map(_short, keys)], [ends, *(marks for _, marks in scales)], strict=True)
     ):
@@ -133,6 +134,25 @@ def _parallel(tuning: Tuning, done: Sequence[TrialRow]) -> Scene:
         bottom + 44,
         shapes,
     )
+
+
+class _Logarithmic:
+    """A logarithmic scale from positive numbers to pixels; what is not positive lies at its start."""
+
+    def __init__(self, numbers: Sequence[float], start: float, end: float) -> None:
+        self._low = min((number for number in numbers if number > 0), default=1.0) / 1.1
+        self._high = max(1.1 * max(numbers), 2 * self._low)
+        self._axis = Axis(math.log(self._low), math.log(self._high), start, end)
+
+    def __call__(self, number: float) -> float:
+        return self._axis(math.log(max(number, self._low)))
+
+    def ticks(self) -> list[float]:
+        """1, 2 and 5 times the powers of ten; those powers alone where that would be too many."""
+        powers = range(math.floor(math.log10(self._low)), math.ceil(math.log10(self._high)) + 1)
+        factors = (1, 2, 5) if len(powers) < 5 else (1,)
+        found = [factor * 10.0**power for power in powers for factor in factors]
+        return [tick for tick in found if self._low <= tick <= self._high]
 
 
 Scale = Callable[[str], float]

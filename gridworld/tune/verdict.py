@@ -34,7 +34,7 @@ class Sample:
         median = statistics.interval(statistics.median, [self.steps], 0)
         form = steps_up_to(self.total)
         bounds = f"[{form(median.low)}, {form(median.high)}]"
-        return f"{told}, half of the seeds by step {form(median.point)} {bounds}"
+        return f"{told}, for good by step {form(median.point)} {bounds} in the median"
 
 
 def sample(runs: Sequence[Job]) -> Sample:
