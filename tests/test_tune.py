@@ -180,7 +180,7 @@ def test_a_search_space_that_makes_no_sense(
         (["tune.storage=postgresql://me:secret@127.0.0.1:1/x"], "tune.storage=postgresql://me:***@127.0.0.1"),
         (["tune.study=a/b"], "tune.study=a/b: must be of letters"),
         (["hydra.run.dir=x"], "tune.py makes its own folder"),
-        (["--config-dir", "nowhere"], "--config-dir nowhere: no such folder"),
+        (["--config-dir", "nowhere", "env=cliff"], "--config-dir nowhere: no such folder"),
     ],
 )
 def test_a_command_line_that_cannot_be_meant(

@@ -15,7 +15,7 @@ from gridworld.config import DimensionConfig, TuneConfig
 from gridworld.errors import InputError
 from gridworld.report import statistics
 from gridworld.training import check_settings
-from gridworld.tune.asked import ask
+from gridworld.tune.asked import Source, ask
 from gridworld.tune.records import write_trials
 from gridworld.tune.score import SeedScore, score
 from gridworld.tune.space import Space, with_values
@@ -25,6 +25,7 @@ from gridworld.tune.verdict import Sample, compare
 from gridworld.tune.worker import Task, _next
 
 SPACES = sorted(file.stem for file in (CONF / "tune").glob("*.yaml"))
+SOURCE = Source(CONF)
 TOTAL = 1000
 ONE_SEED = st.builds(
     SeedScore,
@@ -62,7 +63,7 @@ def test_the_score_of_known_seeds() -> None:
 
 @pytest.mark.parametrize("name", SPACES)
 def test_a_shipped_space_holds_the_shipped_settings(name: str) -> None:
-    asked = ask(CONF, [f"agent={name}"], None)
+    asked = ask(SOURCE, [f"agent={name}"])
     first = asked.space.parameters_of(asked.base)
     assert first is not None
     assert with_values(asked.base, asked.space.values(first)) == asked.base
@@ -70,14 +71,14 @@ def test_a_shipped_space_holds_the_shipped_settings(name: str) -> None:
 
 @pytest.mark.parametrize("name", SPACES)
 def test_what_a_shipped_space_suggests_can_train(name: str) -> None:
-    asked = ask(CONF, [f"agent={name}"], None)
+    asked = ask(SOURCE, [f"agent={name}"])
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     for _ in range(20):
         check_settings(with_values(asked.base, asked.space.suggest(study.ask())))
 
 
 def test_every_batch_of_ppo_divides_every_rollout() -> None:
-    asked = ask(CONF, ["agent=ppo"], None)
+    asked = ask(SOURCE, ["agent=ppo"])
     keys = ("agent.n_steps", "agent.batch_size")
     lists = [asked.space.dimensions[key].choices or [] for key in keys]
     for choice in itertools.product(*lists):
@@ -102,7 +103,7 @@ def test_lists_and_arguments_of_a_class_can_be_searched() -> None:
 
 
 def small(*words: str) -> Objective:
-    asked = ask(CONF, ["agent=q_learning", "total_timesteps=1500", "tune.seeds=2", *words], None)
+    asked = ask(SOURCE, ["agent=q_learning", "total_timesteps=1500", "tune.seeds=2", *words])
     return Objective(asked.measured, asked.space, asked.seeds, asked.settings.reports, 2)
 
 
@@ -179,7 +180,7 @@ def test_a_study_gone_on_with_chooses_as_an_undisturbed_one(tmp_path: Path, samp
 
 
 def test_training_that_diverges_is_such_a_failure(tmp_path: Path) -> None:
-    asked = ask(CONF, ["agent=ppo", "agent.learning_rate=1e30", "total_timesteps=9000", "tune.seeds=1"], None)
+    asked = ask(SOURCE, ["agent=ppo", "agent.learning_rate=1e30", "total_timesteps=9000", "tune.seeds=1"])
     space = Space({"agent.clip_range": DimensionConfig("float", low=0.1, high=0.3)}, "own")
     study, task = study_of(tmp_path, Objective(asked.measured, space, asked.seeds, 10, 2), 1)
     while _next(study, task):

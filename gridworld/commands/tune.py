@@ -51,23 +51,23 @@ examples:
 def main(arguments: Sequence[str]) -> None:
     """Search, confirm, and say what came of it."""
     conf = Path(sys.argv[0]).resolve().parents[1] / "conf"
-    options = _parser(conf).parse_args(arguments)
+    options = _parser(conf).parse_intermixed_args(arguments)
     if importlib.util.find_spec("optuna") is None:
         raise InputError("tune.py: optuna is not installed; pip install 'gridworld[tune]'")
     if options.config_dir is not None and not options.config_dir.is_dir():
         raise InputError(f"--config-dir {options.config_dir}: no such folder")
-    from gridworld.tune.asked import ask
+    from gridworld.tune.asked import Source, ask
 
-    asked = ask(conf, options.overrides, options.config_dir)
+    source = Source(conf, (options.config_dir,) if options.config_dir else ())
+    asked = ask(source, options.overrides)
     if options.cfg:
         _show(asked)
         return
     from gridworld.training import Interrupted
-    from gridworld.tune.recipe import Source
     from gridworld.tune.study import tune
 
     try:
-        tune(asked, Source(conf, options.config_dir))
+        tune(asked, source)
     except Interrupted as interruption:
         again = shlex.join(["python", *sys.argv])
         print(f"{interruption}; nothing that ended is lost; go on with: {again}", file=sys.stderr)

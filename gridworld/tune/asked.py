@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ CHOSEN = ("agent", "env", "observation")
 _SAMPLERS = ("tpe", "random")
 _PRUNERS = ("median", "hyperband", "none")
 _LARGEST_SEED = 2**32
+_PLAIN = re.compile(r"[\w./:-]+")  # what Hydra takes without quotes
 
 
 @dataclass(frozen=True)
@@ -80,17 +82,25 @@ class Asked:
         return tuple(range(first, first + self.settings.confirm_seeds))
 
 
-def ask(conf: Path, words: Sequence[str], config_dir: Path | None) -> Asked:
+@dataclass(frozen=True)
+class Source:
+    """Where configurations come from: `conf`, and folders of the user's, which are searched after it."""
+
+    conf: Path
+    own: tuple[Path, ...] = ()
+
+
+def ask(source: Source, words: Sequence[str]) -> Asked:
     """Compose and check everything. Raises `InputError`."""
     register_schemas()
     try:
         of_search, of_run = _divide(words)
-        whole = compose_in(conf, config_dir, "train", of_run)
+        whole = compose_in(source, "train", of_run)
         choices = {group: str(whole.hydra.runtime.choices[group]) for group in CHOSEN}
         base = without_hydra(whole)
         if not any(override.key_or_group == "tune" for override in of_search):
             of_search = [*of_search, *_parse([f"tune={choices['agent']}"])]
-        search = compose_in(conf, config_dir, "tune", of_search)
+        search = compose_in(source, "tune", of_search)
         space_name = str(search.hydra.runtime.choices["tune"])
         settings = cast(TuneConfig, OmegaConf.to_object(search.tune))
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
@@ -106,19 +116,24 @@ def ask(conf: Path, words: Sequence[str], config_dir: Path | None) -> Asked:
     return asked
 
 
-def compose_in(
-    conf: Path, config_dir: Path | None, name: str, overrides: Sequence[Override | str]
-) -> DictConfig:
-    """Hydra's composition, its own part included; `config_dir` is searched after `conf`."""
+def compose_in(source: Source, name: str, overrides: Sequence[Override | str]) -> DictConfig:
+    """Hydra's composition, its own part included."""
     lines = [str(each.input_line) if isinstance(each, Override) else each for each in overrides]
-    if config_dir is not None:
-        lines.append(f"hydra.searchpath=['file://{config_dir.absolute()}']")
+    if source.own:
+        lines.append(search_path(source.own))
     with (
         warnings.catch_warnings(),
-        hydra.initialize_config_dir(version_base="1.3", config_dir=str(conf.absolute())),
+        hydra.initialize_config_dir(version_base="1.3", config_dir=str(source.conf.absolute())),
     ):
         warnings.simplefilter("error", UserWarning)  # a folder that is not there
         return hydra.compose(name, lines, return_hydra_config=True)
+
+
+def search_path(folders: Sequence[Path]) -> str:
+    """The override that lets Hydra look there too."""
+    places = [f"file://{folder.resolve()}" for folder in folders]
+    quoted = [place if _PLAIN.fullmatch(place) else f"'{place}'" for place in places]
+    return f"hydra.searchpath=[{','.join(quoted)}]"
 
 
 def without_hydra(whole: DictConfig) -> TrainConfig:

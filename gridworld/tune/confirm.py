@@ -14,10 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gridworld.config import TrainConfig
+from gridworld.run import MANIFEST
 from gridworld.sweep.job import JobError, run_in_sweep
+from gridworld.sweep.table import read_json
 from gridworld.tune.worker import become_worker, is_stopped
 
 CONFIRM = "confirm"  # the runs' folder, in the study's
+_ENDED = ("finished", "failed")
 
 
 @dataclass(frozen=True)
@@ -44,14 +47,21 @@ def prepare(folder: Path, runs: Sequence[Job]) -> None:
 
 
 def work(task: Sequence[Job], worker: int, parent: int) -> None:
-    """Run what nobody has run yet. Ends with the parent, however that ends."""
+    """Run what nobody has run yet, until all have ended. Ends with the parent, however that ends."""
     become_worker(parent)
-    for job in task:
-        if is_stopped():
-            break
-        job.folder.mkdir(parents=True, exist_ok=True)
-        try:
-            run_in_sweep(job.config, job.folder, [], stop_at_failure=False)
-        except JobError as error:
-            print(f"{job.folder}: {error}", file=sys.stderr, flush=True)
+    left = list(task)
+    while left and not is_stopped():
+        for job in left:
+            if not is_stopped():
+                _run(job)
+        # Some may be at work elsewhere, in the folder's other workers or in another command's.
+        left = [job for job in left if read_json(job.folder / MANIFEST).get("status") not in _ENDED]
     sys.exit(0)
+
+
+def _run(job: Job) -> None:
+    job.folder.mkdir(parents=True, exist_ok=True)
+    try:
+        run_in_sweep(job.config, job.folder, [], stop_at_failure=False)
+    except JobError as error:
+        print(f"{job.folder}: {error}", file=sys.stderr, flush=True)

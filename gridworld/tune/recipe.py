@@ -3,13 +3,13 @@
     python scripts/train.py --config-dir runs/STUDY experiment=winner
 
 It names the agent, the world and the observation, and every value in which the winner differs from these.
+Where one of them is in a folder of the user's own, train.py needs that too.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +17,10 @@ from omegaconf import OmegaConf
 
 from gridworld.config import TrainConfig
 from gridworld.files import write_text
-from gridworld.tune.asked import compose_in, without_hydra
+from gridworld.tune.asked import Source, compose_in, without_hydra
 
 RECIPE = "winner"
 _NOT_OF_A_RECIPE = ("seed", "device", "threads", "logging", "recording")
-
-
-@dataclass(frozen=True)
-class Source:
-    """Where configurations come from."""
-
-    conf: Path
-    config_dir: Path | None  # the user's own
 
 
 def write_recipe(
@@ -36,7 +28,7 @@ def write_recipe(
 ) -> Path:
     """Write it and make sure that it comes to `config` again; returns its path."""
     overrides = [f"{group}={choice}" for group, choice in choices.items()]
-    bare = without_hydra(compose_in(source.conf, source.config_dir, "train", overrides))
+    bare = without_hydra(compose_in(source, "train", overrides))
     values = _difference(_relevant(bare), _relevant(config))
     lines = ["# @package _global_", f"# {about}", "defaults:"]
     lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
@@ -44,9 +36,9 @@ def write_recipe(
     path = folder / "experiment" / f"{RECIPE}.yaml"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, "\n".join(lines))
-    if source.config_dir is None:  # else it may need both folders
-        again = without_hydra(compose_in(source.conf, folder, "train", [f"experiment={RECIPE}"]))
-        assert _relevant(again) == _relevant(config), f"{path} does not say what the winner is"
+    own = dataclasses.replace(source, own=(*source.own, folder))
+    again = without_hydra(compose_in(own, "train", [f"experiment={RECIPE}"]))
+    assert _relevant(again) == _relevant(config), f"{path} does not say what the winner is"
     return path
 
 

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import itertools
 import math
+import shlex
 import sys
 import time
 from pathlib import Path
@@ -15,20 +16,19 @@ import optuna
 
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
-from gridworld.report.tuning import TRIALS_CSV
 from gridworld.run import MANIFEST, SWEEP_JSON, check_writable
 from gridworld.sweep.report import shown
 from gridworld.tune import confirm, verdict
-from gridworld.tune.asked import Asked
+from gridworld.tune.asked import Asked, Source, search_path
 from gridworld.tune.crew import run_crew
 from gridworld.tune.finals import Final, Finalist, finalists, missing, ranking
 from gridworld.tune.finals import work as finals_work
 from gridworld.tune.progress import SearchProgress
-from gridworld.tune.recipe import RECIPE, Source, write_recipe
+from gridworld.tune.recipe import RECIPE, write_recipe
 from gridworld.tune.records import write_study
 from gridworld.tune.space import with_values
 from gridworld.tune.storage import begin, open_storage, open_study, standing
-from gridworld.tune.trial import Objective
+from gridworld.tune.trial import ERROR, Objective
 from gridworld.tune.worker import Task, search
 
 
@@ -102,10 +102,9 @@ def _finals(asked: Asked, study: optuna.Study, task: Task) -> list[Finalist]:
     """The finalists, the winner first."""
     trials = finalists(study, asked.settings.finalists, asked.space.parameters_of(asked.base))
     if not trials:
-        raise InputError(
-            f"{shown(asked.folder)}: none of {standing(study).ended} trials came to an end; "
-            f"the reasons are in {TRIALS_CSV}"
-        )
+        reasons = [trial.user_attrs[ERROR] for trial in study.trials if trial.user_attrs.get(ERROR)]
+        why = f"all {len(reasons)} failed, the first: {reasons[0]}" if reasons else "there was no time"
+        raise InputError(f"{shown(asked.folder)}: no trial came to a score; {why}")
     seeds = tuple(asked.final_seeds)
     if runs := missing(study, trials, seeds):
         print(
@@ -136,7 +135,11 @@ def _conclude(asked: Asked, study: optuna.Study, source: Source, ranked: list[Fi
         "confirmation": confirmed,
     }
     write_study(asked, study, outcome)
-    _tell(asked, values, confirmed["sentence"], recipe)
+    own = [search_path(source.own)] if source.own else []
+    line = shlex.join(
+        ["python", "scripts/train.py", "--config-dir", shown(asked.folder), f"experiment={RECIPE}", *own]
+    )
+    _tell(asked, values, [confirmed["sentence"], f"  recipe: {shown(recipe)}", f"  train it: {line}"])
 
 
 def _tuned(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
@@ -163,14 +166,12 @@ def _confirm(asked: Asked, winner: list[confirm.Job], began_from: list[confirm.J
     }
 
 
-def _tell(asked: Asked, values: dict[str, Any], sentence: str, recipe: Path) -> None:
+def _tell(asked: Asked, values: dict[str, Any], lines: list[str]) -> None:
     before = asked.space.parameters_of(asked.base) or {}
     width = max(map(len, values))
     print("winner:")
     for key, value in values.items():
         was = f"  (was {before[key]})" if key in before and before[key] != value else ""
         print(f"  {key:<{width}}  {value}{was}")
-    where = shown(asked.folder)
-    print(f"{sentence}\n  recipe: {shown(recipe)}")
-    print(f"  train it: python scripts/train.py --config-dir {where} experiment={RECIPE}")
-    print(f"  look at it: python scripts/report.py {where}", flush=True)
+    print(*lines, sep="\n")
+    print(f"  look at it: python scripts/report.py {shown(asked.folder)}", flush=True)
