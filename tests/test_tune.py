@@ -244,17 +244,18 @@ def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path
     with start(tmp_path) as process:
         killed = wait_for_a_trial(tmp_path)[0]
         os.kill(killed, signal.SIGKILL)
+        assert process.stderr is not None
+        told = next(line for line in process.stderr if "lost" in line)
+        assert told.strip() == "a worker was lost to SIGKILL; its trial is run again"
         end = time.monotonic() + 60
         while not (others := [worker for worker in running(tmp_path) if worker != killed]):
             assert time.monotonic() < end, "no other trial begins"
             time.sleep(0.05)
         asked = time.monotonic()
         process.send_signal(signal.SIGINT)
-        assert process.stderr is not None
         told = process.stderr.read()  # until the last worker has let go of it
     assert time.monotonic() - asked < 10  # seconds, on a machine that is busy
     assert process.returncode == 130
-    assert "a worker was lost to SIGKILL; its trial is run again" in told
     assert "stopped by SIGINT; nothing that ended is lost; go on with: python" in told
     assert not any(map(is_alive, others))
     ended = [row for row in rows(tmp_path) if row["status"] == "done"]

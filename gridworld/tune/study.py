@@ -18,6 +18,7 @@ from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.run import MANIFEST, SWEEP_JSON, check_writable
 from gridworld.sweep.report import shown
+from gridworld.training import hparams, make_mdp
 from gridworld.tune import confirm, verdict
 from gridworld.tune.asked import Asked, Source, search_path
 from gridworld.tune.crew import run_crew
@@ -74,13 +75,11 @@ def _check_folder(folder: Path) -> None:
 
 def _about(asked: Asked) -> dict[str, Any]:
     """What makes trials comparable; the study of another is refused."""
-    settings = dataclasses.asdict(asked.base)
-    for without_effect in ("logging", "recording", "seed"):
-        del settings[without_effect]
-    flat = dict(_flat(settings))
+    settings = {key: value for key, value in hparams(asked.base).items() if value is not None}
+    del settings["seed"]
     return {
         "search space": asked.space.plain(),
-        "configuration": {key: value for key, value in flat.items() if value is not None},
+        "configuration": settings | {"map": make_mdp(asked.base.env).layout.text()},
         "objective": {
             "seeds": list(asked.seeds),
             "stop_after": asked.settings.stop_after,
@@ -88,14 +87,6 @@ def _about(asked: Asked) -> dict[str, Any]:
             "reports": asked.settings.reports,
         },
     }
-
-
-def _flat(content: dict[str, Any], prefix: str = "") -> Any:
-    for key, value in content.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, value
 
 
 def _finals(asked: Asked, study: optuna.Study, task: Task) -> list[Finalist]:

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from optuna.trial import Trial
 
 See = Callable[[float, SeedScore], None]  # (share of the budget, how the seed stands)
-
 IsStopped = Callable[[], bool]
 
 SEEDS, ERROR = "seeds", "error"  # a trial's attributes in the storage
@@ -74,13 +73,7 @@ class Objective:
             trial.set_user_attr(SEEDS, [dataclasses.asdict(each) for each in ended])
         return score(ended, self.base.total_timesteps, len(self.seeds))
 
-    def learn(
-        self,
-        values: Values,
-        seed: int,
-        is_stopped: IsStopped,
-        see: See = lambda share, standing: None,
-    ) -> SeedScore:
+    def learn(self, values: Values, seed: int, is_stopped: IsStopped, see: See = _unseen) -> SeedScore:
         """Train on one seed; `see` is told how it stands at every evaluation but the last."""
         return _learn(self.config(values, seed), see, is_stopped)
 
