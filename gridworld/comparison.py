@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gridworld.agents import family
 from gridworld.config import TrainConfig
-from gridworld.data_files import read_object, read_text
+from gridworld.data_files import LARGEST_CSV, read_object, read_text
 from gridworld.event_file import read_scalars
 from gridworld.mdp import ACTION_NAMES, Mdp
 from gridworld.run import LARGEST_RESULT, Run
@@ -28,7 +28,6 @@ from gridworld.saved_run import read_visits
 
 CLOCK = {"train_seconds", "evaluation_seconds"}  # of the summary
 CLOCK_TAGS = "time/"  # what TensorBoard's tags of SB3's own speed begin with
-_LARGEST_CSV = 64 * 2**20  # bytes
 _SPARE_BYTES = 2**20
 
 
@@ -71,7 +70,7 @@ def _curves(then: Run, now: Run) -> Finding:
 
 
 def _lines(path: Path) -> list[str]:
-    return read_text(path, _LARGEST_CSV).splitlines()
+    return read_text(path, LARGEST_CSV).splitlines()
 
 
 def _cell(text: str | None) -> str:

@@ -21,6 +21,7 @@ from typing import Any
 from gridworld.errors import InputError
 
 LARGEST_JSON = 4 * 2**20  # bytes
+LARGEST_CSV = 64 * 2**20
 
 
 def read_bytes(path: Path, most: int) -> bytes:

@@ -23,7 +23,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gridworld.config import AGENT_SCHEMAS, LAUNCHER_SCHEMAS, SweepConfig, TrainConfig
+from gridworld.config import AGENT_SCHEMAS, LAUNCHER_SCHEMAS, SearchConfig, SweepConfig, TrainConfig
 from gridworld.errors import EXIT_CODE, InputError
 from gridworld.hydra_errors import refuse_added_keys, sentence, unreadable_file
 from gridworld.manual import manual
@@ -166,16 +166,17 @@ def register_schemas() -> None:
     """Tell Hydra the schemas of `config.py`, and OmegaConf the functions that `conf/` uses."""
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig)
+    store.store(name="tune_schema", node=SearchConfig)
     store.store(group="hydra/sweeper", name="gridworld", node=SweepConfig)
     for name, launcher in LAUNCHER_SCHEMAS.items():
         store.store(group="hydra/launcher/schema", name=name, node=launcher)
     for name, schema in AGENT_SCHEMAS.items():
         store.store(group="agent/schema", name=name, node=schema)
-    OmegaConf.register_new_resolver("slug", _slug, replace=True)
+    OmegaConf.register_new_resolver("slug", slug, replace=True)
     OmegaConf.register_new_resolver("token", lambda: secrets.token_hex(3), use_cache=True, replace=True)
 
 
-def _slug(text: Any) -> str:
+def slug(text: Any) -> str:
     """Letters, digits and a few safe signs, of bounded length, for a folder's name."""
     name = re.sub(r"[^A-Za-z0-9_.,=+-]+", "-", Path(str(text)).stem if "/" in str(text) else str(text))
     return name.strip("-.")[:_LONGEST_NAME] or "run"

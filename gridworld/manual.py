@@ -9,6 +9,7 @@ import textwrap
 from pathlib import Path
 
 EXPERIMENTS = "experiment"  # the group of recipes
+SPACES = "tune"  # the group of search spaces, which is tune.py's
 
 _TEXT = """\
 Train an agent on a GridWorld whose optimum is known exactly.
@@ -49,7 +50,7 @@ Examples:
       every recipe of a task, with twenty seeds each
 
 Afterwards: scripts/evaluate.py, scripts/record.py and scripts/play.py --agent, with a run's folder;
-scripts/jobs.py, with a sweep's.
+scripts/jobs.py, with a sweep's. Before: scripts/tune.py finds settings.
 Hydra's own options: python scripts/train.py --hydra-help
 """
 
@@ -61,11 +62,17 @@ def manual(conf: Path) -> str:
 
 def _choices(conf: Path) -> list[str]:
     lines = []
-    for group in sorted({file.parent for file in conf.glob("**/*.yaml")} - {conf}):
+    groups = {file.parent for file in conf.glob("**/*.yaml")} - {conf, conf / SPACES}
+    for group in sorted(groups):
         lines.append(f"  {group.relative_to(conf).as_posix()}=...")
         files = sorted(group.glob("*.yaml"))
-        lines += _recipes(conf, files) if group.name == EXPERIMENTS else map(_choice, files)
+        lines += _recipes(conf, files) if group.name == EXPERIMENTS else choices(group)
     return lines
+
+
+def choices(group: Path) -> list[str]:
+    """A line for each file of a group."""
+    return [_choice(file) for file in sorted(group.glob("*.yaml"))]
 
 
 def _choice(file: Path) -> str:

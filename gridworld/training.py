@@ -66,7 +66,7 @@ def train(
 
     run.start(dataclasses.asdict(config), mdp.layout.text(), overrides)
     try:
-        with _signals_raise():
+        with signals_raise():
             summary = _learn(config, run, judge, agent, seat, log)
     except Interrupted as interruption:
         run.end("interrupted", str(interruption))
@@ -214,7 +214,7 @@ def _flatten(content: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, H
 
 
 @contextmanager
-def _signals_raise() -> Iterator[None]:
+def signals_raise() -> Iterator[None]:
     """SIGINT and SIGTERM raise `Interrupted` in the main thread, so that files are closed on the way out."""
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -16,7 +16,7 @@ from gridworld.observations import make_observation
 from gridworld.saved_run import read_config
 from gridworld.training import hparams, make_mdp
 
-GROUPS = sorted(folder.name for folder in CONF.iterdir() if folder.is_dir())
+GROUPS = sorted(folder.name for folder in CONF.iterdir() if folder.is_dir() and folder.name != "tune")
 CHOICES = [(group, file.stem) for group in GROUPS for file in sorted((CONF / group).glob("*.yaml"))]
 AGENTS = {choice for group, choice in CHOICES if group == "agent"}
 FROM_ELSEWHERE = {"self", "env", "seed", "device", "tensorboard_log", "verbose", "_init_setup_model"}

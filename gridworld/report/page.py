@@ -13,7 +13,7 @@ from markupsafe import Markup
 from gridworld.report import tables
 from gridworld.report.analysis import Comparison, Result, TaskAnalysis
 from gridworld.report.embed import pictures
-from gridworld.report.figures import task_figures
+from gridworld.report.figures import WIDTH, task_figures
 from gridworld.report.metrics import METRICS
 from gridworld.report.reading import Unusable
 from gridworld.report.report import Report
@@ -21,12 +21,15 @@ from gridworld.report.scene import DARK, LIGHT, Scene, Style, styles
 from gridworld.report.statistics import RESAMPLES, Share
 from gridworld.report.svg import to_svg
 from gridworld.report.table import Cell, Table, interval_text, is_text, main_text, number
+from gridworld.report.tuning import Tuning, finalists_table, trials_table, winner_table
+from gridworld.report.tuning_figures import tuning_figures
 
 
 def figures(report: Report) -> dict[str, list[Scene]]:
-    """The figures by task, in the agents' colours."""
+    """The figures by task, in the agents' colours, and those of tuning studies."""
     look = styles(report.study.agents)
-    return {task.task: list(task_figures(task, look)) for task in report.tasks}
+    of_tasks = {task.task: list(task_figures(task, look)) for task in report.tasks}
+    return of_tasks | {tuning.title: list(tuning_figures(tuning)) for tuning in report.tunings}
 
 
 def render(report: Report, scenes: dict[str, list[Scene]]) -> str:
@@ -43,11 +46,15 @@ def render(report: Report, scenes: dict[str, list[Scene]]) -> str:
         title="Evidence",
         headline="Which agent solves which task",
         lead=_lead(report),
-        answers=[_answer(task, report.unusable) for task in report.tasks],
+        answers=[
+            *(f"{tuning.title}. {tuning.sentence}" for tuning in report.tunings),
+            *(_answer(task, report.unusable) for task in report.tasks),
+        ],
         answer=tables.answer_table(report.study, report.tasks),
         problems=report.problems,
         warnings=[*report.study.warnings, *_doubts(report)],
         notes=[*report.study.notes, *report.notes],
+        tunings=[_tuning(tuning, scenes[tuning.title]) for tuning in report.tunings],
         tasks=[_task(task, scenes[task.task], look) for task in report.tasks],
         overall=tables.overall_table(report.overall) if report.overall else None,
         overall_improvements=_improvements(report.overall.comparisons, "all tasks") if report.overall else [],
@@ -86,6 +93,17 @@ def _task(task: TaskAnalysis, scenes: Sequence[Scene], look: dict[str, Style]) -
         "improvements": improvements(task),
         "pictures": [found for result in task.results if (found := list(pictures(result)))],
         "layout": run.layout,
+    }
+
+
+def _tuning(tuning: Tuning, scenes: Sequence[Scene]) -> dict[str, Any]:
+    return {
+        "title": tuning.title,
+        "facts": [f"Study {tuning.name}, {tuning.counts}."],
+        "figures": [Markup(to_svg(scene)) for scene in scenes if scene.width == WIDTH],
+        "wide": [Markup(to_svg(scene)) for scene in scenes if scene.width > WIDTH],
+        "tables": [winner_table(tuning), finalists_table(tuning)],
+        "trials": trials_table(tuning),
     }
 
 

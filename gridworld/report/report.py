@@ -14,6 +14,7 @@ from gridworld.report.analysis import Overall, TaskAnalysis, analyse
 from gridworld.report.find import find_runs
 from gridworld.report.grouping import Study, arrange
 from gridworld.report.reading import Evidence, Unusable, flat, read
+from gridworld.report.tuning import Tuning, find_tunings
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +28,7 @@ class Report:
     problems: tuple[str, ...]  # with the paths that were given
     notes: tuple[str, ...]
     seed: int  # of the bootstrap
+    tunings: tuple[Tuning, ...] = ()
 
     @property
     def complete(self) -> bool:
@@ -50,7 +52,8 @@ def gather(paths: Sequence[Path], seed: int = 0) -> Report:
         )
     study = arrange(runs)
     tasks, overall = analyse(study, seed)
-    return Report(study, tasks, overall, unusable, tuple(problems), _foreign(runs), seed)
+    tunings, unread = find_tunings(paths)
+    return Report(study, tasks, overall, unusable, (*problems, *unread), _foreign(runs), seed, tuple(tunings))
 
 
 def _foreign(runs: Sequence[Evidence]) -> tuple[str, ...]:

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gridworld.data_files import read_text
+from gridworld.data_files import LARGEST_CSV, read_text
 from gridworld.errors import InputError
 from gridworld.mdp import FloatArray
 
-_LARGEST_CSV = 64 * 2**20  # bytes
 _MOST_COLUMNS = 100
 
 REQUIRED = ("step", "value", "regret", "certified", "goal_probability", "return")
@@ -23,7 +22,7 @@ _OPTIONAL = (SAMPLED_RETURN, ONLINE)
 
 def read_curve(path: Path) -> dict[str, FloatArray]:
     """The columns of a learning curve that are needed, (evaluations,) each."""
-    lines = read_text(path, _LARGEST_CSV).splitlines()
+    lines = read_text(path, LARGEST_CSV).splitlines()
     if lines and lines[0].count(",") >= _MOST_COLUMNS:
         raise InputError(f"{path}: has more than {_MOST_COLUMNS} columns; is it of another version?")
     try:

@@ -17,6 +17,7 @@ from gridworld.report.page import figures, improvements, render
 from gridworld.report.png import to_png
 from gridworld.report.report import Report
 from gridworld.report.table import Table, to_csv, to_markdown
+from gridworld.report.tuning import finalists_table, trials_table, winner_table
 
 PAGE = "report.html"
 FIGURES, TABLES, EVENTS = "figures", "tables", "tensorboard"
@@ -102,6 +103,10 @@ def _tables(report: Report) -> Iterator[Table]:
         yield from improvements(task)
     if report.overall is not None:
         yield tables.overall_table(report.overall)
+    for tuning in report.tunings:
+        yield winner_table(tuning)
+        yield finalists_table(tuning)
+        yield trials_table(tuning)
 
 
 def _file_names(names: Iterable[str]) -> list[str]:

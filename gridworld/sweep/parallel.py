@@ -9,18 +9,13 @@ from __future__ import annotations
 import functools
 import os
 import signal
-import threading
-import time
 from collections.abc import Sequence
 
 from hydra.core.utils import JobReturn
 from joblib import Parallel, delayed
 
+from gridworld.process import end_with, parent_died
 from gridworld.sweep.worker import Hydra, unpack
-
-_SECONDS_BETWEEN_LOOKS = 0.2
-_GRACE_SECONDS = 3.0  # to close the files
-_parent_died = threading.Event()
 
 
 def launch(hydra: Hydra, n_jobs: int, jobs: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
@@ -40,22 +35,13 @@ def _run(state: bytes, parent: int, overrides: list[str], number: int) -> JobRet
     try:
         return unpack(state).run(overrides, number)
     except SystemExit:
-        if _parent_died.is_set():
+        if parent_died.is_set():
             os._exit(1)  # nobody is there to take the result; waiting for that would take seconds
         raise
 
 
 @functools.cache
 def _end_with(parent: int) -> None:
-    """End soon after the parent, even if that is killed: first as if asked to, then in any case."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(_SECONDS_BETWEEN_LOOKS)
-        _parent_died.set()
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(_GRACE_SECONDS)
-        os._exit(1)
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent too, which knows what to do
-    threading.Thread(target=watch, daemon=True, name="watch on the sweep").start()
+    """Once a worker: its end is its parent's business, Ctrl-C reaches that too."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with(parent)

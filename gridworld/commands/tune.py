@@ -1,0 +1,95 @@
+"""Search an agent's settings for a task, and confirm the winner on seeds that the search has not seen.
+
+Overrides compose the configuration to begin from, as for train.py. What is searched stands in a file:
+{spaces}
+The same line again goes on with the study. On several machines, with tune.storage=URL of a database that all
+reach, they work on it together.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import importlib.util
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gridworld.errors import InputError
+from gridworld.manual import choices
+
+if TYPE_CHECKING:
+    from gridworld.tune.asked import Asked
+
+_EPILOG = """\
+keys, beside all of train.py's (defaults in conf/tune.yaml):
+  tune=NAME            another file of conf/tune, or of --config-dir's tune/
+  tune.trials          how many, those of earlier calls included (100)
+  tune.seeds           of a trial: seed, seed + 1, ... (3)
+  tune.finalists       trials that go on (5) to more seeds, tune.final_seeds (10)
+  tune.confirm_seeds   still others, for the winner and what the search began from (20)
+  tune.study           its name, by which it is gone on with; tune.folder, its folder (runs/STUDY)
+  tune.storage         any database URL of Optuna's (an SQLite file in the folder)
+  tune.workers         processes (one on each core); tune.timeout, seconds
+  tune.sampler         tpe, random; tune.pruner: median, hyperband, none
+
+examples:
+  python scripts/tune.py agent=ppo env=four_rooms
+      a hundred trials of three seeds; then
+  python scripts/train.py --config-dir runs/tune_ppo_four_rooms experiment=winner
+  python scripts/tune.py experiment=maze_ppo tune.trials=300 tune.study=maze
+      begins from a recipe
+  python scripts/tune.py agent=ppo tune=mine --config-dir my_conf
+      a search space of your own, my_conf/tune/mine.yaml
+  python scripts/report.py runs/tune_ppo_four_rooms
+      the study as a page: its history, which settings mattered, the winner's runs
+"""
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Search, confirm, and say what came of it."""
+    conf = Path(sys.argv[0]).resolve().parents[1] / "conf"
+    options = _parser(conf).parse_intermixed_args(arguments)
+    if importlib.util.find_spec("optuna") is None:
+        raise InputError("tune.py: optuna is not installed; pip install 'gridworld[tune]'")
+    if options.config_dir is not None and not options.config_dir.is_dir():
+        raise InputError(f"--config-dir {options.config_dir}: no such folder")
+    from gridworld.tune.asked import Source, ask
+
+    source = Source(conf, (options.config_dir,) if options.config_dir else ())
+    asked = ask(source, options.overrides)
+    if options.cfg:
+        _show(asked)
+        return
+    from gridworld.training import Interrupted
+    from gridworld.tune.study import tune
+
+    try:
+        tune(asked, source)
+    except Interrupted as interruption:
+        again = shlex.join(["python", *sys.argv])
+        print(f"{interruption}; nothing that ended is lost; go on with: {again}", file=sys.stderr)
+        sys.exit(interruption.exit_code)
+
+
+def _parser(conf: Path) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="tune.py",
+        description=(__doc__ or "").format(spaces="\n".join(choices(conf / "tune"))),
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="train.py's and tune.*")
+    parser.add_argument("--config-dir", type=Path, help="a folder of your own yaml files, beside conf/")
+    parser.add_argument("--cfg", action="store_true", help="print the configuration and do nothing")
+    return parser
+
+
+def _show(asked: Asked) -> None:
+    from omegaconf import OmegaConf
+
+    print(OmegaConf.to_yaml(OmegaConf.structured(asked.base)).rstrip())
+    settings = dataclasses.replace(asked.settings, space={})
+    print(OmegaConf.to_yaml({"tune": dataclasses.asdict(settings) | {"space": asked.space.plain()}}).rstrip())

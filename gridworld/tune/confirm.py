@@ -1,0 +1,67 @@
+"""The winner beside the configuration that the search began from, on seeds that no trial has seen.
+
+The best of many trials on a few seeds owes something to luck. These runs are ordinary ones, with a folder
+each; what is there already is kept.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gridworld.config import TrainConfig
+from gridworld.run import MANIFEST
+from gridworld.sweep.job import JobError, run_in_sweep
+from gridworld.sweep.table import read_json
+from gridworld.tune.worker import become_worker, is_stopped
+
+CONFIRM = "confirm"  # the runs' folder, in the study's
+_ENDED = ("finished", "failed")
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run."""
+
+    folder: Path
+    config: TrainConfig
+
+
+def jobs(folder: Path, name: str, config: TrainConfig, seeds: Sequence[int]) -> list[Job]:
+    """A run on each seed."""
+    runs = folder / CONFIRM
+    return [Job(runs / f"{name},seed={seed}", dataclasses.replace(config, seed=seed)) for seed in seeds]
+
+
+def prepare(folder: Path, runs: Sequence[Job]) -> None:
+    """Make room: the runs of an earlier winner go."""
+    (folder / CONFIRM).mkdir(exist_ok=True)
+    names = {job.folder.name for job in runs}
+    for path in (folder / CONFIRM).glob("*,seed=*"):
+        if path.name not in names:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def work(task: Sequence[Job], worker: int, parent: int) -> None:
+    """Run what nobody has run yet, until all have ended. Ends with the parent, however that ends."""
+    become_worker(parent)
+    left = list(task)
+    while left and not is_stopped():
+        for job in left:
+            if not is_stopped():
+                _run(job)
+        # Some may be at work elsewhere, in the folder's other workers or in another command's.
+        left = [job for job in left if read_json(job.folder / MANIFEST).get("status") not in _ENDED]
+    sys.exit(0)
+
+
+def _run(job: Job) -> None:
+    job.folder.mkdir(parents=True, exist_ok=True)
+    try:
+        run_in_sweep(job.config, job.folder, [], stop_at_failure=False)
+    except JobError as error:
+        print(f"{job.folder}: {error}", file=sys.stderr, flush=True)

@@ -1,0 +1,87 @@
+"""Worker processes, watched: one that is killed is replaced, and none outlives the command."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from multiprocessing.context import SpawnProcess
+from typing import Any
+
+from gridworld.errors import InputError
+from gridworld.training import signals_raise
+
+Work = Callable[[Any, int, int], None]  # (task, number of the worker, process id of the parent)
+
+_SECONDS_BETWEEN_LOOKS = 0.1
+_STOP_WITHIN = 3.0  # seconds
+_MOST_LOST = 20  # a machine on which more are killed has no room for them
+
+
+def run_crew(work: Work, task: Any, workers: int, look: Callable[[], None]) -> None:
+    """Run `work` in so many processes until all have ended, with a `look` now and then.
+
+    Raises `Interrupted` at Ctrl-C and SIGTERM, and `InputError` where workers can do nothing.
+    """
+    processes: dict[int, SpawnProcess] = {}
+    lost = 0
+    with signals_raise():
+        try:
+            for number in range(workers):
+                processes[number] = _start(work, task, number)
+            while processes:
+                for number, process in list(processes.items()):
+                    if process.exitcode is None:
+                        continue
+                    del processes[number]
+                    if process.exitcode > 0 and not processes:
+                        raise InputError("the last worker has failed, with the reason above; no more is run")
+                    if process.exitcode < 0:
+                        lost += 1
+                        _tell(-process.exitcode)
+                        if lost > _MOST_LOST:
+                            raise InputError(f"{lost} workers were killed; is there memory for so many?")
+                        processes[workers + lost] = _start(work, task, workers + lost)
+                look()
+                time.sleep(_SECONDS_BETWEEN_LOOKS)
+        finally:
+            _stop(processes.values())
+
+
+def _start(work: Work, task: Any, number: int) -> SpawnProcess:
+    process = multiprocessing.get_context("spawn").Process(
+        target=work, args=(task, number, os.getpid()), daemon=True
+    )
+    with _ctrl_c_is_ours():
+        process.start()
+    return process
+
+
+@contextlib.contextmanager
+def _ctrl_c_is_ours() -> Iterator[None]:
+    """A process that begins in this block is not reached by it."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _stop(processes: Any) -> None:
+    for process in processes:
+        process.terminate()
+    end = time.monotonic() + _STOP_WITHIN
+    for process in processes:
+        process.join(max(0.0, end - time.monotonic()))
+        if process.exitcode is None:
+            process.kill()
+            process.join()
+
+
+def _tell(number: int) -> None:
+    name = signal.Signals(number).name
+    print(f"a worker was lost to {name}; its trial is run again", file=sys.stderr, flush=True)

@@ -1,0 +1,61 @@
+"""The winner as a recipe: a yaml in the study's folder that train.py takes.
+
+    python scripts/train.py --config-dir runs/STUDY experiment=winner
+
+It names the agent, the world and the observation, and every value in which the winner differs from these.
+Where one of them is in a folder of the user's own, train.py needs that too.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from gridworld.config import TrainConfig
+from gridworld.files import write_text
+from gridworld.tune.asked import Source, compose_in, without_hydra
+
+RECIPE = "winner"
+_NOT_OF_A_RECIPE = ("seed", "device", "threads", "logging", "recording")
+
+
+def write_recipe(
+    folder: Path, source: Source, choices: Mapping[str, str], config: TrainConfig, about: str
+) -> Path:
+    """Write it and make sure that it comes to `config` again; returns its path."""
+    overrides = [f"{group}={choice}" for group, choice in choices.items()]
+    bare = without_hydra(compose_in(source, "train", overrides))
+    values = _difference(_relevant(bare), _relevant(config))
+    lines = ["# @package _global_", f"# {about}", "defaults:"]
+    lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
+    lines += ["  - _self_", "", OmegaConf.to_yaml(OmegaConf.create(values)) if values else ""]
+    path = folder / "experiment" / f"{RECIPE}.yaml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, "\n".join(lines))
+    own = dataclasses.replace(source, own=(*source.own, folder))
+    again = without_hydra(compose_in(own, "train", [f"experiment={RECIPE}"]))
+    assert _relevant(again) == _relevant(config), f"{path} does not say what the winner is"
+    return path
+
+
+def _relevant(config: TrainConfig) -> dict[str, Any]:
+    content = dataclasses.asdict(config)
+    for key in _NOT_OF_A_RECIPE:
+        del content[key]
+    return content
+
+
+def _difference(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+    found = {}
+    for key, value in after.items():
+        was = before.get(key)
+        if isinstance(value, dict) and isinstance(was, dict):
+            if inner := _difference(was, value):
+                found[key] = inner
+        elif key not in before or value != was:
+            found[key] = value
+    return found

@@ -1,0 +1,168 @@
+"""A study from its beginning to its verdict."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+import math
+import shlex
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import optuna
+
+from gridworld.config import TrainConfig
+from gridworld.errors import InputError
+from gridworld.run import MANIFEST, SWEEP_JSON, check_writable
+from gridworld.sweep.report import shown
+from gridworld.training import hparams, make_mdp
+from gridworld.tune import confirm, verdict
+from gridworld.tune.asked import Asked, Source, search_path
+from gridworld.tune.crew import run_crew
+from gridworld.tune.finals import Final, Finalist, finalists, missing, ranking
+from gridworld.tune.finals import work as finals_work
+from gridworld.tune.progress import SearchProgress
+from gridworld.tune.recipe import RECIPE, write_recipe
+from gridworld.tune.records import write_study
+from gridworld.tune.space import with_values
+from gridworld.tune.storage import begin, open_storage, open_study, standing
+from gridworld.tune.trial import ERROR, Objective
+from gridworld.tune.worker import Task, search
+
+
+def tune(asked: Asked, source: Source) -> None:
+    """Run what the study lacks. Raises `InputError`, nothing run, and `Interrupted`."""
+    task = _begin(asked)
+    study = open_study(task.settings, task.url, task.name)
+    progress = SearchProgress(asked, study)
+    try:
+        if standing(study).ended < task.settings.trials:
+            progress.begin()
+            run_crew(search, task, min(task.settings.workers, task.settings.trials), progress.look)
+    finally:
+        progress.end()
+    _conclude(asked, study, source, _finals(asked, study, task))
+
+
+def _begin(asked: Asked) -> Task:
+    """Make the folder and the study, or see that they are of this search."""
+    _check_folder(asked.folder)
+    settings = asked.settings
+    made = not asked.folder.exists()
+    asked.folder.mkdir(parents=True, exist_ok=True)
+    url = settings.storage or f"sqlite:///{asked.folder.absolute() / 'study.db'}"
+    try:
+        begin(open_storage(settings, url), asked.name, _about(asked), asked.space.parameters_of(asked.base))
+    except InputError:
+        if made:
+            with contextlib.suppress(OSError):
+                asked.folder.rmdir()
+        raise
+    objective = Objective(asked.measured, asked.space, asked.seeds, settings.reports, settings.stop_after)
+    deadline = time.time() + (settings.timeout or math.inf)
+    return Task(asked.folder, url, asked.name, settings, objective, deadline)
+
+
+def _check_folder(folder: Path) -> None:
+    for name, kind in ((MANIFEST, "a single run"), (SWEEP_JSON, "a sweep")):
+        if (folder / name).exists():
+            raise InputError(f"{folder}: is the folder of {kind}; choose another tune.folder")
+    check_writable(folder, "tune.folder")
+
+
+def _about(asked: Asked) -> dict[str, Any]:
+    """What makes trials comparable; the study of another is refused."""
+    settings = {key: value for key, value in hparams(asked.base).items() if value is not None}
+    del settings["seed"]
+    return {
+        "search space": asked.space.plain(),
+        "configuration": settings | {"map": make_mdp(asked.base.env).layout.text()},
+        "objective": {
+            "seeds": list(asked.seeds),
+            "stop_after": asked.settings.stop_after,
+            "evaluations": asked.settings.evaluations,
+            "reports": asked.settings.reports,
+        },
+    }
+
+
+def _finals(asked: Asked, study: optuna.Study, task: Task) -> list[Finalist]:
+    """The finalists, the winner first."""
+    trials = finalists(study, asked.settings.finalists, asked.space.parameters_of(asked.base))
+    if not trials:
+        reasons = [trial.user_attrs[ERROR] for trial in study.trials if trial.user_attrs.get(ERROR)]
+        why = f"all {len(reasons)} failed, the first: {reasons[0]}" if reasons else "there was no time"
+        raise InputError(f"{shown(asked.folder)}: no trial came to a score; {why}")
+    seeds = tuple(asked.final_seeds)
+    if runs := missing(study, trials, seeds):
+        print(
+            f"the {len(trials)} finalists on {len(seeds)} seeds more: {runs} runs",
+            file=sys.stderr,
+            flush=True,
+        )
+        named = tuple((trial.number, asked.space.values(trial.params)) for trial in trials)
+        run_crew(finals_work, Final(task, named, seeds), min(asked.settings.workers, runs), lambda: None)
+    return ranking(study, trials, seeds, asked.base.total_timesteps)
+
+
+def _conclude(asked: Asked, study: optuna.Study, source: Source, ranked: list[Finalist]) -> None:
+    """Confirm the winner, write it down, and tell."""
+    best = study.get_trials(deepcopy=False)[ranked[0].trial]
+    values = asked.space.values(best.params)
+    is_new = asked.space.parameters_of(asked.base) != best.params
+    tuned = _tuned(asked.base, values) if is_new else asked.base
+    name = f"trial={best.number}"
+    winner = confirm.jobs(asked.folder, name, _tuned(asked.measured, values), asked.held_out)
+    began_from = confirm.jobs(asked.folder, "default", asked.measured, asked.held_out)
+    confirmed = _confirm(asked, winner if is_new else [], began_from)
+    about = f"the best of {standing(study).ended} trials; study.json has what came of it"
+    recipe = write_recipe(asked.folder, source, asked.choices, tuned, about)
+    outcome = {
+        "winner": {"trial": best.number, "score": best.value, "values": values},
+        "finalists": [dataclasses.asdict(finalist) for finalist in ranked],
+        "confirmation": confirmed,
+    }
+    write_study(asked, study, outcome)
+    own = [search_path(source.own)] if source.own else []
+    line = shlex.join(
+        ["python", "scripts/train.py", "--config-dir", shown(asked.folder), f"experiment={RECIPE}", *own]
+    )
+    _tell(asked, values, [confirmed["sentence"], f"  recipe: {shown(recipe)}", f"  train it: {line}"])
+
+
+def _tuned(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
+    """With a name of its own, so that a report tells it from what it was before."""
+    tuned = with_values(config, values)
+    agent = dataclasses.replace(tuned.agent, name=f"{tuned.agent.name}_tuned")
+    return dataclasses.replace(tuned, agent=agent)
+
+
+def _confirm(asked: Asked, winner: list[confirm.Job], began_from: list[confirm.Job]) -> dict[str, Any]:
+    """Run both; without a winner there is nothing to compare."""
+    runs = [job for pair in itertools.zip_longest(began_from, winner) for job in pair if job is not None]
+    count = len(began_from)
+    print(f"{len(runs)} runs on {count} held-out seeds confirm the winner", file=sys.stderr, flush=True)
+    confirm.prepare(asked.folder, runs)
+    run_crew(confirm.work, runs, min(asked.settings.workers, len(runs)), lambda: None)
+    before = verdict.sample(began_from)
+    if winner:
+        return verdict.compare(verdict.sample(winner), before, "the winner")
+    return {
+        "verdict": "is",
+        "sentence": f"No trial came out better than the settings that the search began from: on {count} "
+        f"held-out seeds these are {before.text()}.",
+    }
+
+
+def _tell(asked: Asked, values: dict[str, Any], lines: list[str]) -> None:
+    before = asked.space.parameters_of(asked.base) or {}
+    width = max(map(len, values))
+    print("winner:")
+    for key, value in values.items():
+        was = f"  (was {before[key]})" if key in before and before[key] != value else ""
+        print(f"  {key:<{width}}  {value}{was}")
+    print(*lines, sep="\n")
+    print(f"  look at it: python scripts/report.py {shown(asked.folder)}", flush=True)

@@ -1,0 +1,86 @@
+"""Whether the winner is better than what the search began from: counted on the held-out runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gridworld.mdp import FloatArray
+from gridworld.report import statistics
+from gridworld.report.table import number, steps_up_to
+from gridworld.run import SUMMARY
+from gridworld.tune.confirm import Job
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What the runs of one configuration came to."""
+
+    certified: statistics.Share
+    steps: FloatArray  # (seeds,), environment steps until the certificate that held; infinite without one
+    total: int
+
+    def text(self) -> str:
+        """In a few words."""
+        told = f"certified on {self.certified.count} of {self.certified.total} "
+        told += f"[{100 * self.certified.low:.0f} %, {100 * self.certified.high:.0f} %]"
+        median = statistics.interval(statistics.median, [self.steps], 0)
+        form = steps_up_to(self.total)
+        bounds = f"[{form(median.low)}, {form(median.high)}]"
+        return f"{told}, for good by step {form(median.point)} {bounds} in the median"
+
+
+def sample(runs: Sequence[Job]) -> Sample:
+    """A run that failed was not certified."""
+    steps = np.array([_steps(job.folder) for job in runs])
+    certified = int(np.isfinite(steps).sum())
+    return Sample(statistics.share(certified, len(steps)), steps, runs[0].config.total_timesteps)
+
+
+def compare(winner: Sample, began_from: Sample, name: str) -> dict[str, Any]:
+    """The verdict, by what the search was after: first the seeds certified, then how soon.
+
+    How soon: the probability that a run of the winner is certified before one of the other's, ties half.
+    """
+    better = statistics.improvement([(-winner.steps, -began_from.steps)], 0)
+    if winner.certified.count < began_from.certified.count or better.high < 0.5:
+        verdict = "does not beat"
+    elif better.low > 0.5:
+        verdict = "beats"
+    else:
+        verdict = "cannot be told apart from"
+    sentence = (
+        f"On {len(winner.steps)} held-out seeds {name} {verdict} the settings that the search began from: "
+        f"{winner.text()}, against {began_from.text()}; a run of it is certified sooner with probability "
+        f"{number(better.point)} [{number(better.low)}, {number(better.high)}]."
+    )
+    return {
+        "verdict": verdict,
+        "sentence": sentence,
+        "probability_sooner": dataclasses.asdict(better),
+        "winner": _plain(winner),
+        "began_from": _plain(began_from),
+    }
+
+
+def _plain(of: Sample) -> dict[str, Any]:
+    return {
+        "certified": dataclasses.asdict(of.certified),
+        "steps": [int(step) if math.isfinite(step) else None for step in of.steps],
+    }
+
+
+def _steps(folder: Path) -> float:
+    try:
+        summary = json.loads((folder / SUMMARY).read_text("utf-8"))
+    except (OSError, ValueError):
+        return math.inf
+    since = summary.get("certified_since_step")
+    return math.inf if since is None else float(since)

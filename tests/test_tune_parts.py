@@ -1,0 +1,212 @@
+"""The parts of tuning: the score, search spaces, what Optuna is told, and how trials end."""
+
+import dataclasses
+import itertools
+import math
+from pathlib import Path
+
+import optuna
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support import CONF, configure
+
+from gridworld.config import DimensionConfig, TuneConfig
+from gridworld.errors import InputError
+from gridworld.report import statistics
+from gridworld.training import check_settings
+from gridworld.tune.asked import Source, ask
+from gridworld.tune.records import write_trials
+from gridworld.tune.score import SeedScore, score
+from gridworld.tune.space import Space, with_values
+from gridworld.tune.storage import open_study, standing
+from gridworld.tune.trial import Objective
+from gridworld.tune.verdict import Sample, compare
+from gridworld.tune.worker import Task, _next
+
+SPACES = sorted(file.stem for file in (CONF / "tune").glob("*.yaml"))
+SOURCE = Source(CONF)
+TOTAL = 1000
+ONE_SEED = st.builds(
+    SeedScore,
+    seed=st.just(0),
+    certified_since=st.none() | st.integers(0, TOTAL),
+    regret=st.floats(0, 100) | st.just(math.inf),
+)
+SEEDS = st.lists(ONE_SEED, min_size=3, max_size=3)
+
+
+@given(SEEDS, SEEDS)
+def test_the_score_ranks_by_certificates_first_and_by_steps_then(
+    first: list[SeedScore], second: list[SeedScore]
+) -> None:
+    def rank(seeds: list[SeedScore]) -> tuple[int, float]:
+        missed = sum(seed.certified_since is None for seed in seeds)
+        return missed, sum(seed.certified_since or 0 for seed in seeds)
+
+    scores = [score(seeds, TOTAL, 3) for seeds in (first, second)]
+    assert all(0 <= value <= 1 for value in scores)
+    (missed, steps), (other_missed, other_steps) = rank(first), rank(second)
+    if missed < other_missed:
+        assert scores[0] < scores[1]
+    if missed == other_missed == 0 and steps < other_steps:
+        assert scores[0] < scores[1]
+
+
+def test_the_score_of_known_seeds() -> None:
+    seeds = [SeedScore(0, 500, 0.0), SeedScore(1, 250, 0.0), SeedScore(2, None, 1.0)]
+    assert score(seeds, TOTAL, 3) == pytest.approx((1 + (0.25 + 0.125 + 0.75) / 3) / 4)
+    assert score(seeds[:1], TOTAL, 3) == pytest.approx(0.25 / 4)
+    less_regret = [dataclasses.replace(seeds[2], regret=0.5)]
+    assert score(less_regret, TOTAL, 3) < score(seeds[2:], TOTAL, 3)
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_a_shipped_space_holds_the_shipped_settings(name: str) -> None:
+    asked = ask(SOURCE, [f"agent={name}"])
+    first = asked.space.parameters_of(asked.base)
+    assert first is not None
+    assert with_values(asked.base, asked.space.values(first)) == asked.base
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_what_a_shipped_space_suggests_can_train(name: str) -> None:
+    asked = ask(SOURCE, [f"agent={name}"])
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    for _ in range(20):
+        check_settings(with_values(asked.base, asked.space.suggest(study.ask())))
+
+
+def test_every_batch_of_ppo_divides_every_rollout() -> None:
+    asked = ask(SOURCE, ["agent=ppo"])
+    keys = ("agent.n_steps", "agent.batch_size")
+    lists = [asked.space.dimensions[key].choices or [] for key in keys]
+    for choice in itertools.product(*lists):
+        check_settings(with_values(asked.base, dict(zip(keys, choice, strict=True))))
+
+
+def test_there_is_a_space_for_every_agent_that_learns() -> None:
+    agents = {file.stem for file in (CONF / "agent").glob("*.yaml")}
+    learn = {name for name in agents if not name.endswith("_sb3_defaults")} - {"value_iteration"}
+    assert set(SPACES) == learn
+
+
+def test_lists_and_arguments_of_a_class_can_be_searched() -> None:
+    nets = DimensionConfig("categorical", choices=[[64], [64, 64]])
+    space = Space({"agent.policy_kwargs.net_arch": nets}, "own")
+    space.check(configure("agent=ppo"))
+    values = space.suggest(optuna.create_study().ask())
+    assert with_values(configure("agent=ppo"), values).agent.policy_kwargs.net_arch in nets.choices  # type: ignore[attr-defined, operator]
+    space = Space({"agent.arguments.gae_lambda": DimensionConfig("float", low=0.5, high=1)}, "own")
+    config = with_values(configure("agent=a2c"), space.values({"agent.arguments.gae_lambda": 0.123456}))
+    assert config.agent.arguments["gae_lambda"] == 0.5  # type: ignore[attr-defined]  # never below the range
+
+
+def small(*words: str) -> Objective:
+    asked = ask(SOURCE, ["agent=q_learning", "total_timesteps=1500", "tune.seeds=2", *words])
+    return Objective(asked.measured, asked.space, asked.seeds, asked.settings.reports, 2)
+
+
+def test_optuna_is_told_the_same_points_of_every_trial() -> None:
+    objective = small("tune.reports=7")
+    study = optuna.create_study(pruner=optuna.pruners.NopPruner())
+    study.optimize(lambda trial: objective(trial, lambda: False), n_trials=3)
+    for trial in study.trials:
+        assert sorted(trial.intermediate_values) == list(range(14))
+        assert trial.intermediate_values[13] == pytest.approx(trial.value)
+        assert [seed["seed"] for seed in trial.user_attrs["seeds"]] == [0, 1]
+
+
+class AfterOneSeed(optuna.pruners.BasePruner):
+    """Ends a trial between its seeds."""
+
+    def prune(self, study: optuna.Study, trial: optuna.trial.FrozenTrial) -> bool:
+        return trial.last_step is not None and trial.last_step >= 9
+
+
+def test_a_pruned_trial_spares_its_other_seeds() -> None:
+    objective = small()
+    study = optuna.create_study(pruner=AfterOneSeed())
+    study.optimize(lambda trial: objective(trial, lambda: False), n_trials=1)
+    assert study.trials[0].state == optuna.trial.TrialState.PRUNED
+    assert max(study.trials[0].intermediate_values) == 9
+
+
+def study_of(folder: Path, objective: object, trials: int, sampler: str = "tpe") -> tuple[optuna.Study, Task]:
+    settings = TuneConfig(trials=trials, heartbeat=1, sampler=sampler)
+    url = f"sqlite:///{folder / 'study.db'}"
+    task = Task(folder, url, "one", settings, objective, math.inf)  # type: ignore[arg-type]
+    return open_study(settings, url, "one"), task
+
+
+def test_what_fails_is_a_trial_with_its_reason_and_the_study_goes_on(tmp_path: Path) -> None:
+    answers = iter(
+        [0.5, math.nan, InputError("agent.gamma=2: must be from 0 to 1"), ZeroDivisionError("x"), 0.25]
+    )
+
+    def objective(trial: optuna.Trial, is_stopped: object) -> float:
+        answer = next(answers)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    study, task = study_of(tmp_path, objective, 5)
+    while _next(study, task):
+        pass
+    now = standing(study)
+    assert (now.complete, now.failed, now.ended) == (2, 3, 5)
+    assert study.best_value == 0.25
+    write_trials(tmp_path, study, Space({"n_envs": DimensionConfig("int", low=1, high=2)}, "own"))
+    table = (tmp_path / "trials.csv").read_text()
+    for reason in ("the objective is NaN", "agent.gamma=2: must be from 0 to 1", "ZeroDivisionError: x"):
+        assert reason in table
+
+
+@pytest.mark.parametrize("sampler", ["tpe", "random"])
+def test_a_study_gone_on_with_chooses_as_an_undisturbed_one(tmp_path: Path, sampler: str) -> None:
+    def objective(trial: optuna.Trial, is_stopped: object) -> float:
+        return trial.suggest_float("x", -1, 1) ** 2
+
+    chosen = []
+    for name, parts in (("calm", [14]), ("halting", [3, 12, 14])):
+        (tmp_path / name).mkdir()
+        for trials in parts:
+            study, task = study_of(tmp_path / name, objective, trials, sampler)
+            while _next(study, task):
+                pass
+        chosen.append([trial.params["x"] for trial in study.trials])
+    assert len(set(chosen[0])) == 14
+    assert chosen[0] == chosen[1]
+
+
+def test_training_that_diverges_is_such_a_failure(tmp_path: Path) -> None:
+    asked = ask(SOURCE, ["agent=ppo", "agent.learning_rate=1e30", "total_timesteps=9000", "tune.seeds=1"])
+    space = Space({"agent.clip_range": DimensionConfig("float", low=0.1, high=0.3)}, "own")
+    study, task = study_of(tmp_path, Objective(asked.measured, space, asked.seeds, 10, 2), 1)
+    while _next(study, task):
+        pass
+    assert "diverged" in study.trials[0].user_attrs["error"]
+
+
+def sample(*steps: float) -> Sample:
+    import numpy as np
+
+    found = np.array(steps, dtype=np.float64)
+    certified = int(np.isfinite(found).sum())
+    return Sample(statistics.share(certified, len(found)), found, TOTAL)
+
+
+@pytest.mark.parametrize(
+    ("winner", "began_from", "verdict"),
+    [
+        ((100, 110, 120, 130, 140, 150), (500, 510, 520, 530, 540, math.inf), "beats"),
+        ((500, 510, 520, 530, 540, math.inf), (100, 110, 120, 130, 140, 150), "does not beat"),
+        ((10, 10, 10, 10, 10, 10, 10, math.inf), (80, 80, 80, 80, 80, 80, 80, 80), "does not beat"),
+        ((100, 200, 300, 400), (110, 190, 310, 390), "cannot be told apart from"),
+        ((math.inf, math.inf), (math.inf, math.inf), "cannot be told apart from"),
+    ],
+)
+def test_the_verdict(winner: tuple[float, ...], began_from: tuple[float, ...], verdict: str) -> None:
+    found = compare(sample(*winner), sample(*began_from), "the winner")
+    assert found["verdict"] == verdict
+    assert f"held-out seeds the winner {verdict} the settings" in found["sentence"]
