@@ -42,8 +42,8 @@ SelectType=select/cons_tres
 SelectTypeParameters=CR_Core
 ReturnToService=2
 MaxArraySize=101
-OverTimeLimit=0
-NodeName={host} NodeAddr=127.0.0.1 CPUs=2 RealMemory=4000
+SlurmdParameters=config_overrides
+NodeName={host} NodeAddr=127.0.0.1 CPUs=2 RealMemory=8000
 PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 """
 
@@ -99,7 +99,11 @@ def ray_head(folder: Path, variables: dict[str, str]) -> Iterator[dict[str, str]
     if importlib.util.find_spec("ray") is None and not os.environ.get("GRIDWORLD_REQUIRE_RAY"):
         pytest.skip("no Ray to test with: pip install 'gridworld[ray]'")
     port, *_ = _free_ports(1)
-    quiet = {"RAY_USAGE_STATS_ENABLED": "0", "PYTHONWARNINGS": "ignore"}
+    token = folder / "token"  # its own, whatever the user has in the home folder
+    token.write_text(secrets.token_hex(32))
+    token.chmod(0o600)
+    access = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token)}
+    quiet = {"RAY_USAGE_STATS_ENABLED": "0", "PYTHONWARNINGS": "ignore", **access}
     # `ray start` without --block would leave its daemons to whoever takes orphans.
     head = [
         *(str(Path(sys.executable).with_name("ray")), "start", "--head", "--block", "--num-cpus=2"),
