@@ -147,9 +147,8 @@ def load(
 
 def load_by_default_size(layout: str | PathLike[str] | Layout, num_rows: int, num_cols: int) -> Layout:
     """The same for callers whose default is classic's own size, so that it may mean that none is given."""
-    rows = None if type(num_rows) is int and num_rows == NUM_ROWS else num_rows
-    cols = None if type(num_cols) is int and num_cols == NUM_COLS else num_cols
-    return load(layout, rows, cols)
+    rows, cols = positive_int("num_rows", num_rows), positive_int("num_cols", num_cols)
+    return load(layout, None if rows == NUM_ROWS else rows, None if cols == NUM_COLS else cols)
 
 
 def shipped_layouts() -> tuple[str, ...]:
