@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import importlib.util
+import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -71,7 +72,8 @@ def main(arguments: Sequence[str]) -> None:
     except Interrupted as interruption:
         again = shlex.join(["python", *sys.argv])
         print(f"{interruption}; nothing that ended is lost; go on with: {again}", file=sys.stderr)
-        sys.exit(interruption.exit_code)
+        sys.stderr.flush()
+        os._exit(interruption.exit_code)  # to take the interpreter down would take seconds more
 
 
 def _parser(conf: Path) -> argparse.ArgumentParser:
