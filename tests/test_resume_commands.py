@@ -72,7 +72,7 @@ def test_resume_and_the_same_command_again(stopped: Path, calm: dict[str, object
     [
         (["resume="], "resume=: must be the folder of a run"),
         (["resume=nowhere"], "nowhere: no such folder"),
-        (["resume=."], ".: not a run's folder, it has no manifest.json"),
+        (["resume=.."], "resume=..: leads out of the current folder"),
         (["resume=run", "seed=1"], "seed=1: a run goes on with the settings that it began with; beside"),
         (["-m", "resume=run"], "-m: a run goes on with the settings"),
         (["resume=run", "total_timesteps=1e5"], "total_timesteps=1e5: must be a number of environment steps"),

@@ -53,14 +53,14 @@ class Values:
         return self.is_plain(value)
 
     def write(self, value: Any, path: str) -> Any:
-        """As a part of a state."""
+        """As a part of a state, to be written before training goes on: arrays are not copied."""
         kind = type(value)
         if value is None or kind in _NUMBERS:
             return value
         if isinstance(value, np.ndarray):
             return self._write_array(value)
         if isinstance(value, Tensor):
-            return {"tensor": value.detach().cpu().numpy().copy()}
+            return {"tensor": value.detach().cpu().numpy()}
         if isinstance(value, np.generic):
             return {"scalar": np.array(value)}
         if kind is list:
@@ -176,7 +176,7 @@ class Values:
 
     def _write_array(self, array: NDArray[Any]) -> Any:
         rows = self._as_rows(array)
-        return array.copy() if rows is None else {"rows": rows, "shape": list(array.shape)}
+        return array if rows is None else {"rows": rows, "shape": list(array.shape)}
 
     def _as_rows(self, array: NDArray[Any]) -> NDArray[Any] | None:
         """The states (n,) whose observations the array begins with and has nothing else in it, if it does."""
