@@ -18,6 +18,7 @@ MISSING = "???"  # OmegaConf's sign for what has to be given
 MOST_ENVS = 2**17  # eight times the largest batch that any measurement here is faster with
 MOST_THREADS = 1024
 MOST_STEPS = 100_000  # of an episode; an evaluation goes through all of them
+AUTO = "auto"  # checkpoints as often as they cost next to nothing
 LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end, as RL Zoo writes it
 
 
@@ -74,6 +75,13 @@ class RecordingConfig:
     mp4: bool = False  # and as episode.mp4, which needs the extra `video`
     cell_size: Optional[int] = None  # noqa: UP045  # pixels of the episode's; null: 100, less on large maps
     fps: int = 4
+
+
+@dataclass
+class CheckpointConfig:
+    """What it takes to go on after an interruption."""
+
+    every: Optional[Union[int, str]] = "auto"  # noqa: UP007, UP045  # steps; auto: as it costs little; null: none
 
 
 @dataclass
@@ -262,6 +270,7 @@ class TrainConfig:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     logging: LoggingConfig = field(default_factory=LoggingConfig)
     recording: RecordingConfig = field(default_factory=RecordingConfig)
+    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
 
 
 @dataclass
@@ -387,6 +396,11 @@ def check(config: TrainConfig) -> None:
     at_least("logging.policy_map_every", config.logging.policy_map_every, 0)
     if config.recording.cell_size is not None:
         at_least("recording.cell_size", config.recording.cell_size, 2)
+    every = config.checkpoint.every
+    if not (every is None or every == AUTO or (type(every) is int and every >= 1)):
+        raise InputError(
+            f"checkpoint.every={every}: must be a number of steps, {AUTO}, or null for no checkpoints"
+        )
     within("recording.fps", config.recording.fps, 1, 100)
 
 

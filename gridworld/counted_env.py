@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from gridworld.mdp import NUM_ACTIONS
+from gridworld.state import State, fill
 from gridworld.vector_env import GridWorldVectorEnv, StateArray, Step
 
 
@@ -52,6 +53,23 @@ class CountedVectorEnv(GridWorldVectorEnv):
             self._ended_return += float(np.add.reduce(returns))
             self._returns[over] = 0.0
         return step
+
+    def get_state(self) -> State:
+        """As ever."""
+        return {
+            **super().get_state(),
+            "visits": self.visits.copy(),
+            "returns": self._returns.copy(),
+            "ended": self._ended,
+            "ended_return": self._ended_return,
+        }
+
+    def set_state(self, state: State) -> None:
+        """As ever."""
+        super().set_state(state)
+        fill(self.visits, state["visits"], "visits")
+        fill(self._returns, state["returns"], "returns")
+        self._ended, self._ended_return = int(state["ended"]), float(state["ended_return"])
 
     def take_mean_return(self) -> float | None:
         """Mean undiscounted return of the episodes that ended since the last call; None where none did."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
+import io
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +19,9 @@ from gridworld.counted_env import CountedVectorEnv
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge, Score
 from gridworld.events import EventWriter
+from gridworld.journal import Journal
 from gridworld.progress import Progress
+from gridworld.state import State
 
 GREEDY, SAMPLED = "eval", "eval_sampled"  # TensorBoard's groups of the two policies
 ONLINE_RETURN = "online/return"  # of training episodes, exploration and half-learnt policies included
@@ -47,7 +51,7 @@ class Curve:
         judge: Judge,
         agent: Agent,
         config: TrainConfig,
-        path: Path,
+        file: Path | Journal,
         envs: CountedVectorEnv | None = None,
     ) -> None:
         self.judge = judge
@@ -67,8 +71,7 @@ class Curve:
         self._streak = 0
         self._next = self._every
         self._total = config.total_timesteps
-        self._file: IO[str] = path.open("w", newline="", encoding="utf-8")
-        self._rows: csv.DictWriter[str] | None = None
+        self.file = file if isinstance(file, Journal) else Journal(file)
         self._progress = Progress(
             config.total_timesteps, f"{config.agent.name} on {judge.mdp.layout.name}", config.logging.progress
         )
@@ -76,11 +79,35 @@ class Curve:
     def log_to(self, events: EventWriter) -> None:
         """Write every evaluation to this event file too."""
         self._events = events
-        events.charts("learning curves beside the optimum", CHARTS)
 
     def watched_by(self, watch: Callable[[int, Beliefs], None]) -> None:
         """Tell it of every evaluation: the step, and what the agent believes."""
         self._watch = watch
+
+    def get_state(self) -> State:
+        """Where the curve stands, as a value."""
+        beliefs = self.beliefs
+        return {
+            "step": self._step,
+            "next": self._next,
+            "streak": self._streak,
+            "first_certified_step": self.first_certified_step,
+            "certified_since_step": self.certified_since_step,
+            "seconds": self.seconds,
+            "beliefs": None if beliefs is None else vars(beliefs).copy(),
+        }
+
+    def set_state(self, state: State) -> None:
+        """Go on from there; scores follow from beliefs."""
+        self._step, self._next, self._streak = int(state["step"]), int(state["next"]), int(state["streak"])
+        self.first_certified_step = state["first_certified_step"]
+        self.certified_since_step = state["certified_since_step"]
+        self.seconds = float(state["seconds"])
+        if state["beliefs"] is not None:
+            names = (field.name for field in dataclasses.fields(Beliefs))
+            self.beliefs = Beliefs(*(state["beliefs"][name] for name in names))
+            self.greedy = self.judge.score(one_hot_policy(self.beliefs.greedy))
+            self.sampled = self.judge.score(self.beliefs.sampled)
 
     def on_step(self, step: int) -> bool:
         """Evaluate if it is due; False once the certificate has held for long enough.
@@ -105,7 +132,7 @@ class Curve:
 
     def close(self) -> None:
         """Close the CSV and the progress bar."""
-        self._file.close()
+        self.file.close()
         self._progress.close()
 
     def _score(self, step: int) -> None:
@@ -139,11 +166,12 @@ class Curve:
         row |= {f"sampled_{name}": value for name, value in sampled.numbers().items()}
         online = None if self._envs is None else self._envs.take_mean_return()
         row["online_return"] = online  # an empty field where no episode ended
-        if self._rows is None:
-            self._rows = csv.DictWriter(self._file, fieldnames=list(row), lineterminator="\n")
-            self._rows.writeheader()
-        self._rows.writerow(row)
-        self._file.flush()
+        text = io.StringIO()
+        rows = csv.DictWriter(text, fieldnames=list(row), lineterminator="\n")
+        if self.file.length == 0:
+            rows.writeheader()
+        rows.writerow(row)
+        self.file.append(text.getvalue().encode())
         if self._events is not None:
             tags = self._tags(greedy, sampled)
             self._events.scalars(tags if online is None else {**tags, ONLINE_RETURN: online}, step)

@@ -14,6 +14,7 @@ import struct
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import google_crc32c
 from google.protobuf.message import DecodeError
@@ -22,6 +23,7 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 
 from gridworld.data_files import read_bytes
 from gridworld.errors import InputError
+from gridworld.journal import Journal
 
 LARGEST = 2**28  # bytes of a file that is read
 _HEADER, _FOOTER = 12, 4  # bytes before and after an event
@@ -56,25 +58,26 @@ def read_scalars(path: Path) -> Iterator[tuple[str, int, float]]:
 
 
 class EventFile:
-    """A new event file in `folder`. What was added is in the file at once, for whoever reads along."""
+    """A new event file in `folder`, or with `mark` the one there, cut back to it (`gridworld.journal`)."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, mark: dict[str, Any] | None = None) -> None:
         now = time.time()
-        self.path = folder / f"events.out.tfevents.{int(now)}.{socket.gethostname()}.{os.getpid()}"
-        self._file = self.path.open("xb", buffering=0)
-        self._write(Event(wall_time=now, file_version=_VERSION))
+        name = f"events.out.tfevents.{int(now)}.{socket.gethostname()}.{os.getpid()}"
+        self.journal = Journal(folder / (name if mark is None else mark["name"]), mark)
+        if mark is None:
+            self._write(Event(wall_time=now, file_version=_VERSION))
 
     def add(self, summary: Summary, step: int) -> None:
         """Append one event, of now."""
         self._write(Event(wall_time=time.time(), step=step, summary=summary))
 
     def close(self) -> None:
-        self._file.close()
+        self.journal.close()
 
     def _write(self, event: Event) -> None:
         content = event.SerializeToString()
         length = struct.pack("<Q", len(content))
-        self._file.write(b"".join([length, _checksum(length), content, _checksum(content)]))
+        self.journal.append(b"".join([length, _checksum(length), content, _checksum(content)]))
 
 
 def _checksum(content: bytes) -> bytes:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from tensorboard.compat.proto.summary_pb2 import Summary, SummaryMetadata
 from tensorboard.compat.proto.tensor_pb2 import TensorProto
@@ -29,10 +30,11 @@ HParamValue = bool | float | str | None
 
 
 class EventWriter:
-    """One event file in `folder`. Steps are environment steps."""
+    """One event file in `folder`, a new one or that of a mark. Steps are environment steps."""
 
-    def __init__(self, folder: Path) -> None:
-        self._file = EventFile(folder)
+    def __init__(self, folder: Path, mark: dict[str, Any] | None = None) -> None:
+        self._file = EventFile(folder, mark)
+        self.journal = self._file.journal
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
         """One point for every tag."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import secrets
-import shlex
 import shutil
 import sys
 import threading
@@ -26,8 +25,9 @@ from omegaconf.errors import OmegaConfBaseException
 from gridworld.config import AGENT_SCHEMAS, LAUNCHER_SCHEMAS, SearchConfig, SweepConfig, TrainConfig
 from gridworld.errors import EXIT_CODE, InputError
 from gridworld.hydra_errors import refuse_added_keys, sentence, unreadable_file
+from gridworld.lock import locked
 from gridworld.manual import manual
-from gridworld.run import MANIFEST, SWEEP_JSON, Run, check_inside, check_new
+from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, Run, check_inside, check_new
 from gridworld.terminal import prepare, tell_error
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -88,6 +88,11 @@ def main(conf: Path) -> None:
     if {"--help", "-h"} & set(sys.argv[1:]):
         print(manual(conf))
         return
+    if any(word.startswith("resume=") for word in sys.argv[1:]):
+        from gridworld.commands import resume, run
+
+        run(resume.main)
+        return
     register_schemas()
     asked_for_traceback = FULL_ERROR in os.environ
     os.environ[FULL_ERROR] = "1"  # so that Hydra raises its errors instead of printing them
@@ -141,14 +146,7 @@ def run_job(settings: DictConfig) -> float:
             from gridworld.sweep.job import run_in_sweep
 
             return run_in_sweep(config, folder, overrides, context.sweeper.stop_at_first_failure)
-        from gridworld.summary import summary_text
-        from gridworld.training import Interrupted, train
-
-        try:
-            summary = train(config, Run(folder), overrides)
-        except Interrupted as interruption:
-            print(f"{interruption}; {_shown(folder)} holds what there was until then", file=sys.stderr)
-            sys.exit(interruption.exit_code)
+        return _run_alone(config, folder, overrides)
     except (InputError, OmegaConfBaseException) as error:
         _discard(folder)
         if context.mode is RunMode.MULTIRUN:
@@ -158,7 +156,23 @@ def run_job(settings: DictConfig) -> float:
     except KeyboardInterrupt:
         _discard(folder)
         raise
-    print(summary_text(summary, shlex.quote(_shown(folder))))
+
+
+def _run_alone(config: TrainConfig, folder: Path, overrides: list[str]) -> float:
+    """A run with its folder to itself; goes on with one that was interrupted there."""
+    from gridworld.resume import train_or_go_on
+    from gridworld.signals import Interrupted
+    from gridworld.telling import tell_end, tell_interrupted
+
+    with locked(folder / LOCK, wait=0) as is_ours:
+        if not is_ours:
+            raise InputError(f"{folder}: another process is at work in it; wait for it or stop it")
+        run = Run(folder)
+        try:
+            summary = train_or_go_on(config, run, overrides)
+        except Interrupted as interruption:
+            sys.exit(tell_interrupted(interruption, run))
+    tell_end(summary, run)
     return float(summary["regret"])
 
 
@@ -191,15 +205,8 @@ def _discard(folder: Path) -> None:
     """Take away what Hydra wrote for a run that never began; anything else in the folder stays."""
     if not (folder / MANIFEST).exists():
         shutil.rmtree(folder / ".hydra", ignore_errors=True)
+        (folder / LOCK).unlink(missing_ok=True)
         try:
             folder.rmdir()
         except OSError:
             return
-
-
-def _shown(folder: Path) -> str:
-    """The folder as a user would type it from here."""
-    try:
-        return str(folder.relative_to(Path.cwd()))
-    except ValueError:
-        return str(folder)

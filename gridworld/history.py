@@ -14,6 +14,7 @@ from gridworld.evaluation import Judge
 from gridworld.film import Film, film_of_frames
 from gridworld.policy_map import draw_policy_map
 from gridworld.render import fitting_cell_size
+from gridworld.state import State
 
 _MOST = 48  # moments
 _MOST_NUMBERS = 5_000_000  # of all moments together: some 25 MB
@@ -55,6 +56,26 @@ class History:
         if self._last is None or (self._kept and self._kept[-1] is self._last):
             return list(self._kept)
         return [*self._kept, self._last]
+
+    def get_state(self) -> State:
+        """What was seen, as a value."""
+        moments = self.moments()
+        return {
+            "every": self._every,
+            "seen": self._seen,
+            "kept": len(self._kept),
+            "steps": [moment.step for moment in moments],
+            "values": [moment.values for moment in moments],
+            "greedy": [moment.greedy for moment in moments],
+        }
+
+    def set_state(self, state: State) -> None:
+        """Go on from there."""
+        columns = state["steps"], state["values"], state["greedy"]
+        moments = [Moment(*moment) for moment in zip(*columns, strict=True)]
+        self._every, self._seen = int(state["every"]), int(state["seen"])
+        self._kept = moments[: state["kept"]]
+        self._last = moments[-1] if moments else None
 
     def film(self, judge: Judge) -> Film:
         """The policy map over training; one scale of colours for all of it."""

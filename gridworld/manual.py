@@ -15,6 +15,7 @@ _TEXT = """\
 Train an agent on a GridWorld whose optimum is known exactly.
 
 usage: python scripts/train.py [-m] [group=choice ...] [key=value ...]
+       python scripts/train.py resume=RUN [total_timesteps=N]
 
 Choices:
 {choices}
@@ -27,7 +28,14 @@ Keys, with their values: python scripts/train.py --cfg job
   evaluation.*   how often the policy is scored exactly, and when to stop
   logging.*      TensorBoard, pictures of the policy, progress
   recording.*    pictures of what was learnt, and the final policy's episode as PNGs, GIF and MP4
+  checkpoint.*   how often a run is saved on its way
   hydra.run.dir  the folder to write to, instead of a new one in runs/
+
+An interrupted run goes on where it was saved, with resume=RUN or when the same command meets its folder, and
+ends as if nothing had happened. With resume=RUN beside it:
+  total_timesteps=N       make the run longer, a finished one too
+  trust=true              import classes that are neither ours nor one of the libraries'
+  anyway=true             with other versions or another processor: the last bits may differ
 
 Sweeps (-m):
   hydra.sweep.dir        the folder to write to; the same one again runs what is not done yet
@@ -44,6 +52,8 @@ Examples:
       another world, slippery, and more time
   python scripts/train.py -m agent=dqn,ppo "seed=range(20)" hydra.sweep.dir=runs/mine
       a sweep of forty runs, a folder each; look at them with tensorboard --logdir runs/mine
+  python scripts/train.py resume=runs/mine
+      go on with a run that was interrupted
   python scripts/train.py experiment=cliff_dqn
       a recipe: that agent and that task, with settings that were tuned for them
   python scripts/train.py -m 'experiment=glob(cliff_*)' seed='range(20)'

@@ -28,6 +28,7 @@ from gridworld.policy_map import draw_policy_map
 from gridworld.render import Frame, fitting_cell_size, frame_size
 from gridworld.run import Run
 from gridworld.solve import value_iteration
+from gridworld.state import State
 from gridworld.visit_map import draw_visit_map
 
 MOST_FRAMES = 500  # of an episode that finds no end; by then a greedy one goes round in circles
@@ -104,6 +105,22 @@ class Pictures:
         if every and self._evaluations % every == 0:
             self._show_policy(step, beliefs)
         self._evaluations += 1
+
+    def get_state(self) -> State:
+        """What was seen and shown, as a value."""
+        return {
+            "history": None if self._history is None else self._history.get_state(),
+            "evaluations": self._evaluations,
+            "shown_at": self._shown_at,
+            "too_large": sorted(self._too_large),
+        }
+
+    def set_state(self, state: State) -> None:
+        """Go on from there."""
+        if self._history is not None:
+            self._history.set_state(state["history"])
+        self._evaluations, self._shown_at = int(state["evaluations"]), state["shown_at"]
+        self._too_large = set(state["too_large"])
 
     def finish(self, step: int, beliefs: Beliefs, visits: NDArray[np.int64]) -> None:
         """Training is over: write everything that is asked for."""

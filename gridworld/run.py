@@ -8,6 +8,7 @@
     visits.npy      how often training took each action in each state, (S, A)
     policy.png, q_error.png, visits.png, learning.gif   what was learnt, how well, where, and how
     frames/, episode.gif, ...   the final policy's episode
+    checkpoints/    what it takes to go on (`gridworld.checkpoint`)
     .hydra/         the configuration as Hydra composed it
     events.out...   TensorBoard's event file
 
@@ -17,7 +18,11 @@ the map's text. Of a finished run it also has the checksums of the files that ho
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
+import shlex
+import shutil
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
@@ -30,9 +35,15 @@ from gridworld.provenance import DIFF, LARGEST_DIFF, describe, source
 
 MANIFEST = "manifest.json"
 CURVE = "curve.csv"
+LOCK = ".lock"  # held by the process that is at work in the folder
 SWEEP_JSON = "sweep.json"  # a sweep's folder has this instead
 SUMMARY = "summary.json"
 LARGEST_RESULT = 2**30  # bytes of a file
+
+_FILES = (
+    *("curve.csv", "summary.json", "model.zip", "visits.npy", "policy.png", "q_error.png", "visits.png"),
+    *("learning.gif", "frames", "episode.gif", "episode.mp4", "checkpoints", "error.txt"),
+)
 
 
 class Run:
@@ -48,8 +59,10 @@ class Run:
         self.frames_folder = folder / "frames"
         self.manifest: dict[str, Any] = {}
 
-    def start(self, config: dict[str, Any], layout_text: str, overrides: list[str]) -> None:
-        """Write the manifest of a run that begins now. Raises `InputError` if the folder has one."""
+    def start(
+        self, config: dict[str, Any], layout_text: str, overrides: list[str], replace: bool = False
+    ) -> None:
+        """Write the manifest of a run that begins now. Raises `InputError` if the folder has one to keep."""
         self.manifest = {
             "status": "running",
             "started": _now(),
@@ -62,27 +75,37 @@ class Run:
             "layout": layout_text.split("\n"),
             "config": config,
         }
-        try:
-            self.manifest_file.open("x").close()  # of two runs that start at once, one gets the folder
-        except FileExistsError:
-            raise InputError(
-                f"{self.folder}: holds a run already; give every run a folder of its own"
-            ) from None
-        write_json(self.manifest_file, self.manifest)
+        if not replace and self.manifest_file.exists():
+            raise InputError(f"{self.folder}: holds a run already; give every run a folder of its own")
+        self._write()
         tree = source()
         if tree is not None and 0 < len(tree.diff) <= LARGEST_DIFF:
             write_bytes(self.folder / DIFF, tree.diff)
 
-    def end(self, status: str, error: str | None = None) -> None:
-        """Record how it ended: finished, interrupted or failed."""
-        self.manifest |= {"status": status, "ended": _now()}
+    def go_on(self, step: int, total_timesteps: int, differs: list[str]) -> None:
+        """Write the manifest of a run that goes on from a checkpoint after `step` steps."""
+        self._tidy()
+        again = {"at": _now(), "step": step, "command": [Path(sys.argv[0]).name, *sys.argv[1:]]}
+        if differs:
+            again["differs"] = differs
+        if total_timesteps != self.manifest["config"]["total_timesteps"]:
+            again["total_timesteps"] = total_timesteps
+            self.manifest["config"]["total_timesteps"] = total_timesteps
+        self.manifest |= {"status": "running", "ended": None}
+        self.manifest.setdefault("resumed", []).append(again)
+        self.manifest.pop("error", None)
+        self._write()
+
+    def end(self, status: str, error: str | None = None, **more: int | None) -> None:
+        """Record how it ended: finished, interrupted or failed; with the steps `reached` and saved."""
+        self.manifest |= {"status": status, "ended": _now(), **more}
         if error is not None:
             self.manifest["error"] = error
         if status == "finished":
             self.manifest["sha256"] = {
                 path.name: file_sha256(path, LARGEST_RESULT) for path in self._results() if path.exists()
             }
-        write_json(self.manifest_file, self.manifest)
+        self._write()
 
     def verify(self, path: Path) -> None:
         """Raise `InputError` unless the file with a part of the result is the one that the run wrote."""
@@ -99,12 +122,54 @@ class Run:
                 "it was damaged or changed"
             )
 
+    def seal(self) -> str:
+        """A hash of what in the manifest decides how the run ends."""
+        content = [self.manifest.get(key) for key in ("config", "layout", "resumed")]
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def clear(self) -> None:
+        """Take away what an attempt left, all but the manifest; what is not the run's stays."""
+        self._tidy()
+        for name in (*_FILES, *(path.name for path in self.folder.glob("events.out.tfevents.*"))):
+            _remove(self.folder / name)
+
+    def resume_words(self) -> str:
+        """The command that goes on with it."""
+        return f"python scripts/train.py resume={shlex.quote(shown(self.folder))}"
+
     def _results(self) -> tuple[Path, ...]:
         return self.curve_file, self.summary_file, self.model_file, self.visits_file
+
+    def _tidy(self) -> None:
+        """Take away what a process that was killed had half written."""
+        for pattern in (".*.part", "checkpoints/.*.part"):
+            for path in self.folder.glob(pattern):
+                _remove(path)
+
+    def _write(self) -> None:
+        self.manifest["seal"] = self.seal()
+        write_json(self.manifest_file, self.manifest)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def open_run(folder: Path) -> Run:
     """A finished run, to look at. Raises `InputError` where there is none."""
+    run = read_run(folder)
+    if run.manifest["status"] != "finished":
+        raise InputError(
+            f"{folder}: this run is {run.manifest['status']!r}; only a finished one can be looked at"
+        )
+    return run
+
+
+def read_run(folder: Path) -> Run:
+    """A run, finished or not. Raises `InputError` where there is none."""
     run = Run(folder)
     if not folder.exists():
         raise InputError(f"{folder}: no such folder; give the folder of a run, e.g. one in runs/")
@@ -113,18 +178,30 @@ def open_run(folder: Path) -> Run:
     manifest = read_object(run.manifest_file)
     if not {"status", "config", "layout"} <= manifest.keys():
         raise InputError(f"{run.manifest_file}: not the manifest of a run; it lacks status, config or layout")
-    if manifest["status"] != "finished":
-        raise InputError(
-            f"{folder}: this run is {str(manifest['status'])[:40]!r}; only a finished one can be looked at"
-        )
     run.manifest = manifest
     return run
 
 
+def shown(folder: Path) -> str:
+    """The folder as a user would type it from here."""
+    try:
+        return str(folder.relative_to(Path.cwd()))
+    except ValueError:
+        return str(folder)
+
+
 def check_new(folder: Path, key: str = "hydra.run.dir") -> None:
-    """Raise `InputError` unless a run can be written to `folder`: it can be made and holds no run yet."""
+    """Raise `InputError` unless a run can be written to `folder`: it can be made and holds no finished run.
+
+    Whether an unfinished one is the same is seen when the settings are known.
+    """
     if (folder / MANIFEST).exists():
-        raise InputError(f"{folder}: holds a run already; choose another folder")
+        run = read_run(folder)
+        if run.manifest["status"] == "finished":
+            raise InputError(
+                f"{folder}: holds a run already; choose another folder, or make that run longer by "
+                f"{run.resume_words()} total_timesteps=..."
+            )
     if (folder / SWEEP_JSON).exists():
         raise InputError(f"{folder}: is the folder of a sweep; choose another {key}")
     if used := next(folder.glob(f"*/{MANIFEST}"), None):

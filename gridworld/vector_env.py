@@ -17,10 +17,12 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from gridworld import render as drawing
+from gridworld.chance import generator_state, set_generator_state
 from gridworld.errors import InputError
 from gridworld.layout import CLASSIC, Layout, load_by_default_size, positive_int
 from gridworld.mdp import NUM_ACTIONS, BoolArray, FloatArray, compile_mdp
 from gridworld.render import CELL_SIZE, Frame
+from gridworld.state import State, StateError, fill
 
 StateArray = NDArray[np.int64]
 Step = tuple[StateArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]
@@ -163,6 +165,30 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         if self.render_mode is None:
             return None
         return tuple(drawing.draw_frame(self.mdp, int(state), self.cell_size) for state in self._state)
+
+    def get_state(self) -> State:
+        """Where all environments stand, as a value that `set_state` of another such batch takes."""
+        return {
+            "random": generator_state(self.np_random),
+            "states": self._state.copy(),
+            "elapsed": self._elapsed.copy(),
+            "over": self._over.copy(),
+        }
+
+    def set_state(self, state: State) -> None:
+        """Stand where a batch stood. Raises `ValueError` for the state of another kind."""
+        states = state["states"]
+        if (
+            isinstance(states, np.ndarray)
+            and states.size
+            and not 0 <= states.min() <= states.max() < self.mdp.num_states
+        ):
+            raise StateError(f"states must be from 0 to {self.mdp.num_states - 1}")
+        set_generator_state(self.np_random, state["random"])
+        fill(self._state, states, "states")
+        fill(self._elapsed, state["elapsed"], "elapsed")
+        fill(self._over, state["over"], "over")
+        self._any_over = bool(self._over.any())
 
     def _restart(self, which: NDArray[np.intp]) -> None:
         starts = self.mdp.start_states

@@ -14,7 +14,8 @@ from gridworld.errors import InputError
 from gridworld.layout import shipped_layouts
 from gridworld.observations import make_observation
 from gridworld.saved_run import read_config
-from gridworld.training import hparams, make_mdp
+from gridworld.session import hparams
+from gridworld.training import make_mdp
 
 GROUPS = sorted(folder.name for folder in CONF.iterdir() if folder.is_dir() and folder.name != "tune")
 CHOICES = [(group, file.stem) for group in GROUPS for file in sorted((CONF / group).glob("*.yaml"))]

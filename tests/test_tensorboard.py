@@ -15,7 +15,7 @@ from browser import chromium
 from support import SHORT, script, train_in
 
 from gridworld.curve import CHARTS
-from gridworld.training import HPARAM_METRICS
+from gridworld.session import HPARAM_METRICS
 
 # Walks through the shadow roots that TensorBoard's components hide behind.
 PAGE_TEXT = """

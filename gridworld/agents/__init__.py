@@ -23,6 +23,7 @@ from gridworld.counted_env import CountedVectorEnv
 from gridworld.errors import InputError
 from gridworld.mdp import FloatArray, IntArray
 from gridworld.observations import ObservationTable
+from gridworld.state import State
 
 if TYPE_CHECKING:
     from gridworld.config import AgentConfig, TrainConfig
@@ -55,11 +56,23 @@ class Seat:
 class Agent(Protocol):
     """What the experiment asks of an agent."""
 
-    def learn(self, total_timesteps: int, on_step: Callable[[int], bool]) -> None:
-        """Learn for that many environment steps (a whole last batch counts).
+    def learn(
+        self,
+        total_timesteps: int,
+        on_step: Callable[[int], bool],
+        at_rest: Callable[[int], None] | None = None,
+        state: State | None = None,
+    ) -> None:
+        """Learn for that many environment steps (a whole last batch counts), from the start or from a state.
 
         `on_step(steps so far)` is called after every batch of steps; learning ends when it returns False.
+        `at_rest(steps so far)` is called where nothing is half done, so that `get_state` has all there is,
+        and once more at the end if that is such a point. Raises `ValueError` for a state that does not fit,
+        and `InputError` at once where `get_state` could not have all there is.
         """
+
+    def get_state(self) -> State:
+        """Everything that learning depends on from here, its environments included."""
 
     def beliefs(self) -> Beliefs:
         """What it believes of every state now."""

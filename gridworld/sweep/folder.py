@@ -23,10 +23,9 @@ from gridworld.errors import InputError
 from gridworld.files import write_json
 from gridworld.lock import locked
 from gridworld.provenance import versions
-from gridworld.run import MANIFEST, SWEEP_JSON, check_writable
+from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, check_writable
 from gridworld.sweep.plan import Job, folder_name
 
-LOCK = ".lock"
 STOP = ".stop"  # in the sweep's folder: no more jobs are to begin, wherever they wait
 _FORMAT = 1
 

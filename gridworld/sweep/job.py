@@ -14,13 +14,14 @@ from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.files import write_json, write_text
 from gridworld.lock import locked
-from gridworld.run import MANIFEST, Run
-from gridworld.sweep.folder import LOCK
+from gridworld.resume import is_intact, train_or_go_on
+from gridworld.run import LOCK, MANIFEST, Run
+from gridworld.signals import Interrupted
 from gridworld.sweep.table import DONE, FAILED, INTERRUPTED, RUNNING, Table, one_line, outcome, read_json
-from gridworld.training import Interrupted, train
 
 ERROR_FILE = "error.txt"  # the traceback of what nobody foresaw
 _HYDRA_FOLDER = ".hydra"
+_TO_GO_ON_WITH = ("running", "interrupted")  # statuses of runs that were stopped from outside
 
 
 class JobError(Exception):
@@ -34,20 +35,22 @@ class StopSweep(BaseException):
 def run_in_sweep(config: TrainConfig, folder: Path, overrides: list[str], stop_at_failure: bool) -> float:
     """Train in the job's folder, unless that is done or being done; returns the final regret.
 
-    What an earlier attempt left behind is replaced. Raises `JobError` or `StopSweep`, and `SystemExit` when
-    interrupted.
+    What was interrupted goes on from its checkpoint; what an attempt left that failed is replaced.
+    Raises `JobError` or `StopSweep`, and `SystemExit` when interrupted.
     """
     table, job = Table(folder.parent), folder.name
     with locked(folder / LOCK, wait=1) as is_ours:
-        if not is_ours or read_json(folder / MANIFEST).get("status") == "finished":
+        status = read_json(folder / MANIFEST).get("status")
+        if not is_ours or status == "finished":
             return math.nan
-        _clear(folder)
+        if status not in _TO_GO_ON_WITH or not is_intact(folder):
+            _clear(folder)
         table.set(job, status=RUNNING, seconds="", objective="", error="")
         started = time.monotonic()
         run = Run(folder)
         config = replace(config, logging=replace(config.logging, progress=False))  # the sweep has its own
         try:
-            summary = train(config, run, overrides)
+            summary = train_or_go_on(config, run, overrides)
         except Interrupted as interruption:
             table.set(job, status=INTERRUPTED, **outcome(folder, run.manifest))
             sys.exit(interruption.exit_code)

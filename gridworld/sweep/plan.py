@@ -109,7 +109,7 @@ def plan(
 
 def _hash(config: TrainConfig, layout: str) -> str:
     content = dataclasses.asdict(config)
-    for without_effect in ("logging", "recording"):
+    for without_effect in ("logging", "recording", "checkpoint"):
         del content[without_effect]
     text = json.dumps([content, layout], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:32]

@@ -19,8 +19,8 @@ from typing import Any
 
 from gridworld.files import write_text
 from gridworld.lock import is_locked, locked
-from gridworld.run import MANIFEST, SUMMARY
-from gridworld.sweep.folder import LOCK, Entry
+from gridworld.run import LOCK, MANIFEST, SUMMARY
+from gridworld.sweep.folder import Entry
 
 JOBS_CSV = "jobs.csv"
 TABLE_LOCK = ".jobs.lock"

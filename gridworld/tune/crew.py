@@ -13,7 +13,7 @@ from multiprocessing.context import SpawnProcess
 from typing import Any
 
 from gridworld.errors import InputError
-from gridworld.training import signals_raise
+from gridworld.signals import StopRequest
 
 Work = Callable[[Any, int, int], None]  # (task, number of the worker, process id of the parent)
 
@@ -29,7 +29,7 @@ def run_crew(work: Work, task: Any, workers: int, look: Callable[[], None]) -> N
     """
     processes: dict[int, SpawnProcess] = {}
     lost = 0
-    with signals_raise():
+    with StopRequest().listening():
         try:
             for number in range(workers):
                 processes[number] = _start(work, task, number)

@@ -17,8 +17,9 @@ import optuna
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.run import MANIFEST, SWEEP_JSON, check_writable
+from gridworld.session import hparams
 from gridworld.sweep.report import shown
-from gridworld.training import hparams, make_mdp
+from gridworld.training import make_mdp
 from gridworld.tune import confirm, verdict
 from gridworld.tune.asked import Asked, Source, search_path
 from gridworld.tune.crew import run_crew

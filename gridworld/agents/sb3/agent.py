@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.save_util import recursive_getattr
 from torch import Tensor
@@ -17,6 +16,7 @@ from gridworld.agents import Beliefs, Seat, WriteScalars
 from gridworld.agents.sb3.building import make_model
 from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters, reason
 from gridworld.agents.sb3.reading import Reading, of_q, read
+from gridworld.agents.sb3.resting import Resting, check_finite, diverged
 from gridworld.agents.sb3.tabulated_dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated_ppo import TabulatedPPO
 from gridworld.chain import one_hot_policy
@@ -24,6 +24,7 @@ from gridworld.config import AgentConfig, SB3Config, within
 from gridworld.errors import InputError
 from gridworld.files import replacing
 from gridworld.mdp import FloatArray, IntArray
+from gridworld.state import State
 
 _CHUNK = 4096  # states a forward pass
 # A model file holds the optimiser's numbers beside every weight, and what SB3 pickles: the last
@@ -45,21 +46,25 @@ class SB3Agent:
         writers = [] if seat.write_scalars is None else [_ScalarsOnly(seat.write_scalars)]
         self.model.set_logger(Logger(folder=None, output_formats=list(writers)))
 
-    def learn(self, total_timesteps: int, on_step: Callable[[int], bool]) -> None:
+    def learn(
+        self,
+        total_timesteps: int,
+        on_step: Callable[[int], bool],
+        at_rest: Callable[[int], None] | None = None,
+        state: State | None = None,
+    ) -> None:
+        self._resting = Resting(on_step, at_rest, self.observation, SB3Agent.learn.__code__)
+        self._resting.state = state
         try:
-            self.model.learn(
-                total_timesteps, callback=_OnStep(on_step), log_interval=self.config.log_interval
-            )
-        except ValueError as error:  # torch's distributions refuse NaN, which SB3 lets through
-            if self._is_finite():
-                raise
-            raise InputError(
-                f"agent={self.config.name}: training diverged, the network's weights are no finite numbers "
-                f"after {self.model.num_timesteps} steps; try a smaller learning rate"
-            ) from error
+            self.model.learn(total_timesteps, callback=self._resting, log_interval=self.config.log_interval)
+        except FloatingPointError as error:
+            raise diverged(self.model, str(error)) from None
+        except ValueError:  # torch's distributions refuse NaN, which SB3 lets through
+            check_finite(self.model)
+            raise
 
-    def _is_finite(self) -> bool:
-        return all(bool(torch.isfinite(weights).all()) for weights in self.model.policy.parameters())
+    def get_state(self) -> State:
+        return self._resting.get_state()
 
     def beliefs(self) -> Beliefs:
         states = np.arange(self.observation.num_states)
@@ -121,15 +126,6 @@ class SB3Agent:
 def _joined(parts: tuple[Tensor | None, ...]) -> FloatArray | None:
     tensors = [part for part in parts if part is not None]
     return torch.cat(tensors).cpu().numpy().astype(np.float64) if tensors else None
-
-
-class _OnStep(BaseCallback):
-    def __init__(self, on_step: Callable[[int], bool]) -> None:
-        super().__init__()
-        self._hook = on_step
-
-    def _on_step(self) -> bool:
-        return self._hook(self.num_timesteps)
 
 
 class _ScalarsOnly(KVWriter):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 import inspect
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -43,7 +44,10 @@ class Descent:
         self._shared: Any = None  # the state of `optimizer` once it consists of views
 
     def step(self, outputs: Sequence[Tensor], slopes: Sequence[NDArray[Any]], max_grad_norm: float) -> None:
-        """One step, from a loss's slopes in the network's outputs."""
+        """One step, from a loss's slopes in the network's outputs.
+
+        Raises `FloatingPointError` for a gradient that is not finite, before it does any harm.
+        """
         self._gradient.zero_()
         if self._parameters[0].grad is not self._gradients[0]:
             for parameter, view in zip(self._parameters, self._gradients, strict=True):
@@ -56,7 +60,10 @@ class Descent:
             ],
         )
         # As torch.nn.utils.clip_grad_norm_ does it.
-        scale = max_grad_norm / (self._gradient.norm().item() + 1e-6)
+        norm = self._gradient.norm().item()
+        if not norm < math.inf:
+            raise FloatingPointError("the gradient is")
+        scale = max_grad_norm / (norm + 1e-6)
         if scale < 1:
             self._gradient *= scale
         if self._optimizer.state is not self._shared and self._optimizer.state:

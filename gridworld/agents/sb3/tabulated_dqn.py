@@ -77,6 +77,7 @@ class TabulatedDQN(DQN):
 
     env: GridWorldVecEnv
     replay_buffer: StateReplayBuffer
+    derived = ("descent", "inputs", "_q", "_target_values")  # from the rest: no part of a checkpoint
 
     def _setup_model(self) -> None:
         observation = self.env.observation
@@ -90,8 +91,11 @@ class TabulatedDQN(DQN):
         self._target_values: Float32Array | None = None  # (S,), until the target network changes
 
     def _excluded_save_params(self) -> list[str]:
-        ours = ["replay_buffer_class", "replay_buffer_kwargs", "descent", "inputs", "_q", "_target_values"]
-        return [*super()._excluded_save_params(), *ours]
+        return [
+            *super()._excluded_save_params(),
+            *("replay_buffer_class", "replay_buffer_kwargs"),
+            *self.derived,
+        ]
 
     def q_values(self, network: QNetwork, states: IntArray | None = None) -> Tensor:
         """Q (U, A) of these states (None: all), with its graph."""

@@ -60,6 +60,7 @@ class TabulatedPPO(PPO):
 
     env: GridWorldVecEnv
     policy: ActorCriticPolicy
+    derived = ("descent", "inputs", "_old")  # from the rest: no part of a checkpoint
 
     def _setup_model(self) -> None:
         self.rollout_buffer_class = StateRolloutBuffer
@@ -70,8 +71,7 @@ class TabulatedPPO(PPO):
         self._old: Outputs  # of all states, from the policy that collected the rollout
 
     def _excluded_save_params(self) -> list[str]:
-        ours = ["rollout_buffer_class", "descent", "inputs", "_old"]
-        return [*super()._excluded_save_params(), *ours]
+        return [*super()._excluded_save_params(), "rollout_buffer_class", *self.derived]
 
     def outputs(self, states: IntArray | None = None) -> tuple[Tensor, Tensor]:
         """Logits (U, A) and values (U, 1) of these states (None: all), with their graph."""

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 from gridworld.errors import InputError
 from gridworld.mdp import NUM_ACTIONS, BoolArray, FloatArray
 from gridworld.observations import ObservationTable
+from gridworld.state import State, fill
 from gridworld.vector_env import GridWorldVectorEnv, StateArray
 
 _MASKS = "action_masks"  # asked for by agents that respect them; here nothing is ever forbidden
@@ -105,6 +106,22 @@ class GridWorldVecEnv(VecEnv):
         self._returns[over] = 0.0
         self._lengths[over] = 0
         return StateStep(states, last, rewards, dones, truncated, infos)
+
+    def get_state(self) -> State:
+        """Where the batch and the counters stand, as a value. Seeds and options were used up by `reset`."""
+        return {
+            "envs": self.envs.get_state(),
+            "returns": self._returns.copy(),
+            "lengths": self._lengths.copy(),
+            "seconds": time.time() - self._started,
+        }
+
+    def set_state(self, state: State) -> None:
+        """Stand there. Raises `ValueError` for the state of another batch."""
+        self.envs.set_state(state["envs"])
+        fill(self._returns, state["returns"], "returns")
+        fill(self._lengths, state["lengths"], "lengths")
+        self._started = time.time() - float(state["seconds"])
 
     def close(self) -> None:
         self.envs.close()

@@ -37,9 +37,11 @@ from gridworld.agents.tabular.policies import (
     expected_value,
     rows_of,
 )
+from gridworld.chance import generator_state, set_generator_state
 from gridworld.config import TabularControlConfig, parse_schedule
 from gridworld.errors import InputError
 from gridworld.mdp import NUM_ACTIONS, FloatArray, IntArray
+from gridworld.state import State, fill, fitting
 
 _NONE: IntArray = np.empty(0, dtype=np.int64)
 
@@ -60,23 +62,38 @@ class TabularControl:
         self._random = np.random.default_rng(np.random.SeedSequence(seat.seed).spawn(1)[0])
         # V of the policy whose Q the table is.
         self._value = best_value if config.algorithm == "q_learning" else expected_value
+        self._steps: int  # from here on: while learning
+        self._actions: IntArray  # (num_envs,), chosen and not yet taken
+        self._episodes: Episodes
+        self._log: _Log
 
-    def learn(self, total_timesteps: int, on_step: Callable[[int], bool]) -> None:
+    def learn(
+        self,
+        total_timesteps: int,
+        on_step: Callable[[int], bool],
+        at_rest: Callable[[int], None] | None = None,
+        state: State | None = None,
+    ) -> None:
         envs, gamma, is_sarsa = self._seat.envs, self.config.gamma, self.config.algorithm == "sarsa"
         q, visits = self.q.reshape(-1), self.visits.reshape(-1)  # flat views
-        episodes = Episodes(envs.num_envs, self.config.stats_window_size)
-        log = _Log(self, episodes)
+        self._episodes = Episodes(envs.num_envs, self.config.stats_window_size)
+        self._log = _Log(self, self._episodes)
         states, _ = envs.reset(seed=self._seat.seed)
-        actions = self._act(states)
-        steps, goes_on = 0, True
-        while goes_on and steps < total_timesteps:
-            step_size = self._step_size(steps / total_timesteps)
+        self._steps, self._actions = 0, self._act(states)
+        if state is not None:
+            with fitting():
+                self._set_state(state)
+            states = envs.states
+        goes_on = True
+        while goes_on and self._steps < total_timesteps:
+            actions = self._actions
+            step_size = self._step_size(self._steps / total_timesteps)
             following, rewards, _, _, infos = envs.step(actions)
-            steps += envs.num_envs
+            self._steps = steps = self._steps + envs.num_envs
             self.exploration_rate = self._epsilon(steps / total_timesteps)
             over = np.flatnonzero(infos["_final_obs"]) if infos else _NONE
             reached = infos["final_obs"] if infos else following  # before the reset of what is over
-            episodes.add(rewards, over)
+            self._episodes.add(rewards, over)
 
             if is_sarsa:
                 actions_there = self._act(reached)
@@ -86,15 +103,47 @@ class TabularControl:
                 targets = rewards + gamma * self._value(rows, self.exploration_rate)[index]
             error = update(q, visits, states * NUM_ACTIONS + actions, targets, step_size)
 
+            if not error < np.inf:
+                raise InputError(
+                    f"agent={self.config.name}: training diverged at step {steps:,}, the error of its update "
+                    "is no finite number; try a smaller learning rate"
+                )
             if is_sarsa:
-                actions = actions_there
                 if over.size:
-                    actions[over] = self._act(following[over])
+                    actions_there[over] = self._act(following[over])
+                self._actions = actions_there
             else:
-                actions = self._act(following)
+                self._actions = self._act(following)
             states = following
-            log.add(error, step_size, steps)
+            self._log.add(error, step_size, steps)
             goes_on = on_step(steps)
+            if at_rest is not None and goes_on:
+                at_rest(steps)
+
+    def get_state(self) -> State:
+        return {
+            "envs": self._seat.envs.get_state(),
+            "random": generator_state(self._random),
+            "q": self.q.copy(),
+            "visits": self.visits.copy(),
+            "exploration_rate": self.exploration_rate,
+            "steps": self._steps,
+            "actions": self._actions.copy(),
+            "episodes": self._episodes.get_state(),
+            "log": self._log.get_state(),
+        }
+
+    def _set_state(self, state: State) -> None:
+        """Mirrors `get_state`, once learning has begun."""
+        self._seat.envs.set_state(state["envs"])
+        set_generator_state(self._random, state["random"])
+        fill(self.q, state["q"], "q")
+        fill(self.visits, state["visits"], "visits")
+        self.exploration_rate = float(state["exploration_rate"])
+        self._steps = int(state["steps"])
+        fill(self._actions, state["actions"], "actions")
+        self._episodes.set_state(state["episodes"])
+        self._log.set_state(state["log"])
 
     def _act(self, states: IntArray) -> IntArray:
         return draw_actions(self.q, self.exploration_rate, states, self._random.random(len(states)))
@@ -143,6 +192,15 @@ class _Log:
         self._write = agent._seat.write_scalars
         self._next = agent.config.log_interval  # episodes
         self._error, self._updates = 0.0, 0
+
+    def get_state(self) -> State:
+        """What is not written yet."""
+        return {"next": self._next, "error": self._error, "updates": self._updates}
+
+    def set_state(self, state: State) -> None:
+        """Go on from there."""
+        self._next, self._updates = int(state["next"]), int(state["updates"])
+        self._error = float(state["error"])
 
     def add(self, error: float, step_size: StepSize, steps: int) -> None:
         """Count an update, and write what there is once enough episodes have ended."""

@@ -7,6 +7,7 @@ from collections import deque
 import numpy as np
 
 from gridworld.mdp import FloatArray, IntArray
+from gridworld.state import State, fill
 
 
 class Episodes:
@@ -25,6 +26,23 @@ class Episodes:
             self.finished += len(over)
             self._last.extend(zip(self._returns[over].tolist(), self._lengths[over].tolist(), strict=True))
             self._returns[over] = self._lengths[over] = 0
+
+    def get_state(self) -> State:
+        """What was counted, as a value."""
+        return {
+            "finished": self.finished,
+            "returns": self._returns.copy(),
+            "lengths": self._lengths.copy(),
+            "last": [list(episode) for episode in self._last],
+        }
+
+    def set_state(self, state: State) -> None:
+        """Go on counting from there."""
+        self.finished = int(state["finished"])
+        fill(self._returns, state["returns"], "returns")
+        fill(self._lengths, state["lengths"], "lengths")
+        self._last.clear()
+        self._last.extend((float(total), float(length)) for total, length in state["last"])
 
     def means(self) -> dict[str, float]:
         """Mean return and length of the last episodes."""

@@ -17,6 +17,7 @@ from gridworld.config import ValueIterationConfig
 from gridworld.errors import InputError
 from gridworld.mdp import BoolArray, FloatArray
 from gridworld.solve import value_iteration
+from gridworld.state import State
 
 
 class Optimum:
@@ -35,9 +36,19 @@ class Optimum:
         self.q: FloatArray = solution.q
         self.optimal: BoolArray = solution.optimal  # (S, A), every action as good as the best
 
-    def learn(self, total_timesteps: int, on_step: Callable[[int], bool]) -> None:
+    def learn(
+        self,
+        total_timesteps: int,
+        on_step: Callable[[int], bool],
+        at_rest: Callable[[int], None] | None = None,
+        state: State | None = None,
+    ) -> None:
         """Nothing is left to learn: 0 steps."""
         on_step(0)
+
+    def get_state(self) -> State:
+        """It is solved for again."""
+        return {}
 
     def beliefs(self) -> Beliefs:
         """Greedy is the first of the optimal actions; the sampled policy takes any of them."""

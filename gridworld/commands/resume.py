@@ -1,0 +1,80 @@
+"""`python scripts/train.py resume=RUN`: go on with a run, as it was begun.
+
+`total_timesteps=N` makes it longer, `logging.progress=false` silent. `trust=true` imports the classes that
+the run names wherever they are from, `anyway=true` accepts other versions or another processor.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from gridworld.errors import InputError
+from gridworld.lock import locked
+from gridworld.run import LOCK, check_inside, read_run
+
+KEY = "resume"
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Go on, and tell the result as a new run would."""
+    words = _read(arguments)
+    folder = Path(words[KEY])
+    check_inside(folder, KEY)
+    read_run(folder)  # before anything is written there
+
+    from gridworld.resume import Unfinished  # what comes now takes a second to import
+    from gridworld.signals import Interrupted
+    from gridworld.telling import tell_end, tell_interrupted
+
+    with locked(folder / LOCK, wait=0) as is_ours:
+        if not is_ours:
+            raise InputError(f"{folder}: another process is at work in it; wait for it or stop it")
+        unfinished = Unfinished(folder, trust=words.get("trust", False))
+        unfinished.config.logging.progress &= words.get("logging.progress", True)
+        try:
+            summary = unfinished.go_on(words.get("total_timesteps"), words.get("anyway", False))
+        except Interrupted as interruption:
+            sys.exit(tell_interrupted(interruption, unfinished.run))
+    tell_end(summary, unfinished.run)
+
+
+def _read(arguments: Sequence[str]) -> dict[str, Any]:
+    kinds: dict[str, Callable[[str], Any]] = {
+        KEY: _folder,
+        "total_timesteps": _number,
+        **dict.fromkeys(("logging.progress", "trust", "anyway"), _truth),
+    }
+    words: dict[str, Any] = {}
+    for argument in arguments:
+        key, _, text = argument.partition("=")
+        if key not in kinds:
+            raise InputError(
+                f"{argument}: a run goes on with the settings that it began with; beside {KEY}=RUN there are "
+                f"{', '.join(list(kinds)[1:])}"
+            )
+        try:
+            words[key] = kinds[key](text)
+        except ValueError as error:
+            raise InputError(f"{argument}: must be {error}") from None
+    return words
+
+
+def _folder(text: str) -> str:
+    if not text:
+        raise ValueError("the folder of a run, e.g. one in runs/")
+    return text
+
+
+def _number(text: str) -> int:
+    if not text.isascii() or not text.isdecimal() or len(text) > 18 or int(text) < 1:
+        raise ValueError("a number of environment steps")
+    return int(text)
+
+
+def _truth(text: str) -> bool:
+    if text not in ("true", "false"):
+        raise ValueError("true or false")
+    return text == "true"

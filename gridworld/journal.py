@@ -1,0 +1,110 @@
+"""A file that only grows: every record is in it whole or not at all, and it can be cut back to a mark.
+
+A mark is the file's name, its length and the SHA-256 of all before it. A run that goes on from a checkpoint
+cuts its files back to the checkpoint's marks, so that no record is there twice and none is missing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+from gridworld.errors import InputError
+
+_PIECE = 1 << 20  # bytes read at once
+
+_log = logging.getLogger("gridworld")
+
+
+class Journal:
+    """A new file at `path`, or with `mark` the one that is there, cut back to it (see `holds`).
+
+    What was appended is in the file at once, for whoever reads along.
+    """
+
+    def __init__(self, path: Path, mark: dict[str, Any] | None = None) -> None:
+        self.path = path
+        self._file = path.open("w+b" if mark is None else "r+b", buffering=0)
+        self._sum = hashlib.sha256()
+        self.length = 0
+        if mark is not None:
+            self.length = mark["length"]
+            self._sum = _sum_of(path, self.length)
+            self._file.truncate(self.length)
+            self._file.seek(self.length)
+
+    def append(self, record: bytes) -> None:
+        """Add a record. After an `OSError`, as on a full disk, the file ends with the record before."""
+        rest = memoryview(record)
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except BaseException:
+            self._file.truncate(self.length)
+            self._file.seek(self.length)
+            raise
+        self.length += len(record)
+        self._sum.update(record)
+
+    def mark(self) -> dict[str, Any]:
+        """Where the file ends now."""
+        return {"name": self.path.name, "length": self.length, "sha256": self._sum.hexdigest()}
+
+    def sync(self) -> None:
+        """Let the file survive a power cut; one that somebody deleted meanwhile is put back first."""
+        self._put_back()
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """No more will be written."""
+        if not self._file.closed:
+            try:
+                self._put_back()
+            finally:
+                self._file.close()
+
+    def _put_back(self) -> None:
+        """An open file outlives its name, so that nothing of it is lost."""
+        try:
+            if os.path.samestat(os.stat(self.path), os.fstat(self._file.fileno())):
+                return
+        except FileNotFoundError:
+            pass
+        _log.warning("%s: was deleted or replaced during the run; it is written again", self.path)
+        self._file.seek(0)
+        content = self._file.read()
+        try:
+            again = self.path.open("w+b", buffering=0)
+        except FileNotFoundError:
+            raise InputError(f"{self.path.parent}: this run's folder was taken away while it ran") from None
+        self._file.close()
+        self._file, self.length = again, 0
+        self._sum = hashlib.sha256()
+        self.append(content or b"")
+
+
+def holds(folder: Path, mark: Any) -> bool:
+    """Whether the file that a mark is of is still there, unchanged up to the mark."""
+    try:
+        path = folder / mark["name"]
+        if path.name != mark["name"] or type(mark["length"]) is not int or mark["length"] < 0:
+            return False  # it leads elsewhere
+        return bool(_sum_of(path, mark["length"]).hexdigest() == mark["sha256"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return False
+
+
+def _sum_of(path: Path, length: int) -> hashlib._Hash:
+    """Of the first `length` bytes. Raises `ValueError` where there are not so many."""
+    found, rest = hashlib.sha256(), length
+    with path.open("rb") as file:
+        while rest > 0:
+            piece = file.read(min(rest, _PIECE))
+            if not piece:
+                raise ValueError(f"{path} has fewer than {length} bytes")
+            found.update(piece)
+            rest -= len(piece)
+    return found

@@ -1,0 +1,199 @@
+"""Resuming as a user meets it: by command, by the same command again, longer, in a sweep, after a signal."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from resuming import begin, differences, go_on, left_behind, stopped_after
+from support import ROOT, SHORT, configure, script
+
+from gridworld import identity
+from gridworld.checkpoint import Checkpoints
+from gridworld.errors import InputError
+from gridworld.files import write_json
+from gridworld.lock import locked
+from gridworld.resume import Unfinished
+from gridworld.run import LOCK
+from gridworld.sweep.job import run_in_sweep
+
+LESS = ["recording.frames=false", "recording.gif=false"]
+WORDS = [*SHORT["q_learning"], *LESS, "checkpoint.every=600"]
+
+
+@pytest.fixture
+def stopped(tmp_path: Path) -> Path:
+    """A run that was killed after 1,200 of 2,000 steps."""
+    stopped_after(2, tmp_path / "run", *WORDS)
+    return tmp_path / "run"
+
+
+@pytest.fixture(scope="module")
+def calm(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
+    folder = tmp_path_factory.mktemp("calm")
+    begin(folder, *WORDS)
+    return left_behind(folder)
+
+
+def manifest(folder: Path) -> dict[str, object]:
+    content = json.loads((folder / "manifest.json").read_text())
+    assert isinstance(content, dict)
+    return content
+
+
+def test_resume_and_the_same_command_again(stopped: Path, calm: dict[str, object]) -> None:
+    shutil.copytree(stopped, stopped.with_name("other"))
+    cwd = stopped.parent
+    done = script("train.py", "resume=run", "logging.progress=false", cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    assert "run: goes on after 1,200 of 2,000 steps" in done.stderr
+    assert "q_learning on classic, seed 0: 2,000 steps" in done.stdout
+    assert differences(left_behind(stopped), calm) == []
+    assert manifest(stopped)["status"] == "finished"
+
+    refused = script("train.py", *WORDS, "hydra.run.dir=other", "seed=3", "env.slip=0.2", cwd=cwd)
+    assert refused.returncode == 2
+    expected = "unfinished run with other settings (seed=3 instead of 0, env.slip=0.2 instead of 0.0); choose"
+    assert expected in refused.stderr
+    again = script("train.py", *WORDS, "hydra.run.dir=other", cwd=cwd)
+    assert again.returncode == 0, again.stderr
+    assert differences(left_behind(cwd / "other"), calm) == []
+    third = script("train.py", *WORDS, "hydra.run.dir=other", cwd=cwd)
+    assert third.returncode == 2
+    assert "other: holds a run already; choose another folder, or make that run longer by" in third.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["resume="], "resume=: must be the folder of a run"),
+        (["resume=nowhere"], "nowhere: no such folder"),
+        (["resume=.."], "resume=..: leads out of the current folder"),
+        (["resume=run", "seed=1"], "seed=1: a run goes on with the settings that it began with; beside"),
+        (["-m", "resume=run"], "-m: a run goes on with the settings"),
+        (["resume=run", "total_timesteps=1e5"], "total_timesteps=1e5: must be a number of environment steps"),
+        (["resume=run", "total_timesteps=1000"], "has come to 1,200 of 2,000 steps; it can be made longer"),
+        (["resume=run", "anyway=maybe"], "anyway=maybe: must be true or false"),
+    ],
+    ids=lambda value: str(value)[:40],
+)
+def test_mistakes(words: list[str], expected: str, stopped: Path) -> None:
+    done = script("train.py", *words, cwd=stopped.parent)
+    assert done.returncode == 2
+    assert expected in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_run_is_one_process_alone(stopped: Path) -> None:
+    with locked(stopped / LOCK):
+        for words in (["resume=run"], [*WORDS, "hydra.run.dir=run"]):
+            done = script("train.py", *words, cwd=stopped.parent)
+            assert done.returncode == 2
+            assert "run: another process is at work in it" in done.stderr
+
+
+def test_a_finished_run_is_made_longer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without settings that fall over training, it is the run that would have been so long from the start."""
+    words = [*SHORT["ppo"], *LESS, "evaluation.every=700"]
+    begin(tmp_path / "long", *words, "total_timesteps=4000")
+    begin(tmp_path / "run", *words)
+    with pytest.raises(InputError, match=r"is finished; to make it longer, say how long: .*=4000"):
+        go_on(tmp_path / "run")
+    go_on(tmp_path / "run", 4000)
+    assert "4,000 steps instead of 2,000: no setting depends on that" in capsys.readouterr().err
+    shorter = left_behind(tmp_path / "run")
+    assert differences(shorter, left_behind(tmp_path / "long")) == []
+    with pytest.raises(InputError, match="it can be made longer, not shorter"):
+        go_on(tmp_path / "run", 3000)
+
+
+def test_what_falls_over_training_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    begin(tmp_path, *SHORT["dqn"], *LESS, "agent.learning_rate=lin_0.004")
+    go_on(tmp_path, 4000)
+    told = capsys.readouterr().err
+    assert "4,000 steps instead of 2,000: from here on as in a run of that length: " in told
+    assert "learning_rate 0 -> 0.001952, exploration rate 0.05 -> 0.5136" in told
+    assert manifest(tmp_path)["config"]["total_timesteps"] == 4000  # type: ignore[index]
+    for file in Checkpoints(tmp_path).files():
+        file.write_bytes(b"")
+    with pytest.raises(InputError, match="was made longer after 2,048 steps and has no checkpoint left"):
+        go_on(tmp_path, 8000)
+
+
+def test_another_environment_is_refused_or_noted(
+    stopped: Path, calm: dict[str, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    versions = dict(identity.versions())
+    monkeypatch.setattr(identity, "versions", lambda: {**versions, "numpy": "0.1"})
+    with pytest.raises(InputError, match=r"begun in another environment \(numpy .* is now 0\.1\)"):
+        go_on(stopped)
+    Unfinished(stopped).go_on(anyway=True)
+    assert "numpy" in str(manifest(stopped)["resumed"])
+    monkeypatch.undo()
+    assert differences({**left_behind(stopped), "state": None}, {**calm, "state": None}) == []
+
+
+def test_a_map_that_changed_meanwhile(tmp_path: Path) -> None:
+    world = tmp_path / "world.txt"
+    world.write_text("S..\n..G\n")
+    words = [*WORDS, "env.layout=world.txt", "hydra.run.dir=run"]
+    command = [sys.executable, str(ROOT / "tests" / "dying.py"), "1", *words]
+    assert subprocess.run(command, cwd=tmp_path, check=False).returncode == -signal.SIGKILL
+    assert manifest(tmp_path / "run")["status"] == "running"
+    world.write_text("S..\nT.G\n")
+    refused = script("train.py", *words, cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "the map world.txt has changed since" in refused.stderr
+    done = script("train.py", "resume=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "its map world.txt has changed since; it goes on with the one that it began with" in done.stderr
+    assert manifest(tmp_path / "run")["layout"] == ["S..", "..G"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_and_ends_soon(number: signal.Signals, tmp_path: Path) -> None:
+    command = [sys.executable, str(ROOT / "scripts" / "train.py"), "agent=ppo", "total_timesteps=100000000"]
+    with subprocess.Popen(
+        [*command, "hydra.run.dir=run"], cwd=tmp_path, stderr=subprocess.PIPE, text=True
+    ) as process:
+        curve, deadline = tmp_path / "run" / "curve.csv", time.monotonic() + 60
+        while not (curve.exists() and curve.read_text().count("\n") > 3) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        process.send_signal(number)
+        _, told = process.communicate(timeout=20)
+    assert process.returncode == 128 + number
+    left = manifest(tmp_path / "run")
+    assert left["status"] == "interrupted"
+    assert left["checkpoint"] == left["reached"] > 0  # type: ignore[operator]
+    assert f"stopped by {number.name}: all {left['reached']:,} steps are saved; go on with" in told
+    assert list((tmp_path / "run").rglob("*.part")) == []
+
+
+def test_where_no_rest_comes_the_last_checkpoint_counts(tmp_path: Path) -> None:
+    """A rollout of many seconds cannot be saved in its middle: it ends soon all the same, and says so."""
+    words = ["agent=a2c", "agent.arguments.n_steps=100000", "total_timesteps=100000000", "hydra.run.dir=run"]
+    command = [sys.executable, str(ROOT / "scripts" / "train.py"), *words, "evaluation.every=1000"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        curve, deadline = tmp_path / "run" / "curve.csv", time.monotonic() + 60
+        while not (curve.exists() and curve.read_text().count("\n") > 2) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGTERM)
+        _, told = process.communicate(timeout=20)
+    assert process.returncode == 143
+    assert "stopped by SIGTERM: nothing is saved, so that it will begin anew; go on with" in told
+
+
+def test_an_interrupted_job_of_a_sweep_goes_on(tmp_path: Path) -> None:
+
+    words = [*WORDS, "seed=1"]
+    begin(tmp_path / "calm", *words)
+    folder = tmp_path / "sweep" / "seed=1"
+    stopped_after(2, folder, *words)
+    write_json(folder / "manifest.json", {**manifest(folder), "status": "running"})
+    run_in_sweep(configure(*words), folder, words, stop_at_failure=False)
+    assert manifest(folder)["resumed"]
+    assert differences(left_behind(folder), left_behind(tmp_path / "calm")) == []
