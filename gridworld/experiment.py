@@ -22,13 +22,16 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gridworld.config import AGENT_SCHEMAS, LAUNCHER_SCHEMAS, SearchConfig, SweepConfig, TrainConfig
+from gridworld.agent_config import AGENT_SCHEMAS
+from gridworld.config import TrainConfig
 from gridworld.errors import EXIT_CODE, InputError
 from gridworld.hydra_errors import refuse_added_keys, sentence, unreadable_file
 from gridworld.lock import locked
 from gridworld.manual import manual
 from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, Run, check_inside, check_new
+from gridworld.sweep.config import LAUNCHER_SCHEMAS, SweepConfig
 from gridworld.terminal import prepare, tell_error
+from gridworld.tune.config import SearchConfig
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 _job_begun = threading.Event()  # set once this process has come to a job

@@ -12,7 +12,8 @@ import json
 import platform
 from typing import Any
 
-from gridworld.config import AgentConfig, SB3Config, TrainConfig
+from gridworld.agent_config import AgentConfig, SB3Config
+from gridworld.config import TrainConfig
 from gridworld.provenance import versions
 
 _MATTER = ("python", "gridworld", "gymnasium", "numpy", "scipy")  # to every agent

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld import record
+from gridworld.agent_config import AgentConfig
 from gridworld.agents import Beliefs
 from gridworld.chain import one_hot_policy
-from gridworld.config import AgentConfig, TrainConfig
+from gridworld.config import TrainConfig
 from gridworld.error_map import draw_error_map, value_error
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge, play_episode

@@ -13,8 +13,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from gridworld.agent_config import LINEAR, AgentConfig, parse_schedule
 from gridworld.checkpoint import Checkpoints
-from gridworld.config import LINEAR, AgentConfig, TrainConfig, parse_schedule
+from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.identity import environment, identity, settings
 from gridworld.journal import holds

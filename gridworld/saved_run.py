@@ -18,9 +18,10 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from gridworld.agent_config import AGENT_SCHEMAS, AgentConfig, SB3ClassConfig
 from gridworld.agents import Beliefs, family
 from gridworld.chain import one_hot_policy
-from gridworld.config import AGENT_SCHEMAS, AgentConfig, SB3ClassConfig, TrainConfig, check
+from gridworld.config import TrainConfig, check
 from gridworld.data_files import read_bytes
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge

@@ -8,8 +8,9 @@ import pytest
 import stable_baselines3
 from support import CONF, DEEP, configure
 
+from gridworld.agent_config import AGENT_SCHEMAS
 from gridworld.agents import family
-from gridworld.config import AGENT_SCHEMAS, TrainConfig, check
+from gridworld.config import TrainConfig, check
 from gridworld.errors import InputError
 from gridworld.layout import shipped_layouts
 from gridworld.observations import make_observation

@@ -12,12 +12,7 @@ import pytest
 from support import ROOT, SHORT, configure, train_in
 
 from gridworld import GridWorldEnv, GridWorldVectorEnv, InputError
-from gridworld.agents import Agent, Seat
-from gridworld.agents.tabular import build
-from gridworld.agents.tabular.batch_update import StepSize, update
-from gridworld.agents.tabular.control import TabularControl
-from gridworld.agents.tabular.policies import draw_actions, epsilon_greedy
-from gridworld.config import (
+from gridworld.agent_config import (
     ExpectedSarsaConfig,
     QLearningConfig,
     SarsaConfig,
@@ -25,6 +20,11 @@ from gridworld.config import (
     TabularControlConfig,
     ValueIterationConfig,
 )
+from gridworld.agents import Agent, Seat
+from gridworld.agents.tabular import build
+from gridworld.agents.tabular.batch_update import StepSize, update
+from gridworld.agents.tabular.control import TabularControl
+from gridworld.agents.tabular.policies import draw_actions, epsilon_greedy
 from gridworld.layout import shipped_layouts
 from gridworld.observations import none
 from gridworld.solve import value_iteration

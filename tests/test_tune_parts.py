@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import CONF, configure
 
-from gridworld.config import DimensionConfig, TuneConfig
 from gridworld.errors import InputError
 from gridworld.report import statistics
 from gridworld.training import check_settings
 from gridworld.tune.asked import Source, ask
+from gridworld.tune.config import DimensionConfig, TuneConfig
 from gridworld.tune.records import write_trials
 from gridworld.tune.score import SeedScore, score
 from gridworld.tune.space import Space, with_values

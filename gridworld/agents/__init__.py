@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from numpy.typing import NDArray
 
-from gridworld.config import MISSING
+from gridworld.agent_config import MISSING
 from gridworld.counted_env import CountedVectorEnv
 from gridworld.errors import InputError
 from gridworld.mdp import FloatArray, IntArray
@@ -26,7 +26,8 @@ from gridworld.observations import ObservationTable
 from gridworld.state import State
 
 if TYPE_CHECKING:
-    from gridworld.config import AgentConfig, TrainConfig
+    from gridworld.agent_config import AgentConfig
+    from gridworld.config import TrainConfig
 
 WriteScalars = Callable[[Mapping[str, float], int], None]  # ({tag: value}, environment steps)
 

@@ -24,7 +24,7 @@ class GridWorldSweeper(Sweeper):
     """Hands the jobs that are not done yet to the launcher; the work is in gridworld/sweep."""
 
     def __init__(self, **settings: Any) -> None:
-        self._settings = settings  # of `gridworld.config.SweepConfig`
+        self._settings = settings  # of `gridworld.sweep.config.SweepConfig`
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Called by Hydra once everything is composed. Raises `InputError` for a launcher that is missing."""
@@ -39,7 +39,7 @@ class GridWorldSweeper(Sweeper):
 
     def sweep(self, arguments: list[str]) -> None:
         """Run the jobs that `arguments` ask for. Ends the program if they did not all end well."""
-        from gridworld.config import SweepConfig
+        from gridworld.sweep.config import SweepConfig
         from gridworld.sweep.sweeper import run_sweep
 
         settings = SweepConfig(**self._settings)
@@ -79,7 +79,7 @@ class SlurmLauncher(_OwnLauncher):
     """Runs jobs on a Slurm cluster."""
 
     def _launch(self, hydra: Hydra, jobs: Sequence[Sequence[str]], first: int) -> Sequence[JobReturn]:
-        from gridworld.config import SlurmConfig
+        from gridworld.sweep.config import SlurmConfig
         from gridworld.sweep.on_slurm import launch
 
         return launch(hydra, SlurmConfig(**self._settings), jobs, first)
@@ -89,7 +89,7 @@ class RayLauncher(_OwnLauncher):
     """Runs jobs on a Ray cluster."""
 
     def _launch(self, hydra: Hydra, jobs: Sequence[Sequence[str]], first: int) -> Sequence[JobReturn]:
-        from gridworld.config import RayConfig
+        from gridworld.sweep.config import RayConfig
         from gridworld.sweep.on_ray import launch
 
         return launch(hydra, RayConfig(**self._settings), jobs, first)

@@ -10,7 +10,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
-from gridworld.config import at_least
+from gridworld.bounds import at_least
 from gridworld.errors import InputError
 
 _OURS = "hydra_plugins.gridworld_sweeper."

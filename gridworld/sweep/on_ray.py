@@ -16,8 +16,8 @@ import ray
 from hydra.core.utils import JobReturn, JobStatus
 from ray.exceptions import RayError, TaskCancelledError
 
-from gridworld.config import RayConfig
 from gridworld.errors import InputError
+from gridworld.sweep.config import RayConfig
 from gridworld.sweep.folder import STOP
 from gridworld.sweep.job import StopSweep
 from gridworld.sweep.worker import Hydra, run_in_turn

@@ -22,9 +22,9 @@ import submitit
 from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import OmegaConf
 
-from gridworld.config import SlurmConfig
 from gridworld.errors import InputError
 from gridworld.files import replacing
+from gridworld.sweep.config import SlurmConfig
 from gridworld.sweep.folder import STOP
 from gridworld.sweep.job import StopSweep
 from gridworld.sweep.worker import Hydra, run_in_turn

@@ -16,12 +16,13 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig
 
-from gridworld.config import SweepConfig, TrainConfig
+from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.experiment import to_config
 from gridworld.run import MANIFEST
 from gridworld.sweep import report
 from gridworld.sweep.compose import SweepLoader
+from gridworld.sweep.config import SweepConfig
 from gridworld.sweep.folder import Entry, SweepFolder
 from gridworld.sweep.job import StopSweep, mark_failed
 from gridworld.sweep.plan import Job, expand, plan

@@ -24,11 +24,13 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from gridworld.config import TrainConfig, TuneConfig, above_zero, at_least
+from gridworld.bounds import above_zero, at_least
+from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.experiment import register_schemas, slug, to_config
 from gridworld.hydra_errors import sentence
 from gridworld.training import check_settings
+from gridworld.tune.config import TuneConfig
 from gridworld.tune.space import Space
 
 CHOSEN = ("agent", "env", "observation")

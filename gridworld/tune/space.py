@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gridworld.config import DimensionConfig, TrainConfig
+from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.experiment import to_config
+from gridworld.tune.config import DimensionConfig
 
 if TYPE_CHECKING:
     from optuna.trial import Trial

@@ -22,8 +22,8 @@ from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
-from gridworld.config import TuneConfig
 from gridworld.errors import InputError
+from gridworld.tune.config import TuneConfig
 from gridworld.tune.trial import ERROR
 
 _ABOUT = "gridworld"  # the study's attribute that says what is searched

@@ -16,10 +16,10 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from gridworld.config import TuneConfig
 from gridworld.lock import locked
 from gridworld.process import end_with
 from gridworld.sweep.table import one_line
+from gridworld.tune.config import TuneConfig
 from gridworld.tune.trial import ERROR, Objective, Stopped, reason
 
 if TYPE_CHECKING:

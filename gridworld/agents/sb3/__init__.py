@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from gridworld.agent_config import AgentConfig
     from gridworld.agents import Agent, Seat
-    from gridworld.config import AgentConfig
 
 __all__ = ["build", "check", "weights"]
 

@@ -12,6 +12,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.save_util import recursive_getattr
 from torch import Tensor
 
+from gridworld.agent_config import AgentConfig, SB3Config
 from gridworld.agents import Beliefs, Seat, WriteScalars
 from gridworld.agents.sb3.building import make_model
 from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters, reason
@@ -19,8 +20,8 @@ from gridworld.agents.sb3.reading import Reading, of_q, read
 from gridworld.agents.sb3.resting import Resting, check_finite, diverged
 from gridworld.agents.sb3.tabulated_dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated_ppo import TabulatedPPO
+from gridworld.bounds import within
 from gridworld.chain import one_hot_policy
-from gridworld.config import AgentConfig, SB3Config, within
 from gridworld.errors import InputError
 from gridworld.files import replacing
 from gridworld.mdp import FloatArray, IntArray

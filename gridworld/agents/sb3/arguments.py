@@ -16,10 +16,10 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import LinearSchedule
 
+from gridworld.agent_config import SB3CheckedConfig, SB3ClassConfig, SB3Config, parse_schedule
 from gridworld.agents.sb3.tabulated import why_not
 from gridworld.agents.sb3.tabulated_dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated_ppo import TabulatedPPO
-from gridworld.config import SB3CheckedConfig, SB3ClassConfig, SB3Config, parse_schedule
 from gridworld.errors import InputError
 
 Arguments = dict[str, Any]

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from gridworld.agent_config import SB3Config
 from gridworld.agents import Seat
 from gridworld.agents.sb3.arguments import algorithm_and_arguments
 from gridworld.agents.sb3.reading import why_unreadable
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.config import SB3Config
 from gridworld.errors import InputError
 from gridworld.observations import ObservationTable
 

@@ -5,19 +5,17 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from gridworld.config import (
+from gridworld.agent_config import (
     DQNConfig,
     PPOConfig,
     SB3CheckedConfig,
     SB3ClassConfig,
     SB3Config,
-    TrainConfig,
-    above_zero,
-    at_least,
     check_exploration,
     parse_schedule,
-    within,
 )
+from gridworld.bounds import above_zero, at_least, within
+from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 
 # Arguments that count something, by the names that SB3 and sb3-contrib give them.

@@ -23,9 +23,9 @@ import torch
 from stable_baselines3.common.policies import BasePolicy
 from torch import Tensor, nn
 
+from gridworld.agent_config import DQNConfig, PPOConfig, SB3CheckedConfig
 from gridworld.agents.sb3.descent import ELEMENTWISE
 from gridworld.agents.sb3.vec_env import StateStep
-from gridworld.config import DQNConfig, PPOConfig, SB3CheckedConfig
 from gridworld.mdp import IntArray
 from gridworld.observations import ObservationTable
 

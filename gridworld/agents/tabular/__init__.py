@@ -15,17 +15,17 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from gridworld.agent_config import AgentConfig
     from gridworld.agents import Agent, Seat
-    from gridworld.config import AgentConfig
 
 __all__ = ["build", "check", "weights"]
 
 
 def build(config: AgentConfig, seat: Seat) -> Agent:
     """An agent of the configured algorithm on the seat's environments."""
+    from gridworld.agent_config import TabularControlConfig, ValueIterationConfig
     from gridworld.agents.tabular.control import TabularControl
     from gridworld.agents.tabular.optimum import Optimum
-    from gridworld.config import TabularControlConfig, ValueIterationConfig
 
     if isinstance(config, ValueIterationConfig):
         return Optimum(config, seat)

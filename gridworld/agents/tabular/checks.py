@@ -4,15 +4,9 @@ from __future__ import annotations
 
 import math
 
-from gridworld.config import (
-    TabularConfig,
-    TabularControlConfig,
-    TrainConfig,
-    at_least,
-    check_exploration,
-    parse_schedule,
-    within,
-)
+from gridworld.agent_config import TabularConfig, TabularControlConfig, check_exploration, parse_schedule
+from gridworld.bounds import at_least, within
+from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 
 

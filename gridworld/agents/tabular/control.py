@@ -26,6 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gridworld.agent_config import TabularControlConfig, parse_schedule
 from gridworld.agents import Beliefs, Seat
 from gridworld.agents.tabular.batch_update import StepSize, update
 from gridworld.agents.tabular.episodes import Episodes
@@ -38,7 +39,6 @@ from gridworld.agents.tabular.policies import (
     rows_of,
 )
 from gridworld.chance import generator_state, set_generator_state
-from gridworld.config import TabularControlConfig, parse_schedule
 from gridworld.errors import InputError
 from gridworld.mdp import NUM_ACTIONS, FloatArray, IntArray
 from gridworld.state import State, fill, fitting

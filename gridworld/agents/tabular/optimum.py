@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gridworld.agent_config import ValueIterationConfig
 from gridworld.agents import Beliefs, Seat
 from gridworld.agents.tabular.model_file import read_model, write_model
-from gridworld.config import ValueIterationConfig
 from gridworld.errors import InputError
 from gridworld.mdp import BoolArray, FloatArray
 from gridworld.solve import value_iteration

@@ -1,0 +1,31 @@
+"""Bounds of settings: a value outside raises `InputError` with a sentence that names key, value and bound."""
+
+from __future__ import annotations
+
+import math
+
+from gridworld.errors import InputError
+
+
+def at_least(key: str, value: float, bound: float) -> None:
+    """Refuse a value that is below the bound, infinite or NaN."""
+    if not bound <= value < math.inf:
+        raise InputError(f"{key}={value}: must be at least {bound}")
+
+
+def at_most(key: str, value: float, bound: float) -> None:
+    """Refuse a value that is above the bound, or NaN."""
+    if not value <= bound:
+        raise InputError(f"{key}={value}: must be at most {bound}")
+
+
+def above_zero(key: str, value: float) -> None:
+    """Refuse a value that is not positive, infinite or NaN."""
+    if not 0 < value < math.inf:
+        raise InputError(f"{key}={value}: must be a positive number")
+
+
+def within(key: str, value: float, low: float, high: float) -> None:
+    """Refuse a value outside [low, high], or NaN."""
+    if not low <= value <= high:
+        raise InputError(f"{key}={value}: must be from {low} to {high}")

@@ -1,0 +1,58 @@
+"""Settings of sweeps and of their launchers: `hydra.sweeper` and `hydra.launcher` on the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Optional
+
+# OmegaConf reads these annotations at run time and knows no `X | None`.
+
+
+@dataclass
+class SweepConfig:
+    """How `-m` runs its jobs; `hydra.sweeper` on the command line."""
+
+    _target_: str = "hydra_plugins.gridworld_sweeper.GridWorldSweeper"
+    retry_failed: bool = False  # run again what failed
+    stop_at_first_failure: bool = False  # leave the rest for later
+    extend: bool = False  # use the folder of a sweep that shares no job with this one
+    max_jobs: int = 10_000  # more are taken for a slip
+
+
+@dataclass
+class JoblibConfig:
+    """`hydra/launcher=joblib`: a sweep's jobs side by side on this machine; `hydra.launcher` there."""
+
+    _target_: str = "hydra_plugins.gridworld_sweeper.JoblibLauncher"
+    n_jobs: int = -1
+
+
+@dataclass
+class SlurmConfig:
+    """`hydra/launcher=slurm`; all but the first two are submitit's, by its names."""
+
+    _target_: str = "hydra_plugins.gridworld_sweeper.SlurmLauncher"
+    jobs_per_task: int = 1
+    array_parallelism: int = 256
+    timeout_min: int = 60
+    signal_delay_s: int = 60
+    cpus_per_task: int = 1
+    mem_gb: Optional[float] = None  # noqa: UP045
+    partition: Optional[str] = None  # noqa: UP045
+    account: Optional[str] = None  # noqa: UP045
+    qos: Optional[str] = None  # noqa: UP045
+    constraint: Optional[str] = None  # noqa: UP045
+    setup: list[str] = field(default_factory=list)
+    more: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class RayConfig:
+    """`hydra/launcher=ray`."""
+
+    _target_: str = "hydra_plugins.gridworld_sweeper.RayLauncher"
+    init: dict[str, Any] = field(default_factory=dict)
+    remote: dict[str, Any] = field(default_factory=dict)
+
+
+LAUNCHER_SCHEMAS: dict[str, type] = {"joblib": JoblibConfig, "slurm": SlurmConfig, "ray": RayConfig}
