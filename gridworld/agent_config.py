@@ -9,10 +9,7 @@ from typing import Any, Optional, Union
 from gridworld.bounds import above_zero, within
 from gridworld.errors import InputError
 
-# OmegaConf reads these annotations at run time and knows no `X | None`.
-
 MISSING = "???"  # OmegaConf's sign for what has to be given
-
 LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end, as RL Zoo writes it
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.

@@ -9,6 +9,7 @@ from os.path import commonprefix
 
 from gridworld.report.scene import Line, Points, Shape, Style, Text, text_width
 
+WIDTH = 440.0  # pixels, of a figure
 SMALL = 11.0  # pixels, of tick labels and legends
 
 Form = Callable[[float], str]
@@ -120,3 +121,8 @@ def steps_like(steps: Sequence[float], values: Sequence[float], x: Axis, y: Axis
             points.append((x(step), points[-1][1]))
         points.append((x(step), y(value)))
     return points
+
+
+def heading(text: str, width: float = WIDTH) -> Text:
+    """A figure's title, at its top."""
+    return Text((12, 20), clipped(text, width - 24, 14), "ink", 14, bold=True)

@@ -12,8 +12,9 @@ from markupsafe import Markup
 
 from gridworld.report import tables
 from gridworld.report.analysis import Comparison, Result, TaskAnalysis
+from gridworld.report.chart import WIDTH
 from gridworld.report.embed import pictures
-from gridworld.report.figures import WIDTH, task_figures
+from gridworld.report.figures import task_figures
 from gridworld.report.metrics import METRICS
 from gridworld.report.reading import Unusable
 from gridworld.report.report import Report

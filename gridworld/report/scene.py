@@ -7,7 +7,7 @@ one figure is legible on both. The agents' colours are those of M. Okabe and K. 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 Points = Sequence[tuple[float, float]]
@@ -105,6 +105,9 @@ class Style:
 
     paint: str
     dash: tuple[float, ...]
+
+
+Styles = Mapping[str, Style]  # by agent
 
 
 def styles(agents: Sequence[str]) -> dict[str, Style]:

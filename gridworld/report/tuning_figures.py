@@ -9,8 +9,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from gridworld.report.chart import SMALL, Axis, clipped, vertical_grid
-from gridworld.report.figures import WIDTH
+from gridworld.report.chart import SMALL, WIDTH, Axis, clipped, heading, vertical_grid
 from gridworld.report.scene import Dot, Line, Scene, Shape, Text, text_width
 from gridworld.report.tuning import TrialRow, Tuning
 
@@ -39,7 +38,7 @@ def _history(tuning: Tuning) -> Scene:
     bottom = _TOP + _HEIGHT
     x = Axis(0, max(1.0, *(trial.number for trial in trials)), left, WIDTH - _RIGHT)
     y = _Logarithmic([trial.score for trial in trials], bottom, _TOP)
-    shapes: list[Shape] = [_title("Score by trial", WIDTH)]
+    shapes: list[Shape] = [heading("Score by trial")]
     shapes += [
         *_key(left, "c0", "done"),
         *_key(left + 70, "muted", "pruned, as it stood then"),
@@ -82,7 +81,7 @@ def _importances(tuning: Tuning) -> Scene:
     right = WIDTH - 50
     bottom = 36 + _ROW * len(ranked)
     x = Axis(0, max(0.01, ranked[0][1]), left, right)
-    shapes: list[Shape] = [_title("Importance of each key", WIDTH)]
+    shapes: list[Shape] = [heading("Importance of each key")]
     for index, (name, (_, share)) in enumerate(zip(names, ranked, strict=True)):
         middle = 36 + _ROW * (index + 0.5)
         shapes.append(Text((left - 8, middle + 4), name, "ink", 12, "end"))
@@ -105,7 +104,7 @@ def _parallel(tuning: Tuning, done: Sequence[TrialRow]) -> Scene:
     bottom = _TOP + 220
     scores = _Logarithmic([trial.score for trial in ranked], bottom, _TOP)
     places = [40 + (WIDE - 80) * index / len(keys) for index in range(len(keys) + 1)]
-    shapes: list[Shape] = [_title("What the best tenth of the finished trials chose, and the winner", WIDE)]
+    shapes: list[Shape] = [heading("What the best tenth of the finished trials chose, and the winner", WIDE)]
     scales = [_scale(tuning.space[key], bottom) for key in keys]
 
     def points(trial: TrialRow) -> list[tuple[float, float]]:
@@ -180,7 +179,3 @@ def _short(key: str) -> str:
 
 def _key(left: float, paint: str, name: str) -> list[Shape]:
     return [Dot((left + 5, 38), 4, paint, 0.8), Text((left + 14, 42), name, "ink", SMALL)]
-
-
-def _title(text: str, width: float) -> Text:
-    return Text((12, 20), clipped(text, width - 24, 14), "ink", 14, bold=True)
