@@ -22,6 +22,7 @@ from gridworld.agents import family
 from gridworld.config import TrainConfig
 from gridworld.data_files import LARGEST_CSV, read_object, read_text
 from gridworld.event_file import read_scalars
+from gridworld.flat import flat
 from gridworld.mdp import ACTION_NAMES, Mdp
 from gridworld.run import LARGEST_RESULT, Run
 from gridworld.saved_run import read_visits
@@ -114,7 +115,7 @@ def _visits(then: Run, now: Run, mdp: Mdp) -> Finding:
 
 
 def _summaries(then: Run, now: Run) -> Finding:
-    before, after = (dict(_leaves(read_object(run.summary_file))) for run in (then, now))
+    before, after = (_without_clock(read_object(run.summary_file)) for run in (then, now))
     for name in {**before, **after}:
         if before.get(name) != after.get(name):
             told = f"{str(before.get(name))[:40]} then, {str(after.get(name))[:40]} now"
@@ -122,12 +123,8 @@ def _summaries(then: Run, now: Run) -> Finding:
     return Finding("summary", f"{len(before)} entries, those of the clock aside")
 
 
-def _leaves(content: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in content.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{key}.")
-        elif key not in CLOCK:
-            yield prefix + key, value
+def _without_clock(summary: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in flat(summary) if key not in CLOCK}
 
 
 def _scalars(then: Run, now: Run) -> Finding:

@@ -148,8 +148,9 @@ class Curve:
             )
         if before is None or self.greedy is None or not np.array_equal(before.greedy, beliefs.greedy):
             self.greedy = self.judge.score(one_hot_policy(beliefs.greedy))
+        if before is None or self.sampled is None or not np.array_equal(before.sampled, beliefs.sampled):
+            self.sampled = self.judge.score(beliefs.sampled)
         greedy = self.greedy
-        self.sampled = self.judge.score(beliefs.sampled)
         self._streak = self._streak + is_new if greedy.certified else 0
         if not greedy.certified:
             self.certified_since_step = None

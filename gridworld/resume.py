@@ -17,6 +17,7 @@ from gridworld.agent_config import LINEAR, AgentConfig, parse_schedule
 from gridworld.checkpoint import Checkpoints
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
+from gridworld.flat import flat
 from gridworld.identity import environment, identity, settings
 from gridworld.journal import holds
 from gridworld.layout import Layout
@@ -67,8 +68,10 @@ class Unfinished:
 
     def check_same(self, config: TrainConfig, layout: str) -> None:
         """Raise `InputError` unless these settings and this map are the run's own."""
-        own = _flat(settings(self.config) | {"total_timesteps": self.config.total_timesteps})
-        other = _flat(settings(config) | {"total_timesteps": config.total_timesteps})
+        own, other = (
+            dict(flat(settings(each) | {"total_timesteps": each.total_timesteps}))
+            for each in (self.config, config)
+        )
         differing = [
             f"{key}={other.get(key)} instead of {own.get(key)}"
             for key in dict.fromkeys([*own, *other])
@@ -150,7 +153,7 @@ class Unfinished:
     def _check_anew(self, old_total: int) -> None:
         if self.is_finished:
             _say(f"{self.run.folder}: has no checkpoint to go on from; begins anew")
-        elif self.config.total_timesteps != old_total or (self.run.folder / "curve.csv").exists():
+        elif self.config.total_timesteps != old_total or self.run.curve_file.exists():
             _say(f"{self.run.folder}: has no checkpoint yet; begins anew")
 
     def _begin_anew(self) -> None:
@@ -214,15 +217,6 @@ def _schedules(config: TrainConfig, progress: float) -> dict[str, float]:
         start, end = agent.get("exploration_initial_eps", 1.0), agent.get("exploration_final_eps", 0.05)
         found["exploration rate"] = start + (end - start) * min(progress / fraction, 1.0)
     return found
-
-
-def _flat(content: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in content.items():
-        flat |= (
-            _flat(value, f"{prefix}{key}.") if isinstance(value, dict) and value else {prefix + key: value}
-        )
-    return flat
 
 
 def _say(text: str) -> None:

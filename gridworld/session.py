@@ -11,7 +11,6 @@ import dataclasses
 import logging
 import math
 import time
-from collections.abc import Iterator
 from typing import Any
 
 from gridworld.agents import Agent, Seat
@@ -23,6 +22,7 @@ from gridworld.errors import InputError
 from gridworld.evaluation import Judge, Score
 from gridworld.events import EventWriter, HParamValue
 from gridworld.files import write_array, write_json
+from gridworld.flat import flat
 from gridworld.identity import environment, identity
 from gridworld.journal import Journal
 from gridworld.pictures import Pictures
@@ -237,14 +237,8 @@ def hparams(config: TrainConfig) -> dict[str, HParamValue]:
     content = dataclasses.asdict(config)
     for told_elsewhere in ("logging", "recording", "checkpoint"):
         del content[told_elsewhere]
-    return dict(_flatten(content))
-
-
-def _flatten(content: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, HParamValue]]:
-    for key, value in content.items():
-        if isinstance(value, dict):
-            yield from _flatten(value, f"{prefix}{key}.")
-        elif value is None or isinstance(value, bool | int | float | str):
-            yield prefix + key, value
-        else:
-            yield prefix + key, str(value)
+    return {
+        key: value if value is None or isinstance(value, bool | int | float | str) else str(value)
+        for key, value in flat(content)
+        if value != {}
+    }

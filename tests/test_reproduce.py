@@ -104,7 +104,7 @@ def other_points(run: Path) -> None:
     events = EventFile(run / "more")
     events.add(Summary(value=[Summary.Value(tag="eval/value", simple_value=0.5)]), 7)
     events.close()
-    events.path.rename(run / "events.out.tfevents.0.first")
+    next((run / "more").iterdir()).rename(run / "events.out.tfevents.0.first")
 
 
 def other_weight(run: Path) -> None:

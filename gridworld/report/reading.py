@@ -14,6 +14,7 @@ import numpy as np
 
 from gridworld.data_files import read_object
 from gridworld.errors import InputError
+from gridworld.flat import flat
 from gridworld.mdp import FloatArray
 from gridworld.report.run_files import read_curve
 from gridworld.run import CURVE, MANIFEST, SUMMARY
@@ -107,7 +108,7 @@ def _evidence(folder: Path, manifest: dict[str, Any]) -> Evidence:
         agent=_text(config.get("agent"), "name", f"{where}: config.agent"),
         env=_text(summary, "env", str(folder / SUMMARY)),
         seed=seed,
-        settings=dict(flat(config)),
+        settings=dict(_settings(config)),
         world=config["env"],
         layout="\n".join(layout),
         gamma=_number(config.get("evaluation"), "gamma", f"{where}: config.evaluation"),
@@ -155,14 +156,11 @@ def _check_agreement(run: Evidence, summary: Mapping[str, Any]) -> None:
         )
 
 
-def flat(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Nested settings with dotted names, their values as JSON."""
-    for key, value in content.items():
-        if isinstance(value, dict) and value:
-            yield from flat(value, f"{prefix}{key}.")
-        else:
-            text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
-            yield printable(prefix + key), printable(text)
+def _settings(config: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """With dotted names, the values as JSON."""
+    for key, value in flat(config):
+        text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+        yield printable(key), printable(text)
 
 
 def _text(content: Any, key: str, where: str) -> str:

@@ -10,10 +10,11 @@ from pathlib import Path
 import gridworld
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
+from gridworld.flat import flat
 from gridworld.report.analysis import Overall, TaskAnalysis, analyse
 from gridworld.report.find import find_runs
 from gridworld.report.grouping import Study, arrange
-from gridworld.report.reading import Evidence, Unusable, flat, read
+from gridworld.report.reading import Evidence, Unusable, read
 from gridworld.report.tuning import Tuning, find_tunings
 
 
