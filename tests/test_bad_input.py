@@ -1,5 +1,6 @@
 """A mistake on a command line gets one sentence, exit code 2, no traceback, and leaves nothing behind."""
 
+import json
 import os
 from pathlib import Path
 
@@ -211,10 +212,14 @@ def test_train_refuses_before_it_writes(
 
 def test_a_used_folder_is_refused_and_left_alone(tmp_path: Path) -> None:
     (tmp_path / "used").mkdir()
-    (tmp_path / "used" / "manifest.json").write_text("{}")
+    manifest = {"status": "finished", "config": {}, "layout": []}
+    (tmp_path / "used" / "manifest.json").write_text(json.dumps(manifest))
     done = script("train.py", "hydra.run.dir=used", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "error: used: holds a run already; choose another folder\n"
+    assert done.stderr == (
+        "error: used: holds a run already; choose another folder, or make that run longer by "
+        "python scripts/train.py resume=used total_timesteps=...\n"
+    )
     assert [path.name for path in (tmp_path / "used").iterdir()] == ["manifest.json"]
 
 
