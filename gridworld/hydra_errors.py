@@ -16,8 +16,12 @@ from hydra.errors import OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from yaml import MarkedYAMLError, YAMLError
 
-from gridworld import config as schemas
+import gridworld.sweep.config
+import gridworld.tune.config
+from gridworld import agent_config, config
 from gridworld.errors import InputError
+
+_SCHEMAS = vars(config) | vars(agent_config) | vars(gridworld.sweep.config) | vars(gridworld.tune.config)
 
 _LISTED = 16  # choices of a group at most; more are told apart by their names
 
@@ -101,7 +105,7 @@ def _suggestion(facts: str) -> str:
             "+agent.policy_kwargs.optimizer_kwargs.eps=1e-5, +agent.arguments.gamma=0.9"
         )
     unknown = re.search(r"Key '([^']*)' not in '([^']*)'", facts)
-    schema = getattr(schemas, unknown.group(2), None) if unknown else None
+    schema = _SCHEMAS.get(unknown.group(2)) if unknown else None
     if unknown is None or not dataclasses.is_dataclass(schema):
         return ""
     return _closest(unknown.group(1), [field.name for field in dataclasses.fields(schema)])

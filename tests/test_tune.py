@@ -199,7 +199,7 @@ def test_without_optuna_it_says_what_to_install(tmp_path: Path, monkeypatch: pyt
 
 
 LONG = (
-    "total_timesteps=25000",
+    "total_timesteps=100000",  # so that the search is not over before it is interrupted
     "tune.pruner=none",
     "tune.stop_after=null",
     "tune.trials=4",
