@@ -15,6 +15,7 @@ from support import DEEP, SHORT, script, train_in
 from tensorboard.compat.proto.summary_pb2 import Summary
 from test_any_class import OWN_CLASS, any_class
 
+from gridworld.commands import reproduce as command
 from gridworld.commands.reproduce import main
 from gridworld.errors import InputError
 from gridworld.event_file import EventFile, read_scalars
@@ -26,7 +27,8 @@ PLAIN = ["recording.frames=false", "recording.gif=false", "env.slip=0.1", "seed=
 
 def verdicts(shown: str) -> dict[str, str]:
     """Of every part that was compared."""
-    return dict(re.findall(r"^  (\w[\w ]*?) {2,}(identical|DIFFERENT|differs|the same)", shown, re.MULTILINE))
+    words = "identical|DIFFERENT|UNKNOWN|differs|the same"
+    return dict(re.findall(rf"^  (\w[\w ]*?) {{2,}}({words})", shown, re.MULTILINE))
 
 
 def reproduce(run: Path, capsys: pytest.CaptureFixture[str], *words: str, code: int = 0) -> str:
@@ -196,6 +198,32 @@ def test_a_run_that_cannot_be_repeated_is_no_other_result(
     manifest(tmp_path / "run", lambda content: content["config"].update(device="cpu"))
     with pytest.raises(InputError, match=r"curve\.csv: is not the file that the run wrote"):
         reproduce(tmp_path / "run", capsys)
+
+
+def test_without_its_event_file_no_run_is_identical(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    next((tmp_path / "run").glob("events*")).unlink()
+    with pytest.raises(InputError, match="but not all of the run is there"):
+        reproduce(tmp_path / "run", capsys)
+    found = verdicts(capsys.readouterr().out)
+    assert found == dict.fromkeys(PARTS, "identical") | {
+        "environment": "the same",
+        "TensorBoard points": "UNKNOWN",
+    }
+
+
+@pytest.mark.parametrize("name", ["curve.csv", "model.zip", "visits.npy", "summary.json", "events*"])
+def test_damage_is_told_before_training(
+    name: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    (file,) = (tmp_path / "run").glob(name)
+    file.write_bytes(file.read_bytes()[:-3])
+    monkeypatch.setattr(command, "train", lambda *_: pytest.fail("it trained"))
+    with pytest.raises(InputError, match="damaged"):
+        main([str(tmp_path / "run")])
 
 
 def test_ones_own_class_needs_trust(

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gridworld.comparison import Finding, compare
+from gridworld.comparison import Finding, check_whole, compare
 from gridworld.config import RecordingConfig, TrainConfig
 from gridworld.errors import InputError
 from gridworld.layout import Layout
@@ -36,6 +36,7 @@ def main(arguments: Sequence[str]) -> None:
     then = open_run(options.run)
     config = settings_of(then, options.trust)
     layout = layout_of(then, config)
+    check_whole(then, config)  # training may take hours
     if options.keep is not None:
         check_inside(options.keep, "--keep")
         check_new(options.keep, "--keep")
@@ -51,6 +52,11 @@ def main(arguments: Sequence[str]) -> None:
     except Interrupted as interruption:
         print(str(interruption), file=sys.stderr)
         sys.exit(interruption.exit_code)
+    if same is None:
+        raise InputError(
+            f"{options.run}: all that could be compared is identical, but not all of the run is there; put "
+            "its files back to compare them too"
+        )
     print("identical" if same else "different")
     if not same:
         sys.exit(DIFFERENT)
@@ -70,8 +76,8 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _again(then: Run, now: Run, config: TrainConfig, layout: Layout) -> bool:
-    """Whether everything is the same."""
+def _again(then: Run, now: Run, config: TrainConfig, layout: Layout) -> bool | None:
+    """Whether everything is the same; None: what can be compared is."""
     mdp = make_mdp(config.env, layout)
     mistake = None
     try:
@@ -86,7 +92,8 @@ def _again(then: Run, now: Run, config: TrainConfig, layout: Layout) -> bool:
     findings = list(compare(then, now, config, mdp))
     for finding in findings:
         _tell(finding)
-    return all(finding.same for finding in findings)
+    verdicts = {finding.same for finding in findings}
+    return next((verdict for verdict in (False, None) if verdict in verdicts), True)
 
 
 def _here(manifest: Mapping[str, Any]) -> dict[str, Any]:
@@ -114,5 +121,5 @@ def _tell_environment(differences: Sequence[str]) -> None:
 
 
 def _tell(finding: Finding) -> None:
-    verdict = "identical" if finding.same else "DIFFERENT"
-    print(f"  {finding.part:<20}{verdict}  {printable(finding.told)}")
+    verdict = {True: "identical", False: "DIFFERENT", None: "UNKNOWN"}[finding.same]
+    print(f"  {finding.part:<20}{verdict:<9}  {printable(finding.told)}")
