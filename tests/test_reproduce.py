@@ -172,6 +172,18 @@ def test_what_differs_in_the_environment_is_told(
     assert not list(differences(describe(), describe()))
 
 
+def test_what_differed_on_the_way_is_told(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    again = {"step": 512, "differs": ["numpy 1 is now 2\x1b[2J"], "git": {"commit": "abc"}}
+    manifest(tmp_path / "run", lambda content: content.update(resumed=[again, "rubbish", {"step": 600}]))
+    shown = reproduce(tmp_path / "run", capsys)
+    assert "    went on after step 512: numpy 1 is now 2\\x1b[2J (anyway=true)\n" in shown
+    assert re.search("    went on after step 512: commit: .* then, abc now\n", shown)
+    assert "600" not in shown
+
+
 def test_a_run_is_kept_where_it_is_asked_for(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -21,7 +21,7 @@ from gridworld.comparison import Finding, check_whole, compare
 from gridworld.config import RecordingConfig, TrainConfig
 from gridworld.errors import InputError
 from gridworld.layout import Layout
-from gridworld.provenance import describe, differences
+from gridworld.provenance import describe, differences, source_differences
 from gridworld.run import Run, check_inside, check_new, open_run
 from gridworld.saved_run import layout_of, settings_of
 from gridworld.terminal import printable
@@ -42,6 +42,7 @@ def main(arguments: Sequence[str]) -> None:
         check_new(options.keep, "--keep")
     print(f"{options.run}: {config.agent.name} on {config.env.layout}, seed {config.seed}")
     _tell_environment(list(differences(then.manifest, _here(then.manifest))))
+    _tell_resumed(then.manifest)
     try:
         if options.keep is not None:
             options.keep.mkdir(parents=True, exist_ok=True)
@@ -118,6 +119,21 @@ def _tell_environment(differences: Sequence[str]) -> None:
     print(f"  {'environment':<20}{'differs' if differences else 'the same'}", flush=True)
     for line in differences:
         print(f"    {printable(line)}")
+
+
+def _tell_resumed(manifest: Mapping[str, Any]) -> None:
+    """Say what was not the same when it went on after an interruption."""
+    resumed, before = manifest.get("resumed"), manifest.get("git")
+    for again in resumed if isinstance(resumed, list) else []:
+        if not isinstance(again, dict):
+            continue
+        differs = again.get("differs")
+        lines = [f"{line} (anyway=true)" for line in differs] if isinstance(differs, list) else []
+        if "git" in again:
+            lines += source_differences(before, before := again["git"])
+        for line in lines:
+            where = f"went on after step {again.get('step')}"
+            print(f"    {printable(f'{where}: {line}')}", flush=True)
 
 
 def _tell(finding: Finding) -> None:
