@@ -92,8 +92,8 @@ class Run:
         if any(source_differences(self.git(), tree)):
             again["git"] = tree
             self._keep_diff(tree)
-        if total_timesteps != self.manifest["config"]["total_timesteps"]:
-            again["total_timesteps"] = total_timesteps
+        if total_timesteps != (old := self.manifest["config"]["total_timesteps"]):
+            again |= {"total_timesteps": total_timesteps, "instead_of": old}
             self.manifest["config"]["total_timesteps"] = total_timesteps
         self.manifest |= {"status": "running", "ended": None}
         self.manifest.setdefault("resumed", []).append(again)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hostile import manifest, seal, weights
+from resuming import go_on, stopped_after
 from support import DEEP, SHORT, script, train_in
 from tensorboard.compat.proto.summary_pb2 import Summary
 from test_any_class import OWN_CLASS, any_class
@@ -184,6 +185,51 @@ def test_what_differed_on_the_way_is_told(
     assert "600" not in shown
 
 
+@pytest.mark.parametrize("agent", ["dqn", "q_learning"])
+def test_a_run_that_was_made_longer_is_made_longer_again(
+    agent: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Twice: exploration jumps up again at each new length, as it does in no run of one length."""
+    folder = tmp_path / "run"
+    train_in(folder, *SHORT[agent], *PLAIN, "total_timesteps=1000")
+    go_on(folder, 1500)
+    go_on(folder, 2500)
+    shown = reproduce(folder, capsys)
+    assert "  made longer: to 1,000, 1,500 steps first, then on to 2,500\n" in shown
+    assert verdicts(shown) == dict.fromkeys(PARTS, "identical") | {"environment": "the same"}
+
+
+def test_a_run_that_was_merely_interrupted_is_identical(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stopped_after(1, tmp_path / "run", *SHORT["dqn"], *PLAIN, "checkpoint.every=600")
+    go_on(tmp_path / "run")
+    assert reproduce(tmp_path / "run", capsys).endswith("identical\n")
+
+
+@pytest.mark.parametrize(
+    ("again", "told"),
+    [
+        (
+            {"step": 1200, "instead_of": 2000},
+            "it got another length after 1,200 of 2,000 steps, before it had",
+        ),
+        ({"step": 2000}, "made longer, and its manifest does not say from what length"),
+        ({"step": 9000, "instead_of": 9000}, "the lengths .* must grow"),
+    ],
+    ids=["unfinished", "unknown", "shrinking"],
+)
+def test_lengths_that_cannot_be_repeated_are_refused_before_training(
+    again: dict[str, int], told: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    again = {**again, "total_timesteps": 2000}
+    manifest(tmp_path / "run", lambda content: content.update(resumed=[again]))
+    monkeypatch.setattr(command, "repeat", lambda *_: pytest.fail("it trained"))
+    with pytest.raises(InputError, match=told):
+        main([str(tmp_path / "run")])
+
+
 def test_a_run_is_kept_where_it_is_asked_for(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -233,7 +279,7 @@ def test_damage_is_told_before_training(
     shutil.copytree(run, tmp_path / "run")
     (file,) = (tmp_path / "run").glob(name)
     file.write_bytes(file.read_bytes()[:-3])
-    monkeypatch.setattr(command, "train", lambda *_: pytest.fail("it trained"))
+    monkeypatch.setattr(command, "repeat", lambda *_: pytest.fail("it trained"))
     with pytest.raises(InputError, match="damaged"):
         main([str(tmp_path / "run")])
 

@@ -2,8 +2,8 @@
 
 First it tells what differs between then and now: commit and uncommitted changes, versions, processor,
 environment variables. Then it trains again, in a temporary folder, and compares the learning curve, the final
-weights, visits, summary and TensorBoard's points. The exit code is 0 if all are identical, 1 if any is not,
-2 if that cannot be told.
+weights, visits, summary and TensorBoard's points. A run that was made longer is made longer again. The exit
+code is 0 if all are identical, 1 if any is not, 2 if that cannot be told.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ from gridworld.config import RecordingConfig, TrainConfig
 from gridworld.errors import InputError
 from gridworld.layout import Layout
 from gridworld.provenance import describe, differences, source_differences
+from gridworld.repeat import lengths, repeat, resumptions
 from gridworld.run import Run, check_inside, check_new, open_run
 from gridworld.saved_run import layout_of, settings_of
 from gridworld.terminal import printable
-from gridworld.training import Interrupted, make_mdp, train
+from gridworld.training import Interrupted, make_mdp
 
 DIFFERENT = 1  # exit code
 
@@ -37,19 +38,24 @@ def main(arguments: Sequence[str]) -> None:
     config = settings_of(then, options.trust)
     layout = layout_of(then, config)
     check_whole(then, config)  # training may take hours
+    *shorter, _ = lengths(then, config)
     if options.keep is not None:
         check_inside(options.keep, "--keep")
         check_new(options.keep, "--keep")
     print(f"{options.run}: {config.agent.name} on {config.env.layout}, seed {config.seed}")
     _tell_environment(list(differences(then.manifest, _here(then.manifest))))
     _tell_resumed(then.manifest)
+    if shorter:
+        told = ", ".join(f"{length:,}" for length in shorter)
+        print(f"  made longer: to {told} steps first, then on to {config.total_timesteps:,}", flush=True)
     try:
         if options.keep is not None:
             options.keep.mkdir(parents=True, exist_ok=True)
-            same = _again(then, Run(options.keep), config, layout)
+            same = _again(then, Run(options.keep), config, layout, options.trust)
         else:
             with tempfile.TemporaryDirectory(prefix="gridworld-") as folder:
-                same = _again(then, Run(Path(folder)), _without_pictures(config), layout)
+                plain = _without_pictures(config)
+                same = _again(then, Run(Path(folder)), plain, layout, options.trust)
     except Interrupted as interruption:
         print(str(interruption), file=sys.stderr)
         sys.exit(interruption.exit_code)
@@ -77,12 +83,12 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _again(then: Run, now: Run, config: TrainConfig, layout: Layout) -> bool | None:
+def _again(then: Run, now: Run, config: TrainConfig, layout: Layout, trust: bool) -> bool | None:
     """Whether everything is the same; None: what can be compared is."""
     mdp = make_mdp(config.env, layout)
     mistake = None
     try:
-        train(config, now, then.manifest.get("overrides") or [], lambda env: mdp)
+        repeat(then, now, config, layout, trust)
     except InputError as error:
         if not now.manifest:  # these settings cannot be run here at all
             raise
@@ -123,10 +129,8 @@ def _tell_environment(differences: Sequence[str]) -> None:
 
 def _tell_resumed(manifest: Mapping[str, Any]) -> None:
     """Say what was not the same when it went on after an interruption."""
-    resumed, before = manifest.get("resumed"), manifest.get("git")
-    for again in resumed if isinstance(resumed, list) else []:
-        if not isinstance(again, dict):
-            continue
+    before = manifest.get("git")
+    for again in resumptions(manifest):
         differs = again.get("differs")
         lines = [f"{line} (anyway=true)" for line in differs] if isinstance(differs, list) else []
         if "git" in again:
