@@ -38,16 +38,19 @@ class Finding:
 
     part: str
     told: str  # how much was compared, or the first difference
-    same: bool = True
+    same: bool | None = True  # None: it cannot be told
+
+
+def check_whole(then: Run, config: TrainConfig) -> None:
+    """Raise `InputError` where a part of the result is not the file that the run wrote, or is damaged."""
+    for path in (then.curve_file, then.model_file, then.visits_file, then.summary_file):
+        then.verify(path)
+    if config.logging.tensorboard:
+        _points(then.folder)
 
 
 def compare(then: Run, now: Run, config: TrainConfig, mdp: Mdp) -> Iterator[Finding]:
-    """A finding for every part, in the order in which training writes them.
-
-    Raises `InputError` where a part of `then` is not the file that the run wrote.
-    """
-    for path in (then.curve_file, then.model_file, then.visits_file, then.summary_file):
-        then.verify(path)
+    """A finding for every part, in the order in which training writes them."""
     yield _curves(then, now)
     yield _weights(then, now, config)
     yield _visits(then, now, mdp)
@@ -131,7 +134,7 @@ def _scalars(then: Run, now: Run) -> Finding:
     part = "TensorBoard points"
     before, after = (_points(run.folder) for run in (then, now))
     if not before:
-        return Finding(part, "not compared, the run's folder has no event file")
+        return Finding(part, "the run's folder has no event file any more", None)
     for old, new in zip_longest(before, after):
         if old != new and not (old and new and old[:2] == new[:2] and math.isnan(old[2] + new[2])):
             tag, step, _ = old or new or ("", 0, 0.0)

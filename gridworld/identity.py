@@ -14,7 +14,7 @@ from typing import Any
 
 from gridworld.agent_config import AgentConfig, SB3Config
 from gridworld.config import TrainConfig
-from gridworld.provenance import versions
+from gridworld.provenance import code, versions
 
 _MATTER = ("python", "gridworld", "gymnasium", "numpy", "scipy")  # to every agent
 _MATTER_TO_NETWORKS = ("stable-baselines3", "sb3-contrib", "torch")
@@ -34,10 +34,11 @@ def identity(config: TrainConfig, layout: str) -> str:
 
 
 def environment(agent: AgentConfig) -> dict[str, str]:
-    """Versions, and what the processor is used for; torch's too if the agent needs it."""
+    """Versions, our own code, and what the processor is used for; torch's too if the agent needs it."""
     import numpy as np  # here, as torch below, to be light where nobody asks
 
     found = {name: str(versions().get(name)) for name in _MATTER}
+    found["source code"] = code()[:12]
     found["machine"] = platform.machine()
     found["processor for numpy"] = " ".join(np.show_config(mode="dicts")["SIMD Extensions"]["found"])
     if isinstance(agent, SB3Config):

@@ -7,6 +7,7 @@ numbers do.
 from __future__ import annotations
 
 import functools
+import hashlib
 import os
 import platform
 import sys
@@ -51,11 +52,11 @@ class Source:
     commit: str
     diff: bytes  # as git writes it, empty for a clean tree; files that git does not know are in it
 
-    def told(self) -> dict[str, Any]:
-        """For the manifest."""
+    def told(self, file: str = DIFF) -> dict[str, Any]:
+        """For the manifest; `file` is to have the changes."""
         about: dict[str, Any] = {"commit": self.commit, "dirty": bool(self.diff)}
         if self.diff:
-            kept = DIFF if len(self.diff) <= LARGEST_DIFF else None
+            kept = file if len(self.diff) <= LARGEST_DIFF else None
             about["diff"] = {"file": kept, "bytes": len(self.diff), "sha256": sha256(self.diff)}
         return about
 
@@ -81,35 +82,52 @@ def source() -> Source | None:
     return source_of(Path(__file__).parents[1])
 
 
+def git(file: str = DIFF) -> dict[str, Any] | None:
+    """`Source.told` of this package's tree, None where it is not known."""
+    tree = source()
+    return None if tree is None else tree.told(file)
+
+
 def source_of(tree: Path) -> Source | None:
     """That of a folder."""
+    import shutil
     import subprocess
     import tempfile
 
     if not (tree / ".git").exists():
         return None
 
-    def git(*words: str, **variables: str) -> bytes:
+    def ask(*words: str, **variables: str) -> bytes:
         environment = {**os.environ, **variables, "GIT_OPTIONAL_LOCKS": "0"}
         command = ["git", "-C", str(tree), *words]
         done = subprocess.run(command, capture_output=True, check=True, timeout=_GIT_SECONDS, env=environment)
         return done.stdout
 
     try:
-        commit = git("rev-parse", "HEAD").decode().strip()
-        if not git("status", "--porcelain", "--", *_PARTS):
+        commit = ask("rev-parse", "HEAD").decode().strip()
+        if not ask("status", "--porcelain", "--", *_PARTS):
             return Source(commit, b"")
         there = [part for part in _PARTS if (tree / part).exists()]  # `add` wants them all to be
         # A copy of the index, to which unknown files are added by name: `diff` then has their content.
         with tempfile.TemporaryDirectory() as folder:
             index = Path(folder) / "index"
-            index.write_bytes((tree / git("rev-parse", "--git-path", "index").decode().strip()).read_bytes())
-            git("add", "--intent-to-add", "--all", "--", *there, GIT_INDEX_FILE=str(index))
+            # With its time: what was written since then and in the same second, git looks into.
+            shutil.copy2(tree / ask("rev-parse", "--git-path", "index").decode().strip(), index)
+            ask("add", "--intent-to-add", "--all", "--", *there, GIT_INDEX_FILE=str(index))
             words = ("diff", "--no-ext-diff", "--no-color", "--binary", "HEAD", "--", *_PARTS)
-            diff = git(*words, GIT_INDEX_FILE=str(index))
+            diff = ask(*words, GIT_INDEX_FILE=str(index))
     except (OSError, ValueError, subprocess.SubprocessError):
         return None
     return Source(commit, diff)
+
+
+@functools.cache
+def code() -> str:
+    """A hash of the package's modules as they are, whatever a version or a commit says of them."""
+    package, found = Path(__file__).parent, hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        found.update(f"{path.relative_to(package).as_posix()} {sha256(path.read_bytes())}\n".encode())
+    return found.hexdigest()
 
 
 def processor() -> dict[str, Any]:
@@ -149,10 +167,9 @@ def variables() -> dict[str, str]:
 
 def describe() -> dict[str, Any]:
     """All of it, for a manifest."""
-    tree = source()
     return {
         "versions": versions(),
-        "git": None if tree is None else tree.told(),
+        "git": git(),
         "platform": platform.platform(),
         "processor": processor(),
         "environment": variables(),
@@ -161,7 +178,7 @@ def describe() -> dict[str, Any]:
 
 def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
     """A line for everything that differs between two descriptions; `then` may be anybody's JSON."""
-    yield from _source_differences(then.get("git"), now.get("git"))
+    yield from source_differences(then.get("git"), now.get("git"))
     for section, name in (("versions", ""), ("processor", "processor "), ("environment", "")):
         before, after = then.get(section), now[section]
         before = before if isinstance(before, dict) else {}
@@ -172,7 +189,8 @@ def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str
         yield f"platform: {_told(then.get('platform'))} then, {_told(now['platform'])} now"
 
 
-def _source_differences(then: Any, now: Any) -> Iterator[str]:
+def source_differences(then: Any, now: Any) -> Iterator[str]:
+    """The same for two of `git`."""
     before, after = (git if isinstance(git, dict) else {} for git in (then, now))
     if before.get("commit") != after.get("commit"):
         yield f"commit: {_told(before.get('commit'))} then, {_told(after.get('commit'))} now"

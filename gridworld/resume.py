@@ -21,10 +21,12 @@ from gridworld.flat import flat
 from gridworld.identity import environment, identity, settings
 from gridworld.journal import holds
 from gridworld.layout import Layout
+from gridworld.provenance import git, source_differences
 from gridworld.run import Run, read_run
 from gridworld.saved_run import layout_of, settings_of
 from gridworld.session import CONTENT, Summary
 from gridworld.state import State, StateError
+from gridworld.terminal import printable
 from gridworld.training import carry_out, check_settings, make_mdp, train
 
 
@@ -112,6 +114,8 @@ class Unfinished:
                 f"{old_total:,} steps; it can be made longer, not shorter"
             )
         _say(f"{run.folder}: goes on after {steps:,} of {config.total_timesteps:,} steps")
+        if changes := list(source_differences(run.git(), git())):
+            _say(f"{run.folder}: the source tree is another, which is noted: {printable('; '.join(changes))}")
         if config.total_timesteps != old_total:
             _say(_what_changes(config, steps, old_total))
         Checkpoints(run.folder).forget_after(steps)
@@ -185,8 +189,9 @@ def _differences(then: dict[str, Any], agent: AgentConfig, run: Run, anyway: boo
     differs = [f"{key} {then.get(key)} is now {now.get(key)}" for key in keys]
     if differs and not anyway:
         raise InputError(
-            f"{run.folder}: was begun in another environment ({'; '.join(differs)}), where numbers are "
-            "rounded otherwise; go on there, or add anyway=true, which notes it in the manifest"
+            f"{run.folder}: was begun in another environment ({'; '.join(differs)}), where numbers may "
+            f"come out otherwise; go on there, or by {run.resume_words()} anyway=true, which notes it in the "
+            "manifest"
         )
     return differs
 

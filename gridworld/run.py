@@ -1,7 +1,8 @@
 """A run's folder: its files, its manifest, its status.
 
     manifest.json   what ran, with which versions and settings, from when to when, and how it ended
-    source.diff     what was changed in the source tree since its commit, where anything was
+    source.diff     what was changed in the source tree since its commit, where anything was; and
+                    source-STEP.diff, where it was another when the run went on after STEP steps
     curve.csv       the learning curve, a row per evaluation
     summary.json    the result
     model.zip       the trained model
@@ -28,10 +29,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from gridworld import provenance
 from gridworld.data_files import file_sha256, read_object
 from gridworld.errors import InputError
 from gridworld.files import write_bytes, write_json
-from gridworld.provenance import DIFF, LARGEST_DIFF, describe, source
+from gridworld.provenance import describe, source_differences
 
 MANIFEST = "manifest.json"
 CURVE = "curve.csv"
@@ -78,9 +80,7 @@ class Run:
         if not replace and self.manifest_file.exists():
             raise InputError(f"{self.folder}: holds a run already; give every run a folder of its own")
         self._write()
-        tree = source()
-        if tree is not None and 0 < len(tree.diff) <= LARGEST_DIFF:
-            write_bytes(self.folder / DIFF, tree.diff)
+        self._keep_diff(self.manifest["git"])
 
     def go_on(self, step: int, total_timesteps: int, differs: list[str]) -> None:
         """Write the manifest of a run that goes on from a checkpoint after `step` steps."""
@@ -88,13 +88,22 @@ class Run:
         again = {"at": _now(), "step": step, "command": [Path(sys.argv[0]).name, *sys.argv[1:]]}
         if differs:
             again["differs"] = differs
-        if total_timesteps != self.manifest["config"]["total_timesteps"]:
-            again["total_timesteps"] = total_timesteps
+        tree = provenance.git(f"source-{step}.diff")
+        if any(source_differences(self.git(), tree)):
+            again["git"] = tree
+            self._keep_diff(tree)
+        if total_timesteps != (old := self.manifest["config"]["total_timesteps"]):
+            again |= {"total_timesteps": total_timesteps, "instead_of": old}
             self.manifest["config"]["total_timesteps"] = total_timesteps
         self.manifest |= {"status": "running", "ended": None}
         self.manifest.setdefault("resumed", []).append(again)
         self.manifest.pop("error", None)
         self._write()
+
+    def git(self) -> Any:
+        """The source tree that it ran with last, as `provenance.git` has it."""
+        told = [self.manifest, *self.manifest.get("resumed", [])]
+        return next((again["git"] for again in reversed(told) if "git" in again), None)
 
     def end(self, status: str, error: str | None = None, **more: int | None) -> None:
         """Record how it ended: finished, interrupted or failed; with the steps `reached` and saved."""
@@ -130,12 +139,19 @@ class Run:
     def clear(self) -> None:
         """Take away what an attempt left, all but the manifest; what is not the run's stays."""
         self._tidy()
-        for name in (*_FILES, *(path.name for path in self.folder.glob("events.out.tfevents.*"))):
-            _remove(self.folder / name)
+        for pattern in (*_FILES, "events.out.tfevents.*", "source*.diff"):
+            for path in self.folder.glob(pattern):
+                _remove(path)
 
     def resume_words(self) -> str:
         """The command that goes on with it."""
         return f"python scripts/train.py resume={shlex.quote(shown(self.folder))}"
+
+    def _keep_diff(self, git: dict[str, Any] | None) -> None:
+        """Write what was changed since the commit, where the manifest says that a file has it."""
+        tree, name = provenance.source(), ((git or {}).get("diff") or {}).get("file")
+        if tree is not None and name is not None:
+            write_bytes(self.folder / name, tree.diff)
 
     def _results(self) -> tuple[Path, ...]:
         return self.curve_file, self.summary_file, self.model_file, self.visits_file

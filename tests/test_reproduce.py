@@ -11,10 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hostile import manifest, seal, weights
+from resuming import go_on, stopped_after
 from support import DEEP, SHORT, script, train_in
 from tensorboard.compat.proto.summary_pb2 import Summary
 from test_any_class import OWN_CLASS, any_class
 
+from gridworld.commands import reproduce as command
 from gridworld.commands.reproduce import main
 from gridworld.errors import InputError
 from gridworld.event_file import EventFile, read_scalars
@@ -26,7 +28,8 @@ PLAIN = ["recording.frames=false", "recording.gif=false", "env.slip=0.1", "seed=
 
 def verdicts(shown: str) -> dict[str, str]:
     """Of every part that was compared."""
-    return dict(re.findall(r"^  (\w[\w ]*?) {2,}(identical|DIFFERENT|differs|the same)", shown, re.MULTILINE))
+    words = "identical|DIFFERENT|UNKNOWN|differs|the same"
+    return dict(re.findall(rf"^  (\w[\w ]*?) {{2,}}({words})", shown, re.MULTILINE))
 
 
 def reproduce(run: Path, capsys: pytest.CaptureFixture[str], *words: str, code: int = 0) -> str:
@@ -170,6 +173,63 @@ def test_what_differs_in_the_environment_is_told(
     assert not list(differences(describe(), describe()))
 
 
+def test_what_differed_on_the_way_is_told(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    again = {"step": 512, "differs": ["numpy 1 is now 2\x1b[2J"], "git": {"commit": "abc"}}
+    manifest(tmp_path / "run", lambda content: content.update(resumed=[again, "rubbish", {"step": 600}]))
+    shown = reproduce(tmp_path / "run", capsys)
+    assert "    went on after step 512: numpy 1 is now 2\\x1b[2J (anyway=true)\n" in shown
+    assert re.search("    went on after step 512: commit: .* then, abc now\n", shown)
+    assert "600" not in shown
+
+
+@pytest.mark.parametrize("agent", ["dqn", "q_learning"])
+def test_a_run_that_was_made_longer_is_made_longer_again(
+    agent: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Twice: exploration jumps up again at each new length, as it does in no run of one length."""
+    folder = tmp_path / "run"
+    train_in(folder, *SHORT[agent], *PLAIN, "total_timesteps=1000")
+    go_on(folder, 1500)
+    go_on(folder, 2500)
+    shown = reproduce(folder, capsys)
+    assert "  made longer: to 1,000, 1,500 steps first, then on to 2,500\n" in shown
+    assert verdicts(shown) == dict.fromkeys(PARTS, "identical") | {"environment": "the same"}
+
+
+def test_a_run_that_was_merely_interrupted_is_identical(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stopped_after(1, tmp_path / "run", *SHORT["dqn"], *PLAIN, "checkpoint.every=600")
+    go_on(tmp_path / "run")
+    assert reproduce(tmp_path / "run", capsys).endswith("identical\n")
+
+
+@pytest.mark.parametrize(
+    ("again", "told"),
+    [
+        (
+            {"step": 1200, "instead_of": 2000},
+            "it got another length after 1,200 of 2,000 steps, before it had",
+        ),
+        ({"step": 2000}, "made longer, and its manifest does not say from what length"),
+        ({"step": 9000, "instead_of": 9000}, "the lengths .* must grow"),
+    ],
+    ids=["unfinished", "unknown", "shrinking"],
+)
+def test_lengths_that_cannot_be_repeated_are_refused_before_training(
+    again: dict[str, int], told: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    again = {**again, "total_timesteps": 2000}
+    manifest(tmp_path / "run", lambda content: content.update(resumed=[again]))
+    monkeypatch.setattr(command, "repeat", lambda *_: pytest.fail("it trained"))
+    with pytest.raises(InputError, match=told):
+        main([str(tmp_path / "run")])
+
+
 def test_a_run_is_kept_where_it_is_asked_for(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -196,6 +256,32 @@ def test_a_run_that_cannot_be_repeated_is_no_other_result(
     manifest(tmp_path / "run", lambda content: content["config"].update(device="cpu"))
     with pytest.raises(InputError, match=r"curve\.csv: is not the file that the run wrote"):
         reproduce(tmp_path / "run", capsys)
+
+
+def test_without_its_event_file_no_run_is_identical(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    next((tmp_path / "run").glob("events*")).unlink()
+    with pytest.raises(InputError, match="but not all of the run is there"):
+        reproduce(tmp_path / "run", capsys)
+    found = verdicts(capsys.readouterr().out)
+    assert found == dict.fromkeys(PARTS, "identical") | {
+        "environment": "the same",
+        "TensorBoard points": "UNKNOWN",
+    }
+
+
+@pytest.mark.parametrize("name", ["curve.csv", "model.zip", "visits.npy", "summary.json", "events*"])
+def test_damage_is_told_before_training(
+    name: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    (file,) = (tmp_path / "run").glob(name)
+    file.write_bytes(file.read_bytes()[:-3])
+    monkeypatch.setattr(command, "repeat", lambda *_: pytest.fail("it trained"))
+    with pytest.raises(InputError, match="damaged"):
+        main([str(tmp_path / "run")])
 
 
 def test_ones_own_class_needs_trust(

@@ -12,11 +12,12 @@ import pytest
 from resuming import begin, differences, go_on, left_behind, stopped_after
 from support import ROOT, SHORT, configure, script
 
-from gridworld import identity
+from gridworld import identity, provenance
 from gridworld.checkpoint import Checkpoints
 from gridworld.errors import InputError
 from gridworld.files import write_json
 from gridworld.lock import locked
+from gridworld.provenance import Source
 from gridworld.resume import Unfinished
 from gridworld.run import LOCK
 from gridworld.sweep.job import run_in_sweep
@@ -135,6 +136,32 @@ def test_another_environment_is_refused_or_noted(
     assert "numpy" in str(manifest(stopped)["resumed"])
     monkeypatch.undo()
     assert differences({**left_behind(stopped), "state": None}, {**calm, "state": None}) == []
+
+
+def test_other_code_is_refused_or_noted(stopped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(identity, "code", lambda: "0" * 64)
+    with pytest.raises(InputError, match=r"\(source code [0-9a-f]{12} is now 0{12}\).*anyway=true"):
+        go_on(stopped)
+    Unfinished(stopped).go_on(anyway=True)
+    (again,) = manifest(stopped)["resumed"]  # type: ignore[misc, attr-defined]
+    assert again["differs"][0].endswith("is now 000000000000")
+
+
+def test_another_commit_is_told_and_noted(
+    stopped: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The code is the same, as after a commit to the README."""
+    monkeypatch.setattr(provenance, "source", lambda: Source("abc", b"some changes"))
+    go_on(stopped)
+    told = capsys.readouterr().err
+    assert "run: the source tree is another, which is noted: commit: " in told
+    assert " then, abc now; uncommitted source: " in told
+    (again,) = manifest(stopped)["resumed"]  # type: ignore[misc, attr-defined]
+    assert again["git"]["commit"] == "abc"
+    assert (stopped / again["git"]["diff"]["file"]).read_bytes() == b"some changes"
+    go_on(stopped, 3000)
+    assert "git" not in manifest(stopped)["resumed"][1]  # type: ignore[index]
+    assert "the source tree" not in capsys.readouterr().err
 
 
 def test_a_map_that_changed_meanwhile(tmp_path: Path) -> None:

@@ -2,8 +2,8 @@
 
 First it tells what differs between then and now: commit and uncommitted changes, versions, processor,
 environment variables. Then it trains again, in a temporary folder, and compares the learning curve, the final
-weights, visits, summary and TensorBoard's points. The exit code is 0 if all are identical, 1 if any is not,
-2 if that cannot be told.
+weights, visits, summary and TensorBoard's points. A run that was made longer is made longer again. The exit
+code is 0 if all are identical, 1 if any is not, 2 if that cannot be told.
 """
 
 from __future__ import annotations
@@ -17,15 +17,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gridworld.comparison import Finding, compare
+from gridworld.comparison import Finding, check_whole, compare
 from gridworld.config import RecordingConfig, TrainConfig
 from gridworld.errors import InputError
 from gridworld.layout import Layout
-from gridworld.provenance import describe, differences
+from gridworld.provenance import describe, differences, source_differences
+from gridworld.repeat import lengths, repeat, resumptions
 from gridworld.run import Run, check_inside, check_new, open_run
 from gridworld.saved_run import layout_of, settings_of
 from gridworld.terminal import printable
-from gridworld.training import Interrupted, make_mdp, train
+from gridworld.training import Interrupted, make_mdp
 
 DIFFERENT = 1  # exit code
 
@@ -36,21 +37,33 @@ def main(arguments: Sequence[str]) -> None:
     then = open_run(options.run)
     config = settings_of(then, options.trust)
     layout = layout_of(then, config)
+    check_whole(then, config)  # training may take hours
+    *shorter, _ = lengths(then, config)
     if options.keep is not None:
         check_inside(options.keep, "--keep")
         check_new(options.keep, "--keep")
     print(f"{options.run}: {config.agent.name} on {config.env.layout}, seed {config.seed}")
     _tell_environment(list(differences(then.manifest, _here(then.manifest))))
+    _tell_resumed(then.manifest)
+    if shorter:
+        told = ", ".join(f"{length:,}" for length in shorter)
+        print(f"  made longer: to {told} steps first, then on to {config.total_timesteps:,}", flush=True)
     try:
         if options.keep is not None:
             options.keep.mkdir(parents=True, exist_ok=True)
-            same = _again(then, Run(options.keep), config, layout)
+            same = _again(then, Run(options.keep), config, layout, options.trust)
         else:
             with tempfile.TemporaryDirectory(prefix="gridworld-") as folder:
-                same = _again(then, Run(Path(folder)), _without_pictures(config), layout)
+                plain = _without_pictures(config)
+                same = _again(then, Run(Path(folder)), plain, layout, options.trust)
     except Interrupted as interruption:
         print(str(interruption), file=sys.stderr)
         sys.exit(interruption.exit_code)
+    if same is None:
+        raise InputError(
+            f"{options.run}: all that could be compared is identical, but not all of the run is there; put "
+            "its files back to compare them too"
+        )
     print("identical" if same else "different")
     if not same:
         sys.exit(DIFFERENT)
@@ -70,12 +83,12 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _again(then: Run, now: Run, config: TrainConfig, layout: Layout) -> bool:
-    """Whether everything is the same."""
+def _again(then: Run, now: Run, config: TrainConfig, layout: Layout, trust: bool) -> bool | None:
+    """Whether everything is the same; None: what can be compared is."""
     mdp = make_mdp(config.env, layout)
     mistake = None
     try:
-        train(config, now, then.manifest.get("overrides") or [], lambda env: mdp)
+        repeat(then, now, config, layout, trust)
     except InputError as error:
         if not now.manifest:  # these settings cannot be run here at all
             raise
@@ -86,7 +99,8 @@ def _again(then: Run, now: Run, config: TrainConfig, layout: Layout) -> bool:
     findings = list(compare(then, now, config, mdp))
     for finding in findings:
         _tell(finding)
-    return all(finding.same for finding in findings)
+    verdicts = {finding.same for finding in findings}
+    return next((verdict for verdict in (False, None) if verdict in verdicts), True)
 
 
 def _here(manifest: Mapping[str, Any]) -> dict[str, Any]:
@@ -113,6 +127,19 @@ def _tell_environment(differences: Sequence[str]) -> None:
         print(f"    {printable(line)}")
 
 
+def _tell_resumed(manifest: Mapping[str, Any]) -> None:
+    """Say what was not the same when it went on after an interruption."""
+    before = manifest.get("git")
+    for again in resumptions(manifest):
+        differs = again.get("differs")
+        lines = [f"{line} (anyway=true)" for line in differs] if isinstance(differs, list) else []
+        if "git" in again:
+            lines += source_differences(before, before := again["git"])
+        for line in lines:
+            where = f"went on after step {again.get('step')}"
+            print(f"    {printable(f'{where}: {line}')}", flush=True)
+
+
 def _tell(finding: Finding) -> None:
-    verdict = "identical" if finding.same else "DIFFERENT"
-    print(f"  {finding.part:<20}{verdict}  {printable(finding.told)}")
+    verdict = {True: "identical", False: "DIFFERENT", None: "UNKNOWN"}[finding.same]
+    print(f"  {finding.part:<20}{verdict:<9}  {printable(finding.told)}")
