@@ -1,4 +1,4 @@
-"""The one exception for what a user got wrong."""
+"""The one exception for what a user got wrong, and what is told like it."""
 
 
 class InputError(ValueError):
@@ -7,6 +7,19 @@ class InputError(ValueError):
     The sentence names the thing, where it is, and what would be right. Command lines print it without a
     traceback and exit with `EXIT_CODE`.
     """
+
+
+class MachineError(InputError):
+    """A disk was full or gone. What was begun is an interrupted run, and goes on once that is put right."""
+
+
+def reason(error: BaseException) -> str:
+    """What went wrong, for a sentence."""
+    if isinstance(error, InputError):
+        return str(error)
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror + (f": {error.filename}" if error.filename else "")
+    return f"{type(error).__name__}: {error}"
 
 
 EXIT_CODE = 2

@@ -44,15 +44,6 @@ def train_or_go_on(config: TrainConfig, run: Run, overrides: list[str]) -> Summa
     return unfinished.go_on()
 
 
-def is_intact(folder: Path) -> bool:
-    """Whether the manifest of the run in the folder is as the run wrote it."""
-    try:
-        Unfinished(folder, trust=True)
-    except InputError:
-        return False
-    return True
-
-
 class Unfinished:
     """A run's folder to go on in. Raises `InputError` where the manifest is none, or is not what it was."""
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from gridworld.agents import Seat, family
 from gridworld.config import EnvConfig, TrainConfig, check
 from gridworld.counted_env import CountedVectorEnv
-from gridworld.errors import InputError
+from gridworld.errors import InputError, MachineError, reason
 from gridworld.evaluation import Judge
 from gridworld.layout import Layout, load
 from gridworld.mdp import Mdp, compile_mdp
@@ -66,12 +66,13 @@ def carry_out(
         raise
     except BaseException as error:
         with contextlib.suppress(OSError):  # nothing can be written perhaps
-            run.end("failed", _reason(error), **_progress(session))
+            status = "interrupted" if isinstance(error, OSError) else "failed"
+            run.end(status, reason(error), **_progress(session))
         if isinstance(error, StateError):
             raise InputError(f"{run.folder}: its checkpoint does not fit this run: {error}") from None
         if isinstance(error, OSError):
-            raise InputError(
-                f"{shown(run.folder)}: {_reason(error)}; put that right, then go on with {run.resume_words()}"
+            raise MachineError(
+                f"{shown(run.folder)}: {reason(error)}; put that right, then go on with {run.resume_words()}"
             ) from None
         raise
     session.checkpoints.keep(1)
@@ -84,14 +85,6 @@ def _progress(session: Session | None) -> dict[str, int | None]:
     if session is None:
         return {}
     return {"reached": session.reached, "checkpoint": session.checkpoints.newest}
-
-
-def _reason(error: BaseException) -> str:
-    if isinstance(error, InputError):
-        return str(error)
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror + (f": {error.filename}" if error.filename else "")
-    return f"{type(error).__name__}: {error}"
 
 
 def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = make_mdp) -> Mdp:

@@ -5,6 +5,7 @@ import errno
 import fcntl
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -17,11 +18,14 @@ from tempfile import TemporaryDirectory
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support import ROOT, script
+from support import ROOT, configure, script
 
 from gridworld.commands import jobs as jobs_command
 from gridworld.errors import InputError
+from gridworld.journal import Journal
 from gridworld.lock import is_locked, locked
+from gridworld.run import read_run
+from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.progress import SweepProgress, duration
 from gridworld.sweep.table import Row, Table
 
@@ -190,6 +194,111 @@ def test_a_worker_that_is_killed_takes_no_other_job_along(tmp_path: Path) -> Non
     assert {row["error"] for row in rows} == {"its process was lost (TerminatedWorkerError)", ""}
     again = with_own_classes(*words, cwd=tmp_path)
     assert "0 to run" in again.stderr  # what failed is remembered
+
+
+def test_a_job_that_cannot_go_on_says_why_and_begins_anew_if_asked(tmp_path: Path) -> None:
+    assert sweep("seed=0,1", cwd=tmp_path).returncode == 0
+    run = read_run(tmp_path / "sweep" / "seed=0")
+    run.manifest["config"]["total_timesteps"] = 700
+    run.end("interrupted")
+    check_told_and_begun_anew(tmp_path, "holds an unfinished run with other settings (total_timesteps=500")
+
+
+def test_a_job_that_was_made_longer_is_no_longer_done(tmp_path: Path) -> None:
+    assert sweep("seed=0,1", cwd=tmp_path).returncode == 0
+    longer = script("train.py", "resume=sweep/seed=0", "total_timesteps=700", cwd=tmp_path)
+    assert longer.returncode == 0, longer.stderr
+    check_told_and_begun_anew(tmp_path, "the run in seed=0 was made 700 steps long")
+
+
+@pytest.mark.parametrize("keep", [0, 300])
+def test_a_job_with_a_damaged_manifest_is_told(keep: int, tmp_path: Path) -> None:
+    assert sweep("seed=0,1", cwd=tmp_path).returncode == 0
+    file = tmp_path / "sweep" / "seed=0" / "manifest.json"
+    file.write_bytes(file.read_bytes()[:keep])
+    check_told_and_begun_anew(tmp_path, "manifest.json: is no JSON, it was changed or cut off")
+
+
+def check_told_and_begun_anew(cwd: Path, why: str) -> None:
+    """The job on seed 0 is left alone, however often, until it is asked for; what is not its own stays."""
+    folder = cwd / "sweep" / "seed=0"
+    (folder / "mynotes.txt").write_text("mine")
+    before = (folder / "model.zip").read_bytes()
+    for _ in range(2):
+        told = sweep("seed=0,1", cwd=cwd)
+        assert told.returncode == 1
+        assert f"failed:\n  {' '.join(QUICK)} seed=0: " in told.stderr
+        assert why in told.stderr
+        assert why in table(cwd / "sweep")["seed=0"]["error"]
+        assert (folder / "model.zip").read_bytes() == before
+    assert "0 to run" in told.stderr
+    again = sweep("seed=0,1", "hydra.sweeper.retry_failed=true", cwd=cwd)
+    assert again.returncode == 0, again.stderr
+    assert statuses(cwd / "sweep") == {"seed=0": "done", "seed=1": "done"}
+    assert "resumed" not in json.loads((folder / "manifest.json").read_text())
+    assert json.loads((folder / "summary.json").read_text())["total_timesteps"] == 500
+    assert (folder / "mynotes.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(("most", "stands"), [(100, set()), (15_000, {"interrupted"})])
+def test_a_full_disk_is_told_and_the_same_line_goes_on(most: int, stands: set[str], tmp_path: Path) -> None:
+    """Files may not grow beyond `most` bytes: too few for the table, or for a job's event file."""
+
+    def limit() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, most))
+
+    words = ["-m", *QUICK, "seed=0,1", "total_timesteps=2000", "checkpoint.every=500", FOLDER]
+    command = [sys.executable, str(ROOT / "scripts" / "train.py"), *words]
+    full = subprocess.run(
+        command, cwd=tmp_path, preexec_fn=limit, capture_output=True, text=True, check=False
+    )
+    assert full.returncode == 1
+    assert "Traceback" not in full.stderr
+    assert "File too large" in full.stderr
+    assert "go on with: python " in full.stderr.splitlines()[-1]
+    if stands:
+        assert set(statuses(tmp_path / "sweep").values()) == stands
+        assert "File too large" in table(tmp_path / "sweep")["seed=0"]["error"]
+    again = script("train.py", *words, cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert set(statuses(tmp_path / "sweep").values()) == {"done"}
+
+
+def test_a_job_that_a_full_disk_ended_goes_on_from_its_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = (*QUICK, "total_timesteps=2000", "checkpoint.every=500", "evaluation.every=100")
+    folder = tmp_path / "seed=0"
+    folder.mkdir()
+    append = Journal.append
+
+    def fill(journal: Journal, content: bytes) -> None:
+        if any(folder.glob("checkpoints/*.state")):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        append(journal, content)
+
+    monkeypatch.setattr(Journal, "append", fill)
+    with pytest.raises(JobError, match="No space left on device"):
+        run_in_sweep(configure(*words), folder, list(words), stop_at_failure=False)
+    assert statuses(tmp_path) == {"seed=0": "interrupted"}
+    monkeypatch.setattr(Journal, "append", append)
+    assert run_in_sweep(configure(*words), folder, list(words), stop_at_failure=False) >= 0
+    assert statuses(tmp_path) == {"seed=0": "done"}
+    assert json.loads((folder / "manifest.json").read_text())["resumed"][0]["step"] > 0
+
+
+def test_a_table_that_cannot_be_written_is_no_fault_of_the_job(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: object, **changes: str) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    (tmp_path / "seed=0").mkdir()
+    monkeypatch.setattr(Table, "set", fail)
+    with pytest.raises(OSError, match="No space left on device"):
+        run_in_sweep(configure(*QUICK), tmp_path / "seed=0", [], stop_at_failure=False)
+    assert not (tmp_path / "seed=0" / "manifest.json").exists()
 
 
 def with_own_classes(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -1,5 +1,6 @@
 """From a sweep's command line to its jobs: which there are, when two are the same, what they are called."""
 
+import dataclasses
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -12,12 +13,14 @@ from hydra.types import RunMode
 from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
-from support import CONF, configure
+from support import CONF, SHORT, configure
 
 from gridworld.errors import InputError
 from gridworld.experiment import register_schemas
+from gridworld.run import Run, read_run
 from gridworld.sweep.compose import SweepLoader
-from gridworld.sweep.plan import Job, expand, folder_name, plan
+from gridworld.sweep.plan import Job, expand, folder_name, plan, settings_hash
+from gridworld.training import check_settings
 
 
 @pytest.fixture
@@ -84,6 +87,18 @@ def test_jobs_are_the_same_if_the_same_settings_come_out(tmp_path: Path) -> None
     assert len({plain, other, in_a_file}) == 3
     map_file.write_text("S..\n.TG\n")
     assert hashes(["agent=q_learning", f"env.layout={map_file}"]) != [in_a_file]
+
+
+@pytest.mark.parametrize("agent", SHORT)
+def test_a_manifest_has_the_settings_of_its_job(agent: str, tmp_path: Path) -> None:
+    """By which a sweep knows a run that is no longer the job's."""
+    words = SHORT[agent]
+    config = configure(*words)
+    layout = check_settings(config).layout.text()
+    run = Run(tmp_path)
+    run.start(dataclasses.asdict(config), layout, words)
+    manifest = read_run(tmp_path).manifest
+    assert [settings_hash(manifest["config"], "\n".join(manifest["layout"]))] == hashes(words)
 
 
 def test_a_sweep_runs_the_same_job_once_and_knows_mistakes() -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-import shutil
 import sys
 import time
 import traceback
@@ -11,16 +11,27 @@ from dataclasses import replace
 from pathlib import Path
 
 from gridworld.config import TrainConfig
-from gridworld.errors import InputError
+from gridworld.errors import InputError, MachineError, reason
 from gridworld.files import write_json, write_text
 from gridworld.lock import locked
-from gridworld.resume import is_intact, train_or_go_on
+from gridworld.provenance import DIFF
+from gridworld.resume import train_or_go_on
 from gridworld.run import LOCK, MANIFEST, Run
 from gridworld.signals import Interrupted
-from gridworld.sweep.table import DONE, FAILED, INTERRUPTED, RUNNING, Table, one_line, outcome, read_json
+from gridworld.sweep.table import (
+    DONE,
+    FAILED,
+    INTERRUPTED,
+    PENDING,
+    RUNNING,
+    Table,
+    one_line,
+    outcome,
+    read_json,
+    read_manifest,
+)
 
 ERROR_FILE = "error.txt"  # the traceback of what nobody foresaw
-_HYDRA_FOLDER = ".hydra"
 _TO_GO_ON_WITH = ("running", "interrupted")  # statuses of runs that were stopped from outside
 
 
@@ -36,49 +47,64 @@ def run_in_sweep(config: TrainConfig, folder: Path, overrides: list[str], stop_a
     """Train in the job's folder, unless that is done or being done; returns the final regret.
 
     What was interrupted goes on from its checkpoint; what an attempt left that failed is replaced.
-    Raises `JobError` or `StopSweep`, and `SystemExit` when interrupted.
+    Raises `JobError` or `StopSweep`, and `SystemExit` when interrupted; `OSError` if not even the table can
+    be written.
     """
-    table, job = Table(folder.parent), folder.name
+    table = Table(folder.parent)
     with locked(folder / LOCK, wait=1) as is_ours:
-        status = read_json(folder / MANIFEST).get("status")
-        if not is_ours or status == "finished":
+        if not is_ours or not _make_ready(folder, table):
             return math.nan
-        if status not in _TO_GO_ON_WITH or not is_intact(folder):
-            _clear(folder)
-        table.set(job, status=RUNNING, seconds="", objective="", error="")
-        started = time.monotonic()
-        run = Run(folder)
-        config = replace(config, logging=replace(config.logging, progress=False))  # the sweep has its own
+        table.set(folder.name, status=RUNNING, seconds="", objective="", error="")
         try:
-            summary = train_or_go_on(config, run, overrides)
-        except Interrupted as interruption:
-            table.set(job, status=INTERRUPTED, **outcome(folder, run.manifest))
-            sys.exit(interruption.exit_code)
-        except Exception as error:
-            reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
-            if not isinstance(error, InputError):
-                write_text(folder / ERROR_FILE, traceback.format_exc())
-            seconds = f"{time.monotonic() - started:.2f}"
-            table.set(job, status=FAILED, seconds=seconds, error=one_line(reason))
-            raise (StopSweep if stop_at_failure else JobError)(one_line(reason)) from None
-        table.set(job, status=DONE, **outcome(folder, run.manifest))
-    return float(summary["regret"])
+            return _run(config, Run(folder), overrides, table)
+        except JobError as error:
+            if stop_at_failure:
+                raise StopSweep(str(error)) from None
+            raise
 
 
-def mark_failed(folder: Path, reason: str) -> None:
-    """Say in the manifest, if the job came so far, what its own process could not."""
+def mark_failed(folder: Path, why: str) -> None:
+    """Say in the manifest, if the job came so far, what its own process did not."""
     manifest = read_json(folder / MANIFEST)
-    if manifest:
-        write_json(folder / MANIFEST, manifest | {"status": "failed", "error": reason})
+    if manifest.get("status") in _TO_GO_ON_WITH:
+        write_json(folder / MANIFEST, manifest | {"status": "failed", "error": why})
 
 
-def _clear(folder: Path) -> None:
-    """Take away what an attempt left that came to no end, its manifest first."""
-    (folder / MANIFEST).unlink(missing_ok=True)
-    for path in folder.iterdir():
-        if path.name in (LOCK, _HYDRA_FOLDER):
-            continue
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink()
+def _make_ready(folder: Path, table: Table) -> bool:
+    """Take away what an attempt left that came to no end, its manifest first; False: there is nothing to do.
+
+    A run that is finished is replaced if the table has the job as failed: then it is another job's.
+    """
+    status = read_manifest(folder).get("status")
+    row = table.row(folder.name)
+    if status == "finished" and (row is None or row.status != FAILED):
+        return False
+    if status not in _TO_GO_ON_WITH:
+        for name in (MANIFEST, DIFF):
+            (folder / name).unlink(missing_ok=True)
+        Run(folder).clear()
+    return True
+
+
+def _run(config: TrainConfig, run: Run, overrides: list[str], table: Table) -> float:
+    started, job = time.monotonic(), run.folder.name
+    config = replace(config, logging=replace(config.logging, progress=False))  # the sweep has its own
+    try:
+        summary = train_or_go_on(config, run, overrides)
+    except Interrupted as interruption:
+        table.set(job, status=INTERRUPTED, **outcome(run.folder, run.manifest))
+        sys.exit(interruption.exit_code)
+    except (OSError, MachineError) as error:  # no fault of the job's, which goes on later
+        why = one_line(reason(error))
+        table.set(job, status=INTERRUPTED if run.manifest_file.exists() else PENDING, error=why)
+        raise JobError(why) from None
+    except Exception as error:
+        why = one_line(reason(error))
+        if not isinstance(error, InputError):
+            with contextlib.suppress(OSError):  # the reason is worth more than its traceback
+                write_text(run.folder / ERROR_FILE, traceback.format_exc())
+        mark_failed(run.folder, why)  # one that could not go on says nothing itself
+        table.set(job, status=FAILED, seconds=f"{time.monotonic() - started:.2f}", error=why)
+        raise JobError(why) from None
+    table.set(job, status=DONE, **outcome(run.folder, run.manifest))
+    return float(summary["regret"])

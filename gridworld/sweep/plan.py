@@ -30,6 +30,7 @@ from gridworld.training import check_settings, make_mdp
 _LONGEST_NAME = 100  # characters of a job's folder
 _MOST_VALUES = 1_000_000  # of one key
 _HASH_SHOWN = 6  # characters of the hash in a name that needs it
+_WITHOUT_EFFECT = ("logging", "recording", "checkpoint")  # on the result
 _SEED = re.compile(r"\+*seed=")
 
 
@@ -100,17 +101,16 @@ def plan(
             layout = check_settings(config, world).layout.text()
         except InputError as error:
             mistake = str(error)
-        digest = _hash(config, layout)
+        digest = settings_hash(dataclasses.asdict(config), layout)
         planned.setdefault(
             digest, Job(tuple(overrides), tuple(swept), digest, mistake, config.logging.progress)
         )
     return list(planned.values())
 
 
-def _hash(config: TrainConfig, layout: str) -> str:
-    content = dataclasses.asdict(config)
-    for without_effect in ("logging", "recording", "checkpoint"):
-        del content[without_effect]
+def settings_hash(settings: dict[str, Any], layout: str) -> str:
+    """Of a run's settings and its map's text; the same for settings that have been in a manifest."""
+    content = {key: value for key, value in settings.items() if key not in _WITHOUT_EFFECT}
     text = json.dumps([content, layout], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 

@@ -8,10 +8,12 @@ from collections import Counter
 from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 
+from gridworld.errors import reason
 from gridworld.sweep.progress import duration
-from gridworld.sweep.table import DONE, FAILED, JOBS_CSV, RUNNING, STATUSES, Row
+from gridworld.sweep.table import DONE, FAILED, INTERRUPTED, JOBS_CSV, PENDING, RUNNING, STATUSES, Row
+from gridworld.terminal import tell_error
 
-_MOST_FAILURES = 50  # in the list on the terminal; jobs.csv has them all
+_MOST_LISTED = 50  # of a kind, on the terminal; jobs.csv has them all
 
 
 def counts_text(rows: Iterable[Row]) -> str:
@@ -29,19 +31,16 @@ def tell_start(folder: Path, rows: Sequence[Row], to_run: int) -> None:
 def tell_end(
     folder: Path, rows: Sequence[Row], seconds: float, stopped: str, mistakes: Container[str]
 ) -> None:
-    """How the jobs stand, each failure with its reason, and how to go on where there is more to do.
+    """How the jobs stand, with the reason of each that did not end well, and how to go on with the rest.
 
     Those in `mistakes` would fail again.
     """
     print(f"sweep {shown(folder)}: {counts_text(rows)}, in {duration(seconds)}")
     print(f"  jobs: {shown(folder / JOBS_CSV)}\n  curves: tensorboard --logdir {shown(folder)}", flush=True)
     failed = [row for row in rows if row.status == FAILED]
-    if failed:
-        print("failed:", file=sys.stderr)
-    for row in failed[:_MOST_FAILURES]:
-        print(f"  {row.overrides}: {row.error}", file=sys.stderr)
-    if len(failed) > _MOST_FAILURES:
-        print(f"  and {len(failed) - _MOST_FAILURES} more; {JOBS_CSV} has all", file=sys.stderr)
+    halted = [row for row in rows if row.error and row.status in (PENDING, INTERRUPTED)]
+    _list("interrupted", halted)
+    _list("failed", failed)
     if stopped:
         print(f"{stopped}; go on with: {command(folder)}", file=sys.stderr)
     elif any(row.job not in mistakes for row in failed):
@@ -52,6 +51,21 @@ def tell_end(
     elif any(row.status not in (DONE, FAILED) for row in rows):
         print(f"the rest did not come to its end; go on with: {command(folder)}", file=sys.stderr)
     sys.stderr.flush()
+
+
+def _list(what: str, rows: Sequence[Row]) -> None:
+    """Each with its reason."""
+    if rows:
+        print(f"{what}:", file=sys.stderr)
+    for row in rows[:_MOST_LISTED]:
+        print(f"  {row.overrides}: {row.error}", file=sys.stderr)
+    if len(rows) > _MOST_LISTED:
+        print(f"  and {len(rows) - _MOST_LISTED} more; {JOBS_CSV} has all", file=sys.stderr)
+
+
+def tell_stopped_by(error: OSError, folder: Path) -> None:
+    """The disk was full, say: what is wrong, and how to go on."""
+    tell_error(f"{shown(folder)}: {reason(error)}; put that right, then go on with: {command(folder)}")
 
 
 def command(folder: Path, *more: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import threading
@@ -17,7 +18,7 @@ from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig
 
 from gridworld.config import TrainConfig
-from gridworld.errors import InputError
+from gridworld.errors import InputError, reason
 from gridworld.experiment import to_config
 from gridworld.run import MANIFEST
 from gridworld.sweep import report
@@ -27,12 +28,13 @@ from gridworld.sweep.folder import Entry, SweepFolder
 from gridworld.sweep.job import StopSweep, mark_failed
 from gridworld.sweep.plan import Job, expand, plan
 from gridworld.sweep.progress import SweepProgress
-from gridworld.sweep.table import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, Row, Table, read_json
+from gridworld.sweep.table import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, Row, Table, one_line, read_json
 
 _ORPHANS_END_WITHIN = 5.0  # seconds; workers of a sweep that was killed
 _STOPPED_END_WITHIN = 2.5  # seconds; those of one that is being stopped
 _SECONDS_BETWEEN_LOOKS = 0.1
 _STOP_WITHIN = 4.0  # seconds after a signal
+_DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def run_sweep(
@@ -54,11 +56,17 @@ def run_sweep(
     jobs = plan(expand(words, loader, settings.max_jobs), configure)
     _refuse_mistakes(jobs, settings)
     folder.check(jobs, settings.extend)
-    with folder.at_work():
-        entries = folder.add(jobs, words)
-        mistakes = {entry.job: job.mistake for entry, job in zip(entries, jobs, strict=True) if job.mistake}
-        sweep = _Sweep(folder, entries, launcher)
-        code = sweep.run(mistakes, settings.retry_failed, any(job.progress for job in jobs))
+    try:
+        with folder.at_work():
+            entries = folder.add(jobs, words)
+            mistakes = {e.job: job.mistake for e, job in zip(entries, jobs, strict=True) if job.mistake}
+            sweep = _Sweep(folder, entries, launcher)
+            code = sweep.run(mistakes, settings.retry_failed, any(job.progress for job in jobs))
+    except ConnectionError:
+        raise  # a cluster's, not a disk's
+    except OSError as error:
+        report.tell_stopped_by(error, folder.path)
+        code = 1
     if code:
         raise SystemExit(code)
 
@@ -143,6 +151,8 @@ class _Sweep:
         rows = self._put_right()
         pending = [entry for entry in batch if rows[entry.job].status == PENDING]
         died = [entry for entry in batch if rows[entry.job].status == INTERRUPTED]
+        if isinstance(error, OSError) and error.errno in _DISK_IS_FULL:
+            raise error
         if len(batch) == 1:
             for entry in pending + died:
                 self._fail(entry, f"its process was lost ({type(error).__name__})")
@@ -159,10 +169,14 @@ class _Sweep:
         lost = any(result.status is JobStatus.UNKNOWN for result in results)
         rows = self._put_right() if lost else self._table.read()
         for entry, result in zip(batch, results, strict=True):
-            if rows[entry.job].status not in (PENDING, INTERRUPTED):
+            row = rows[entry.job]
+            if row.status not in (PENDING, INTERRUPTED):
                 continue
-            if result.status is not JobStatus.UNKNOWN:
-                self._fail(entry, f"it did not run ({result._return_value})")
+            if isinstance(result._return_value, OSError):
+                self._table.set(entry.job, error=one_line(reason(result._return_value)))
+            elif result.status is not JobStatus.UNKNOWN:
+                if not row.error:
+                    self._fail(entry, f"it did not run ({result._return_value})")
             elif read_json(self._folder.path / entry.job / MANIFEST).get("status") == "running":
                 self._fail(entry, f"its process was lost ({result._return_value})")
 

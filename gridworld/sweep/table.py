@@ -11,16 +11,20 @@ import dataclasses
 import io
 import json
 import math
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from gridworld.data_files import read_object
+from gridworld.errors import InputError
 from gridworld.files import write_text
 from gridworld.lock import is_locked, locked
 from gridworld.run import LOCK, MANIFEST, SUMMARY
 from gridworld.sweep.folder import Entry
+from gridworld.sweep.plan import settings_hash
 
 JOBS_CSV = "jobs.csv"
 TABLE_LOCK = ".jobs.lock"
@@ -63,6 +67,11 @@ class Table:
             return {}
         return {line[0]: Row(*line) for line in lines[1:] if len(line) == len(_COLUMNS)}
 
+    def row(self, job: str) -> Row | None:
+        """The job's row as the file has it."""
+        found = self._find(job)
+        return self.read().get(job) if found is None else found[1]
+
     def set(self, job: str, **changes: str) -> None:
         """Change a job's row. Other rows are copied as they stand: reading ten thousand takes 0.1 s."""
         with locked(self.folder / TABLE_LOCK):
@@ -104,13 +113,18 @@ class Table:
     def _look_at(self, entry: Entry, before: Row | None) -> Row:
         folder = self.folder / entry.job
         row = Row(entry.job, one_line(" ".join(entry.overrides)))
-        manifest = read_json(folder / MANIFEST)
+        manifest = read_manifest(folder)
         status = _OF_A_RUN.get(manifest.get("status", ""), INTERRUPTED if manifest else PENDING)
         if status in (PENDING, INTERRUPTED) and is_locked(folder / LOCK):
             return dataclasses.replace(row, status=RUNNING)
         if status == PENDING and before is not None and before.status == FAILED:
             return dataclasses.replace(before, overrides=row.overrides)  # it never came to a manifest
-        return dataclasses.replace(row, status=status, **outcome(folder, manifest))
+        row = dataclasses.replace(row, status=status, **outcome(folder, manifest))
+        if status == DONE and (error := _other_job(manifest, entry)):
+            return dataclasses.replace(row, status=FAILED, objective="", error=error)
+        if before is not None and before.status == status and not row.error:
+            return dataclasses.replace(row, error=before.error)  # the disk was too full for the manifest
+        return row
 
     def _write(self, rows: Iterable[Row]) -> None:
         lines = [_line(_COLUMNS), *(_line(dataclasses.astuple(row)) for row in rows)]
@@ -138,6 +152,29 @@ def outcome(folder: Path, manifest: dict[str, Any]) -> dict[str, str]:
     if isinstance(regret, int | float) and math.isfinite(regret):
         found["objective"] = repr(regret)
     return found
+
+
+def _other_job(manifest: dict[str, Any], entry: Entry) -> str:
+    """What of a finished run in the job's folder makes it another job's; "" if it is the job's own."""
+    try:
+        if settings_hash(manifest["config"], "\n".join(manifest["layout"])) == entry.hash:
+            return ""
+        lengths = [again["total_timesteps"] for again in manifest["resumed"] if "total_timesteps" in again]
+    except (KeyError, TypeError, AttributeError):
+        lengths = []
+    what = f"was made {lengths[-1]} steps long" if lengths else "has other settings than the job"
+    return f"the run in {entry.job} {what}, so that it is not this job's result; move it to keep it"
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """A run's manifest; empty where there is none. One that is damaged counts as that of a failed run."""
+    if not os.path.lexists(folder / MANIFEST):
+        return {}
+    try:
+        manifest = read_object(folder / MANIFEST)
+    except InputError as error:
+        return {"status": "failed", "error": str(error)}
+    return manifest or {"status": "failed", "error": f"{folder / MANIFEST}: is empty"}
 
 
 def one_line(text: Any) -> str:

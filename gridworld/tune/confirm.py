@@ -51,17 +51,18 @@ def work(task: Sequence[Job], worker: int, parent: int) -> None:
     become_worker(parent)
     left = list(task)
     while left and not is_stopped():
-        for job in left:
-            if not is_stopped():
-                _run(job)
+        left = [job for job in left if is_stopped() or _run(job)]
         # Some may be at work elsewhere, in the folder's other workers or in another command's.
         left = [job for job in left if read_json(job.folder / MANIFEST).get("status") not in _ENDED]
     sys.exit(0)
 
 
-def _run(job: Job) -> None:
+def _run(job: Job) -> bool:
+    """Whether it went well, as far as this process can tell."""
     job.folder.mkdir(parents=True, exist_ok=True)
     try:
         run_in_sweep(job.config, job.folder, [], stop_at_failure=False)
     except JobError as error:
         print(f"{job.folder}: {error}", file=sys.stderr, flush=True)
+        return False
+    return True
