@@ -32,14 +32,20 @@ def train_or_go_on(config: TrainConfig, run: Run, overrides: list[str]) -> Summa
     """Train, or go on with the unfinished run in the folder. Raises `InputError` if that is another."""
     if not run.manifest_file.exists():
         return train(config, run, overrides)
-    unfinished = Unfinished(run.folder, trust=True)  # its classes are those of the settings, or it is refused
-    if unfinished.is_finished:
-        raise InputError(f"{run.folder}: holds a run already; give every run a folder of its own")
-    unfinished.check_same(config, check_settings(config).layout.text())
+    unfinished = unfinished_in(run.folder, config)
     unfinished.config = config
     run.manifest = unfinished.run.manifest
     unfinished.run = run
     return unfinished.go_on()
+
+
+def unfinished_in(folder: Path, config: TrainConfig) -> Unfinished:
+    """The unfinished run of these settings. Raises `InputError` where that in the folder is another."""
+    unfinished = Unfinished(folder, trust=True)  # its classes are those of the settings, or it is refused
+    if unfinished.is_finished:
+        raise InputError(f"{folder}: holds a run already; give every run a folder of its own")
+    unfinished.check_same(config, check_settings(config).layout.text())
+    return unfinished
 
 
 def is_intact(folder: Path) -> bool:

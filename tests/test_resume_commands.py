@@ -12,7 +12,7 @@ import pytest
 from resuming import begin, differences, go_on, left_behind, stopped_after
 from support import ROOT, SHORT, configure, script
 
-from gridworld import identity
+from gridworld import identity, lock
 from gridworld.checkpoint import Checkpoints
 from gridworld.errors import InputError
 from gridworld.files import write_json
@@ -94,6 +94,54 @@ def test_a_run_is_one_process_alone(stopped: Path) -> None:
             done = script("train.py", *words, cwd=stopped.parent)
             assert done.returncode == 2
             assert "run: another process is at work in it" in done.stderr
+
+
+def test_a_refused_start_leaves_the_folder_to_who_has_it(tmp_path: Path) -> None:
+    """Also before there is a manifest."""
+    folder = tmp_path / "run"
+    (folder / ".hydra").mkdir(parents=True)
+    (folder / ".hydra" / "config.yaml").write_text("seed: 7\n")
+    with locked(folder / LOCK):
+        before = left_there(folder)
+        done = script("train.py", *WORDS, "hydra.run.dir=run", cwd=tmp_path)
+        assert done.returncode == 2
+        assert "run: another process is at work in it" in done.stderr
+        assert left_there(folder) == before
+
+
+def test_a_refused_start_leaves_the_configuration_of_the_run(stopped: Path) -> None:
+    before = left_there(stopped)
+    done = script("train.py", *WORDS, "hydra.run.dir=run", "seed=77", cwd=stopped.parent)
+    assert done.returncode == 2
+    assert "unfinished run with other settings (seed=77 instead of 0)" in done.stderr
+    assert left_there(stopped) == {**before, ".lock": b""}
+
+
+def left_there(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_start_that_comes_to_nothing_leaves_no_folder(tmp_path: Path) -> None:
+    assert script("train.py", *WORDS, "hydra.run.dir=run", "seed=-1", cwd=tmp_path).returncode == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_on_a_file_that_was_taken_away_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever had the lock deletes its file between our opening it and our having it."""
+    path, take, taken = tmp_path / LOCK, lock._take, 0
+
+    def late(file: int, wait: float | None) -> bool:
+        nonlocal taken
+        taken += 1
+        if taken == 1:
+            path.unlink()
+        return take(file, wait)
+
+    monkeypatch.setattr(lock, "_take", late)
+    with locked(path, wait=0) as first, locked(path, wait=0) as second:
+        assert (first, second) == (True, False)
 
 
 def test_a_finished_run_is_made_longer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
