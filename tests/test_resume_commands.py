@@ -159,6 +159,17 @@ def test_a_finished_run_is_made_longer(tmp_path: Path, capsys: pytest.CaptureFix
         go_on(tmp_path / "run", 3000)
 
 
+@pytest.mark.parametrize("total", [1000, 4000])
+def test_a_finished_run_without_its_checkpoint_is_kept(total: int, tmp_path: Path) -> None:
+    begin(tmp_path / "run", *WORDS)
+    for file in Checkpoints(tmp_path / "run").files():
+        file.write_bytes(b"")
+    before = left_there(tmp_path / "run")
+    with pytest.raises(InputError, match=r"is finished, and checkpoints/ has no checkpoint .* a new run in"):
+        go_on(tmp_path / "run", total)
+    assert left_there(tmp_path / "run") == before
+
+
 def test_what_falls_over_training_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     begin(tmp_path, *SHORT["dqn"], *LESS, "agent.learning_rate=lin_0.004")
     go_on(tmp_path, 4000)
