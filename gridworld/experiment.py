@@ -100,6 +100,9 @@ def _alone_in(folder: Path) -> Iterator[None]:
             raise InputError(f"{shown(folder)}: another process is at work in it; wait for it or stop it")
         try:
             yield
+        except OSError as error:
+            error.filename = error.filename or shown(folder)  # writing does not tell where
+            raise
         finally:
             _discard(folder)
 
@@ -187,7 +190,7 @@ def run_job(settings: DictConfig) -> float:
             return run_in_sweep(config, folder, overrides, context.sweeper.stop_at_first_failure)
         with _alone_in(folder) if is_one_of_many else contextlib.nullcontext():
             return _run_alone(config, folder, overrides)
-    except (InputError, OmegaConfBaseException) as error:
+    except (InputError, OSError, OmegaConfBaseException) as error:
         if is_one_of_many:
             print(f"job {context.job.num} failed: {sentence(error)}", file=sys.stderr)
             raise JobError(sentence(error)) from None
