@@ -160,6 +160,28 @@ def test_a_finished_run_is_made_longer(tmp_path: Path, capsys: pytest.CaptureFix
         go_on(tmp_path / "run", 3000)
 
 
+@pytest.mark.parametrize(
+    ("words", "total", "longer"),
+    [
+        (["agent=q_learning", "n_envs=16", "evaluation.every=220"], 1760, 4000),  # due at the last step
+        ([*SHORT["ppo"], "evaluation.every=128"], 600, 2000),  # due thrice between 600 and 1,024, the last
+        (["agent=a2c", "n_envs=4", "agent.arguments.n_steps=8", "evaluation.every=100"], 484, 1000),
+        ([*SHORT["dqn"], "n_envs=32", "agent.exploration_fraction=1e-9", "evaluation.every=500"], 1001, 1500),
+    ],
+    ids=["q_learning", "ppo", "a2c", "dqn"],
+)
+def test_the_curve_of_a_run_made_longer(words: list[str], total: int, longer: int, tmp_path: Path) -> None:
+    """An evaluation that is due where the shorter run ends is where it is in the longer one."""
+    words = [*words, *LESS]
+    begin(tmp_path / "long", *words, f"total_timesteps={longer}", "logging.policy_map_every=2")
+    begin(tmp_path / "run", *words, f"total_timesteps={total}", "logging.policy_map_every=2")
+    go_on(tmp_path / "run", longer)
+    one, other = left_behind(tmp_path / "run"), left_behind(tmp_path / "long")
+    for left in (one, other):  # of one step, they may be in another order in the file
+        left["points"] = sorted(left["points"], key=lambda point: (point[0], point[1]))
+    assert differences(one, other) == []
+
+
 @pytest.mark.parametrize("total", [1000, 4000])
 def test_a_finished_run_without_its_checkpoint_is_kept(total: int, tmp_path: Path) -> None:
     begin(tmp_path / "run", *WORDS)
@@ -231,6 +253,36 @@ def test_a_signal_saves_and_ends_soon(number: signal.Signals, tmp_path: Path) ->
     assert left["checkpoint"] == left["reached"] > 0  # type: ignore[operator]
     assert f"stopped by {number.name}: all {left['reached']:,} steps are saved; go on with" in told
     assert list((tmp_path / "run").rglob("*.part")) == []
+
+
+STOPPED_EARLY = """
+import os, sys
+from gridworld.early import at_work, listen
+listen()
+try:
+    with at_work():
+        print("begun")
+        if sys.argv[1] == "at work":
+            os.kill(os.getpid(), int(sys.argv[2]))
+except KeyboardInterrupt:
+    sys.exit(130)
+os.kill(os.getpid(), int(sys.argv[2]))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("when", ["at work", "afterwards"])
+def test_a_signal_that_comes_early_or_late(when: str, number: signal.Signals) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", STOPPED_EARLY, when, str(int(number))],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 128 + number
+    assert done.stdout == "begun\n"
+    assert "Traceback" not in done.stderr
 
 
 def test_where_no_rest_comes_the_last_checkpoint_counts(tmp_path: Path) -> None:
