@@ -14,7 +14,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from gridworld.files import replacing
+from gridworld.data_files import check_no_link, read_bytes
+from gridworld.errors import InputError
+from gridworld.files import remove, replacing
 from gridworld.state import State, StateError, decode, encode
 
 FOLDER = "checkpoints"
@@ -34,6 +36,7 @@ class Checkpoints:
 
     def save(self, steps: int, state: State, durable: bool = True, small: bool = False) -> None:
         """Write one; `durable`, it survives a power cut; `small`, it takes longer and less space."""
+        check_no_link(self.folder)
         self.folder.mkdir(exist_ok=True)
         path = self._path(steps)
         with replacing(path) as part, part.open("wb") as file:
@@ -50,21 +53,20 @@ class Checkpoints:
     def keep(self, count: int) -> None:
         """Remove all but so many of the newest."""
         for old in self.files()[count:]:
-            old.unlink()
+            remove(old)
 
     def files(self) -> list[Path]:
-        """Newest first."""
+        """Newest first. Raises `InputError` where the folder is a link: what it leads to is not the run's."""
+        check_no_link(self.folder)
         return sorted(self.folder.glob(f"[0-9]*{_SUFFIX}"), reverse=True)
 
     def states(self) -> Iterator[tuple[Path, State | StateError]]:
         """Each file with what is in it, newest first."""
         for path in self.files():
             try:
-                if not path.is_file() or path.stat().st_size > _MOST_BYTES:
-                    raise StateError("it is no file of a size that is ever written")
-                yield path, decode(path.read_bytes())
-            except OSError as error:
-                yield path, StateError(f"it cannot be read ({error.strerror})")
+                yield path, decode(read_bytes(path, _MOST_BYTES))
+            except InputError as error:
+                yield path, StateError(str(error).removeprefix(f"{path}: "))
             except StateError as error:
                 yield path, error
 
@@ -72,7 +74,7 @@ class Checkpoints:
         """Remove those of more steps, which are no use: the run goes on from here."""
         for path in self.files():
             if path.name > self._path(steps).name:
-                path.unlink()
+                remove(path)
         self.newest = steps
 
     def _path(self, steps: int) -> Path:

@@ -7,7 +7,7 @@ however many cells the world has.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -16,6 +16,18 @@ from numpy.typing import NDArray
 from gridworld.mdp import NUM_ACTIONS
 from gridworld.state import State, fill
 from gridworld.vector_env import GridWorldVectorEnv, StateArray, Step
+
+
+class Returns(NamedTuple):
+    """Of some episodes."""
+
+    episodes: int
+    total: float
+
+    @property
+    def mean(self) -> float | None:
+        """None where there is none."""
+        return self.total / self.episodes if self.episodes else None
 
 
 class CountedVectorEnv(GridWorldVectorEnv):
@@ -71,8 +83,12 @@ class CountedVectorEnv(GridWorldVectorEnv):
         fill(self._returns, state["returns"], "returns")
         self._ended, self._ended_return = int(state["ended"]), float(state["ended_return"])
 
-    def take_mean_return(self) -> float | None:
-        """Mean undiscounted return of the episodes that ended since the last call; None where none did."""
-        mean = self._ended_return / self._ended if self._ended else None
+    def take_returns(self) -> Returns:
+        """Undiscounted, of the episodes that ended since the last call."""
+        taken = Returns(self._ended, self._ended_return)
         self._ended, self._ended_return = 0, 0.0
-        return mean
+        return taken
+
+    def put_back(self, taken: Returns) -> None:
+        """As if they had not been taken; no step was made meanwhile."""
+        self._ended, self._ended_return = taken.episodes, taken.total

@@ -15,7 +15,7 @@ import numpy as np
 from gridworld.agents import Agent, Beliefs
 from gridworld.chain import one_hot_policy
 from gridworld.config import TrainConfig
-from gridworld.counted_env import CountedVectorEnv
+from gridworld.counted_env import CountedVectorEnv, Returns
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge, Score
 from gridworld.events import EventWriter
@@ -37,6 +37,15 @@ CHARTS = {
     "return": [ONLINE_RETURN, f"{GREEDY}/return", f"{SAMPLED}/return"],
     "length": [f"{GREEDY}/length", f"{SAMPLED}/length", f"{GREEDY}/optimal_length"],
 }
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Held:
+    """An evaluation that was due where training may be over; what it is of, as it was then."""
+
+    step: int
+    beliefs: Beliefs
+    returns: Returns
 
 
 class Curve:
@@ -70,6 +79,7 @@ class Curve:
         self._step = -1
         self._streak = 0
         self._next = self._every
+        self._held: _Held | None = None
         self._total = config.total_timesteps
         self.file = file if isinstance(file, Journal) else Journal(file)
         self._progress = Progress(
@@ -86,7 +96,7 @@ class Curve:
 
     def get_state(self) -> State:
         """Where the curve stands, as a value."""
-        beliefs = self.beliefs
+        beliefs, held = self.beliefs, self._held
         return {
             "step": self._step,
             "next": self._next,
@@ -95,6 +105,13 @@ class Curve:
             "certified_since_step": self.certified_since_step,
             "seconds": self.seconds,
             "beliefs": None if beliefs is None else vars(beliefs).copy(),
+            "held": None
+            if held is None
+            else {
+                "step": held.step,
+                "beliefs": vars(held.beliefs).copy(),
+                "returns": held.returns._asdict(),
+            },
         }
 
     def set_state(self, state: State) -> None:
@@ -103,28 +120,53 @@ class Curve:
         self.first_certified_step = state["first_certified_step"]
         self.certified_since_step = state["certified_since_step"]
         self.seconds = float(state["seconds"])
+        if (held := state["held"]) is not None:
+            self._held = _Held(int(held["step"]), _beliefs(held["beliefs"]), Returns(**held["returns"]))
         if state["beliefs"] is not None:
-            names = (field.name for field in dataclasses.fields(Beliefs))
-            self.beliefs = Beliefs(*(state["beliefs"][name] for name in names))
+            self.beliefs = _beliefs(state["beliefs"])
             self.greedy = self.judge.score(one_hot_policy(self.beliefs.greedy))
             self.sampled = self.judge.score(self.beliefs.sampled)
+
+    def catch_up(self) -> None:
+        """Write what was held at the end of a shorter run, if that is not the end any more."""
+        if self._held is not None and self._held.step < self._total:
+            self._write_held()
 
     def on_step(self, step: int) -> bool:
         """Evaluate if it is due; False once the certificate has held for long enough.
 
-        The last step is left to the evaluation after training, since an update may still follow it.
+        The last step is left to the evaluation after training, since an update may still follow it. Which one
+        is the last, training alone knows: from the configured end on, an evaluation is held until a step
+        follows. So a run that is made longer later has it where the longer run has it.
         """
-        if self._next <= step < self._total:
+        self._write_held()
+        if self._next <= step:
             self._next += self._every * ((step - self._next) // self._every + 1)
-            self.evaluate(step)
+            if step < self._total:
+                self.evaluate(step)
+            else:
+                self._held = _Held(step, self._agent.beliefs(), self._take_returns())
         return self._stop_after is None or self._streak < self._stop_after
 
     def evaluate(self, step: int) -> None:
         """Score both policies as they are after `step` steps and write a row, once a step."""
-        if step == self._step:
-            return
+        if self._held is not None and self._envs is not None:
+            self._envs.put_back(self._held.returns)
+        self._held = None
+        if step != self._step:
+            self._evaluate(step, self._agent.beliefs, self._take_returns())
+
+    def _write_held(self) -> None:
+        held, self._held = self._held, None
+        if held is not None:
+            self._evaluate(held.step, lambda: held.beliefs, held.returns)
+
+    def _take_returns(self) -> Returns:
+        return Returns(0, 0.0) if self._envs is None else self._envs.take_returns()
+
+    def _evaluate(self, step: int, beliefs: Callable[[], Beliefs], returns: Returns) -> None:
         started = time.perf_counter()
-        self._score(step)
+        self._score(step, beliefs(), returns)
         self.seconds += time.perf_counter() - started
         if self._watch is not None:
             assert self.beliefs is not None
@@ -135,9 +177,9 @@ class Curve:
         self.file.close()
         self._progress.close()
 
-    def _score(self, step: int) -> None:
+    def _score(self, step: int, beliefs: Beliefs, returns: Returns) -> None:
         self._step = step
-        before, beliefs = self.beliefs, self._agent.beliefs()
+        before = self.beliefs
         # Between two updates the same policy may be met again; it earns one certificate, not several.
         is_new = before is None or not np.array_equal(before.values, beliefs.values)
         self.beliefs = beliefs
@@ -158,14 +200,13 @@ class Curve:
             self.certified_since_step = step
             if self.first_certified_step is None:
                 self.first_certified_step = step
-        self._write(step, greedy, self.sampled)
+        self._write(step, greedy, self.sampled, returns.mean)
         note = f"regret {greedy.regret:.3g}, goal {greedy.outcome.goal:.0%}"
         self._progress.update(step, note + (", certified optimal" if greedy.certified else ""))
 
-    def _write(self, step: int, greedy: Score, sampled: Score) -> None:
+    def _write(self, step: int, greedy: Score, sampled: Score, online: float | None) -> None:
         row: dict[str, Any] = {"step": step, **greedy.numbers()}
         row |= {f"sampled_{name}": value for name, value in sampled.numbers().items()}
-        online = None if self._envs is None else self._envs.take_mean_return()
         row["online_return"] = online  # an empty field where no episode ended
         text = io.StringIO()
         rows = csv.DictWriter(text, fieldnames=list(row), lineterminator="\n")
@@ -186,3 +227,8 @@ class Curve:
         for group, score in ((GREEDY, greedy), (SAMPLED, sampled)):
             tags |= {f"{group}/{name}": float(value) for name, value in score.numbers().items()}
         return tags
+
+
+def _beliefs(state: State) -> Beliefs:
+    """Mirrors `vars`; nothing is left to a default."""
+    return Beliefs(*(state[field.name] for field in dataclasses.fields(Beliefs)))

@@ -42,12 +42,16 @@ def read_object(path: Path, most: int = LARGEST_JSON) -> dict[str, Any]:
     """A JSON object."""
     text = read_text(path, most)
     try:
-        content = json.loads(text)
+        content = json.loads(text, parse_constant=_refuse)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is no JSON, it was changed or cut off ({error})") from None
     if not isinstance(content, dict):
         raise InputError(f"{path}: holds no JSON object")
     return content
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"JSON has no {constant}")
 
 
 def check_no_link(path: Path) -> None:
@@ -69,25 +73,41 @@ def file_sha256(path: Path, most: int) -> str:
 
 @contextmanager
 def _opened(path: Path, most: int) -> Iterator[io.BufferedReader]:
-    # Without O_NONBLOCK, opening a pipe waits for somebody to write into it.
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    except FileNotFoundError:
-        raise InputError(f"{path.parent}: has no {path.name}") from None
-    except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise InputError(f"{path}: is a symbolic link, which is not followed out of a run") from None
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    with open(descriptor, "rb") as file:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            raise InputError(f"{path}: is no ordinary file")
-        if status.st_size > most:
+    with open_ordinary(path) as file:
+        if os.fstat(file.fileno()).st_size > most:
             raise InputError(f"{path}: is larger than {_size(most)}")
         try:
             yield file
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def open_ordinary(path: Path) -> io.BufferedReader:
+    """Open an ordinary file to read it."""
+    return open(_descriptor(path, os.O_RDONLY), "rb")
+
+
+def open_to_go_on(path: Path) -> io.FileIO:
+    """Open an ordinary file that is there to read and write it, without a buffer."""
+    return open(_descriptor(path, os.O_RDWR), "r+b", buffering=0)
+
+
+def _descriptor(path: Path, flags: int) -> int:
+    # Without O_NONBLOCK, opening a pipe waits for somebody to write into it.
+    try:
+        descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError:
+        raise InputError(f"{path.parent}: has no {path.name}") from None
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise InputError(f"{path}: is a symbolic link, which is not followed out of a run") from None
+        raise InputError(
+            f"{path}: cannot be {'read' if flags == os.O_RDONLY else 'written'} ({error.strerror})"
+        ) from None
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise InputError(f"{path}: is no ordinary file")
+    return descriptor
 
 
 def _size(count: int) -> str:

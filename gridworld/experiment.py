@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import copy
 import os
 import re
 import secrets
@@ -19,22 +21,24 @@ from hydra.core.utils import JobReturn
 from hydra.errors import CompactHydraException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.agent_config import AGENT_SCHEMAS
 from gridworld.config import TrainConfig
+from gridworld.early import at_work
 from gridworld.errors import EXIT_CODE, InputError
 from gridworld.hydra_errors import refuse_added_keys, sentence, unreadable_file
 from gridworld.lock import locked
 from gridworld.manual import manual
-from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, Run, check_inside, check_new
+from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, Run, check_inside, check_new, shown
 from gridworld.sweep.config import LAUNCHER_SCHEMAS, SweepConfig
 from gridworld.terminal import prepare, tell_error
 from gridworld.tune.config import SearchConfig
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 _job_begun = threading.Event()  # set once this process has come to a job
+_place = contextlib.ExitStack()  # holds the folder of a run alone from before Hydra writes there to the end
 _LONGEST_NAME = 100  # characters of a job's folder
 
 
@@ -68,6 +72,40 @@ def _check_run_folder(config: DictConfig) -> None:
     check_inside(folder, "hydra.run.dir")
     _check_names(config)
     check_new(folder)
+    folder = folder.absolute()  # a job may change the current one
+    _place.enter_context(_alone_in(folder))
+    if (folder / MANIFEST).exists():
+        # An interpolation may need what Hydra knows only in the job, where it is looked at again.
+        with contextlib.suppress(OmegaConfBaseException):
+            _check_same(config, folder)
+
+
+def _check_same(config: DictConfig, folder: Path) -> None:
+    from gridworld.resume import unfinished_in
+
+    job = copy.deepcopy(config)
+    with read_write(job), open_dict(job):
+        del job["hydra"]
+    unfinished_in(folder, to_config(job))
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Have a run's folder for this process alone; one where no run began is as it was before, afterwards.
+
+    Raises `InputError` where another process has it, which is left alone.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder / LOCK, wait=0) as is_ours:
+        if not is_ours:
+            raise InputError(f"{shown(folder)}: another process is at work in it; wait for it or stop it")
+        try:
+            yield
+        except OSError as error:
+            error.filename = error.filename or shown(folder)  # writing does not tell where
+            raise
+        finally:
+            _discard(folder)
 
 
 def _check_sweep_folder(config: DictConfig) -> None:
@@ -100,7 +138,8 @@ def main(conf: Path) -> None:
     asked_for_traceback = FULL_ERROR in os.environ
     os.environ[FULL_ERROR] = "1"  # so that Hydra raises its errors instead of printing them
     try:
-        hydra.main(version_base="1.3", config_path=str(conf), config_name="train")(run_job)()
+        with at_work(), _place:
+            hydra.main(version_base="1.3", config_path=str(conf), config_name="train")(run_job)()
     except Exception as error:
         # Until a job begins, whatever goes wrong is the command line's or a yaml file's fault.
         mistake = isinstance(error, CompactHydraException) or not _job_begun.is_set()
@@ -143,38 +182,33 @@ def run_job(settings: DictConfig) -> float:
     _job_begun.set()
     folder = Path(context.runtime.output_dir)
     overrides = cast("list[str]", OmegaConf.to_container(context.overrides.task))
+    is_one_of_many = context.mode is RunMode.MULTIRUN
     try:
         config = to_config(settings)
-        if context.mode is RunMode.MULTIRUN and (folder.parent / SWEEP_JSON).exists():
+        if is_one_of_many and (folder.parent / SWEEP_JSON).exists():
             from gridworld.sweep.job import run_in_sweep
 
             return run_in_sweep(config, folder, overrides, context.sweeper.stop_at_first_failure)
-        return _run_alone(config, folder, overrides)
-    except (InputError, OmegaConfBaseException) as error:
-        _discard(folder)
-        if context.mode is RunMode.MULTIRUN:
+        with _alone_in(folder) if is_one_of_many else contextlib.nullcontext():
+            return _run_alone(config, folder, overrides)
+    except (InputError, OSError, OmegaConfBaseException) as error:
+        if is_one_of_many:
             print(f"job {context.job.num} failed: {sentence(error)}", file=sys.stderr)
             raise JobError(sentence(error)) from None
         sys.exit(_tell(error))
-    except KeyboardInterrupt:
-        _discard(folder)
-        raise
 
 
 def _run_alone(config: TrainConfig, folder: Path, overrides: list[str]) -> float:
-    """A run with its folder to itself; goes on with one that was interrupted there."""
+    """A run in a folder that this process has; goes on with one that was interrupted there."""
     from gridworld.resume import train_or_go_on
     from gridworld.signals import Interrupted
     from gridworld.telling import tell_end, tell_interrupted
 
-    with locked(folder / LOCK, wait=0) as is_ours:
-        if not is_ours:
-            raise InputError(f"{folder}: another process is at work in it; wait for it or stop it")
-        run = Run(folder)
-        try:
-            summary = train_or_go_on(config, run, overrides)
-        except Interrupted as interruption:
-            sys.exit(tell_interrupted(interruption, run))
+    run = Run(folder)
+    try:
+        summary = train_or_go_on(config, run, overrides)
+    except Interrupted as interruption:
+        sys.exit(tell_interrupted(interruption, run))
     tell_end(summary, run)
     return float(summary["regret"])
 
@@ -205,7 +239,10 @@ def _tell(error: Exception) -> int:
 
 
 def _discard(folder: Path) -> None:
-    """Take away what Hydra wrote for a run that never began; anything else in the folder stays."""
+    """Take away what Hydra wrote for a run that never began; anything else in the folder stays.
+
+    Only for who holds the folder's lock: another process may have come as far as this one.
+    """
     if not (folder / MANIFEST).exists():
         shutil.rmtree(folder / ".hydra", ignore_errors=True)
         (folder / LOCK).unlink(missing_ok=True)

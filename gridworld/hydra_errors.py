@@ -31,6 +31,8 @@ def sentence(error: BaseException) -> str:
     message = str(error)
     if isinstance(error, InputError):
         return message
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
         mark = error.problem_mark
         return f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}: is no yaml, {error.problem}"

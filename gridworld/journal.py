@@ -7,11 +7,15 @@ cuts its files back to the checkpoint's marks, so that no record is there twice 
 from __future__ import annotations
 
 import hashlib
+import io
 import logging
 import os
+import stat
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
+from gridworld.data_files import open_ordinary, open_to_go_on
 from gridworld.errors import InputError
 
 _PIECE = 1 << 20  # bytes read at once
@@ -27,7 +31,7 @@ class Journal:
 
     def __init__(self, path: Path, mark: dict[str, Any] | None = None) -> None:
         self.path = path
-        self._file = path.open("w+b" if mark is None else "r+b", buffering=0)
+        self._file = _new(path) if mark is None else open_to_go_on(path)
         self._sum = hashlib.sha256()
         self.length = 0
         if mark is not None:
@@ -69,15 +73,17 @@ class Journal:
     def _put_back(self) -> None:
         """An open file outlives its name, so that nothing of it is lost."""
         try:
-            if os.path.samestat(os.stat(self.path), os.fstat(self._file.fileno())):
+            if os.path.samestat(os.lstat(self.path), os.fstat(self._file.fileno())):
                 return
+            if self.path.is_symlink():
+                self.path.unlink()
         except FileNotFoundError:
             pass
         _log.warning("%s: was deleted or replaced during the run; it is written again", self.path)
         self._file.seek(0)
         content = self._file.read()
         try:
-            again = self.path.open("w+b", buffering=0)
+            again = _new(self.path)
         except FileNotFoundError:
             raise InputError(f"{self.path.parent}: this run's folder was taken away while it ran") from None
         self._file.close()
@@ -86,21 +92,36 @@ class Journal:
         self.append(content or b"")
 
 
-def holds(folder: Path, mark: Any) -> bool:
-    """Whether the file that a mark is of is still there, unchanged up to the mark."""
+def holds(folder: Path, mark: Any, pattern: str) -> bool:
+    """Whether the file that a mark is of is still there, unchanged up to the mark.
+
+    A mark may come from a stranger: it is of a file whose name is of the pattern, or of none.
+    """
     try:
         path = folder / mark["name"]
-        if path.name != mark["name"] or type(mark["length"]) is not int or mark["length"] < 0:
+        if path.name != mark["name"] or not fnmatchcase(path.name, pattern):
             return False  # it leads elsewhere
+        if type(mark["length"]) is not int or mark["length"] < 0:
+            return False
         return bool(_sum_of(path, mark["length"]).hexdigest() == mark["sha256"])
     except (OSError, ValueError, TypeError, KeyError):
         return False
 
 
+def _new(path: Path) -> io.FileIO:
+    """An empty file, or a device that takes everything; nothing is written through a link or into a pipe."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    file = open(os.open(path, flags, 0o666), "w+b", buffering=0)  # noqa: SIM115
+    if stat.S_ISFIFO(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise InputError(f"{path}: is a pipe; remove it")
+    return file
+
+
 def _sum_of(path: Path, length: int) -> hashlib._Hash:
     """Of the first `length` bytes. Raises `ValueError` where there are not so many."""
     found, rest = hashlib.sha256(), length
-    with path.open("rb") as file:
+    with open_ordinary(path) as file:
         while rest > 0:
             piece = file.read(min(rest, _PIECE))
             if not piece:

@@ -21,18 +21,22 @@ def locked(path: Path, wait: float | None = None) -> Iterator[bool]:
 
     The file is made where there is none, and stays. Raises `InputError` where the file system has no locks.
     """
-    file = os.open(path, os.O_RDWR | os.O_CREAT | _FLAGS, 0o666)
-    try:
+    while True:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | _FLAGS, 0o666)
         try:
-            is_ours = _take(file, wait)
-        except OSError as error:
-            raise InputError(
-                f"{path}: this file system has no locks ({error.strerror}); choose a folder on one that has, "
-                "or have it mounted with them (Lustre: -o flock)"
-            ) from None
-        yield is_ours
-    finally:
-        os.close(file)
+            try:
+                is_ours = _take(file, wait)
+            except OSError as error:
+                raise InputError(
+                    f"{path}: this file system has no locks ({error.strerror}); choose a folder on one that "
+                    "has, or have it mounted with them (Lustre: -o flock)"
+                ) from None
+            if is_ours and not _is_at(file, path):
+                continue  # who had it before took the file away; a lock on that keeps nobody out
+            yield is_ours
+            return
+        finally:
+            os.close(file)
 
 
 def is_locked(path: Path) -> bool:
@@ -48,6 +52,13 @@ def is_locked(path: Path) -> bool:
     finally:
         os.close(file)
     return False
+
+
+def _is_at(file: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file), os.lstat(path))
+    except FileNotFoundError:
+        return False
 
 
 def _take(file: int, wait: float | None) -> bool:

@@ -6,7 +6,6 @@ PNG, APNG and GIF keep every pixel exact. MP4 needs PyAV (the extra `video`).
 from __future__ import annotations
 
 import io
-import shutil
 from collections.abc import Collection
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from gridworld.errors import InputError
-from gridworld.files import replacing, write_bytes
+from gridworld.files import remove, replacing, write_bytes
 from gridworld.film import Film
 from gridworld.gif import encode_gif as _encode_gif
 from gridworld.png import encode_png
@@ -29,9 +28,9 @@ _RUN_LENGTHS = 3  # zlib's Z_RLE: the fastest way to store flat colour, and smal
 
 
 def save_pngs(film: Film, folder: Path) -> None:
-    """0000.png, 0001.png, ... in `folder`, which is replaced as a whole."""
+    """0000.png, 0001.png, ... in `folder`, which is replaced as a whole, also where it is a link."""
     part = folder.with_name(f".{folder.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
+    remove(part)
     part.mkdir(parents=True)
     digits = max(4, len(str(len(film) - 1)))
     encoded: dict[int, bytes] = {}
@@ -41,8 +40,7 @@ def save_pngs(film: Film, folder: Path) -> None:
             film.draw(key).save(buffer, "PNG", compress_type=_RUN_LENGTHS)
             encoded[key] = buffer.getvalue()
         (part / f"{index:0{digits}}.png").write_bytes(encoded[key])
-    if folder.exists():
-        shutil.rmtree(folder)
+    remove(folder)
     part.rename(folder)
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.agent_config import LINEAR, AgentConfig, parse_schedule
-from gridworld.checkpoint import Checkpoints
+from gridworld.checkpoint import FOLDER, Checkpoints
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.flat import flat
@@ -22,26 +22,34 @@ from gridworld.identity import environment, identity, settings
 from gridworld.journal import holds
 from gridworld.layout import Layout
 from gridworld.provenance import git, source_differences
-from gridworld.run import Run, read_run
+from gridworld.run import CURVE, EVENTS, Run, read_run
 from gridworld.saved_run import layout_of, settings_of
 from gridworld.session import CONTENT, Summary
 from gridworld.state import State, StateError
 from gridworld.terminal import printable
 from gridworld.training import carry_out, check_settings, make_mdp, train
 
+_FILES = {"curve": CURVE, "events": EVENTS}  # names that a checkpoint's marks may be of
+
 
 def train_or_go_on(config: TrainConfig, run: Run, overrides: list[str]) -> Summary:
     """Train, or go on with the unfinished run in the folder. Raises `InputError` if that is another."""
     if not run.manifest_file.exists():
         return train(config, run, overrides)
-    unfinished = Unfinished(run.folder, trust=True)  # its classes are those of the settings, or it is refused
-    if unfinished.is_finished:
-        raise InputError(f"{run.folder}: holds a run already; give every run a folder of its own")
-    unfinished.check_same(config, check_settings(config).layout.text())
+    unfinished = unfinished_in(run.folder, config)
     unfinished.config = config
     run.manifest = unfinished.run.manifest
     unfinished.run = run
     return unfinished.go_on()
+
+
+def unfinished_in(folder: Path, config: TrainConfig) -> Unfinished:
+    """The unfinished run of these settings. Raises `InputError` where that in the folder is another."""
+    unfinished = Unfinished(folder, trust=True)  # its classes are those of the settings, or it is refused
+    if unfinished.is_finished:
+        raise InputError(f"{folder}: holds a run already; give every run a folder of its own")
+    unfinished.check_same(config, check_settings(config).layout.text())
+    return unfinished
 
 
 class Unfinished:
@@ -54,6 +62,7 @@ class Unfinished:
             raise InputError(f"{where}: was changed or damaged since the run began; put back a good copy")
         self.config: TrainConfig = settings_of(self.run, trust)
         self.layout: Layout = layout_of(self.run, self.config)
+        _lengthened(self.run)
 
     @property
     def is_finished(self) -> bool:
@@ -95,7 +104,7 @@ class Unfinished:
         state = self._newest(identity(config, mdp.layout.text()))
         differs = [] if state is None else _differences(state["environment"], config.agent, run, anyway)
         if state is None:
-            self._check_anew(old_total)
+            self._check_anew(total_timesteps, old_total)
             return carry_out(config, run, mdp, self._begin_anew)
         steps = state["steps"]
         is_shorter = config.total_timesteps != old_total and config.total_timesteps < steps
@@ -127,9 +136,7 @@ class Unfinished:
     def _newest(self, own: str) -> State | None:
         """The state to go on from; says why others are passed over."""
         folder = self.run.folder
-        lengthened = [
-            again["step"] for again in self.run.manifest.get("resumed", []) if "total_timesteps" in again
-        ]
+        lengthened = _lengthened(self.run)
         for path, state in Checkpoints(folder).states():
             reason = _why_not(state, folder, own)
             if reason is None and lengthened and state["steps"] < lengthened[-1]:  # type: ignore[index]
@@ -145,10 +152,14 @@ class Unfinished:
             )
         return None
 
-    def _check_anew(self, old_total: int) -> None:
+    def _check_anew(self, total_timesteps: int | None, old_total: int) -> None:
+        """Raise `InputError` where beginning anew would take a finished run away; say it where it is told."""
         if self.is_finished:
-            _say(f"{self.run.folder}: has no checkpoint to go on from; begins anew")
-        elif self.config.total_timesteps != old_total or self.run.curve_file.exists():
+            raise InputError(
+                f"{self.run.folder}: is finished, and {FOLDER}/ has no checkpoint that it could go on from; "
+                f"for {self.config.total_timesteps:,} steps begin a new run in another folder"
+            )
+        if total_timesteps not in (None, old_total) or self.run.curve_file.exists():
             _say(f"{self.run.folder}: has no checkpoint yet; begins anew")
 
     def _begin_anew(self) -> None:
@@ -158,17 +169,28 @@ class Unfinished:
         run.start(content, self.layout.text(), overrides, replace=True)
 
 
+def _lengthened(run: Run) -> list[int]:
+    """After how many steps it was made longer, each time. Raises `InputError`: a seal can be forged."""
+    resumed = run.manifest.get("resumed", [])
+    if not isinstance(resumed, list) or not all(isinstance(again, dict) for again in resumed):
+        raise InputError(f"{run.manifest_file}: resumed must be a list of when the run went on")
+    steps = [again.get("step") for again in resumed if "total_timesteps" in again]
+    if not all(type(step) is int and step >= 0 for step in steps):
+        raise InputError(f"{run.manifest_file}: resumed must have the step after which the run went on")
+    return steps
+
+
 def _why_not(state: State | StateError, folder: Path, own: str) -> str | None:
     """Why a run cannot go on from it, in words; None: it can."""
     if isinstance(state, StateError):
         return str(state)
     kinds = {key: type(value) for key, value in state.items()}
-    if kinds != CONTENT or state["marks"].keys() != {"curve", "events"}:
+    if kinds != CONTENT or state["marks"].keys() != _FILES.keys():
         return "it lacks what a checkpoint has"
     if state["identity"] != own:
         return "it is of another run"
     for name, mark in state["marks"].items():
-        if not holds(folder, mark) and not (name == "events" and mark is None):
+        if not holds(folder, mark, _FILES[name]) and not (name == "events" and mark is None):
             return f"the file of the {name} is not what it was then"
     return None
 
@@ -216,4 +238,4 @@ def _schedules(config: TrainConfig, progress: float) -> dict[str, float]:
 
 
 def _say(text: str) -> None:
-    print(text, file=sys.stderr)
+    print(printable(text), file=sys.stderr)

@@ -23,20 +23,20 @@ import hashlib
 import json
 import os
 import shlex
-import shutil
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from gridworld import provenance
-from gridworld.data_files import file_sha256, read_object
+from gridworld.data_files import check_no_link, file_sha256, read_object
 from gridworld.errors import InputError
-from gridworld.files import write_bytes, write_json
+from gridworld.files import remove, write_bytes, write_json
 from gridworld.provenance import describe, source_differences
 
 MANIFEST = "manifest.json"
 CURVE = "curve.csv"
+EVENTS = "events.out.tfevents.*"
 LOCK = ".lock"  # held by the process that is at work in the folder
 SWEEP_JSON = "sweep.json"  # a sweep's folder has this instead
 SUMMARY = "summary.json"
@@ -139,9 +139,9 @@ class Run:
     def clear(self) -> None:
         """Take away what an attempt left, all but the manifest; what is not the run's stays."""
         self._tidy()
-        for pattern in (*_FILES, "events.out.tfevents.*", "source*.diff"):
+        for pattern in (*_FILES, EVENTS, "source*.diff"):
             for path in self.folder.glob(pattern):
-                _remove(path)
+                remove(path)
 
     def resume_words(self) -> str:
         """The command that goes on with it."""
@@ -157,21 +157,18 @@ class Run:
         return self.curve_file, self.summary_file, self.model_file, self.visits_file
 
     def _tidy(self) -> None:
-        """Take away what a process that was killed had half written."""
+        """Take away what a process that was killed had half written.
+
+        Raises `InputError` where the checkpoints' folder is a link: what it leads to is not the run's.
+        """
+        check_no_link(self.folder / "checkpoints")
         for pattern in (".*.part", "checkpoints/.*.part"):
             for path in self.folder.glob(pattern):
-                _remove(path)
+                remove(path)
 
     def _write(self) -> None:
         self.manifest["seal"] = self.seal()
         write_json(self.manifest_file, self.manifest)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
 
 
 def open_run(folder: Path) -> Run:

@@ -109,6 +109,7 @@ class Session:
             with fitting():
                 self.curve.set_state(self._state["curve"])
                 self._pictures.set_state(self._state["pictures"])
+            self.curve.catch_up()
             return
         if self._events is not None:
             self._events.hparams(hparams(self._config), HPARAM_METRICS)

@@ -56,7 +56,10 @@ def carry_out(
     seat = make_seat(config, mdp, observation, log)
     agent = family(config.agent).build(config.agent, seat)
 
-    begin()
+    try:
+        begin()
+    except OSError as error:  # the manifest is the old one, or none: files are replaced whole
+        raise _unwritable(run, error) from None
     session = None
     try:
         session = Session(config, run, judge, agent, seat, state)
@@ -71,13 +74,16 @@ def carry_out(
         if isinstance(error, StateError):
             raise InputError(f"{run.folder}: its checkpoint does not fit this run: {error}") from None
         if isinstance(error, OSError):
-            raise MachineError(
-                f"{shown(run.folder)}: {reason(error)}; put that right, then go on with {run.resume_words()}"
-            ) from None
+            raise _unwritable(run, error) from None
         raise
     session.checkpoints.keep(1)
     run.end("finished", None, **_progress(session))
     return summary
+
+
+def _unwritable(run: Run, error: OSError) -> MachineError:
+    how = f"go on with {run.resume_words()}" if run.manifest_file.exists() else "give the command again"
+    return MachineError(f"{shown(run.folder)}: {reason(error)}; put that right, then {how}")
 
 
 def _progress(session: Session | None) -> dict[str, int | None]:

@@ -1,7 +1,10 @@
 """Measure this project beside its peers: `python scripts/benchmark.py`; see `--help`."""
 
-from gridworld.commands import run
-from gridworld.commands.benchmark import main
+from gridworld.early import listen
 
 if __name__ == "__main__":
+    listen()  # before what takes time to import
+    from gridworld.commands import run
+    from gridworld.commands.benchmark import main
+
     run(main)

@@ -1,7 +1,10 @@
 """Score a finished run again: `python scripts/evaluate.py runs/...`; see `--help`."""
 
-from gridworld.commands import run
-from gridworld.commands.evaluate import main
+from gridworld.early import listen
 
 if __name__ == "__main__":
+    listen()  # before what takes time to import
+    from gridworld.commands import run
+    from gridworld.commands.evaluate import main
+
     run(main)

@@ -1,7 +1,10 @@
 """Show how the jobs of a sweep stand: `python scripts/jobs.py runs/...`; see `--help`."""
 
-from gridworld.commands import run
-from gridworld.commands.jobs import main
+from gridworld.early import listen
 
 if __name__ == "__main__":
+    listen()  # before what takes time to import
+    from gridworld.commands import run
+    from gridworld.commands.jobs import main
+
     run(main)

@@ -1,7 +1,10 @@
 """Play a world with the arrow keys: `python scripts/play.py --layout maze`; see `--help`."""
 
-from gridworld.commands import run
-from gridworld.commands.play import main
+from gridworld.early import listen
 
 if __name__ == "__main__":
+    listen()  # before what takes time to import
+    from gridworld.commands import run
+    from gridworld.commands.play import main
+
     run(main)

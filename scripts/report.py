@@ -1,7 +1,10 @@
 """Put many runs side by side, as one page: `python scripts/report.py runs/...`; see `--help`."""
 
-from gridworld.commands import run
-from gridworld.commands.report import main
+from gridworld.early import listen
 
 if __name__ == "__main__":
+    listen()  # before what takes time to import
+    from gridworld.commands import run
+    from gridworld.commands.report import main
+
     run(main)

@@ -1,7 +1,10 @@
 """Run a run again and compare bit for bit: `python scripts/reproduce.py runs/...`; see `--help`."""
 
-from gridworld.commands import run
-from gridworld.commands.reproduce import main
+from gridworld.early import listen
 
 if __name__ == "__main__":
+    listen()  # before what takes time to import
+    from gridworld.commands import run
+    from gridworld.commands.reproduce import main
+
     run(main)

@@ -2,7 +2,10 @@
 
 from pathlib import Path
 
-from gridworld.experiment import main
+from gridworld.early import listen
 
 if __name__ == "__main__":
+    listen()  # before what takes time to import
+    from gridworld.experiment import main
+
     main(Path(__file__).resolve().parents[1] / "conf")

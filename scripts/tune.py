@@ -1,7 +1,10 @@
 """Search an agent's settings: `python scripts/tune.py agent=ppo env=four_rooms`; see `--help`."""
 
-from gridworld.commands import run
-from gridworld.commands.tune import main
+from gridworld.early import listen
 
 if __name__ == "__main__":
+    listen()  # before what takes time to import
+    from gridworld.commands import run
+    from gridworld.commands.tune import main
+
     run(main)

@@ -21,7 +21,7 @@ from typing import Any
 
 from support import ROOT
 
-COMMANDS = ("evaluate", "record", "report", "reproduce", "play")
+COMMANDS = ("evaluate", "record", "report", "reproduce", "play", "resume")
 _MOST_SECONDS = 60
 _WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 

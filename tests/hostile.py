@@ -14,6 +14,7 @@ import io
 import json
 import os
 import pickle
+import shutil
 import struct
 import zipfile
 import zlib
@@ -27,6 +28,7 @@ import torch
 
 from gridworld.event_file import _checksum
 from gridworld.png import _chunk
+from gridworld.state import MAGIC, decode, encode
 
 SECRET = "the-secret-7f3a"
 Spoil = Callable[[Path, Path], None]
@@ -598,3 +600,100 @@ def events_that_wait_for_a_writer(run: Path, base: Path) -> None:
 @hostile(FINE)
 def events_that_are_the_secret(run: Path, base: Path) -> None:
     link(run / "events.out.tfevents.0.a.1", base / "secret.txt")
+
+
+# ---- what resume goes on with ------------------------------------------------------------------------------
+
+
+def checkpoint(run: Path, edit: Callable[[dict[str, Any]], object]) -> None:
+    """Change the newest checkpoint, whose checksum is right again."""
+    path = max((run / "checkpoints").glob("*.state"))
+    state = decode(path.read_bytes())
+    edit(state)
+    path.write_bytes(b"".join(encode(state)))
+
+
+def mark_of_nothing(run: Path, part: str, name: str) -> None:
+    """A mark that every file holds, and that a run would cut it back to."""
+    mark = {"name": name, "length": 0, "sha256": hashlib.sha256(b"").hexdigest()}
+    checkpoint(run, lambda state: state["marks"].update({part: mark}))
+
+
+@hostile(FINE)
+def mark_of_a_curve_outside(run: Path, base: Path) -> None:
+    mark_of_nothing(run, "curve", "curve.csv")
+    (base / "outside" / "kept").write_text("kept")
+    link(run / "curve.csv", base / "outside" / "kept")
+
+
+@hostile(FINE)
+def mark_of_events_outside(run: Path, base: Path) -> None:
+    mark_of_nothing(run, "events", "x")
+    (base / "outside" / "kept").write_text("kept")
+    link(run / "x", base / "outside" / "kept")
+
+
+@hostile(FINE)
+def mark_of_another_file_of_the_run(run: Path, base: Path) -> None:
+    mark_of_nothing(run, "curve", "manifest.json")
+
+
+@hostile(FINE)
+def checkpoints_that_lead_outside(run: Path, base: Path) -> None:
+    shutil.copytree(run / "checkpoints", base / "outside" / "checkpoints")
+    for name in ("000000000001.state", "999999999999.state", ".x.part"):
+        (base / "outside" / "checkpoints" / name).write_text("kept")
+    link(run / "checkpoints", base / "outside" / "checkpoints")
+
+
+@hostile(FINE)
+def curve_that_waits_for_a_writer(run: Path, base: Path) -> None:
+    (run / "curve.csv").unlink()
+    os.mkfifo(run / "curve.csv")
+
+
+@hostile(FINE)
+def checkpoint_that_waits_for_a_writer(run: Path, base: Path) -> None:
+    os.mkfifo(run / "checkpoints" / "999999999999.state")
+
+
+@hostile(FINE)
+def checkpoint_that_is_a_folder(run: Path, base: Path) -> None:
+    (run / "checkpoints" / "999999999999.state").mkdir()
+
+
+@hostile(FINE)
+def checkpoint_that_acts_on_the_terminal(run: Path, base: Path) -> None:
+    tree = json.dumps({"arrays": [["\x1b[31m\x1b]0;x\x07", [1], 1]], "state": {}}).encode()
+    body = b"-" + struct.pack("<Q", len(tree)) + tree + b"0"
+    content = MAGIC + hashlib.sha256(body).digest() + body
+    (run / "checkpoints" / "999999999999.state").write_bytes(content)
+
+
+def resealed(run: Path, **values: Any) -> None:
+    """Change the manifest and what seals it."""
+    manifest(run, lambda content: content.update(values))
+    content = json.loads((run / "manifest.json").read_text())
+    what = [content.get(key) for key in ("config", "layout", "resumed")]
+    digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
+    manifest(run, lambda content: content.update(seal=digest))
+
+
+@hostile(FINE)
+def continuations_that_are_no_list(run: Path, base: Path) -> None:
+    resealed(run, resumed={"a": 1})
+
+
+@hostile(FINE)
+def continuations_without_a_step(run: Path, base: Path) -> None:
+    resealed(run, resumed=[{"total_timesteps": 1}])
+
+
+@hostile(FINE)
+def continuations_after_no_number_of_steps(run: Path, base: Path) -> None:
+    resealed(run, resumed=[{"total_timesteps": 1, "step": "x"}])
+
+
+@hostile("manifest.json: is no JSON")
+def numbers_that_json_has_not(run: Path, base: Path) -> None:
+    manifest(run, lambda content: content.update(reached=float("nan"), seed=float("inf")))

@@ -81,7 +81,7 @@ def left_behind(folder: Path) -> dict[str, Any]:
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
         if path.is_file() and not name.startswith(
-            (".", "events.", "manifest", "summary", "checkpoints/", "model")
+            (".", "events.", "manifest", "summary", "checkpoints/", "model", "source.diff")
         ):
             found[name] = path.read_bytes()
     summary = json.loads((folder / "summary.json").read_text())

@@ -38,8 +38,8 @@ def test_visits_and_returns_are_those_of_a_naive_tally(settings: dict, dtype: ty
         assert np.array_equal(counted.step(chosen)[0], states)  # counting changes nothing
     assert len(ended) > 20
     assert np.array_equal(counted.visits, visits)
-    assert counted.take_mean_return() == pytest.approx(np.mean(ended))
-    assert counted.take_mean_return() is None
+    assert counted.take_returns().mean == pytest.approx(np.mean(ended))
+    assert counted.take_returns().mean is None
 
 
 def test_an_episode_given_up_is_not_one_that_ended() -> None:
@@ -49,9 +49,9 @@ def test_an_episode_given_up_is_not_one_that_ended() -> None:
     envs.reset(options={"reset_mask": np.array([True, False])})
     envs.step(np.array([0, 0]))
     envs.step(np.array([0, 0]))  # the second environment's third step
-    assert envs.take_mean_return() == -3
+    assert envs.take_returns().mean == -3
     envs.step(np.array([0, 0]))  # the first one's
-    assert envs.take_mean_return() == -3
+    assert envs.take_returns().mean == -3
 
 
 @pytest.mark.parametrize("agent", LEARNING)

@@ -23,6 +23,7 @@ WORDS = {
     "report": ["run", "--readme", "table.md"],
     "reproduce": ["run"],
     "play": ["--agent", "run"],
+    "resume": ["resume=run", "total_timesteps=2500"],  # last, since it writes there
 }
 NO_DISPLAY = "there is no display to open a window on"
 MOST_SECONDS, MOST_MEGABYTES = 20, 200
@@ -40,6 +41,9 @@ FIRST = {
     *("class_that_opens_a_file", "map_file_that_is_the_secret", "settings_nested_as_deep_as_json_goes"),
     *("manifest_that_is_the_secret", "names_that_act_on_the_terminal", "names_that_are_scripts"),
     *("picture_that_is_the_secret", "frames_that_lead_outside", "files_that_lead_outside"),
+    *("mark_of_a_curve_outside", "mark_of_events_outside", "checkpoints_that_lead_outside"),
+    *("curve_that_waits_for_a_writer", "checkpoint_that_is_a_folder", "checkpoint_that_acts_on_the_terminal"),
+    *("continuations_without_a_step", "numbers_that_json_has_not"),
     *("report_that_leads_outside", "yaml_that_runs_and_grows", "event_of_an_exabyte"),
 }
 ALL = os.environ.get("GRIDWORLD_HOSTILE") == "all"
@@ -82,7 +86,7 @@ def test_nothing_of_a_hostile_run_gets_out(case: Hostile, forks: Forks, good: Pa
     (place / "table.md").write_text("before\n<!-- results -->\n<!-- /results -->\nafter\n")
     shutil.copytree(good / case.agent, place / "run")
     case.spoil(place / "run", base)
-    before = {path.relative_to(outside) for path in outside.rglob("*")}
+    before = contents(outside)
     assert not (base / "canary").exists()
 
     looked_at = -1
@@ -108,9 +112,13 @@ def test_nothing_of_a_hostile_run_gets_out(case: Hostile, forks: Forks, good: Pa
         if command == "evaluate":
             looked_at = ended.code
 
-    assert {path.relative_to(outside) for path in outside.rglob("*")} == before
+    assert contents(outside) == before
     assert [path for path in place.rglob("*") if holds_the_secret(path)] == []
     check_report(place)
+
+
+def contents(folder: Path) -> dict[Path, bytes | None]:
+    return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
 
 
 def holds_the_secret(path: Path) -> bool:

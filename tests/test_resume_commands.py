@@ -12,7 +12,7 @@ import pytest
 from resuming import begin, differences, go_on, left_behind, stopped_after
 from support import ROOT, SHORT, configure, script
 
-from gridworld import identity, provenance
+from gridworld import identity, lock, provenance
 from gridworld.checkpoint import Checkpoints
 from gridworld.errors import InputError
 from gridworld.files import write_json
@@ -78,6 +78,7 @@ def test_resume_and_the_same_command_again(stopped: Path, calm: dict[str, object
         (["-m", "resume=run"], "-m: a run goes on with the settings"),
         (["resume=run", "total_timesteps=1e5"], "total_timesteps=1e5: must be a number of environment steps"),
         (["resume=run", "total_timesteps=1000"], "has come to 1,200 of 2,000 steps; it can be made longer"),
+        (["resume=run", "resume=other"], "resume=other: resume is given already; give it once"),
         (["resume=run", "anyway=maybe"], "anyway=maybe: must be true or false"),
     ],
     ids=lambda value: str(value)[:40],
@@ -97,6 +98,54 @@ def test_a_run_is_one_process_alone(stopped: Path) -> None:
             assert "run: another process is at work in it" in done.stderr
 
 
+def test_a_refused_start_leaves_the_folder_to_who_has_it(tmp_path: Path) -> None:
+    """Also before there is a manifest."""
+    folder = tmp_path / "run"
+    (folder / ".hydra").mkdir(parents=True)
+    (folder / ".hydra" / "config.yaml").write_text("seed: 7\n")
+    with locked(folder / LOCK):
+        before = left_there(folder)
+        done = script("train.py", *WORDS, "hydra.run.dir=run", cwd=tmp_path)
+        assert done.returncode == 2
+        assert "run: another process is at work in it" in done.stderr
+        assert left_there(folder) == before
+
+
+def test_a_refused_start_leaves_the_configuration_of_the_run(stopped: Path) -> None:
+    before = left_there(stopped)
+    done = script("train.py", *WORDS, "hydra.run.dir=run", "seed=77", cwd=stopped.parent)
+    assert done.returncode == 2
+    assert "unfinished run with other settings (seed=77 instead of 0)" in done.stderr
+    assert left_there(stopped) == {**before, ".lock": b""}
+
+
+def left_there(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_start_that_comes_to_nothing_leaves_no_folder(tmp_path: Path) -> None:
+    assert script("train.py", *WORDS, "hydra.run.dir=run", "seed=-1", cwd=tmp_path).returncode == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_on_a_file_that_was_taken_away_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever had the lock deletes its file between our opening it and our having it."""
+    path, take, taken = tmp_path / LOCK, lock._take, 0
+
+    def late(file: int, wait: float | None) -> bool:
+        nonlocal taken
+        taken += 1
+        if taken == 1:
+            path.unlink()
+        return take(file, wait)
+
+    monkeypatch.setattr(lock, "_take", late)
+    with locked(path, wait=0) as first, locked(path, wait=0) as second:
+        assert (first, second) == (True, False)
+
+
 def test_a_finished_run_is_made_longer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Without settings that fall over training, it is the run that would have been so long from the start."""
     words = [*SHORT["ppo"], *LESS, "evaluation.every=700"]
@@ -110,6 +159,39 @@ def test_a_finished_run_is_made_longer(tmp_path: Path, capsys: pytest.CaptureFix
     assert differences(shorter, left_behind(tmp_path / "long")) == []
     with pytest.raises(InputError, match="it can be made longer, not shorter"):
         go_on(tmp_path / "run", 3000)
+
+
+@pytest.mark.parametrize(
+    ("words", "total", "longer"),
+    [
+        (["agent=q_learning", "n_envs=16", "evaluation.every=220"], 1760, 4000),  # due at the last step
+        ([*SHORT["ppo"], "evaluation.every=128"], 600, 2000),  # due thrice between 600 and 1,024, the last
+        (["agent=a2c", "n_envs=4", "agent.arguments.n_steps=8", "evaluation.every=100"], 484, 1000),
+        ([*SHORT["dqn"], "n_envs=32", "agent.exploration_fraction=1e-9", "evaluation.every=500"], 1001, 1500),
+    ],
+    ids=["q_learning", "ppo", "a2c", "dqn"],
+)
+def test_the_curve_of_a_run_made_longer(words: list[str], total: int, longer: int, tmp_path: Path) -> None:
+    """An evaluation that is due where the shorter run ends is where it is in the longer one."""
+    words = [*words, *LESS]
+    begin(tmp_path / "long", *words, f"total_timesteps={longer}", "logging.policy_map_every=2")
+    begin(tmp_path / "run", *words, f"total_timesteps={total}", "logging.policy_map_every=2")
+    go_on(tmp_path / "run", longer)
+    one, other = left_behind(tmp_path / "run"), left_behind(tmp_path / "long")
+    for left in (one, other):  # of one step, they may be in another order in the file
+        left["points"] = sorted(left["points"], key=lambda point: (point[0], point[1]))
+    assert differences(one, other) == []
+
+
+@pytest.mark.parametrize("total", [1000, 4000])
+def test_a_finished_run_without_its_checkpoint_is_kept(total: int, tmp_path: Path) -> None:
+    begin(tmp_path / "run", *WORDS)
+    for file in Checkpoints(tmp_path / "run").files():
+        file.write_bytes(b"")
+    before = left_there(tmp_path / "run")
+    with pytest.raises(InputError, match=r"is finished, and checkpoints/ has no checkpoint .* a new run in"):
+        go_on(tmp_path / "run", total)
+    assert left_there(tmp_path / "run") == before
 
 
 def test_what_falls_over_training_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -198,6 +280,36 @@ def test_a_signal_saves_and_ends_soon(number: signal.Signals, tmp_path: Path) ->
     assert left["checkpoint"] == left["reached"] > 0  # type: ignore[operator]
     assert f"stopped by {number.name}: all {left['reached']:,} steps are saved; go on with" in told
     assert list((tmp_path / "run").rglob("*.part")) == []
+
+
+STOPPED_EARLY = """
+import os, sys
+from gridworld.early import at_work, listen
+listen()
+try:
+    with at_work():
+        print("begun")
+        if sys.argv[1] == "at work":
+            os.kill(os.getpid(), int(sys.argv[2]))
+except KeyboardInterrupt:
+    sys.exit(130)
+os.kill(os.getpid(), int(sys.argv[2]))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("when", ["at work", "afterwards"])
+def test_a_signal_that_comes_early_or_late(when: str, number: signal.Signals) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", STOPPED_EARLY, when, str(int(number))],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 128 + number
+    assert done.stdout == "begun\n"
+    assert "Traceback" not in done.stderr
 
 
 def test_where_no_rest_comes_the_last_checkpoint_counts(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ import pytest
 from resuming import begin, differences, go_on, left_behind, stopped_after
 from support import ROOT, SHORT, configure, script
 
-from gridworld import checkpoint
+from gridworld import checkpoint, run
 from gridworld.agents.sb3.tabulated_dqn import TabulatedDQN
 from gridworld.checkpoint import Checkpoints
 from gridworld.errors import InputError
@@ -150,6 +150,31 @@ def test_a_really_full_disk(tmp_path: Path, calm: dict[str, Any]) -> None:
     again = script("train.py", "resume=run", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert differences(left_behind(tmp_path / "run"), calm) == []
+
+
+def test_no_room_for_the_manifest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(run, "write_json", failing(run.write_json, 1, errno.ENOSPC))
+        with pytest.raises(InputError, match=r"run: No space left on device; .* give the command again$"):
+            begin(tmp_path / "run", *WORDS)
+    begin(tmp_path / "run", *WORDS)
+
+
+def test_what_was_changed_in_the_source_is_that_of_the_run(tmp_path: Path) -> None:
+    begin(tmp_path, *WORDS)
+    (tmp_path / "source.diff").write_text("of another time")
+    run.Run(tmp_path).clear()
+    assert {path.name for path in tmp_path.iterdir()} == {"manifest.json"}
+
+
+def test_frames_that_are_a_link_are_replaced(tmp_path: Path) -> None:
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside" / "kept.png").write_text("kept")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "frames").symlink_to(tmp_path / "outside")
+    begin(tmp_path / "run", *WORDS, "recording.frames=true")
+    assert not (tmp_path / "run" / "frames").is_symlink()
+    assert [path.name for path in (tmp_path / "outside").iterdir()] == ["kept.png"]
 
 
 def test_a_clock_that_jumps(calm: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

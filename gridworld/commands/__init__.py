@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from gridworld.early import at_work
 from gridworld.errors import EXIT_CODE, InputError
 from gridworld.terminal import prepare, tell_error
 
@@ -36,7 +37,8 @@ def run(main: Main) -> None:
     """Call `main`; a user's mistake ends the program with one sentence and no traceback."""
     prepare()
     try:
-        main(sys.argv[1:])
+        with at_work():
+            main(sys.argv[1:])
     except InputError as error:
         tell_error(str(error))
         sys.exit(EXIT_CODE)

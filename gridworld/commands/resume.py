@@ -6,6 +6,7 @@ the run names wherever they are from, `anyway=true` accepts other versions or an
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,6 +25,8 @@ def main(arguments: Sequence[str]) -> None:
     folder = Path(words[KEY])
     check_inside(folder, KEY)
     read_run(folder)  # before anything is written there
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"{folder}: is read-only; copy the run to where you may write and resume= the copy")
 
     from gridworld.resume import Unfinished  # what comes now takes a second to import
     from gridworld.signals import Interrupted
@@ -55,6 +58,8 @@ def _read(arguments: Sequence[str]) -> dict[str, Any]:
                 f"{argument}: a run goes on with the settings that it began with; beside {KEY}=RUN there are "
                 f"{', '.join(list(kinds)[1:])}"
             )
+        if key in words:
+            raise InputError(f"{argument}: {key} is given already; give it once")
         try:
             words[key] = kinds[key](text)
         except ValueError as error:
