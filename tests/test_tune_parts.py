@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import optuna
@@ -196,17 +197,38 @@ def sample(*steps: float) -> Sample:
     return Sample(statistics.share(certified, len(found)), found, TOTAL)
 
 
+def around(certified: int, step: int) -> list[float]:
+    """Twenty runs, so many certified within 10 % of that step."""
+    spread = [step * (0.9 + 0.2 * place / 19) for place in range(20)]
+    return [*spread[:certified], *[math.inf] * (20 - certified)]
+
+
 @pytest.mark.parametrize(
     ("winner", "began_from", "verdict"),
     [
         ((100, 110, 120, 130, 140, 150), (500, 510, 520, 530, 540, math.inf), "beats"),
         ((500, 510, 520, 530, 540, math.inf), (100, 110, 120, 130, 140, 150), "does not beat"),
-        ((10, 10, 10, 10, 10, 10, 10, math.inf), (80, 80, 80, 80, 80, 80, 80, 80), "does not beat"),
+        (
+            (10, 10, 10, 10, 10, 10, 10, math.inf),
+            (80, 80, 80, 80, 80, 80, 80, 80),
+            "cannot be told apart from",
+        ),
         ((100, 200, 300, 400), (110, 190, 310, 390), "cannot be told apart from"),
         ((math.inf, math.inf), (math.inf, math.inf), "cannot be told apart from"),
+        # A share that is surely greater decides, whoever is sooner.
+        (around(20, 550), around(10, 250), "beats"),
+        (around(10, 250), around(20, 550), "does not beat"),
+        # Newcombe's interval of 20 / 20 less 16 / 20 is [-0.0005, 0.416], of 15 / 20 it lies above 0.
+        (around(20, 550), around(16, 250), "cannot be told apart from"),
+        (around(20, 550), around(15, 250), "beats"),
+        # One seed does not outweigh being much sooner, nor does being sooner outweigh it.
+        (around(19, 110), around(20, 850), "cannot be told apart from"),
+        (around(19, 850), around(20, 110), "does not beat"),
+        (around(20, 110), around(19, 850), "beats"),
+        (around(20, 110), around(20, 850), "beats"),
     ],
 )
-def test_the_verdict(winner: tuple[float, ...], began_from: tuple[float, ...], verdict: str) -> None:
+def test_the_verdict(winner: Sequence[float], began_from: Sequence[float], verdict: str) -> None:
     found = compare(sample(*winner), sample(*began_from), "the winner")
     assert found["verdict"] == verdict
     assert f"held-out seeds the winner {verdict} the settings" in found["sentence"]
