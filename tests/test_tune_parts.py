@@ -103,6 +103,25 @@ def test_lists_and_arguments_of_a_class_can_be_searched() -> None:
     assert config.agent.arguments["gae_lambda"] == 0.5  # type: ignore[attr-defined]  # never below the range
 
 
+@pytest.mark.parametrize(
+    ("key", "dimension", "value", "is_inside"),
+    [
+        ("agent.gamma", DimensionConfig("float", low=0.5, high=1.0, step=0.25), 0.75, True),
+        ("agent.gamma", DimensionConfig("float", low=0.5, high=1.0, step=0.25), 0.9, False),
+        ("agent.gamma", DimensionConfig("float", low=0.0, high=1.0, step=0.1), 0.3, True),
+        ("agent.gamma", DimensionConfig("float", low=0.5, high=1.0), 0.9, True),
+        ("n_envs", DimensionConfig("int", low=1, high=9, step=4), 5, True),
+        ("n_envs", DimensionConfig("int", low=1, high=9, step=4), 4, False),
+        ("agent.gamma", DimensionConfig("int", low=0, high=1), 0.5, False),
+    ],
+)
+def test_what_is_off_the_grid_is_outside(
+    key: str, dimension: DimensionConfig, value: float, is_inside: bool
+) -> None:
+    found = Space({key: dimension}, "own").parameters_of(configure("agent=q_learning", f"{key}={value}"))
+    assert found == ({key: value} if is_inside else None)
+
+
 def small(*words: str) -> Objective:
     asked = ask(SOURCE, ["agent=q_learning", "total_timesteps=1500", "tune.seeds=2", *words])
     return Objective(asked.measured, asked.space, asked.seeds, asked.settings.reports, 2)

@@ -131,10 +131,14 @@ def _check(key: str, dimension: DimensionConfig) -> None:
         raise InputError(f"{key}: low={low}, high={high} must be two numbers, the first below the second")
     if dimension.log and (low <= 0 or step is not None):
         raise InputError(f"{key}: log=true needs a positive low and no step; it has low={low}, step={step}")
-    if step is not None and not (step > 0 and math.isclose((high - low) / step, round((high - low) / step))):
+    if step is not None and not (step > 0 and _is_multiple(high - low, step)):
         raise InputError(f"{key}: step={step} must lead from low={low} to high={high}")
     if kind == "int" and not all(float(number).is_integer() for number in (low, high, step or 1.0)):
         raise InputError(f"{key}: type=int takes whole numbers; it has low={low}, high={high}, step={step}")
+
+
+def _is_multiple(distance: float, step: float) -> bool:
+    return math.isclose(distance / step, round(distance / step), abs_tol=1e-9)
 
 
 def _extremes(dimension: DimensionConfig) -> Iterator[Any]:
@@ -169,7 +173,10 @@ def _parameter(dimension: DimensionConfig, value: Any) -> Any:
         return _token(value) if value in (dimension.choices or []) else _OUTSIDE
     if isinstance(value, bool) or not isinstance(value, int | float):
         return _OUTSIDE
-    return value if (dimension.low or 0.0) <= value <= (dimension.high or 0.0) else _OUTSIDE
+    low, high = dimension.low or 0.0, dimension.high or 0.0
+    step = dimension.step or (1.0 if dimension.type == "int" else None)
+    is_on_grid = step is None or _is_multiple(value - low, step)
+    return value if low <= value <= high and is_on_grid else _OUTSIDE
 
 
 def _token(choice: Any) -> Any:
