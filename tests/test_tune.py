@@ -176,6 +176,12 @@ def test_a_search_space_that_makes_no_sense(
         (["tune.trials=0"], "tune.trials=0: must be at least 1"),
         (["tune.pruner=axe"], "tune.pruner=axe: must be median, hyperband or none"),
         (["tune.storage=nonsense"], "tune.storage=nonsense: is no URL of a database"),
+        (["tune.storage=sqlite://"], "tune.storage=sqlite://: is a database in the memory of one process"),
+        (
+            ["tune.storage=sqlite:///:memory:"],
+            "where no worker finds it; name a file, e.g. sqlite:////shared",
+        ),
+        (["tune.storage='sqlite:///file:x?mode=memory&uri=true'"], "in the memory of one process"),
         (["tune.storage=sqlite:////no/such/x.db"], "cannot be reached (unable to open database file)"),
         (["tune.storage=postgresql://me:secret@127.0.0.1:1/x"], "tune.storage=postgresql://me:***@127.0.0.1"),
         (["tune.study=a/b"], "tune.study=a/b: must be of letters"),

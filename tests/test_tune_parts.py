@@ -20,8 +20,8 @@ from gridworld.tune.config import DimensionConfig, TuneConfig
 from gridworld.tune.records import write_trials
 from gridworld.tune.score import SeedScore, score
 from gridworld.tune.space import Space, with_values
-from gridworld.tune.storage import open_study, standing
-from gridworld.tune.trial import Objective
+from gridworld.tune.storage import is_lost, open_study, standing
+from gridworld.tune.trial import Objective, Stopped
 from gridworld.tune.verdict import Sample, compare
 from gridworld.tune.worker import Task, _next
 
@@ -197,6 +197,34 @@ def test_a_study_gone_on_with_chooses_as_an_undisturbed_one(tmp_path: Path, samp
         chosen.append([trial.params["x"] for trial in study.trials])
     assert len(set(chosen[0])) == 14
     assert chosen[0] == chosen[1]
+
+
+@pytest.mark.parametrize("sampler", ["tpe", "random"])
+def test_trials_that_are_cut_short_do_not_change_what_is_chosen(tmp_path: Path, sampler: str) -> None:
+    calls = itertools.count()
+
+    def chosen(name: str, stops: Sequence[int]) -> list[tuple[float, float]]:
+        def objective(trial: optuna.Trial, is_stopped: object) -> float:
+            place = next(calls)
+            value = trial.suggest_float("x", -1, 1) ** 2 + trial.suggest_float("y", -1, 1) ** 2
+            if place in stops:
+                raise Stopped
+            return value
+
+        nonlocal calls
+        calls = itertools.count()
+        (tmp_path / name).mkdir()
+        study, task = study_of(tmp_path / name, objective, 14, sampler)
+        more = True
+        while more:
+            try:
+                more = _next(study, task)
+            except Stopped:
+                study, task = study_of(tmp_path / name, objective, 14, sampler)
+        assert len(study.trials) == 14 + len(stops)
+        return [(trial.params["x"], trial.params["y"]) for trial in study.trials if not is_lost(trial)]
+
+    assert chosen("calm", []) == chosen("stopped", [0, 4, 5, 13])
 
 
 def test_training_that_diverges_is_such_a_failure(tmp_path: Path) -> None:

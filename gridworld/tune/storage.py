@@ -19,7 +19,7 @@ import optuna
 from optuna.exceptions import DuplicatedStudyError, ExperimentalWarning, OptunaError
 from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback, fail_stale_trials
 from optuna.trial import FrozenTrial, TrialState
-from sqlalchemy.engine import make_url
+from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import SQLAlchemyError
 
 from gridworld.errors import InputError
@@ -30,6 +30,7 @@ _ABOUT = "gridworld"  # the study's attribute that says what is searched
 _MOST_RETRIES = 3  # of a trial whose worker is lost each time
 _SILENT_BEATS = 3
 _CONNECT_SECONDS = 10
+_EXAMPLES = "sqlite:////shared/study.db or postgresql://user@host/name"
 _LOCKED_SECONDS = 60  # that a worker waits for others at an SQLite file
 
 
@@ -52,15 +53,17 @@ def open_storage(settings: TuneConfig, url: str) -> RDBStorage:
     """Raises `InputError` where it cannot be reached."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     try:
-        shown = make_url(url).render_as_string(hide_password=True)
-        drivername = make_url(url).drivername
+        parsed = make_url(url)
     except SQLAlchemyError:
+        raise InputError(f"tune.storage={url}: is no URL of a database, e.g. {_EXAMPLES}") from None
+    shown, drivername = parsed.render_as_string(hide_password=True), parsed.drivername
+    is_sqlite = drivername.startswith("sqlite")
+    if is_sqlite and _is_in_memory(parsed):
         raise InputError(
-            f"tune.storage={url}: is no URL of a database, e.g. sqlite:////shared/study.db or "
-            "postgresql://user@host/name"
-        ) from None
-    is_file = drivername.startswith("sqlite")
-    connect = {"timeout": _LOCKED_SECONDS} if is_file else {"connect_timeout": _CONNECT_SECONDS}
+            f"tune.storage={shown}: is a database in the memory of one process, where no worker finds it; "
+            f"name a file, e.g. {_EXAMPLES}"
+        )
+    connect = {"timeout": _LOCKED_SECONDS} if is_sqlite else {"connect_timeout": _CONNECT_SECONDS}
     try:
         with _quiet():
             return RDBStorage(
@@ -137,16 +140,26 @@ def put_back(study: optuna.Study, number: int) -> None:
 def seed_sampler(study: optuna.Study, settings: TuneConfig, place: str) -> None:
     """Give the next trial a source of chance of its own, whichever worker runs it.
 
-    So one worker's study is the same whether it was interrupted or not. `place` tells machines apart.
+    Trials that were lost do not count, nor do their copies that wait to be run again, and neither TPE nor the
+    median pruner looks at them. So one worker's study is the same whether it was stopped and gone on with or
+    not. (Hyperband's brackets go by the trial's number, which a copy has of its own.) `place` tells machines
+    apart.
     """
-    trials = len(study.get_trials(deepcopy=False))
-    seed = zlib.crc32(repr((settings.sampler_seed, trials, place)).encode())
+    trials = study.get_trials(deepcopy=False)
+    begun = sum(trial.state != TrialState.WAITING and not is_lost(trial) for trial in trials)
+    seed = zlib.crc32(repr((settings.sampler_seed, begun, place)).encode())
     with _quiet():
         study.sampler = (
             optuna.samplers.RandomSampler(seed=seed)
             if settings.sampler == "random"
             else optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True)
         )
+
+
+def _is_in_memory(url: URL) -> bool:
+    """Of SQLite's."""
+    name = url.database or ":memory:"
+    return name in (":memory:", "file::memory:") or url.query.get("mode") == "memory"
 
 
 def _pruner(settings: TuneConfig) -> optuna.pruners.BasePruner:
