@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -52,9 +53,8 @@ def test_a_search_leaves_a_row_per_trial_and_a_verdict(studied: Path) -> None:
     assert 0 in [finalist["trial"] for finalist in study["finalists"]]
     assert study["winner"]["trial"] == study["finalists"][0]["trial"]
     confirmed = sorted(path.name for path in (studied / "study" / "confirm").glob("*,seed=*"))
-    assert [name for name in confirmed if name.startswith("default")] == [
-        f"default,seed={seed}" for seed in (3, 4)
-    ]
+    seeds = [name.rpartition(",")[2] for name in confirmed if name.startswith("default,")]
+    assert seeds == ["seed=3", "seed=4"]
 
 
 def test_its_winner_is_a_recipe_of_train_py(studied: Path) -> None:
@@ -118,6 +118,22 @@ def test_a_study_of_another_search_is_refused(
     before = (studied / "study" / "trials.csv").read_bytes()
     assert sentence in refusal(monkeypatch, studied, *QUICK, *more, "--config-dir", str(tmp_path))
     assert (studied / "study" / "trials.csv").read_bytes() == before
+
+
+def test_a_folder_of_another_study_is_refused(
+    studied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(studied / "study", tmp_path / "study")
+    told = refusal(monkeypatch, tmp_path, *QUICK, "agent=sarsa", "total_timesteps=50", "tune.trials=2")
+    assert "study: is the folder of the study tune_q_learning_classic; choose another tune.folder" in told
+    for name in ("search.json", "study.json"):  # either of them tells
+        (tmp_path / "study" / "study.db").unlink(missing_ok=True)
+        before = sorted(tmp_path.rglob("*"))
+        told = refusal(monkeypatch, tmp_path, *QUICK)
+        assert "study: is of the study tune_q_learning_classic, which sqlite:////" in told
+        assert "study.db does not have; bring its database back" in told
+        assert sorted(tmp_path.rglob("*")) == before
+        (tmp_path / "study" / name).unlink()
 
 
 def refusal(monkeypatch: pytest.MonkeyPatch, folder: Path, *arguments: str) -> str:

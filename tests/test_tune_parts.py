@@ -17,6 +17,7 @@ from gridworld.report import statistics
 from gridworld.training import check_settings
 from gridworld.tune.asked import Source, ask
 from gridworld.tune.config import DimensionConfig, TuneConfig
+from gridworld.tune.confirm import jobs
 from gridworld.tune.records import write_trials
 from gridworld.tune.score import SeedScore, score
 from gridworld.tune.space import Space, with_values
@@ -242,6 +243,18 @@ def sample(*steps: float) -> Sample:
     found = np.array(steps, dtype=np.float64)
     certified = int(np.isfinite(found).sum())
     return Sample(statistics.share(certified, len(found)), found, TOTAL)
+
+
+def test_held_out_runs_of_other_settings_are_other_runs(tmp_path: Path) -> None:
+    def names(*words: str) -> list[str]:
+        found = jobs(tmp_path, "default", configure("agent=q_learning", *words), range(3, 6))
+        assert [job.config.seed for job in found] == [3, 4, 5]
+        return [job.folder.name for job in found]
+
+    assert len(set(names())) == 3
+    assert names() == names("seed=9", "logging.progress=false")
+    for other in ("total_timesteps=50", "agent.gamma=0.8", "env.slip=0.1"):
+        assert not set(names()) & set(names(other))
 
 
 def around(certified: int, step: int) -> list[float]:

@@ -11,8 +11,9 @@ import contextlib
 import json
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import optuna
@@ -56,7 +57,7 @@ def open_storage(settings: TuneConfig, url: str) -> RDBStorage:
         parsed = make_url(url)
     except SQLAlchemyError:
         raise InputError(f"tune.storage={url}: is no URL of a database, e.g. {_EXAMPLES}") from None
-    shown, drivername = parsed.render_as_string(hide_password=True), parsed.drivername
+    shown, drivername = shown_url(url), parsed.drivername
     is_sqlite = drivername.startswith("sqlite")
     if is_sqlite and _is_in_memory(parsed):
         raise InputError(
@@ -80,6 +81,11 @@ def open_storage(settings: TuneConfig, url: str) -> RDBStorage:
         raise InputError(f"tune.storage={shown}: cannot be reached ({_first_line(error)})") from None
 
 
+def shown_url(url: str) -> str:
+    """Without the password."""
+    return make_url(url).render_as_string(hide_password=True)
+
+
 def open_study(settings: TuneConfig, url: str, name: str) -> optuna.Study:
     """The study, made where there is none."""
     storage = open_storage(settings, url)
@@ -89,7 +95,22 @@ def open_study(settings: TuneConfig, url: str, name: str) -> optuna.Study:
     return study
 
 
-def begin(storage: RDBStorage, name: str, about: dict[str, Any], first: dict[str, Any] | None) -> None:
+def has_study(settings: TuneConfig, url: str, name: str) -> bool:
+    """Whether the storage has it; makes no SQLite file to find that out. Raises `InputError`."""
+    with contextlib.suppress(SQLAlchemyError):
+        parsed = make_url(url)
+        file = parsed.database or ""
+        if (
+            parsed.drivername.startswith("sqlite")
+            and not file.startswith("file:")
+            and not Path(file).exists()
+        ):
+            return False
+    with _quiet():
+        return name in optuna.get_all_study_names(open_storage(settings, url))
+
+
+def begin(storage: RDBStorage, name: str, about: Mapping[str, Any], first: dict[str, Any] | None) -> None:
     """Make the study, with `first` as its first trial, or see that it is the same search.
 
     Raises `InputError` where the study of that name searches something else.
@@ -105,7 +126,7 @@ def begin(storage: RDBStorage, name: str, about: dict[str, Any], first: dict[str
         if first is not None:
             study.enqueue_trial(first, skip_if_exists=True)
         study.set_user_attr(_ABOUT, about)
-    _compare(name, study.user_attrs[_ABOUT], json.loads(json.dumps(about)))
+    compare(name, study.user_attrs[_ABOUT], about)
 
 
 def standing(study: optuna.Study) -> Standing:
@@ -173,7 +194,9 @@ def _pruner(settings: TuneConfig) -> optuna.pruners.BasePruner:
     return optuna.pruners.MedianPruner(n_warmup_steps=settings.reports // 2)
 
 
-def _compare(name: str, before: dict[str, Any], now: dict[str, Any]) -> None:
+def compare(name: str, before: Mapping[str, Any], about: Mapping[str, Any]) -> None:
+    """Raise `InputError` for the first difference between what a study was begun with, and now."""
+    now = json.loads(json.dumps(about))
     for part, was in before.items():
         is_now = now.get(part, {})
         if was == is_now:

@@ -22,6 +22,7 @@ from gridworld.sweep.report import shown
 from gridworld.training import make_mdp
 from gridworld.tune import confirm, verdict
 from gridworld.tune.asked import Asked, Source, search_path
+from gridworld.tune.claim import claim, is_claimed
 from gridworld.tune.crew import run_crew
 from gridworld.tune.finals import Final, Finalist, finalists, missing, ranking
 from gridworld.tune.finals import work as finals_work
@@ -29,7 +30,7 @@ from gridworld.tune.progress import SearchProgress
 from gridworld.tune.recipe import RECIPE, write_recipe
 from gridworld.tune.records import write_study
 from gridworld.tune.space import with_values
-from gridworld.tune.storage import begin, open_storage, open_study, standing
+from gridworld.tune.storage import begin, has_study, open_storage, open_study, shown_url, standing
 from gridworld.tune.trial import ERROR, Objective
 from gridworld.tune.worker import Task, search
 
@@ -51,17 +52,23 @@ def tune(asked: Asked, source: Source) -> None:
 def _begin(asked: Asked) -> Task:
     """Make the folder and the study, or see that they are of this search."""
     _check_folder(asked.folder)
-    settings = asked.settings
+    settings, about = asked.settings, _about(asked)
+    url = settings.storage or f"sqlite:///{asked.folder.absolute() / 'study.db'}"
+    if is_claimed(asked.folder, asked.name, about) and not has_study(settings, url, asked.name):
+        raise InputError(
+            f"{asked.folder}: is of the study {asked.name}, which {shown_url(url)} does not have; "
+            "bring its database back, or choose another tune.folder"
+        )
     made = not asked.folder.exists()
     asked.folder.mkdir(parents=True, exist_ok=True)
-    url = settings.storage or f"sqlite:///{asked.folder.absolute() / 'study.db'}"
     try:
-        begin(open_storage(settings, url), asked.name, _about(asked), asked.space.parameters_of(asked.base))
+        begin(open_storage(settings, url), asked.name, about, asked.space.parameters_of(asked.base))
     except InputError:
         if made:
             with contextlib.suppress(OSError):
                 asked.folder.rmdir()
         raise
+    claim(asked.folder, asked.name, about)
     objective = Objective(asked.measured, asked.space, asked.seeds, settings.reports, settings.stop_after)
     deadline = time.time() + (settings.timeout or math.inf)
     return Task(asked.folder, url, asked.name, settings, objective, deadline)
