@@ -12,11 +12,15 @@ import time
 from pathlib import Path
 
 import pytest
+from optuna.trial import TrialState
 from support import CONF, ROOT, script
 
 from gridworld.commands import report as report_command
 from gridworld.commands import tune as tune_command
 from gridworld.errors import InputError
+from gridworld.tune.storage import open_study
+from gridworld.tune.trial import ERROR
+from gridworld.tune.worker import Task
 
 QUICK = (
     *("agent=q_learning", "total_timesteps=1500", "recording.gif=false", "recording.learning=false"),
@@ -143,6 +147,24 @@ def refusal(monkeypatch: pytest.MonkeyPatch, folder: Path, *arguments: str) -> s
     with pytest.raises(InputError) as caught:
         tune_command.main(list(arguments))
     return str(caught.value)
+
+
+def test_a_search_that_comes_to_nothing_is_no_mistake_of_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def all_fail(work: object, task: Task, *more: object) -> None:
+        study = open_study(task.settings, task.url, task.name)
+        study.ask().set_user_attr(ERROR, "training diverged")
+        study.tell(0, state=TrialState.FAIL)
+
+    monkeypatch.setattr("gridworld.tune.study.run_crew", all_fail)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(ROOT / "scripts" / "tune.py"), *QUICK])
+    with pytest.raises(SystemExit) as ended:
+        tune_command.main(QUICK)
+    assert ended.value.code == 1
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert told == "error: study: no trial came to a score; all 1 failed, the first: training diverged"
 
 
 FLOAT = "agent.learning_rate: {type: float, low: 1e-3, high: 1e-2}"
@@ -293,6 +315,19 @@ def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path
         repeated = next(other for other in found if other["repeats"] == row["trial"])
         chosen = [key for key in keys if row[key]]  # the worker may have been lost before it chose all
         assert [repeated[key] for key in chosen] == [row[key] for key in chosen]
+
+
+def test_a_database_that_disappears_is_one_sentence(tmp_path: Path) -> None:
+    with start(tmp_path) as process:
+        wait_for_a_trial(tmp_path)
+        (tmp_path / "study" / "study.db").unlink()
+        assert process.stderr is not None
+        told = process.stderr.read().splitlines()
+    assert process.returncode == 1
+    errors = [line for line in told if "study cannot be reached any more" in line]
+    assert len(errors) == 1
+    assert errors[0].startswith("error: tune.storage=sqlite:////")
+    assert not [line for line in told if "Traceback" in line or "Error" in line]
 
 
 def test_no_worker_outlives_a_search_that_is_killed(tmp_path: Path) -> None:

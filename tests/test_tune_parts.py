@@ -18,10 +18,11 @@ from gridworld.training import check_settings
 from gridworld.tune.asked import Source, ask
 from gridworld.tune.config import DimensionConfig, TuneConfig
 from gridworld.tune.confirm import jobs
+from gridworld.tune.crew import StorageLostError
 from gridworld.tune.records import write_trials
 from gridworld.tune.score import SeedScore, score
 from gridworld.tune.space import Space, with_values
-from gridworld.tune.storage import is_lost, open_study, standing
+from gridworld.tune.storage import begin, in_reach, is_lost, open_storage, open_study, standing
 from gridworld.tune.trial import Objective, Stopped
 from gridworld.tune.verdict import Sample, compare
 from gridworld.tune.worker import Task, _next
@@ -156,6 +157,7 @@ def test_a_pruned_trial_spares_its_other_seeds() -> None:
 def study_of(folder: Path, objective: object, trials: int, sampler: str = "tpe") -> tuple[optuna.Study, Task]:
     settings = TuneConfig(trials=trials, heartbeat=1, sampler=sampler)
     url = f"sqlite:///{folder / 'study.db'}"
+    begin(open_storage(settings, url), "one", {}, None)
     task = Task(folder, url, "one", settings, objective, math.inf)  # type: ignore[arg-type]
     return open_study(settings, url, "one"), task
 
@@ -226,6 +228,20 @@ def test_trials_that_are_cut_short_do_not_change_what_is_chosen(tmp_path: Path, 
         return [(trial.params["x"], trial.params["y"]) for trial in study.trials if not is_lost(trial)]
 
     assert chosen("calm", []) == chosen("stopped", [0, 4, 5, 13])
+
+
+def test_a_storage_that_goes_away_is_told_in_a_sentence(tmp_path: Path) -> None:
+    study, task = study_of(tmp_path, None, 3)
+    (tmp_path / "study.db").unlink()
+    with (
+        pytest.raises(StorageLostError, match=r"study\.db: the study cannot be"),
+        in_reach(task.url),
+    ):
+        study.set_user_attr("x", 1)
+    with pytest.raises(StorageLostError, match="has no study one"), in_reach(task.url):
+        open_study(task.settings, task.url, "one")
+    with pytest.raises(ZeroDivisionError), in_reach(task.url):
+        _ = 1 / 0
 
 
 def test_training_that_diverges_is_such_a_failure(tmp_path: Path) -> None:

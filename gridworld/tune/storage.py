@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import optuna
-from optuna.exceptions import DuplicatedStudyError, ExperimentalWarning, OptunaError
+from optuna.exceptions import DuplicatedStudyError, ExperimentalWarning, OptunaError, StorageInternalError
 from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback, fail_stale_trials
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.engine import URL, make_url
@@ -25,6 +25,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from gridworld.errors import InputError
 from gridworld.tune.config import TuneConfig
+from gridworld.tune.crew import StorageLostError
 from gridworld.tune.trial import ERROR
 
 _ABOUT = "gridworld"  # the study's attribute that says what is searched
@@ -86,13 +87,37 @@ def shown_url(url: str) -> str:
     return make_url(url).render_as_string(hide_password=True)
 
 
+@contextlib.contextmanager
+def in_reach(url: str) -> Iterator[None]:
+    """Raise `StorageLostError`, with a sentence, for what comes of a storage that went away in the block."""
+    try:
+        yield
+    except Exception as error:
+        if (cause := storage_error(error)) is None:
+            raise
+        raise StorageLostError(
+            f"tune.storage={shown_url(url)}: the study cannot be reached any more ({_first_line(cause)}); "
+            "bring the database back, with what has ended in it, and run the same line again"
+        ) from None
+
+
+def storage_error(error: BaseException | None) -> BaseException | None:
+    """What the storage answered, if an error follows from that: Optuna's own handlers stumble over it."""
+    while error is not None and not isinstance(
+        error, SQLAlchemyError | StorageInternalError | StorageLostError
+    ):
+        error = error.__cause__ or error.__context__
+    return error
+
+
 def open_study(settings: TuneConfig, url: str, name: str) -> optuna.Study:
-    """The study, made where there is none."""
+    """The study, which `begin` has made. Raises `StorageLostError` where it is gone since."""
     storage = open_storage(settings, url)
-    with _quiet():
-        study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True)
-        study.pruner = _pruner(settings)
-    return study
+    try:
+        with _quiet():
+            return optuna.load_study(storage=storage, study_name=name, pruner=_pruner(settings))
+    except KeyError:
+        raise StorageLostError(f"it has no study {name}") from None
 
 
 def has_study(settings: TuneConfig, url: str, name: str) -> bool:

@@ -23,21 +23,26 @@ from gridworld.training import make_mdp
 from gridworld.tune import confirm, verdict
 from gridworld.tune.asked import Asked, Source, search_path
 from gridworld.tune.claim import claim, is_claimed
-from gridworld.tune.crew import run_crew
+from gridworld.tune.crew import SearchError, run_crew
 from gridworld.tune.finals import Final, Finalist, finalists, missing, ranking
 from gridworld.tune.finals import work as finals_work
 from gridworld.tune.progress import SearchProgress
 from gridworld.tune.recipe import RECIPE, write_recipe
 from gridworld.tune.records import write_study
 from gridworld.tune.space import with_values
-from gridworld.tune.storage import begin, has_study, open_storage, open_study, shown_url, standing
+from gridworld.tune.storage import begin, has_study, in_reach, open_storage, open_study, shown_url, standing
 from gridworld.tune.trial import ERROR, Objective
 from gridworld.tune.worker import Task, search
 
 
 def tune(asked: Asked, source: Source) -> None:
-    """Run what the study lacks. Raises `InputError`, nothing run, and `Interrupted`."""
+    """Run what the study lacks. Raises `InputError`, nothing run, `SearchError` and `Interrupted`."""
     task = _begin(asked)
+    with in_reach(task.url):
+        _search(asked, source, task)
+
+
+def _search(asked: Asked, source: Source, task: Task) -> None:
     study = open_study(task.settings, task.url, task.name)
     progress = SearchProgress(asked, study)
     try:
@@ -103,7 +108,7 @@ def _finals(asked: Asked, study: optuna.Study, task: Task) -> list[Finalist]:
     if not trials:
         reasons = [trial.user_attrs[ERROR] for trial in study.trials if trial.user_attrs.get(ERROR)]
         why = f"all {len(reasons)} failed, the first: {reasons[0]}" if reasons else "there was no time"
-        raise InputError(f"{shown(asked.folder)}: no trial came to a score; {why}")
+        raise SearchError(f"{shown(asked.folder)}: no trial came to a score; {why}")
     seeds = tuple(asked.final_seeds)
     if runs := missing(study, trials, seeds):
         print(
