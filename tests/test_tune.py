@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from optuna.trial import TrialState
+from optuna.trial import TrialState, create_trial
 from support import CONF, ROOT, script
 
 from gridworld.commands import report as report_command
@@ -154,8 +154,7 @@ def test_a_search_that_comes_to_nothing_is_no_mistake_of_the_command_line(
 ) -> None:
     def all_fail(work: object, task: Task, *more: object) -> None:
         study = open_study(task.settings, task.url, task.name)
-        study.ask().set_user_attr(ERROR, "training diverged")
-        study.tell(0, state=TrialState.FAIL)
+        study.add_trial(create_trial(state=TrialState.FAIL, user_attrs={ERROR: "training diverged"}))
 
     monkeypatch.setattr("gridworld.tune.study.run_crew", all_fail)
     monkeypatch.chdir(tmp_path)
@@ -189,6 +188,22 @@ FLOAT = "agent.learning_rate: {type: float, low: 1e-3, high: 1e-2}"
         ("# @package tune.space\nagent.gamma: {type: categorical, low: 1}", "must be a list"),
         ("# @package tune.space\nn_envs: {type: int, low: 1.5, high: 3}", "takes whole numbers"),
         ("# @package tune.space\nn_envs: {type: categorical, choices: [many]}", "n_envs=many"),
+        (
+            "# @package tune.space\nagent.gamma: {type: float, low: 0.5, high: 5}",
+            "agent.gamma=5.0: must be from",
+        ),
+        (
+            "# @package tune.space\nagent.learning_rate: {type: float, low: -3, high: -1}",
+            "tune=bad: agent.learning_rate=-3.0: must be a number of at least 0",
+        ),
+        (
+            "# @package tune.space\nagent.learning_rate: {type: categorical, choices: [0.1, abc]}",
+            "tune=bad: agent.learning_rate=abc",
+        ),
+        (
+            "# @package tune.space\nobservation.kind: {type: categorical, choices: [one_hot, coordinates]}",
+            "tune=bad: observation=one_hot: agent=q_learning keeps a table",
+        ),
         ("# @package tune.space\nagent.gama: {type: float, low: 0, high: 1}", "agent.gama"),
         ("# @package tune.space\nenv.slip: {type: float, low: 0, high: 1}", "is part of the task"),
     ],

@@ -88,6 +88,15 @@ def test_every_batch_of_ppo_divides_every_rollout() -> None:
         check_settings(with_values(asked.base, dict(zip(keys, choice, strict=True))))
 
 
+def test_choices_that_need_each_other_are_no_mistake() -> None:
+    base = configure("agent=ppo")  # 128 environments, so that a rollout is 128 times n_steps
+    batch = {"agent.batch_size": DimensionConfig("categorical", choices=[384, 1024])}
+    with pytest.raises(InputError, match=r"tune=own: agent\.batch_size=384"):
+        Space(batch, "own").check(base, check_settings(base))
+    rollout = {"agent.n_steps": DimensionConfig("categorical", choices=[3, 16])}
+    Space(batch | rollout, "own").check(base, check_settings(base))
+
+
 def test_there_is_a_space_for_every_agent_that_learns() -> None:
     agents = {file.stem for file in (CONF / "agent").glob("*.yaml")}
     learn = {name for name in agents if not name.endswith("_sb3_defaults")} - {"value_iteration"}
@@ -97,7 +106,8 @@ def test_there_is_a_space_for_every_agent_that_learns() -> None:
 def test_lists_and_arguments_of_a_class_can_be_searched() -> None:
     nets = DimensionConfig("categorical", choices=[[64], [64, 64]])
     space = Space({"agent.policy_kwargs.net_arch": nets}, "own")
-    space.check(configure("agent=ppo"))
+    base = configure("agent=ppo")
+    space.check(base, check_settings(base))
     values = space.suggest(optuna.create_study().ask())
     assert with_values(configure("agent=ppo"), values).agent.policy_kwargs.net_arch in nets.choices  # type: ignore[attr-defined, operator]
     space = Space({"agent.arguments.gae_lambda": DimensionConfig("float", low=0.5, high=1)}, "own")
