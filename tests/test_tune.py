@@ -258,7 +258,7 @@ def test_without_optuna_it_says_what_to_install(tmp_path: Path, monkeypatch: pyt
 
 
 LONG = (
-    "total_timesteps=25000",
+    "total_timesteps=60000",  # so that a trial outlasts the two seconds between two tables
     "tune.pruner=none",
     "tune.stop_after=null",
     "tune.trials=4",
