@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gridworld.report import statistics
-from gridworld.report.statistics import bands, improvement, interval, iqm, mean, median, share
+from gridworld.report.statistics import bands, difference, improvement, interval, iqm, mean, median, share
 
 numbers = st.floats(-100, 100).map(lambda x: round(x, 2))
 samples = st.lists(numbers, min_size=1, max_size=30)
@@ -125,3 +125,21 @@ def test_wilsons_interval() -> None:
     assert (told.low, told.high) == pytest.approx((middle - half, middle + half), abs=1e-6)
     assert share(0, 5).low == 0.0 < share(0, 5).high
     assert share(5, 5).high == 1.0 > share(5, 5).low
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "bounds"),
+    [
+        ((56, 70), (48, 80), (0.0524, 0.3339)),
+        ((9, 10), (3, 10), (0.1705, 0.8090)),
+        ((10, 10), (0, 10), (0.6075, 1.0)),
+    ],
+)
+def test_newcombes_interval(
+    first: tuple[int, int], second: tuple[int, int], bounds: tuple[float, float]
+) -> None:
+    told = difference(share(*first), share(*second))
+    assert told.point == pytest.approx(first[0] / first[1] - second[0] / second[1])
+    assert (told.low, told.high) == pytest.approx(bounds, abs=1e-4)
+    back = difference(share(*second), share(*first))
+    assert (back.low, back.high) == pytest.approx((-told.high, -told.low))

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,11 +12,15 @@ import time
 from pathlib import Path
 
 import pytest
+from optuna.trial import TrialState, create_trial
 from support import CONF, ROOT, script
 
 from gridworld.commands import report as report_command
 from gridworld.commands import tune as tune_command
 from gridworld.errors import InputError
+from gridworld.tune.storage import open_study
+from gridworld.tune.trial import ERROR
+from gridworld.tune.worker import Task
 
 QUICK = (
     *("agent=q_learning", "total_timesteps=1500", "recording.gif=false", "recording.learning=false"),
@@ -52,9 +57,8 @@ def test_a_search_leaves_a_row_per_trial_and_a_verdict(studied: Path) -> None:
     assert 0 in [finalist["trial"] for finalist in study["finalists"]]
     assert study["winner"]["trial"] == study["finalists"][0]["trial"]
     confirmed = sorted(path.name for path in (studied / "study" / "confirm").glob("*,seed=*"))
-    assert [name for name in confirmed if name.startswith("default")] == [
-        f"default,seed={seed}" for seed in (3, 4)
-    ]
+    seeds = [name.rpartition(",")[2] for name in confirmed if name.startswith("default,")]
+    assert seeds == ["seed=3", "seed=4"]
 
 
 def test_its_winner_is_a_recipe_of_train_py(studied: Path) -> None:
@@ -120,6 +124,22 @@ def test_a_study_of_another_search_is_refused(
     assert (studied / "study" / "trials.csv").read_bytes() == before
 
 
+def test_a_folder_of_another_study_is_refused(
+    studied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(studied / "study", tmp_path / "study")
+    told = refusal(monkeypatch, tmp_path, *QUICK, "agent=sarsa", "total_timesteps=50", "tune.trials=2")
+    assert "study: is the folder of the study tune_q_learning_classic; choose another tune.folder" in told
+    for name in ("search.json", "study.json"):  # either of them tells
+        (tmp_path / "study" / "study.db").unlink(missing_ok=True)
+        before = sorted(tmp_path.rglob("*"))
+        told = refusal(monkeypatch, tmp_path, *QUICK)
+        assert "study: is of the study tune_q_learning_classic, which sqlite:////" in told
+        assert "study.db does not have; bring its database back" in told
+        assert sorted(tmp_path.rglob("*")) == before
+        (tmp_path / "study" / name).unlink()
+
+
 def refusal(monkeypatch: pytest.MonkeyPatch, folder: Path, *arguments: str) -> str:
     """What tune.py says to such a command line."""
     monkeypatch.chdir(folder)
@@ -127,6 +147,23 @@ def refusal(monkeypatch: pytest.MonkeyPatch, folder: Path, *arguments: str) -> s
     with pytest.raises(InputError) as caught:
         tune_command.main(list(arguments))
     return str(caught.value)
+
+
+def test_a_search_that_comes_to_nothing_is_no_mistake_of_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def all_fail(work: object, task: Task, *more: object) -> None:
+        study = open_study(task.settings, task.url, task.name)
+        study.add_trial(create_trial(state=TrialState.FAIL, user_attrs={ERROR: "training diverged"}))
+
+    monkeypatch.setattr("gridworld.tune.study.run_crew", all_fail)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [str(ROOT / "scripts" / "tune.py"), *QUICK])
+    with pytest.raises(SystemExit) as ended:
+        tune_command.main(QUICK)
+    assert ended.value.code == 1
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert told == "error: study: no trial came to a score; all 1 failed, the first: training diverged"
 
 
 FLOAT = "agent.learning_rate: {type: float, low: 1e-3, high: 1e-2}"
@@ -151,6 +188,22 @@ FLOAT = "agent.learning_rate: {type: float, low: 1e-3, high: 1e-2}"
         ("# @package tune.space\nagent.gamma: {type: categorical, low: 1}", "must be a list"),
         ("# @package tune.space\nn_envs: {type: int, low: 1.5, high: 3}", "takes whole numbers"),
         ("# @package tune.space\nn_envs: {type: categorical, choices: [many]}", "n_envs=many"),
+        (
+            "# @package tune.space\nagent.gamma: {type: float, low: 0.5, high: 5}",
+            "agent.gamma=5.0: must be from",
+        ),
+        (
+            "# @package tune.space\nagent.learning_rate: {type: float, low: -3, high: -1}",
+            "tune=bad: agent.learning_rate=-3.0: must be a number of at least 0",
+        ),
+        (
+            "# @package tune.space\nagent.learning_rate: {type: categorical, choices: [0.1, abc]}",
+            "tune=bad: agent.learning_rate=abc",
+        ),
+        (
+            "# @package tune.space\nobservation.kind: {type: categorical, choices: [one_hot, coordinates]}",
+            "tune=bad: observation=one_hot: agent=q_learning keeps a table",
+        ),
         ("# @package tune.space\nagent.gama: {type: float, low: 0, high: 1}", "agent.gama"),
         ("# @package tune.space\nenv.slip: {type: float, low: 0, high: 1}", "is part of the task"),
     ],
@@ -176,6 +229,12 @@ def test_a_search_space_that_makes_no_sense(
         (["tune.trials=0"], "tune.trials=0: must be at least 1"),
         (["tune.pruner=axe"], "tune.pruner=axe: must be median, hyperband or none"),
         (["tune.storage=nonsense"], "tune.storage=nonsense: is no URL of a database"),
+        (["tune.storage=sqlite://"], "tune.storage=sqlite://: is a database in the memory of one process"),
+        (
+            ["tune.storage=sqlite:///:memory:"],
+            "where no worker finds it; name a file, e.g. sqlite:////shared",
+        ),
+        (["tune.storage='sqlite:///file:x?mode=memory&uri=true'"], "in the memory of one process"),
         (["tune.storage=sqlite:////no/such/x.db"], "cannot be reached (unable to open database file)"),
         (["tune.storage=postgresql://me:secret@127.0.0.1:1/x"], "tune.storage=postgresql://me:***@127.0.0.1"),
         (["tune.study=a/b"], "tune.study=a/b: must be of letters"),
@@ -199,7 +258,7 @@ def test_without_optuna_it_says_what_to_install(tmp_path: Path, monkeypatch: pyt
 
 
 LONG = (
-    "total_timesteps=100000",  # so that the search is not over before it is interrupted
+    "total_timesteps=60000",  # so that a trial outlasts the two seconds between two tables
     "tune.pruner=none",
     "tune.stop_after=null",
     "tune.trials=4",
@@ -271,6 +330,19 @@ def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path
         repeated = next(other for other in found if other["repeats"] == row["trial"])
         chosen = [key for key in keys if row[key]]  # the worker may have been lost before it chose all
         assert [repeated[key] for key in chosen] == [row[key] for key in chosen]
+
+
+def test_a_database_that_disappears_is_one_sentence(tmp_path: Path) -> None:
+    with start(tmp_path) as process:
+        wait_for_a_trial(tmp_path)
+        (tmp_path / "study" / "study.db").unlink()
+        assert process.stderr is not None
+        told = process.stderr.read().splitlines()
+    assert process.returncode == 1
+    errors = [line for line in told if "study cannot be reached any more" in line]
+    assert len(errors) == 1
+    assert errors[0].startswith("error: tune.storage=sqlite:////")
+    assert not [line for line in told if "Traceback" in line or "Error" in line]
 
 
 def test_no_worker_outlives_a_search_that_is_killed(tmp_path: Path) -> None:

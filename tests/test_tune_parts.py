@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import optuna
@@ -16,11 +17,13 @@ from gridworld.report import statistics
 from gridworld.training import check_settings
 from gridworld.tune.asked import Source, ask
 from gridworld.tune.config import DimensionConfig, TuneConfig
+from gridworld.tune.confirm import jobs
+from gridworld.tune.crew import StorageLostError
 from gridworld.tune.records import write_trials
 from gridworld.tune.score import SeedScore, score
 from gridworld.tune.space import Space, with_values
-from gridworld.tune.storage import open_study, standing
-from gridworld.tune.trial import Objective
+from gridworld.tune.storage import begin, in_reach, is_lost, open_storage, open_study, standing
+from gridworld.tune.trial import Objective, Stopped
 from gridworld.tune.verdict import Sample, compare
 from gridworld.tune.worker import Task, _next
 
@@ -85,6 +88,15 @@ def test_every_batch_of_ppo_divides_every_rollout() -> None:
         check_settings(with_values(asked.base, dict(zip(keys, choice, strict=True))))
 
 
+def test_choices_that_need_each_other_are_no_mistake() -> None:
+    base = configure("agent=ppo")  # 128 environments, so that a rollout is 128 times n_steps
+    batch = {"agent.batch_size": DimensionConfig("categorical", choices=[384, 1024])}
+    with pytest.raises(InputError, match=r"tune=own: agent\.batch_size=384"):
+        Space(batch, "own").check(base, check_settings(base))
+    rollout = {"agent.n_steps": DimensionConfig("categorical", choices=[3, 16])}
+    Space(batch | rollout, "own").check(base, check_settings(base))
+
+
 def test_there_is_a_space_for_every_agent_that_learns() -> None:
     agents = {file.stem for file in (CONF / "agent").glob("*.yaml")}
     learn = {name for name in agents if not name.endswith("_sb3_defaults")} - {"value_iteration"}
@@ -94,12 +106,32 @@ def test_there_is_a_space_for_every_agent_that_learns() -> None:
 def test_lists_and_arguments_of_a_class_can_be_searched() -> None:
     nets = DimensionConfig("categorical", choices=[[64], [64, 64]])
     space = Space({"agent.policy_kwargs.net_arch": nets}, "own")
-    space.check(configure("agent=ppo"))
+    base = configure("agent=ppo")
+    space.check(base, check_settings(base))
     values = space.suggest(optuna.create_study().ask())
     assert with_values(configure("agent=ppo"), values).agent.policy_kwargs.net_arch in nets.choices  # type: ignore[attr-defined, operator]
     space = Space({"agent.arguments.gae_lambda": DimensionConfig("float", low=0.5, high=1)}, "own")
     config = with_values(configure("agent=a2c"), space.values({"agent.arguments.gae_lambda": 0.123456}))
     assert config.agent.arguments["gae_lambda"] == 0.5  # type: ignore[attr-defined]  # never below the range
+
+
+@pytest.mark.parametrize(
+    ("key", "dimension", "value", "is_inside"),
+    [
+        ("agent.gamma", DimensionConfig("float", low=0.5, high=1.0, step=0.25), 0.75, True),
+        ("agent.gamma", DimensionConfig("float", low=0.5, high=1.0, step=0.25), 0.9, False),
+        ("agent.gamma", DimensionConfig("float", low=0.0, high=1.0, step=0.1), 0.3, True),
+        ("agent.gamma", DimensionConfig("float", low=0.5, high=1.0), 0.9, True),
+        ("n_envs", DimensionConfig("int", low=1, high=9, step=4), 5, True),
+        ("n_envs", DimensionConfig("int", low=1, high=9, step=4), 4, False),
+        ("agent.gamma", DimensionConfig("int", low=0, high=1), 0.5, False),
+    ],
+)
+def test_what_is_off_the_grid_is_outside(
+    key: str, dimension: DimensionConfig, value: float, is_inside: bool
+) -> None:
+    found = Space({key: dimension}, "own").parameters_of(configure("agent=q_learning", f"{key}={value}"))
+    assert found == ({key: value} if is_inside else None)
 
 
 def small(*words: str) -> Objective:
@@ -135,6 +167,7 @@ def test_a_pruned_trial_spares_its_other_seeds() -> None:
 def study_of(folder: Path, objective: object, trials: int, sampler: str = "tpe") -> tuple[optuna.Study, Task]:
     settings = TuneConfig(trials=trials, heartbeat=1, sampler=sampler)
     url = f"sqlite:///{folder / 'study.db'}"
+    begin(open_storage(settings, url), "one", {}, None)
     task = Task(folder, url, "one", settings, objective, math.inf)  # type: ignore[arg-type]
     return open_study(settings, url, "one"), task
 
@@ -179,6 +212,48 @@ def test_a_study_gone_on_with_chooses_as_an_undisturbed_one(tmp_path: Path, samp
     assert chosen[0] == chosen[1]
 
 
+@pytest.mark.parametrize("sampler", ["tpe", "random"])
+def test_trials_that_are_cut_short_do_not_change_what_is_chosen(tmp_path: Path, sampler: str) -> None:
+    calls = itertools.count()
+
+    def chosen(name: str, stops: Sequence[int]) -> list[tuple[float, float]]:
+        def objective(trial: optuna.Trial, is_stopped: object) -> float:
+            place = next(calls)
+            value = trial.suggest_float("x", -1, 1) ** 2 + trial.suggest_float("y", -1, 1) ** 2
+            if place in stops:
+                raise Stopped
+            return value
+
+        nonlocal calls
+        calls = itertools.count()
+        (tmp_path / name).mkdir()
+        study, task = study_of(tmp_path / name, objective, 14, sampler)
+        more = True
+        while more:
+            try:
+                more = _next(study, task)
+            except Stopped:
+                study, task = study_of(tmp_path / name, objective, 14, sampler)
+        assert len(study.trials) == 14 + len(stops)
+        return [(trial.params["x"], trial.params["y"]) for trial in study.trials if not is_lost(trial)]
+
+    assert chosen("calm", []) == chosen("stopped", [0, 4, 5, 13])
+
+
+def test_a_storage_that_goes_away_is_told_in_a_sentence(tmp_path: Path) -> None:
+    study, task = study_of(tmp_path, None, 3)
+    (tmp_path / "study.db").unlink()
+    with (
+        pytest.raises(StorageLostError, match=r"study\.db: the study cannot be"),
+        in_reach(task.url),
+    ):
+        study.set_user_attr("x", 1)
+    with pytest.raises(StorageLostError, match="has no study one"), in_reach(task.url):
+        open_study(task.settings, task.url, "one")
+    with pytest.raises(ZeroDivisionError), in_reach(task.url):
+        _ = 1 / 0
+
+
 def test_training_that_diverges_is_such_a_failure(tmp_path: Path) -> None:
     asked = ask(SOURCE, ["agent=ppo", "agent.learning_rate=1e30", "total_timesteps=9000", "tune.seeds=1"])
     space = Space({"agent.clip_range": DimensionConfig("float", low=0.1, high=0.3)}, "own")
@@ -196,17 +271,50 @@ def sample(*steps: float) -> Sample:
     return Sample(statistics.share(certified, len(found)), found, TOTAL)
 
 
+def test_held_out_runs_of_other_settings_are_other_runs(tmp_path: Path) -> None:
+    def names(*words: str) -> list[str]:
+        found = jobs(tmp_path, "default", configure("agent=q_learning", *words), range(3, 6))
+        assert [job.config.seed for job in found] == [3, 4, 5]
+        return [job.folder.name for job in found]
+
+    assert len(set(names())) == 3
+    assert names() == names("seed=9", "logging.progress=false")
+    for other in ("total_timesteps=50", "agent.gamma=0.8", "env.slip=0.1"):
+        assert not set(names()) & set(names(other))
+
+
+def around(certified: int, step: int) -> list[float]:
+    """Twenty runs, so many certified within 10 % of that step."""
+    spread = [step * (0.9 + 0.2 * place / 19) for place in range(20)]
+    return [*spread[:certified], *[math.inf] * (20 - certified)]
+
+
 @pytest.mark.parametrize(
     ("winner", "began_from", "verdict"),
     [
         ((100, 110, 120, 130, 140, 150), (500, 510, 520, 530, 540, math.inf), "beats"),
         ((500, 510, 520, 530, 540, math.inf), (100, 110, 120, 130, 140, 150), "does not beat"),
-        ((10, 10, 10, 10, 10, 10, 10, math.inf), (80, 80, 80, 80, 80, 80, 80, 80), "does not beat"),
+        (
+            (10, 10, 10, 10, 10, 10, 10, math.inf),
+            (80, 80, 80, 80, 80, 80, 80, 80),
+            "cannot be told apart from",
+        ),
         ((100, 200, 300, 400), (110, 190, 310, 390), "cannot be told apart from"),
         ((math.inf, math.inf), (math.inf, math.inf), "cannot be told apart from"),
+        # A share that is surely greater decides, whoever is sooner.
+        (around(20, 550), around(10, 250), "beats"),
+        (around(10, 250), around(20, 550), "does not beat"),
+        # Newcombe's interval of 20 / 20 less 16 / 20 is [-0.0005, 0.416], of 15 / 20 it lies above 0.
+        (around(20, 550), around(16, 250), "cannot be told apart from"),
+        (around(20, 550), around(15, 250), "beats"),
+        # One seed does not outweigh being much sooner, nor does being sooner outweigh it.
+        (around(19, 110), around(20, 850), "cannot be told apart from"),
+        (around(19, 850), around(20, 110), "does not beat"),
+        (around(20, 110), around(19, 850), "beats"),
+        (around(20, 110), around(20, 850), "beats"),
     ],
 )
-def test_the_verdict(winner: tuple[float, ...], began_from: tuple[float, ...], verdict: str) -> None:
+def test_the_verdict(winner: Sequence[float], began_from: Sequence[float], verdict: str) -> None:
     found = compare(sample(*winner), sample(*began_from), "the winner")
     assert found["verdict"] == verdict
     assert f"held-out seeds the winner {verdict} the settings" in found["sentence"]

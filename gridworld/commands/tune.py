@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 from gridworld.errors import InputError
 from gridworld.manual import choices
+from gridworld.terminal import tell_error
 
 if TYPE_CHECKING:
     from gridworld.tune.asked import Asked
@@ -65,10 +66,14 @@ def main(arguments: Sequence[str]) -> None:
         _show(asked)
         return
     from gridworld.training import Interrupted
+    from gridworld.tune.crew import SearchError
     from gridworld.tune.study import tune
 
     try:
         tune(asked, source)
+    except SearchError as failure:
+        tell_error(str(failure))
+        sys.exit(1)
     except Interrupted as interruption:
         again = shlex.join(["python", *sys.argv])
         print(f"{interruption}; nothing that ended is lost; go on with: {again}", file=sys.stderr)

@@ -14,7 +14,7 @@ finite as long as fewer than half are infinite, an IQM as long as no more than t
 
 References: R. Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS
 2021; H. B. Mann and D. R. Whitney, Annals of Mathematical Statistics 18, 1947; E. B. Wilson, Journal of the
-American Statistical Association 22, 1927.
+American Statistical Association 22, 1927; R. G. Newcombe, Statistics in Medicine 17, 1998 (his method 10).
 """
 
 from __future__ import annotations
@@ -79,6 +79,16 @@ def share(count: int, total: int) -> Share:
     """Wilson's interval stays honest where none, or every one, is a hit."""
     bounds = scipy.stats.binomtest(count, total).proportion_ci(LEVEL, method="wilson")
     return Share(count, total, float(bounds.low), float(bounds.high))
+
+
+def difference(first: Share, second: Share) -> Interval:
+    """How much greater the first share is, with Newcombe's interval, which is made of Wilson's two."""
+    one, other = first.count / first.total, second.count / second.total
+    return Interval(
+        one - other,
+        one - other - math.hypot(one - first.low, second.high - other),
+        one - other + math.hypot(first.high - one, other - second.low),
+    )
 
 
 def bands(

@@ -5,6 +5,7 @@
     score.py     what several seeds come to, as one number
     trial.py     one trial: train on each seed in memory, stop what cannot win
     storage.py   the study, where several processes and machines find it
+    claim.py     whose the study's folder is
     worker.py    a process that runs trials until there are enough
     crew.py      several of them, watched
     records.py   trials.csv and study.json: what a reader needs, without Optuna

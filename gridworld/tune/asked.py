@@ -110,8 +110,7 @@ def ask(source: Source, words: Sequence[str]) -> Asked:
     _check(settings)
     settings = _completed(settings, choices["agent"], base)
     space = Space(settings.space, space_name)
-    check_settings(base)
-    space.check(base)
+    space.check(base, check_settings(base))
     asked = Asked(base, choices, settings, space)
     if asked.held_out[-1] >= _LARGEST_SEED:
         raise InputError(f"seed={base.seed}: leaves no room for the other seeds after it, below 2**32")

@@ -16,10 +16,12 @@ from pathlib import Path
 from gridworld.config import TrainConfig
 from gridworld.run import MANIFEST
 from gridworld.sweep.job import JobError, run_in_sweep
+from gridworld.sweep.plan import plan
 from gridworld.sweep.table import read_json
 from gridworld.tune.worker import become_worker, is_stopped
 
 CONFIRM = "confirm"  # the runs' folder, in the study's
+_HASH_SHOWN = 8  # characters
 _ENDED = ("finished", "failed")
 
 
@@ -32,9 +34,14 @@ class Job:
 
 
 def jobs(folder: Path, name: str, config: TrainConfig, seeds: Sequence[int]) -> list[Job]:
-    """A run on each seed."""
+    """A run on each seed. Its folder's name holds a hash of its settings: other settings are other runs."""
+    of_seed = {str(seed): dataclasses.replace(config, seed=seed) for seed in seeds}
+    planned = plan((([seed], []) for seed in of_seed), lambda words: of_seed[words[0]])
     runs = folder / CONFIRM
-    return [Job(runs / f"{name},seed={seed}", dataclasses.replace(config, seed=seed)) for seed in seeds]
+    return [
+        Job(runs / f"{name},{job.hash[:_HASH_SHOWN]},seed={seed}", of_seed[seed])
+        for seed, job in zip(of_seed, planned, strict=True)
+    ]
 
 
 def prepare(folder: Path, runs: Sequence[Job]) -> None:

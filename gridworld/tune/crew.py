@@ -12,20 +12,29 @@ from collections.abc import Callable, Iterator
 from multiprocessing.context import SpawnProcess
 from typing import Any
 
-from gridworld.errors import InputError
 from gridworld.signals import StopRequest
 
 Work = Callable[[Any, int, int], None]  # (task, number of the worker, process id of the parent)
+
+UNREACHABLE = 3  # exit code of a worker that cannot reach the study any more, and has told nobody
 
 _SECONDS_BETWEEN_LOOKS = 0.1
 _STOP_WITHIN = 3.0  # seconds
 _MOST_LOST = 20  # a machine on which more are killed has no room for them
 
 
+class SearchError(Exception):
+    """A search that had begun came to nothing, or cannot go on; told in one sentence."""
+
+
+class StorageLostError(SearchError):
+    """The study cannot be reached any more."""
+
+
 def run_crew(work: Work, task: Any, workers: int, look: Callable[[], None]) -> None:
     """Run `work` in so many processes until all have ended, with a `look` now and then.
 
-    Raises `Interrupted` at Ctrl-C and SIGTERM, and `InputError` where workers can do nothing.
+    Raises `Interrupted` at Ctrl-C and SIGTERM, and `SearchError` where workers can do nothing.
     """
     processes: dict[int, SpawnProcess] = {}
     lost = 0
@@ -38,13 +47,15 @@ def run_crew(work: Work, task: Any, workers: int, look: Callable[[], None]) -> N
                     if process.exitcode is None:
                         continue
                     del processes[number]
+                    if process.exitcode == UNREACHABLE and not processes:
+                        raise StorageLostError("the last worker could not write to it")
                     if process.exitcode > 0 and not processes:
-                        raise InputError("the last worker has failed, with the reason above; no more is run")
+                        raise SearchError("the last worker failed, with the reason above; no more is run")
                     if process.exitcode < 0:
                         lost += 1
                         _tell(-process.exitcode)
                         if lost > _MOST_LOST:
-                            raise InputError(f"{lost} workers were killed; is there memory for so many?")
+                            raise SearchError(f"{lost} workers were killed; is there memory for so many?")
                         processes[workers + lost] = _start(work, task, workers + lost)
                 look()
                 time.sleep(_SECONDS_BETWEEN_LOOKS)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from gridworld.tune.score import SeedScore, score
 from gridworld.tune.trial import SEEDS
-from gridworld.tune.worker import Task, become_worker, is_stopped
+from gridworld.tune.worker import Task, at_study, become_worker, is_stopped
 
 if TYPE_CHECKING:
     from optuna import Study
@@ -57,10 +57,13 @@ def finalists(study: Study, count: int, began_from: Mapping[str, Any] | None) ->
 def work(final: Final, worker: int, parent: int) -> None:
     """Run what nobody has run yet. Ends with the parent, however that ends."""
     become_worker(parent)
-    from gridworld.tune.storage import open_study
+    with at_study(final.task) as study:
+        _run_missing(final, study, worker)
+    sys.exit(0)
 
+
+def _run_missing(final: Final, study: Study, worker: int) -> None:
     task = final.task
-    study = open_study(task.settings, task.url, task.name)
     jobs = [(*finalist, seed) for seed in final.seeds for finalist in final.finalists]
     start = worker * len(jobs) // max(1, task.settings.workers)  # so that workers seldom meet
     for number, values, seed in [*jobs[start % len(jobs) :], *jobs[: start % len(jobs)]]:
@@ -74,7 +77,6 @@ def work(final: Final, worker: int, parent: int) -> None:
             except Exception:  # it failed, for a reason that its trial did not meet
                 result = SeedScore(seed, None, sys.float_info.max)
             study.set_user_attr(_name(number, seed), dataclasses.asdict(result))
-    sys.exit(0)
 
 
 def ranking(study: Study, trials: Sequence[FrozenTrial], seeds: Sequence[int], total: int) -> list[Finalist]:

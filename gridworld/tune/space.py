@@ -5,7 +5,7 @@
     agent.policy_kwargs.net_arch: {type: categorical, choices: [[64], [64, 64]]}
 
 A key is one of a run's configuration, or an argument of the agent's class. Before anything runs, both ends of
-a range and every choice of a list are put into the configuration, whose schema refuses what does not fit.
+a range and every choice of a list are put into the configuration, and it is checked as a run's would be.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import random
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,8 @@ from omegaconf.errors import OmegaConfBaseException
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.experiment import to_config
+from gridworld.mdp import Mdp
+from gridworld.training import check_settings
 from gridworld.tune.config import DimensionConfig
 
 if TYPE_CHECKING:
@@ -32,6 +35,7 @@ Values = Mapping[str, Any]  # {"agent.learning_rate": 0.01, ...}
 
 _TYPES = ("float", "int", "categorical")
 _NOT_SEARCHED = ("seed", "total_timesteps", "device", "threads", "env", "evaluation", "logging", "recording")
+_CORNERS = 100
 _DIGITS = 4  # of a real number: no learning rate needs more, and recipes are read by people
 
 
@@ -54,14 +58,33 @@ class Space:
             except InputError as error:
                 raise InputError(f"tune={self.name}: {error}") from None
 
-    def check(self, base: TrainConfig) -> None:
-        """Raise `InputError` unless every key is one of the configuration's and takes these values."""
+    def check(self, base: TrainConfig, mdp: Mdp) -> None:
+        """Raise `InputError` unless every key is one of the configuration's and takes these values.
+
+        A value that does not go with the base may still go with other choices, as a batch does with longer
+        rollouts. It is refused if it goes with none of those that are tried. `mdp` is the base's world.
+        """
+
+        def mistake(values: Values) -> InputError | None:
+            try:
+                check_settings(with_values(base, values), lambda env: mdp)
+            except InputError as error:
+                return error
+            return None
+
         for key, dimension in self.dimensions.items():
             for value in _extremes(dimension):
-                try:
-                    with_values(base, {key: value})
-                except InputError as error:
-                    raise InputError(f"tune={self.name}: {error}") from None
+                found = mistake({key: value})
+                if found and all(mistake({**others, key: value}) for others in self._corners()):
+                    raise InputError(f"tune={self.name}: {found}")
+
+    def _corners(self) -> Iterator[dict[str, Any]]:
+        """Each value alone, then some points that have an extreme value for every key."""
+        extremes = {key: list(_extremes(dimension)) for key, dimension in self.dimensions.items()}
+        yield from ({key: value} for key, values in extremes.items() for value in values)
+        chance = random.Random(0)
+        for _ in range(_CORNERS):
+            yield {key: chance.choice(values) for key, values in extremes.items()}
 
     def suggest(self, trial: Trial) -> dict[str, Any]:
         """A value for every key, chosen by the study's sampler."""
@@ -131,10 +154,14 @@ def _check(key: str, dimension: DimensionConfig) -> None:
         raise InputError(f"{key}: low={low}, high={high} must be two numbers, the first below the second")
     if dimension.log and (low <= 0 or step is not None):
         raise InputError(f"{key}: log=true needs a positive low and no step; it has low={low}, step={step}")
-    if step is not None and not (step > 0 and math.isclose((high - low) / step, round((high - low) / step))):
+    if step is not None and not (step > 0 and _is_multiple(high - low, step)):
         raise InputError(f"{key}: step={step} must lead from low={low} to high={high}")
     if kind == "int" and not all(float(number).is_integer() for number in (low, high, step or 1.0)):
         raise InputError(f"{key}: type=int takes whole numbers; it has low={low}, high={high}, step={step}")
+
+
+def _is_multiple(distance: float, step: float) -> bool:
+    return math.isclose(distance / step, round(distance / step), abs_tol=1e-9)
 
 
 def _extremes(dimension: DimensionConfig) -> Iterator[Any]:
@@ -169,7 +196,10 @@ def _parameter(dimension: DimensionConfig, value: Any) -> Any:
         return _token(value) if value in (dimension.choices or []) else _OUTSIDE
     if isinstance(value, bool) or not isinstance(value, int | float):
         return _OUTSIDE
-    return value if (dimension.low or 0.0) <= value <= (dimension.high or 0.0) else _OUTSIDE
+    low, high = dimension.low or 0.0, dimension.high or 0.0
+    step = dimension.step or (1.0 if dimension.type == "int" else None)
+    is_on_grid = step is None or _is_multiple(value - low, step)
+    return value if low <= value <= high and is_on_grid else _OUTSIDE
 
 
 def _token(choice: Any) -> Any:

@@ -11,25 +11,28 @@ import contextlib
 import json
 import warnings
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import optuna
-from optuna.exceptions import DuplicatedStudyError, ExperimentalWarning, OptunaError
+from optuna.exceptions import DuplicatedStudyError, ExperimentalWarning, OptunaError, StorageInternalError
 from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback, fail_stale_trials
 from optuna.trial import FrozenTrial, TrialState
-from sqlalchemy.engine import make_url
+from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import SQLAlchemyError
 
 from gridworld.errors import InputError
 from gridworld.tune.config import TuneConfig
+from gridworld.tune.crew import StorageLostError
 from gridworld.tune.trial import ERROR
 
 _ABOUT = "gridworld"  # the study's attribute that says what is searched
 _MOST_RETRIES = 3  # of a trial whose worker is lost each time
 _SILENT_BEATS = 3
 _CONNECT_SECONDS = 10
+_EXAMPLES = "sqlite:////shared/study.db or postgresql://user@host/name"
 _LOCKED_SECONDS = 60  # that a worker waits for others at an SQLite file
 
 
@@ -52,15 +55,17 @@ def open_storage(settings: TuneConfig, url: str) -> RDBStorage:
     """Raises `InputError` where it cannot be reached."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     try:
-        shown = make_url(url).render_as_string(hide_password=True)
-        drivername = make_url(url).drivername
+        parsed = make_url(url)
     except SQLAlchemyError:
+        raise InputError(f"tune.storage={url}: is no URL of a database, e.g. {_EXAMPLES}") from None
+    shown, drivername = shown_url(url), parsed.drivername
+    is_sqlite = drivername.startswith("sqlite")
+    if is_sqlite and _is_in_memory(parsed):
         raise InputError(
-            f"tune.storage={url}: is no URL of a database, e.g. sqlite:////shared/study.db or "
-            "postgresql://user@host/name"
-        ) from None
-    is_file = drivername.startswith("sqlite")
-    connect = {"timeout": _LOCKED_SECONDS} if is_file else {"connect_timeout": _CONNECT_SECONDS}
+            f"tune.storage={shown}: is a database in the memory of one process, where no worker finds it; "
+            f"name a file, e.g. {_EXAMPLES}"
+        )
+    connect = {"timeout": _LOCKED_SECONDS} if is_sqlite else {"connect_timeout": _CONNECT_SECONDS}
     try:
         with _quiet():
             return RDBStorage(
@@ -77,16 +82,60 @@ def open_storage(settings: TuneConfig, url: str) -> RDBStorage:
         raise InputError(f"tune.storage={shown}: cannot be reached ({_first_line(error)})") from None
 
 
+def shown_url(url: str) -> str:
+    """Without the password."""
+    return make_url(url).render_as_string(hide_password=True)
+
+
+@contextlib.contextmanager
+def in_reach(url: str) -> Iterator[None]:
+    """Raise `StorageLostError`, with a sentence, for what comes of a storage that went away in the block."""
+    try:
+        yield
+    except Exception as error:
+        if (cause := storage_error(error)) is None:
+            raise
+        raise StorageLostError(
+            f"tune.storage={shown_url(url)}: the study cannot be reached any more ({_first_line(cause)}); "
+            "bring the database back, with what has ended in it, and run the same line again"
+        ) from None
+
+
+def storage_error(error: BaseException | None) -> BaseException | None:
+    """What the storage answered, if an error follows from that: Optuna's own handlers stumble over it."""
+    while error is not None and not isinstance(
+        error, SQLAlchemyError | StorageInternalError | StorageLostError
+    ):
+        error = error.__cause__ or error.__context__
+    return error
+
+
 def open_study(settings: TuneConfig, url: str, name: str) -> optuna.Study:
-    """The study, made where there is none."""
+    """The study, which `begin` has made. Raises `StorageLostError` where it is gone since."""
     storage = open_storage(settings, url)
+    try:
+        with _quiet():
+            return optuna.load_study(storage=storage, study_name=name, pruner=_pruner(settings))
+    except KeyError:
+        raise StorageLostError(f"it has no study {name}") from None
+
+
+def has_study(settings: TuneConfig, url: str, name: str) -> bool:
+    """Whether the storage has it; makes no SQLite file to find that out. Raises `InputError`."""
+    with contextlib.suppress(SQLAlchemyError):
+        parsed = make_url(url)
+        file = parsed.database or ""
+        if (
+            parsed.drivername.startswith("sqlite")
+            and not file.startswith("file:")
+            and not Path(file).exists()
+        ):
+            return False
     with _quiet():
-        study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True)
-        study.pruner = _pruner(settings)
-    return study
+        return name in optuna.get_all_study_names(open_storage(settings, url))
 
 
-def begin(storage: RDBStorage, name: str, about: dict[str, Any], first: dict[str, Any] | None) -> None:
+def begin(storage: RDBStorage, name: str, about: Mapping[str, Any], first: dict[str, Any] | None) -> None:
     """Make the study, with `first` as its first trial, or see that it is the same search.
 
     Raises `InputError` where the study of that name searches something else.
@@ -102,7 +151,7 @@ def begin(storage: RDBStorage, name: str, about: dict[str, Any], first: dict[str
         if first is not None:
             study.enqueue_trial(first, skip_if_exists=True)
         study.set_user_attr(_ABOUT, about)
-    _compare(name, study.user_attrs[_ABOUT], json.loads(json.dumps(about)))
+    compare(name, study.user_attrs[_ABOUT], about)
 
 
 def standing(study: optuna.Study) -> Standing:
@@ -137,16 +186,26 @@ def put_back(study: optuna.Study, number: int) -> None:
 def seed_sampler(study: optuna.Study, settings: TuneConfig, place: str) -> None:
     """Give the next trial a source of chance of its own, whichever worker runs it.
 
-    So one worker's study is the same whether it was interrupted or not. `place` tells machines apart.
+    Trials that were lost do not count, nor do their copies that wait to be run again, and neither TPE nor the
+    median pruner looks at them. So one worker's study is the same whether it was stopped and gone on with or
+    not. (Hyperband's brackets go by the trial's number, which a copy has of its own.) `place` tells machines
+    apart.
     """
-    trials = len(study.get_trials(deepcopy=False))
-    seed = zlib.crc32(repr((settings.sampler_seed, trials, place)).encode())
+    trials = study.get_trials(deepcopy=False)
+    begun = sum(trial.state != TrialState.WAITING and not is_lost(trial) for trial in trials)
+    seed = zlib.crc32(repr((settings.sampler_seed, begun, place)).encode())
     with _quiet():
         study.sampler = (
             optuna.samplers.RandomSampler(seed=seed)
             if settings.sampler == "random"
             else optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True)
         )
+
+
+def _is_in_memory(url: URL) -> bool:
+    """Of SQLite's."""
+    name = url.database or ":memory:"
+    return name in (":memory:", "file::memory:") or url.query.get("mode") == "memory"
 
 
 def _pruner(settings: TuneConfig) -> optuna.pruners.BasePruner:
@@ -160,7 +219,9 @@ def _pruner(settings: TuneConfig) -> optuna.pruners.BasePruner:
     return optuna.pruners.MedianPruner(n_warmup_steps=settings.reports // 2)
 
 
-def _compare(name: str, before: dict[str, Any], now: dict[str, Any]) -> None:
+def compare(name: str, before: Mapping[str, Any], about: Mapping[str, Any]) -> None:
+    """Raise `InputError` for the first difference between what a study was begun with, and now."""
+    now = json.loads(json.dumps(about))
     for part, was in before.items():
         is_now = now.get(part, {})
         if was == is_now:

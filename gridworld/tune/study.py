@@ -22,21 +22,27 @@ from gridworld.sweep.report import shown
 from gridworld.training import make_mdp
 from gridworld.tune import confirm, verdict
 from gridworld.tune.asked import Asked, Source, search_path
-from gridworld.tune.crew import run_crew
+from gridworld.tune.claim import claim, is_claimed
+from gridworld.tune.crew import SearchError, run_crew
 from gridworld.tune.finals import Final, Finalist, finalists, missing, ranking
 from gridworld.tune.finals import work as finals_work
 from gridworld.tune.progress import SearchProgress
 from gridworld.tune.recipe import RECIPE, write_recipe
 from gridworld.tune.records import write_study
 from gridworld.tune.space import with_values
-from gridworld.tune.storage import begin, open_storage, open_study, standing
+from gridworld.tune.storage import begin, has_study, in_reach, open_storage, open_study, shown_url, standing
 from gridworld.tune.trial import ERROR, Objective
 from gridworld.tune.worker import Task, search
 
 
 def tune(asked: Asked, source: Source) -> None:
-    """Run what the study lacks. Raises `InputError`, nothing run, and `Interrupted`."""
+    """Run what the study lacks. Raises `InputError`, nothing run, `SearchError` and `Interrupted`."""
     task = _begin(asked)
+    with in_reach(task.url):
+        _search(asked, source, task)
+
+
+def _search(asked: Asked, source: Source, task: Task) -> None:
     study = open_study(task.settings, task.url, task.name)
     progress = SearchProgress(asked, study)
     try:
@@ -51,17 +57,23 @@ def tune(asked: Asked, source: Source) -> None:
 def _begin(asked: Asked) -> Task:
     """Make the folder and the study, or see that they are of this search."""
     _check_folder(asked.folder)
-    settings = asked.settings
+    settings, about = asked.settings, _about(asked)
+    url = settings.storage or f"sqlite:///{asked.folder.absolute() / 'study.db'}"
+    if is_claimed(asked.folder, asked.name, about) and not has_study(settings, url, asked.name):
+        raise InputError(
+            f"{asked.folder}: is of the study {asked.name}, which {shown_url(url)} does not have; "
+            "bring its database back, or choose another tune.folder"
+        )
     made = not asked.folder.exists()
     asked.folder.mkdir(parents=True, exist_ok=True)
-    url = settings.storage or f"sqlite:///{asked.folder.absolute() / 'study.db'}"
     try:
-        begin(open_storage(settings, url), asked.name, _about(asked), asked.space.parameters_of(asked.base))
+        begin(open_storage(settings, url), asked.name, about, asked.space.parameters_of(asked.base))
     except InputError:
         if made:
             with contextlib.suppress(OSError):
                 asked.folder.rmdir()
         raise
+    claim(asked.folder, asked.name, about)
     objective = Objective(asked.measured, asked.space, asked.seeds, settings.reports, settings.stop_after)
     deadline = time.time() + (settings.timeout or math.inf)
     return Task(asked.folder, url, asked.name, settings, objective, deadline)
@@ -96,7 +108,7 @@ def _finals(asked: Asked, study: optuna.Study, task: Task) -> list[Finalist]:
     if not trials:
         reasons = [trial.user_attrs[ERROR] for trial in study.trials if trial.user_attrs.get(ERROR)]
         why = f"all {len(reasons)} failed, the first: {reasons[0]}" if reasons else "there was no time"
-        raise InputError(f"{shown(asked.folder)}: no trial came to a score; {why}")
+        raise SearchError(f"{shown(asked.folder)}: no trial came to a score; {why}")
     seeds = tuple(asked.final_seeds)
     if runs := missing(study, trials, seeds):
         print(

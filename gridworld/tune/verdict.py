@@ -45,29 +45,43 @@ def sample(runs: Sequence[Job]) -> Sample:
 
 
 def compare(winner: Sample, began_from: Sample, name: str) -> dict[str, Any]:
-    """The verdict, by what the search was after: first the seeds certified, then how soon.
+    """The verdict, by what the search was after: first the share certified, then how soon.
 
     How soon: the probability that a run of the winner is certified before one of the other's, ties half.
     """
-    better = statistics.improvement([(-winner.steps, -began_from.steps)], 0)
-    if winner.certified.count < began_from.certified.count or better.high < 0.5:
-        verdict = "does not beat"
-    elif better.low > 0.5:
-        verdict = "beats"
-    else:
-        verdict = "cannot be told apart from"
+    more = statistics.difference(winner.certified, began_from.certified)
+    sooner = statistics.improvement([(-winner.steps, -began_from.steps)], 0)
+    verdict = ("does not beat", "cannot be told apart from", "beats")[1 + _sign(more, sooner)]
     sentence = (
         f"On {len(winner.steps)} held-out seeds {name} {verdict} the settings that the search began from: "
         f"{winner.text()}, against {began_from.text()}; a run of it is certified sooner with probability "
-        f"{number(better.point)} [{number(better.low)}, {number(better.high)}]."
+        f"{number(sooner.point)} [{number(sooner.low)}, {number(sooner.high)}]."
     )
     return {
         "verdict": verdict,
         "sentence": sentence,
-        "probability_sooner": dataclasses.asdict(better),
+        "more_certified": dataclasses.asdict(more),
+        "probability_sooner": dataclasses.asdict(sooner),
         "winner": _plain(winner),
         "began_from": _plain(began_from),
     }
+
+
+def _sign(more: statistics.Interval, sooner: statistics.Interval) -> int:
+    """1 for better, -1 for worse, 0 where the runs do not tell.
+
+    A difference in shares that is surely there decides. Where it may be chance, being sooner does, unless the
+    shares lean the other way: then what is gained in time might be paid for in certificates.
+    """
+    if share := _side(more, 0.0):
+        return share
+    time = _side(sooner, 0.5)
+    return 0 if time * more.point < 0 else time
+
+
+def _side(of: statistics.Interval, neutral: float) -> int:
+    """On which side of the neutral value the whole interval lies; 0 where it holds it."""
+    return int(of.low > neutral) - int(of.high < neutral)
 
 
 def _plain(of: Sample) -> dict[str, Any]:

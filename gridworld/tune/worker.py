@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 import os
@@ -10,6 +11,7 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +22,7 @@ from gridworld.lock import locked
 from gridworld.process import end_with
 from gridworld.sweep.table import one_line
 from gridworld.tune.config import TuneConfig
+from gridworld.tune.crew import UNREACHABLE, StorageLostError
 from gridworld.tune.trial import ERROR, Objective, Stopped, reason
 
 if TYPE_CHECKING:
@@ -47,15 +50,27 @@ class Task:
 def search(task: Task, worker: int, parent: int) -> None:
     """Run trials. Ends with the parent, however that ends."""
     become_worker(parent)
-    from gridworld.tune.storage import open_study
-
-    study = open_study(task.settings, task.url, task.name)
-    try:
+    with at_study(task) as study, contextlib.suppress(Stopped):
         while not is_stopped() and time.time() < task.deadline and _next(study, task):
             pass
-    except Stopped:
-        pass
     sys.exit(0)
+
+
+@contextlib.contextmanager
+def at_study(task: Task) -> Iterator[Study]:
+    """The study for a worker, who leaves with an exit code, and no word, when it is out of reach."""
+    from gridworld.tune.storage import in_reach, open_study, storage_error
+
+    def heartbeat_failed(thread: threading.ExceptHookArgs) -> None:
+        if storage_error(thread.exc_value) is None:
+            threading.__excepthook__(thread)
+
+    threading.excepthook = heartbeat_failed  # the trial itself comes upon it too
+    try:
+        with in_reach(task.url):
+            yield open_study(task.settings, task.url, task.name)
+    except StorageLostError:
+        sys.exit(UNREACHABLE)
 
 
 def become_worker(parent: int) -> None:

@@ -1,0 +1,38 @@
+"""Whose a study's folder is: search.json names the study and what it is about, from its beginning on.
+
+The storage may be elsewhere, or be deleted, while the folder keeps the tables and held-out runs of a search.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from gridworld.errors import InputError
+from gridworld.files import write_json
+from gridworld.report.tuning import STUDY_JSON
+from gridworld.sweep.table import read_json
+from gridworld.tune.storage import compare
+
+SEARCH_JSON = "search.json"
+
+
+def is_claimed(folder: Path, name: str, about: Mapping[str, Any]) -> bool:
+    """Whether this study has the folder already. Raises `InputError` where it is another search's."""
+    content = read_json(folder / SEARCH_JSON) or read_json(folder / STUDY_JSON)
+    owner = content.get("study")
+    if owner is None:
+        return False
+    if owner != name:
+        raise InputError(
+            f"{folder}: is the folder of the study {owner}; choose another tune.folder, "
+            f"or tune.study={owner} to go on with that"
+        )
+    compare(name, content.get("about", {}), about)
+    return True
+
+
+def claim(folder: Path, name: str, about: Mapping[str, Any]) -> None:
+    """From now on it is this study's."""
+    write_json(folder / SEARCH_JSON, {"study": name, "about": about})
