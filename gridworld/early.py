@@ -6,6 +6,7 @@ the signals, and puts these handlers back afterwards.
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
@@ -21,6 +22,7 @@ def listen() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) is not signal.SIG_IGN:  # as it is of a job in the background
             signal.signal(number, _asked)
+    atexit.register(_ignore)
 
 
 @contextmanager
@@ -35,6 +37,12 @@ def at_work() -> Iterator[None]:
         for stream in (sys.stdout, sys.stderr):
             if stream is not None:
                 stream.flush()
+
+
+def _ignore() -> None:
+    """Python takes its handlers away before it is gone; what is left is ignored then, the exit code stays."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _asked(number: int, frame: FrameType | None) -> None:

@@ -284,6 +284,10 @@ def test_a_signal_saves_and_ends_soon(number: signal.Signals, tmp_path: Path) ->
 
 STOPPED_EARLY = """
 import os, sys
+class Last:
+    def __del__(self, kill=os.kill, here=os.getpid(), number=int(sys.argv[2])):
+        kill(here, number)
+last = Last()
 from gridworld.early import at_work, listen
 listen()
 try:
@@ -293,12 +297,14 @@ try:
             os.kill(os.getpid(), int(sys.argv[2]))
 except KeyboardInterrupt:
     sys.exit(130)
+if sys.argv[1] == "at the very end":
+    sys.exit(128 + int(sys.argv[2]))
 os.kill(os.getpid(), int(sys.argv[2]))
 """
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("when", ["at work", "afterwards"])
+@pytest.mark.parametrize("when", ["at work", "afterwards", "at the very end"])
 def test_a_signal_that_comes_early_or_late(when: str, number: signal.Signals) -> None:
     done = subprocess.run(
         [sys.executable, "-c", STOPPED_EARLY, when, str(int(number))],
