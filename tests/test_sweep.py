@@ -378,6 +378,38 @@ def test_a_damaged_sweep_is_refused_and_left_alone(damage: str, tmp_path: Path) 
     assert [path.name for path in (tmp_path / "sweep").iterdir()] == ["sweep.json"]
 
 
+def test_a_run_that_is_there_is_not_taken_for_another_job(tmp_path: Path) -> None:
+    assert sweep("seed=0", cwd=tmp_path).returncode == 0
+    asked = (tmp_path / "sweep" / "sweep.json").read_bytes()
+    assert sweep("seed=0,1", "n_envs=4", "hydra.sweeper.extend=true", cwd=tmp_path).returncode == 0
+    other = (tmp_path / "sweep" / "n_envs=4,seed=1" / "manifest.json").read_bytes()
+    (tmp_path / "sweep" / "n_envs=4,seed=1").rename(tmp_path / "sweep" / "seed=1")
+    (tmp_path / "sweep" / "sweep.json").write_bytes(asked)
+    done = sweep("seed=0,1", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert len(statuses(tmp_path / "sweep")) == 2
+    assert "seed=1" not in statuses(tmp_path / "sweep")
+    assert (tmp_path / "sweep" / "seed=1" / "manifest.json").read_bytes() == other
+
+
+def test_a_table_that_is_taken_away_during_the_sweep_is_made_again(tmp_path: Path) -> None:
+    command = [sys.executable, str(ROOT / "scripts" / "train.py"), "-m", *QUICK, FOLDER, "seed=range(6)"]
+    jobs = tmp_path / "sweep" / "jobs.csv"
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        while process.poll() is None and not (tmp_path / "sweep" / "seed=2" / "manifest.json").exists():
+            time.sleep(0.01)
+        old = jobs.read_bytes()
+        jobs.unlink()
+        while process.poll() is None and not (tmp_path / "sweep" / "seed=4" / "manifest.json").exists():
+            time.sleep(0.01)
+        jobs.write_bytes(old)  # as an editor's "save" would
+        assert process.stderr is not None
+        told = process.stderr.read()
+    assert "Traceback" not in told
+    assert process.returncode == 0, told
+    assert Counter(statuses(tmp_path / "sweep").values()) == {"done": 6}
+
+
 def test_a_table_that_was_damaged_or_lost_is_made_again(tmp_path: Path) -> None:
     assert sweep("seed=0,1", cwd=tmp_path).returncode == 0
     file = tmp_path / "sweep" / "jobs.csv"

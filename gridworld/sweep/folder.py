@@ -86,6 +86,7 @@ class SweepFolder:
     def add(self, jobs: Sequence[Job], words: Sequence[str]) -> list[Entry]:
         """Note what is asked for; returns the jobs' entries, new ones with a folder of their own."""
         taken = {entry.job.lower() for entry in self.entries.values()}
+        taken |= {used.parent.name.lower() for used in self.path.glob(f"*/{MANIFEST}")}  # whosever they are
         lines = [e.overrides for e in self.entries.values()] + [job.overrides for job in jobs]
         common = set(lines[0]).intersection(*lines)
         for job in jobs:
@@ -121,6 +122,8 @@ class SweepFolder:
                 item["hash"]: Entry(_plain_name(item["job"]), str(item["hash"]), tuple(item["overrides"]))
                 for item in content["jobs"]
             }
+            if not content["asked"]:
+                raise ValueError("nothing was asked for")
             for earlier in content["asked"]:
                 shlex.join(earlier["overrides"])
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:

@@ -51,10 +51,14 @@ class SweepProgress:
 
     def _watch(self) -> None:
         seen: object = None
+        counts: Counter[str] = Counter()
         wait = _SECONDS_BETWEEN_LOOKS
         while not self._stop.wait(wait):
             looked = time.monotonic()
-            changed = self._table.file.stat().st_mtime_ns
+            try:
+                changed = self._table.file.stat().st_mtime_ns
+            except OSError:  # somebody took the table away; the next change of a row brings it back
+                continue
             if changed != seen:
                 seen = changed
                 rows = self._table.read()

@@ -86,6 +86,7 @@ class _Sweep:
         self._entries = entries
         self._launcher = launcher
         self._table = Table(folder.path)
+        self._launcher_failed = False  # before any job had begun
 
     def _to_do(self, mistakes: dict[str, str], retry_failed: bool) -> list[Entry]:
         """The jobs to run now. Those with a mistake are noted as failed."""
@@ -101,7 +102,7 @@ class _Sweep:
         to_do = self._to_do(mistakes, retry_failed)
         started = time.monotonic()
         names = [entry.job for entry in self._entries]
-        rows = self._table.read()
+        rows = self._table.look(self._entries)
         report.tell_start(self._folder.path, [rows[name] for name in names], len(to_do))
         stopped, code = "", 0
         received: list[int] = []
@@ -158,7 +159,10 @@ class _Sweep:
                 self._fail(entry, f"its process was lost ({type(error).__name__})")
             return []
         if len(pending) == len(batch):
-            raise error  # the launcher itself does not work
+            if self._launcher_failed or isinstance(error, InputError):
+                raise error  # the launcher itself does not work
+            self._launcher_failed = True  # perhaps one worker was killed before its first job
+            return [pending]
         return [pending, *([entry] for entry in died)]
 
     def _settle(self, batch: list[Entry], results: Sequence[JobReturn]) -> None:
@@ -166,8 +170,7 @@ class _Sweep:
 
         One that was told to stop, or did not come to its turn, stays as it is for the next start.
         """
-        lost = any(result.status is JobStatus.UNKNOWN for result in results)
-        rows = self._put_right() if lost else self._table.read()
+        rows = self._put_right()  # the table itself may have been edited meanwhile, or deleted
         for entry, result in zip(batch, results, strict=True):
             row = rows[entry.job]
             if row.status not in (PENDING, INTERRUPTED):

@@ -74,12 +74,12 @@ def _start(work: Work, task: Any, number: int) -> SpawnProcess:
 
 @contextlib.contextmanager
 def _ctrl_c_is_ours() -> Iterator[None]:
-    """A process that begins in this block is not reached by it."""
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """A process that begins in this block is not reached by it; it reaches us when the block ends."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _stop(processes: Any) -> None:
