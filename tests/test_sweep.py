@@ -381,9 +381,10 @@ def test_a_damaged_sweep_is_refused_and_left_alone(damage: str, tmp_path: Path) 
 def test_a_run_that_is_there_is_not_taken_for_another_job(tmp_path: Path) -> None:
     assert sweep("seed=0", cwd=tmp_path).returncode == 0
     asked = (tmp_path / "sweep" / "sweep.json").read_bytes()
-    assert sweep("seed=0,1", "n_envs=4", "hydra.sweeper.extend=true", cwd=tmp_path).returncode == 0
-    other = (tmp_path / "sweep" / "n_envs=4,seed=1" / "manifest.json").read_bytes()
-    (tmp_path / "sweep" / "n_envs=4,seed=1").rename(tmp_path / "sweep" / "seed=1")
+    assert sweep("seed=1", "n_envs=4", "hydra.sweeper.extend=true", cwd=tmp_path).returncode == 0
+    (there,) = (job for job in statuses(tmp_path / "sweep") if "seed=1" in job)
+    (tmp_path / "sweep" / there).rename(tmp_path / "sweep" / "seed=1")
+    other = (tmp_path / "sweep" / "seed=1" / "manifest.json").read_bytes()
     (tmp_path / "sweep" / "sweep.json").write_bytes(asked)
     done = sweep("seed=0,1", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
