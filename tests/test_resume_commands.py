@@ -283,7 +283,8 @@ def test_a_signal_saves_and_ends_soon(number: signal.Signals, tmp_path: Path) ->
 
 
 STOPPED_EARLY = """
-import os, sys
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore it
 class Last:
     def __del__(self, kill=os.kill, here=os.getpid(), number=int(sys.argv[2])):
         kill(here, number)
