@@ -23,7 +23,9 @@ from gridworld.sweep.job import StopSweep
 from gridworld.sweep.worker import Hydra, run_in_turn
 
 _SECONDS_BETWEEN_LOOKS = 1.0
-_CANCELLED_WITHIN = 1.0  # seconds
+_ENDED_WITHIN = 1.0  # seconds
+
+Tasks = list["ray.ObjectRef[list[str]]"]
 
 
 def launch(hydra: Hydra, settings: RayConfig, jobs: Sequence[Sequence[str]], first: int) -> list[JobReturn]:
@@ -41,13 +43,27 @@ def launch(hydra: Hydra, settings: RayConfig, jobs: Sequence[Sequence[str]], fir
             _, waiting = ray.wait(waiting, num_returns=len(waiting), timeout=_SECONDS_BETWEEN_LOOKS)
             if (hydra.sweep / STOP).exists():
                 raise StopSweep("a job failed")
+    except StopSweep:
+        # Those that wait see the mark and end by themselves. Ray does not bear a task to be cancelled in the
+        # moment in which it ends: its own process is aborted then.
+        _cancel(_still_at_it(waiting))
+        raise
     except BaseException:
-        for waited in waiting:
-            ray.cancel(waited)
-        ray.wait(waiting, num_returns=len(waiting), timeout=_CANCELLED_WITHIN)
-        print(f"ray: {len(waiting)} tasks cancelled", file=sys.stderr, flush=True)
+        _cancel(waiting)
         raise
     return [_result(task) for task in tasks]
+
+
+def _still_at_it(tasks: Tasks) -> Tasks:
+    """Those that a second later have not ended."""
+    return ray.wait(tasks, num_returns=len(tasks), timeout=_ENDED_WITHIN)[1] if tasks else tasks
+
+
+def _cancel(tasks: Tasks) -> None:
+    for task in tasks:
+        ray.cancel(task)
+    _still_at_it(tasks)
+    print(f"ray: {len(tasks)} tasks cancelled", file=sys.stderr, flush=True)
 
 
 def _run(state: bytes, sweep: str, job: list[str], number: int) -> list[str]:
