@@ -24,7 +24,7 @@ from gridworld.data_files import LARGEST_CSV, read_object, read_text
 from gridworld.event_file import read_scalars
 from gridworld.flat import flat
 from gridworld.mdp import ACTION_NAMES, Mdp
-from gridworld.run import LARGEST_RESULT, Run
+from gridworld.run import EVENTS, LARGEST_RESULT, Run
 from gridworld.saved_run import read_visits
 
 CLOCK = {"train_seconds", "evaluation_seconds"}  # of the summary
@@ -147,6 +147,5 @@ def _scalars(then: Run, now: Run) -> Finding:
 
 def _points(folder: Path) -> list[tuple[str, int, float]]:
     """(tag, step, value) in the order in which they were written."""
-    files = sorted(path for path in folder.iterdir() if path.name.startswith("events.out.tfevents."))
-    points = (point for path in files for point in read_scalars(path))
+    points = (point for path in sorted(folder.glob(EVENTS)) for point in read_scalars(path))
     return [point for point in points if not point[0].startswith(CLOCK_TAGS)]

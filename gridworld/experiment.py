@@ -29,9 +29,8 @@ from gridworld.config import TrainConfig
 from gridworld.early import at_work
 from gridworld.errors import EXIT_CODE, InputError
 from gridworld.hydra_errors import refuse_added_keys, sentence, unreadable_file
-from gridworld.lock import locked
 from gridworld.manual import manual
-from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, Run, check_inside, check_new, shown
+from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, Run, alone_in, check_inside, check_new, shown
 from gridworld.sweep.config import LAUNCHER_SCHEMAS, SweepConfig
 from gridworld.terminal import prepare, tell_error
 from gridworld.tune.config import SearchConfig
@@ -73,7 +72,7 @@ def _check_run_folder(config: DictConfig) -> None:
     _check_names(config)
     check_new(folder)
     folder = folder.absolute()  # a job may change the current one
-    _place.enter_context(_alone_in(folder))
+    _place.enter_context(_begun_in(folder))
     if (folder / MANIFEST).exists():
         # An interpolation may need what Hydra knows only in the job, where it is looked at again.
         with contextlib.suppress(OmegaConfBaseException):
@@ -83,22 +82,17 @@ def _check_run_folder(config: DictConfig) -> None:
 def _check_same(config: DictConfig, folder: Path) -> None:
     from gridworld.resume import unfinished_in
 
-    job = copy.deepcopy(config)
-    with read_write(job), open_dict(job):
-        del job["hydra"]
-    unfinished_in(folder, to_config(job))
+    unfinished_in(folder, without_hydra(copy.deepcopy(config)))
 
 
 @contextlib.contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
+def _begun_in(folder: Path) -> Iterator[None]:
     """Have a run's folder for this process alone; one where no run began is as it was before, afterwards.
 
     Raises `InputError` where another process has it, which is left alone.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with locked(folder / LOCK, wait=0) as is_ours:
-        if not is_ours:
-            raise InputError(f"{shown(folder)}: another process is at work in it; wait for it or stop it")
+    with alone_in(folder):
         try:
             yield
         except OSError as error:
@@ -170,6 +164,13 @@ def compose(conf: Path, overrides: list[str]) -> TrainConfig:
     return to_config(settings)
 
 
+def without_hydra(whole: DictConfig) -> TrainConfig:
+    """The run's part of a composition that has Hydra's too, which is taken out of it."""
+    with read_write(whole), open_dict(whole):
+        del whole["hydra"]
+    return to_config(whole)
+
+
 def to_config(settings: DictConfig) -> TrainConfig:
     """Hydra's settings as the dataclasses that everything below here takes. Raises `InputError`."""
     refuse_added_keys(settings)
@@ -189,7 +190,7 @@ def run_job(settings: DictConfig) -> float:
             from gridworld.sweep.job import run_in_sweep
 
             return run_in_sweep(config, folder, overrides, context.sweeper.stop_at_first_failure)
-        with _alone_in(folder) if is_one_of_many else contextlib.nullcontext():
+        with _begun_in(folder) if is_one_of_many else contextlib.nullcontext():
             return _run_alone(config, folder, overrides)
     except (InputError, OSError, OmegaConfBaseException) as error:
         if is_one_of_many:

@@ -7,14 +7,13 @@ the same environment: other versions or another processor round differently.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
-import platform
 from typing import Any
 
 from gridworld.agent_config import AgentConfig, SB3Config
 from gridworld.config import TrainConfig
-from gridworld.provenance import code, versions
+from gridworld.data_files import sha256
+from gridworld.provenance import code, processor, versions
 
 _MATTER = ("python", "gridworld", "gymnasium", "numpy", "scipy")  # to every agent
 _MATTER_TO_NETWORKS = ("stable-baselines3", "sb3-contrib", "torch")
@@ -30,20 +29,18 @@ def settings(config: TrainConfig) -> dict[str, Any]:
 def identity(config: TrainConfig, layout: str) -> str:
     """A hash of these settings and of the map's text."""
     text = json.dumps([settings(config), layout], sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()
+    return sha256(text.encode())
 
 
 def environment(agent: AgentConfig) -> dict[str, str]:
     """Versions, our own code, and what the processor is used for; torch's too if the agent needs it."""
-    import numpy as np  # here, as torch below, to be light where nobody asks
-
     found = {name: str(versions().get(name)) for name in _MATTER}
     found["source code"] = code()[:12]
-    found["machine"] = platform.machine()
-    found["processor for numpy"] = " ".join(np.show_config(mode="dicts")["SIMD Extensions"]["found"])
     if isinstance(agent, SB3Config):
-        import torch
+        import torch  # noqa: F401  # `processor` knows of it once it is imported
 
         found |= {name: str(versions().get(name)) for name in _MATTER_TO_NETWORKS}
-        found["processor for torch"] = torch.backends.cpu.get_cpu_capability()
+        found["processor for torch"] = str(processor()["torch"])
+    found["machine"] = processor()["machine"]
+    found["processor for numpy"] = " ".join(processor()["numpy"])
     return found

@@ -19,19 +19,21 @@ the map's text. Of a finished run it also has the checksums of the files that ho
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shlex
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from gridworld import provenance
-from gridworld.data_files import check_no_link, file_sha256, read_object
+from gridworld.data_files import check_no_link, file_sha256, read_object, sha256
 from gridworld.errors import InputError
 from gridworld.files import remove, write_bytes, write_json
+from gridworld.lock import locked
 from gridworld.provenance import describe, source_differences
 
 MANIFEST = "manifest.json"
@@ -134,7 +136,7 @@ class Run:
     def seal(self) -> str:
         """A hash of what in the manifest decides how the run ends."""
         content = [self.manifest.get(key) for key in ("config", "layout", "resumed")]
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+        return sha256(json.dumps(content, sort_keys=True).encode())
 
     def clear(self) -> None:
         """Take away what an attempt left, all but the manifest; what is not the run's stays."""
@@ -193,6 +195,15 @@ def read_run(folder: Path) -> Run:
         raise InputError(f"{run.manifest_file}: not the manifest of a run; it lacks status, config or layout")
     run.manifest = manifest
     return run
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Hold the run's folder for this process. Raises `InputError` where another one has it."""
+    with locked(folder / LOCK, wait=0) as is_ours:
+        if not is_ours:
+            raise InputError(f"{shown(folder)}: another process is at work in it; wait for it or stop it")
+        yield
 
 
 def shown(folder: Path) -> str:

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.errors import InputError
-from gridworld.lock import locked
-from gridworld.run import LOCK, check_inside, read_run
+from gridworld.run import alone_in, check_inside, read_run
 
 KEY = "resume"
 
@@ -32,9 +31,7 @@ def main(arguments: Sequence[str]) -> None:
     from gridworld.signals import Interrupted
     from gridworld.telling import tell_end, tell_interrupted
 
-    with locked(folder / LOCK, wait=0) as is_ours:
-        if not is_ours:
-            raise InputError(f"{folder}: another process is at work in it; wait for it or stop it")
+    with alone_in(folder):
         unfinished = Unfinished(folder, trust=words.get("trust", False))
         unfinished.config.logging.progress &= words.get("logging.progress", True)
         try:

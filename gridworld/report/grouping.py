@@ -6,13 +6,13 @@ differ in anything that touches learning are reported apart, under labels that s
 
 from __future__ import annotations
 
-import hashlib
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from gridworld.data_files import sha256
 from gridworld.report.reading import Evidence, Settings
 
 # Settings without an influence on what is learnt, or told elsewhere: seed and task.
@@ -85,7 +85,7 @@ def task_key(run: Evidence) -> Key:
         for name, value in run.settings.items()
         if name.startswith("env.") and name not in ("env.layout", "env.num_rows", "env.num_cols")
     }
-    digest = hashlib.sha256(run.layout.encode()).hexdigest()[:6]
+    digest = sha256(run.layout.encode())[:6]
     world |= {"layout": run.env, "map": digest, "evaluation.gamma": str(run.gamma)}
     return tuple(sorted(world.items()))
 
@@ -124,7 +124,7 @@ def _difference(settings: Settings, namesakes: Sequence[Settings]) -> str:
         if len(told) == len(namesakes):
             more = f", {len(names) - count} more" if count < len(names) else ""
             return _told(settings, names[:count]) + more
-    digest = hashlib.sha256(repr(sorted(settings.items())).encode()).hexdigest()[:6]
+    digest = sha256(repr(sorted(settings.items())).encode())[:6]
     return f"{_told(settings, names[:3])}, {digest}"  # values too long to be told apart by their beginnings
 
 

@@ -8,7 +8,6 @@ it, and the map's text is in it, since a map file can change.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import itertools
 import json
 import math
@@ -23,6 +22,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
 from gridworld.config import EnvConfig, TrainConfig
+from gridworld.data_files import sha256
 from gridworld.errors import InputError
 from gridworld.mdp import Mdp
 from gridworld.training import check_settings, make_mdp
@@ -112,7 +112,7 @@ def settings_hash(settings: dict[str, Any], layout: str) -> str:
     """Of a run's settings and its map's text; the same for settings that have been in a manifest."""
     content = {key: value for key, value in settings.items() if key not in _WITHOUT_EFFECT}
     text = json.dumps([content, layout], sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
+    return sha256(text.encode())[:32]
 
 
 def folder_name(job: Job, taken: Collection[str], common: Collection[str] = ()) -> str:

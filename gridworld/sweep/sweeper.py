@@ -21,6 +21,7 @@ from gridworld.config import TrainConfig
 from gridworld.errors import InputError, reason
 from gridworld.experiment import to_config
 from gridworld.run import MANIFEST
+from gridworld.signals import handling
 from gridworld.sweep import report
 from gridworld.sweep.compose import SweepLoader
 from gridworld.sweep.config import SweepConfig
@@ -210,12 +211,8 @@ def _signals_exit(received: list[int]) -> Iterator[None]:
         _exit_within(_STOP_WITHIN, 128 + number)
         raise SystemExit(128 + number)
 
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with handling({signal.SIGINT: stop, signal.SIGTERM: stop}):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _exit_within(seconds: float, code: int) -> None:

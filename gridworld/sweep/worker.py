@@ -22,6 +22,7 @@ from hydra.core.utils import JobReturn, JobStatus, run_job, setup_globals
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, open_dict
 
+from gridworld.signals import handling
 from gridworld.sweep.folder import STOP
 from gridworld.sweep.job import StopSweep
 
@@ -109,13 +110,8 @@ def _signals_exit() -> Iterator[None]:
     def pass_on(number: int, frame: FrameType | None) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
-    handlers = {signal.SIGTERM: stop, signal.SIGUSR2: pass_on}
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
-    try:
+    with handling({signal.SIGTERM: stop, signal.SIGUSR2: pass_on}):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @functools.cache

@@ -20,14 +20,14 @@ import hydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from gridworld.bounds import above_zero, at_least
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
-from gridworld.experiment import register_schemas, slug, to_config
+from gridworld.experiment import register_schemas, slug, without_hydra
 from gridworld.hydra_errors import sentence
 from gridworld.training import check_settings
 from gridworld.tune.config import TuneConfig
@@ -135,13 +135,6 @@ def search_path(folders: Sequence[Path]) -> str:
     places = [f"file://{folder.resolve()}" for folder in folders]
     quoted = [place if _PLAIN.fullmatch(place) else f"'{place}'" for place in places]
     return f"hydra.searchpath=[{','.join(quoted)}]"
-
-
-def without_hydra(whole: DictConfig) -> TrainConfig:
-    """The run's part of a composition."""
-    with open_dict(whole):
-        del whole["hydra"]
-    return to_config(whole)
 
 
 def _divide(words: Sequence[str]) -> tuple[list[Override], list[Override]]:

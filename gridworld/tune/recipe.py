@@ -16,8 +16,9 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from gridworld.config import TrainConfig
+from gridworld.experiment import without_hydra
 from gridworld.files import write_text
-from gridworld.tune.asked import Source, compose_in, without_hydra
+from gridworld.tune.asked import Source, compose_in
 
 RECIPE = "winner"
 _NOT_OF_A_RECIPE = ("seed", "device", "threads", "logging", "recording")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from gridworld.mdp import FloatArray
 from gridworld.report import statistics
 from gridworld.report.table import number, steps_up_to
 from gridworld.run import SUMMARY
+from gridworld.sweep.table import read_json
 from gridworld.tune.confirm import Job
 
 
@@ -92,9 +92,5 @@ def _plain(of: Sample) -> dict[str, Any]:
 
 
 def _steps(folder: Path) -> float:
-    try:
-        summary = json.loads((folder / SUMMARY).read_text("utf-8"))
-    except (OSError, ValueError):
-        return math.inf
-    since = summary.get("certified_since_step")
+    since = read_json(folder / SUMMARY).get("certified_since_step")
     return math.inf if since is None else float(since)
