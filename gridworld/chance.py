@@ -1,4 +1,4 @@
-"""Sources of chance as a value: where a generator stands, to the last bit."""
+"""Random generators: independent ones from one seed, and where one stands as a value, to the last bit."""
 
 from __future__ import annotations
 
@@ -8,6 +8,18 @@ from typing import Any
 import numpy as np
 
 from gridworld.state import State
+
+
+def independent_generator(seed: int) -> np.random.Generator:
+    """A generator that is independent of the one that the seed itself gives, `np.random.default_rng(seed)`.
+
+    Two generators with the same seed are one stream of numbers used twice. Where both an environment and who
+    acts in it draw, actions, slips and starts would depend on each other; one of them takes this generator.
+
+    Returns:
+        The generator of the seed's first spawned child; see `numpy.random.SeedSequence.spawn`.
+    """
+    return np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
 
 
 def generator_state(generator: np.random.Generator) -> State:

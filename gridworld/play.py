@@ -13,6 +13,7 @@ import numpy as np
 
 from gridworld import render as drawing
 from gridworld.canvas import Canvas
+from gridworld.chance import independent_generator
 from gridworld.env import GridWorldEnv
 from gridworld.evaluation import Judge
 from gridworld.mdp import FloatArray
@@ -129,7 +130,7 @@ class Game:
             self.agent.step(int(self._chance.choice(len(row), p=row)))
 
     def _restart(self) -> None:
-        self._chance = np.random.default_rng(self._seed)
+        self._chance = independent_generator(self._seed)  # the world takes the seed's own
         for player in self.players:
             player.restart(self._seed)
 

@@ -90,3 +90,16 @@ def test_a_seed_is_used_once() -> None:
     again = walk()
     assert all(map(np.array_equal, first, again))
     assert not all(map(np.array_equal, first, second))
+
+
+@pytest.mark.parametrize("algorithm", [DQN, PPO])
+def test_environments_and_exploration_draw_from_different_streams(algorithm: type) -> None:
+    """A PCG64 generator's increment is the number of its stream."""
+    model = algorithm("MlpPolicy", batch(2, slip=0.2), seed=3)
+    model.env.reset()
+    streams = [
+        each.np_random.bit_generator.state["state"]["inc"]
+        for each in (model.action_space, model.env.envs, np.random.default_rng(3).bit_generator)
+        if hasattr(each, "np_random")
+    ]
+    assert len(set(streams)) == len(streams) == 2

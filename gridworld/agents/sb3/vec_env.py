@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from gridworld.chance import independent_generator
 from gridworld.errors import InputError
 from gridworld.mdp import NUM_ACTIONS, BoolArray, FloatArray
 from gridworld.observations import ObservationTable
@@ -58,8 +59,14 @@ class GridWorldVecEnv(VecEnv):
         return self.envs.states
 
     def reset(self) -> VecEnvObs:
-        """Start all episodes; a seed given by `seed()` before is used once."""
-        states, _ = self.envs.reset(seed=self._seeds[0])
+        """Start all episodes; a seed given by `seed()` before is used once.
+
+        SB3 seeds the action space, from which DQN explores, with the same number as the environments. These
+        take an independent generator instead, so that slips and starts do not depend on the actions.
+        """
+        if self._seeds[0] is not None:
+            self.envs.np_random = independent_generator(self._seeds[0])
+        states, _ = self.envs.reset()
         self._returns[:] = 0.0
         self._lengths[:] = 0
         self._reset_seeds()

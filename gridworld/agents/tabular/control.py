@@ -38,7 +38,7 @@ from gridworld.agents.tabular.policies import (
     expected_value,
     rows_of,
 )
-from gridworld.chance import generator_state, set_generator_state
+from gridworld.chance import generator_state, independent_generator, set_generator_state
 from gridworld.errors import InputError
 from gridworld.mdp import NUM_ACTIONS, FloatArray, IntArray
 from gridworld.state import State, fill, fitting
@@ -58,8 +58,7 @@ class TabularControl:
         self.exploration_rate = config.exploration_initial_eps
         self._seat = seat
         self._rate, self._rate_falls = parse_schedule("agent.learning_rate", config.learning_rate)
-        # The environments draw from the seed's own generator; this one is independent of it.
-        self._random = np.random.default_rng(np.random.SeedSequence(seat.seed).spawn(1)[0])
+        self._random = independent_generator(seat.seed)  # the environments take the seed's own
         # V of the policy whose Q the table is.
         self._value = best_value if config.algorithm == "q_learning" else expected_value
         self._steps: int  # from here on: while learning
