@@ -4,22 +4,29 @@ The value of a policy π solves the linear system V = r_π + γ P_π V; what bec
 its distribution over states, step by step. A policy is a table (S, A) of action probabilities. Small worlds
 are dense matrices, large ones sparse.
 
-Reference: M. L. Puterman, Markov Decision Processes, 1994, chapter 6 and appendix A.
+Without discount (γ = 1) the value is the expected total reward. A policy may then go on for ever. Where it
+comes to walk among states without earning anything, nothing is added any more; where it goes on earning, its
+gains or its losses are infinite.
+
+Reference: M. L. Puterman, Markov Decision Processes, 1994, chapters 6 and 7 and appendix A.
 """
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gridworld.absorption import Absorption, factor
 from gridworld.errors import InputError
 from gridworld.layout import positive_int
 from gridworld.mdp import NUM_ACTIONS, BoolArray, FloatArray, IntArray, Mdp
 
+ORDINARY_GAMMA = 0.9999  # up to here a plain solution of the linear system is accurate
 _DENSE_STATES = 512  # up to here a dense matrix is both faster and small
 _STEPS_AT_ONCE = 32  # of an episode, before looking whether it can still go on
 
@@ -33,6 +40,18 @@ class Outcome:
     timeout: float
     expected_return: float  # undiscounted sum of rewards
     expected_length: float  # steps
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Of one policy under one discount, each (S,)."""
+
+    value: FloatArray  # V_π = E Σ γ^t r_t
+    scale: FloatArray  # E Σ γ^t |r_t|, what a relative error is relative to
+    slope: FloatArray | None = (
+        None  # dV_π/dγ = E Σ t γ^(t-1) r_t: of equal values, the sooner has the smaller
+    )
+    slope_scale: FloatArray | None = None  # the same of |r_t|
 
 
 class Chain:
@@ -57,18 +76,35 @@ class Chain:
         return csr_array((weight[used], (rows[used], self.mdp.next_state[used])), shape=(size, size))
 
     def value(self, gamma: float) -> FloatArray:
-        """V_π (S,). With γ = 1, a policy that may go on for ever is worth 0 or ±inf by its step reward."""
-        return self._solve(check_gamma(gamma), self.reward[:, None])[:, 0]
+        """V_π (S,), the expected discounted sum of rewards, without a step limit.
 
-    def value_and_scale(self, gamma: float) -> tuple[FloatArray, FloatArray]:
-        """V_π and the expected discounted sum of |reward|, both (S,).
-
-        By an elimination whose error is small beside each state's own scale, not only beside the largest
-        one, so that it tells good from better even where values have become tiny.
+        With γ = 1 it is ±inf where a policy may go on earning for ever, NaN where it goes on doing both.
         """
-        magnitude = (self._weight * np.abs(self.mdp.reward)).sum(axis=(1, 2))
-        both = self._solve(gamma, np.stack([self.reward, magnitude], axis=1), precise=True)
-        return both[:, 0], both[:, 1]
+        gamma = check_gamma(gamma)
+        if gamma > ORDINARY_GAMMA:
+            return self.evaluation(gamma).value
+        states = np.flatnonzero(self._in_play)
+        if not isinstance(self.transition, np.ndarray):
+            return self._sums(self.reward[:, None], gamma)[:, 0]
+        value = np.zeros(self.mdp.num_states)
+        matrix = np.eye(len(states)) - gamma * self.transition[np.ix_(states, states)]
+        value[states] = np.linalg.solve(matrix, self.reward[states])
+        return value
+
+    def evaluation(self, gamma: float, with_slope: bool = False) -> Evaluation:
+        """The value and what else policy iteration needs, in which tiny values are accurate too.
+
+        Gains and losses are solved for apart, as sums of non-negative numbers, whose error is small beside
+        each state's own scale, not only beside the largest one.
+        """
+        signs = (np.maximum(self.mdp.reward, 0), np.maximum(-self.mdp.reward, 0))
+        paid = np.stack([(self._weight * part).sum(axis=(1, 2)) for part in signs], axis=1)
+        sums = self._sums(paid, gamma)
+        if not with_slope:
+            return Evaluation(*_value_and_scale(sums))
+        finite = np.isfinite(sums)
+        slopes = self._sums(self.transition @ np.where(finite, sums, 0.0), gamma)
+        return Evaluation(*_value_and_scale(sums), *_value_and_scale(np.where(finite, slopes, np.inf)))
 
     def outcome(self, max_steps: int) -> Outcome:
         """Goal, trap and time-out probability, return and length, exact within `max_steps`."""
@@ -84,6 +120,17 @@ class Chain:
             mass = visits[-1]
         goal, trap = float(mass[self.mdp.goal].sum()), float(mass[self.mdp.trap].sum())
         return Outcome(goal, trap, float(mass[live].sum()), float(total[1]), float(total[0]))
+
+    def discounted_return(self, max_steps: int, gamma: float) -> float:
+        """The expected discounted sum of rewards of an episode that is cut after `max_steps`, exact."""
+        positive_int("max_steps", max_steps)
+        total, mass = 0.0, self.mdp.start
+        for first in range(0, max_steps, _STEPS_AT_ONCE):
+            visits = self._visits(mass, min(_STEPS_AT_ONCE, max_steps - first))
+            discounts = gamma ** np.arange(first, first + len(visits) - 1)
+            total += float(discounts @ (visits[:-1] @ self.reward))
+            mass = visits[-1]
+        return total
 
     def _visits(self, mass: FloatArray, steps: int) -> FloatArray:
         """(steps + 1, S), the distribution over states from `mass` on, step by step."""
@@ -117,38 +164,53 @@ class Chain:
                 return states
             states = following
 
-    def _solve(self, gamma: float, right: FloatArray, precise: bool = False) -> FloatArray:
-        """x = right + γ P_π x for each column, x = 0 where nothing moves any more."""
-        mdp = self.mdp
-        solution = np.zeros_like(right)
-        playing = ~(mdp.terminal | mdp.wall)
-        if gamma == 1:
-            taken = self._weight > 0
-            endless = playing & ~can_reach(mdp, taken, mdp.terminal)
-            playing &= ~endless
-            if mdp.step_reward != 0:
-                # For ever is infinitely much, and so is a chance of it.
-                lost = can_reach(mdp, taken, endless)
-                solution[lost] = np.sign(mdp.step_reward) * np.inf
-                playing &= ~lost
-        states = np.flatnonzero(playing)
-        if isinstance(self.transition, np.ndarray):
-            matrix = np.eye(len(states)) - gamma * self.transition[np.ix_(states, states)]
-            solve = _eliminate if precise else np.linalg.solve
-            solution[states] = solve(matrix, right[states])
-        else:
-            from scipy.sparse import eye_array
-            from scipy.sparse.linalg import splu
+    @cached_property
+    def _in_play(self) -> BoolArray:
+        return ~(self.mdp.terminal | self.mdp.wall)
 
-            matrix = eye_array(len(states), format="csr") - gamma * self.transition[states][:, states]
-            factors = splu(
-                matrix.tocsc(),
-                permc_spec="MMD_AT_PLUS_A",
-                diag_pivot_thresh=0.0,
-                options={"SymmetricMode": True},
-            )
-            solution[states] = factors.solve(right[states])
-        return solution
+    def _sums(self, right: FloatArray, gamma: float) -> FloatArray:
+        """x = right + γ P_π x for each column, x = 0 where nothing moves any more.
+
+        With γ = 1 the columns must not be negative; x is infinite where it does not stop growing.
+        """
+        sums = np.zeros_like(right)
+        playing = self._in_play
+        if gamma == 1:
+            sums[self._growing(right)] = np.inf
+            playing = playing & ~(self._recurrent > 0) & np.isfinite(sums).all(axis=1)
+        states = np.flatnonzero(playing)
+        if states.size:
+            sums[states] = self._system(gamma, states).solve(right[states])
+        return sums
+
+    def _system(self, gamma: float, states: IntArray) -> Absorption:
+        outside = np.flatnonzero(~np.isin(np.arange(self.mdp.num_states), states))
+        leak = (1 - gamma) + gamma * self.transition[states][:, outside].sum(axis=1)
+        return factor(gamma * self.transition[states][:, states], leak)
+
+    def _growing(self, right: FloatArray) -> BoolArray:
+        """(S, columns), states from which a column is collected for ever with some probability."""
+        growing = np.zeros(right.shape, dtype=np.bool_)
+        for column, collected in zip(growing.T, right.T, strict=True):
+            paying = np.unique(self._recurrent[(self._recurrent > 0) & (collected > 0)])
+            if paying.size:
+                column[:] = can_reach(self.mdp, self._weight > 0, np.isin(self._recurrent, paying))
+        return growing
+
+    @cached_property
+    def _recurrent(self) -> IntArray:
+        """(S,), a number from 1 on for each class of states that it never leaves, 0 for all other states."""
+        recurrent = np.zeros(self.mdp.num_states, dtype=np.int64)
+        endless = np.flatnonzero(self._in_play & ~can_reach(self.mdp, self._weight > 0, self.mdp.terminal))
+        if endless.size:
+            from scipy.sparse import coo_array
+            from scipy.sparse.csgraph import connected_components
+
+            among = coo_array(self.transition[endless][:, endless])
+            _, label = connected_components(among, directed=True, connection="strong")
+            leaving = label[among.row][label[among.row] != label[among.col]]
+            recurrent[endless] = np.where(np.isin(label, leaving), 0, label + 1)
+        return recurrent
 
 
 def check_gamma(gamma: float) -> float:
@@ -187,29 +249,25 @@ def check_policy(mdp: Mdp, policy: ArrayLike) -> FloatArray:
 
 def can_reach(mdp: Mdp, taken: BoolArray, targets: BoolArray) -> BoolArray:
     """(S,), states from which `targets` can be reached over the outcomes in `taken`; the targets are."""
-    reaching = targets.copy()
+    return steps_to(mdp, taken, targets) >= 0
+
+
+def steps_to(mdp: Mdp, taken: BoolArray, targets: BoolArray) -> IntArray:
+    """(S,), the fewest steps to `targets` over the outcomes in `taken` (S, A, K); -1: never."""
+    steps = np.where(targets, 0, -1)
     frontier: IntArray = np.flatnonzero(targets)
+    distance = 0
     while frontier.size:
+        distance += 1
         around = np.unique(mdp.neighbour[frontier])
-        around = around[~reaching[around]]
-        leads = (reaching[mdp.next_state[around]] & taken[around]).any(axis=(1, 2))
+        around = around[steps[around] < 0]
+        leads = ((steps[mdp.next_state[around]] >= 0) & taken[around]).any(axis=(1, 2))
         frontier = around[leads]
-        reaching[frontier] = True
-    return reaching
+        steps[frontier] = distance
+    return steps
 
 
-def _eliminate(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Gaussian elimination without pivoting, in place.
-
-    I - γ P_π is an M-matrix: nothing cancels off the diagonal, the diagonal stays at least 1 - γ, and sums
-    of non-negative numbers stay exactly that. Pivoting would give this up for nothing.
-    """
-    size = len(matrix)
-    for k in range(size - 1):
-        factors = matrix[k + 1 :, k] / matrix[k, k]
-        rows = np.flatnonzero(factors)
-        matrix[k + 1 + rows, k:] -= factors[rows, None] * matrix[k, k:]
-        right[k + 1 + rows] -= factors[rows, None] * right[k]
-    for k in range(size - 1, -1, -1):
-        right[k] = (right[k] - matrix[k, k + 1 :] @ right[k + 1 :]) / matrix[k, k]
-    return right
+def _value_and_scale(sums: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gains - losses and gains + losses."""
+    with np.errstate(invalid="ignore"):  # inf - inf is no value
+        return sums[:, 0] - sums[:, 1], sums.sum(axis=1)

@@ -6,8 +6,21 @@ With V = 0 at the end of an episode, the optimum is the fixed point of
 
 found by value iteration and made exact by policy iteration.
 
-References: M. L. Puterman, Markov Decision Processes, 1994, chapters 6 and 7; R. Sutton and A. Barto,
-Reinforcement Learning, 2nd ed., 2018, chapter 4.
+Without discount (γ = 1) there may be other fixed points, and greedy actions may never end. There V* is the
+largest expected total reward that any policy has, one that goes on for ever included. Of the actions that
+keep it, those are optimal that bring gains sooner and losses later: with the smallest Σ_t t E[r_t], the slope
+of the value in γ. Both are what discounting prefers as γ goes to 1 (the first two orders of Blackwell's
+optimality). Policy iteration in this order, first V and then the slope, begins with a policy that is worth
+something everywhere: it rests where it can stay for ever without a reward, and elsewhere comes surely to
+such states or to an end if that is possible. So it cannot be caught in a fixed point that is not the optimum:
+where the optimum is better by the largest margin, it would have to stay among such states for ever, earn
+nothing there, and be no better than resting. Discounts just below 1 are treated in the same way, since the
+cost of a step gets lost in rounding beside the value.
+
+References: M. L. Puterman, Markov Decision Processes, 1994, chapters 6, 7 and 10; R. Sutton and A. Barto,
+Reinforcement Learning, 2nd ed., 2018, chapter 4; A. Veinott, Discrete dynamic programming with sensitive
+discount optimality criteria, 1969; D. Bertsekas and J. Tsitsiklis, An analysis of stochastic shortest path
+problems, 1991.
 """
 
 from __future__ import annotations
@@ -16,7 +29,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridworld.chain import Chain, check_gamma, one_hot_policy
+from gridworld.chain import ORDINARY_GAMMA, Chain, Evaluation, check_gamma, one_hot_policy, steps_to
 from gridworld.errors import InputError
 from gridworld.mdp import BoolArray, FloatArray, IntArray, Mdp
 
@@ -24,8 +37,9 @@ from gridworld.mdp import BoolArray, FloatArray, IntArray, Mdp
 TIE = 1e-9
 
 _SWEEP_TOLERANCE = 1e-3  # sweeps need only find a good policy; the rest is solved exactly
-_NEARLY_ONE = 1 - 1e-8  # one step more costs ten times as much as what counts as a tie
 _IMPROVEMENT = 1e-11
+_VISIBLE = 1e-13  # relative; less than that is rounding
+_PATIENT = 100.0  # steps; a longer horizon, 1 / (1 - γ), adds up more of what counts as a tie in one step
 _NOTHING = 1e-290  # a value that has faded so far is 0: the smallest numbers of all never get smaller
 
 
@@ -41,41 +55,152 @@ class Solution:
 
 
 def value_iteration(mdp: Mdp, gamma: float) -> Solution:
-    """V*, Q* and all optimal actions.
+    """V*, Q* and all optimal actions, exact up to rounding.
 
-    Value iteration from V = 0 finds a good policy; policy iteration from there makes values and ties exact
-    up to rounding. γ = 1 is taken as the limit of discounting (Blackwell's optimality): of two ways to the
-    same return the shorter one, and never one that puts the end off for ever. Raises `InputError` where no
-    finite optimum exists (γ = 1 and a positive step reward). With γ = 1 and a negative step reward, a cell
-    from which no end can be reached has V = -inf.
+    Raises `InputError` where no finite optimum exists: γ = 1 and a way to go on earning for ever. With γ = 1
+    and costs, a state from which every policy may go on paying for ever has V = -inf, and all its actions are
+    as good as each other.
     """
     gamma = check_gamma(gamma)
-    if gamma < 1:
-        return _discounted(mdp, gamma)
-    if mdp.step_reward > 0:
-        raise InputError(
-            f"gamma=1 with step_reward={mdp.step_reward}: the return grows without end; "
-            "take a gamma below 1 or a step_reward of at most 0"
-        )
-    limit = _discounted(mdp, _NEARLY_ONE)
-    v, scale = Chain(mdp, one_hot_policy(np.argmax(limit.optimal, axis=1))).value_and_scale(1.0)
-    return Solution(1.0, v, _backup(mdp, v, 1.0), limit.optimal, scale)
+    ordinary = min(gamma, ORDINARY_GAMMA)
+    greedy: IntArray = np.argmax(_backup(mdp, _sweep(mdp, ordinary), ordinary), axis=1)
+    if gamma <= ORDINARY_GAMMA:
+        return _solve_discounted(mdp, gamma, greedy)
+    if gamma == 1:
+        greedy = _better_of(mdp, greedy, _resting_policy(mdp))
+    return _solve_by_value_and_slope(mdp, gamma, greedy)
 
 
-def _discounted(mdp: Mdp, gamma: float) -> Solution:
-    greedy, seen = np.argmax(_backup(mdp, _sweep(mdp, gamma), gamma), axis=1), set()
+def _solve_discounted(mdp: Mdp, gamma: float, greedy: IntArray) -> Solution:
+    """Policy iteration from `greedy` (S,)."""
+    seen = set()
+    precision = min(1.0, _PATIENT * (1 - gamma))
     while True:
-        v, scale = Chain(mdp, one_hot_policy(greedy)).value_and_scale(gamma)
+        chain = Chain(mdp, one_hot_policy(greedy)).evaluation(gamma)
+        v, scale = chain.value, chain.scale
         q = _backup(mdp, v, gamma)
         q_scale = _backup(mdp, scale, gamma, magnitude=True)
         best = np.argmax(q, axis=1)
         gain = _pick(q, best) - _pick(q, greedy)
-        better = gain > _NOTHING + _IMPROVEMENT * np.maximum(_pick(q_scale, best), _pick(q_scale, greedy))
+        least = precision * _IMPROVEMENT * np.maximum(_pick(q_scale, best), _pick(q_scale, greedy))
         seen.add(greedy.tobytes())
-        greedy = np.where(better, best, greedy)
+        greedy = np.where(gain > _NOTHING + least, best, greedy)
         if greedy.tobytes() in seen:  # no better action anywhere; by rounding, perhaps one met before
-            tolerance = TIE * np.maximum(q_scale, _pick(q_scale, best)[:, None])
+            tolerance = precision * TIE * np.maximum(q_scale, _pick(q_scale, best)[:, None])
             return Solution(gamma, v, q, q >= _pick(q, best)[:, None] - tolerance, scale)
+
+
+def _solve_by_value_and_slope(mdp: Mdp, gamma: float, greedy: IntArray) -> Solution:
+    """Policy iteration from `greedy` (S,): the larger value first, of equal values the smaller slope."""
+    seen = set()
+    while True:
+        found = Chain(mdp, one_hot_policy(greedy)).evaluation(gamma, with_slope=True)
+        seen.add(greedy.tobytes())
+        optimal, greedy = _best_actions(mdp, found, gamma, greedy)
+        if greedy.tobytes() in seen:  # no better action anywhere; by rounding, perhaps one met before
+            return Solution(gamma, found.value, _backup(mdp, found.value, gamma), optimal, found.scale)
+
+
+def _best_actions(mdp: Mdp, found: Evaluation, gamma: float, greedy: IntArray) -> tuple[BoolArray, IntArray]:
+    """The actions (S, A) that are best as one step before a policy, and the policy (S,) to go on with.
+
+    `found` is of the policy `greedy` (S,), whose actions stay unless others are better by more than rounding.
+    """
+    assert found.slope is not None
+    assert found.slope_scale is not None
+    lost = ~np.isfinite(found.value)
+    gain, rounding = _advantage(mdp, found.value, found.scale, gamma, mdp.reward, np.abs(mdp.reward))
+    next_value, next_scale = (table[mdp.next_state] for table in (found.value, found.scale))
+    delay, delay_rounding = _advantage(mdp, found.slope, found.slope_scale, gamma, next_value, next_scale)
+
+    as_good = gain >= -rounding
+    better = gain > rounding
+    as_good[np.arange(len(greedy)), greedy] = True
+    as_good[lost] = True
+    best = np.where(better.any(axis=1), gain.argmax(axis=1), greedy)
+    delay = np.where(as_good, delay, np.inf)
+    soonest = delay.argmin(axis=1)
+    is_sooner = _pick(delay, soonest) < -_pick(delay_rounding, soonest)
+    best = np.where(better.any(axis=1) | lost | ~is_sooner, best, soonest)
+    optimal = as_good & ((delay <= delay_rounding) | lost[:, None])
+    return optimal, best
+
+
+def _advantage(
+    mdp: Mdp,
+    values: FloatArray,
+    scale: FloatArray,
+    gamma: float,
+    reward: FloatArray,
+    reward_scale: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Σ_k p_k [ r_k + γ x(next_k) - x(s) ] (S, A) for rewards r (S, A, K) and values x (S,); its rounding.
+
+    Summed up as differences of values, it is exact also where all but a tiny part stays where it is. What the
+    policy's own actions differ from 0 is rounding; of an action without a finite value it is -inf.
+    """
+    here, there = values[:, None, None], values[mdp.next_state]
+    moved = mdp.next_state != np.arange(mdp.num_states)[:, None, None]
+    with np.errstate(invalid="ignore"):  # inf - inf, where all is lost
+        change = reward + gamma * (there - here) - (1 - gamma) * here
+        size = reward_scale + moved * (scale[mdp.next_state] + scale[:, None, None])
+        size += (1 - gamma) * scale[:, None, None]
+        sums = (np.where(mdp.probability > 0, mdp.probability * part, 0.0) for part in (change, size))
+        gained, rounding = (part.sum(axis=2) for part in sums)
+    unknown = ~np.isfinite(rounding)
+    over = mdp.terminal | mdp.wall
+    gained[unknown], rounding[unknown] = -np.inf, 0.0
+    gained[over] = rounding[over] = 0.0
+    return gained, _VISIBLE * rounding
+
+
+def _better_of(mdp: Mdp, one: IntArray, other: IntArray) -> IntArray:
+    """The actions (S,) of `one` where it is worth more without discount, else of `other`."""
+    first, second = (Chain(mdp, one_hot_policy(each)).evaluation(1.0) for each in (one, other))
+    with np.errstate(invalid="ignore"):
+        better = first.value > second.value + _VISIBLE * (first.scale + second.scale)
+    better |= np.isneginf(second.value) & np.isfinite(first.value)
+    actions: IntArray = np.where(better, one, other)
+    return actions
+
+
+def _resting_policy(mdp: Mdp) -> IntArray:
+    """A policy (S,) that surely comes to an end or to rest, wherever one can; see the module's head.
+
+    Raises `InputError` where a policy can go on for ever and earn on its way.
+    """
+    possible = mdp.probability > 0
+    playing = ~(mdp.terminal | mdp.wall)
+    going_on = _staying(mdp, possible, playing, np.ones(possible.shape[:2], dtype=np.bool_))
+    if (going_on & (possible & (mdp.reward > 0)).any(axis=2)).any():
+        raise InputError(
+            f"gamma=1 with step_reward={mdp.step_reward}: the return grows without end; "
+            "take a gamma below 1 or a step_reward of at most 0"
+        )
+    free = ~np.asarray((possible & (mdp.reward != 0)).any(axis=2))
+    resting = _staying(mdp, possible, playing, free)
+    rest = np.asarray(resting.any(axis=1))
+    safe: BoolArray = np.ones(mdp.num_states, dtype=np.bool_)
+    while True:  # drop what can be led astray from every way there
+        allowed = np.asarray((safe[mdp.next_state] | ~possible).all(axis=2))
+        ways = possible & allowed[:, :, None]
+        steps = steps_to(mdp, ways, mdp.terminal | rest)
+        if np.array_equal(steps >= 0, safe):
+            break
+        safe = steps >= 0
+    nearer = np.asarray((ways & (steps[mdp.next_state] < steps[:, None, None])).any(axis=2))
+    policy: IntArray = np.where(rest, resting.argmax(axis=1), nearer.argmax(axis=1))
+    return policy
+
+
+def _staying(mdp: Mdp, possible: BoolArray, within: BoolArray, actions: BoolArray) -> BoolArray:
+    """(S, A), those of `actions` by which one can stay `within` some states for ever."""
+    while True:
+        keeping: BoolArray = actions & within[:, None] & (within[mdp.next_state] | ~possible).all(axis=2)
+        left = np.asarray(keeping.any(axis=1))
+        if np.array_equal(left, within):
+            return keeping
+        within = left
 
 
 def _backup(

@@ -54,13 +54,13 @@ class World:
         ):
             if probability > 0:
                 target = self.moved(cell, direction)
-                chance[target] = chance.get(target, 0.0) + probability
+                chance[target] = chance.get(target, 0) + probability
         entering = {"G": self.settings["goal_reward"], "T": self.settings["trap_reward"]}
         return [
             (
                 p,
                 target,
-                self.settings["step_reward"] + entering.get(self.tile[target], 0.0),
+                self.settings["step_reward"] + entering.get(self.tile[target], 0),
                 self.ends(target),
             )
             for target, p in chance.items()
