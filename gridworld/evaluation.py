@@ -1,5 +1,10 @@
 """How good a policy is: exactly, by solving for its value, and by playing episodes beside that.
 
+Two horizons stand side by side. Value and regret are without a step limit, as in the theory that the
+certificate rests on. What becomes of an episode (goal, trap and time-out probability, return, length) is
+within the step limit, as training and sampling see it. The discounted return within the limit links the two:
+it is what sampled episodes estimate, and it comes near to the value where few episodes are cut.
+
 The exact scores carry no sampling noise and cannot hang: a policy that walks in circles has a time-out
 probability of 1, whatever its number of steps.
 """
@@ -12,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridworld.chain import Chain, Outcome, check_policy, one_hot_policy
+from gridworld.chance import independent_generator
 from gridworld.layout import Cell
 from gridworld.mdp import BoolArray, FloatArray, IntArray, Mdp
 from gridworld.solve import Solution, value_iteration
@@ -24,10 +30,10 @@ REGRET_TOLERANCE = 1e-6  # relative; a detour of one step costs at least 1 % at 
 class Score:
     """Exact scores of one policy, in expectation over starts."""
 
-    value: float  # discounted
+    value: float  # discounted, without a step limit
     regret: float  # optimal value - value, at least 0 up to rounding
     certified: bool  # no policy is better
-    outcome: Outcome
+    outcome: Outcome  # of an episode within the step limit
 
     def numbers(self) -> dict[str, float | int]:
         """All of it flat, under the names that files and charts use."""
@@ -60,7 +66,7 @@ class Sampled:
     """Scores of one policy as estimated from episodes, each cut at the step limit."""
 
     episodes: int
-    value: Estimate  # discounted
+    discounted_return: Estimate
     goal: Estimate
     trap: Estimate
     timeout: Estimate
@@ -86,9 +92,13 @@ class Judge:
         """The exact scores of a policy table (S, A)."""
         chain = Chain(self.mdp, policy)
         value = self._at_start(chain.value(self.solution.gamma))
-        regret = self.optimal_value - value
+        regret = 0.0 if value == self.optimal_value else self.optimal_value - value  # both may be -inf
         certified = regret <= REGRET_TOLERANCE * self._at_start(self.solution.scale)
         return Score(value, regret, certified, chain.outcome(self.max_episode_steps))
+
+    def discounted_return(self, policy: FloatArray) -> float:
+        """The exact discounted return of a policy table (S, A), within the step limit."""
+        return Chain(self.mdp, policy).discounted_return(self.max_episode_steps, self.solution.gamma)
 
     def endless_cells(self, policy: FloatArray) -> list[Cell]:
         """Cells in which the policy may walk for ever; empty for one that ends."""
@@ -104,7 +114,7 @@ class Judge:
             autoreset_mode="Disabled",
             **self.mdp.settings(),
         )
-        actions = np.random.default_rng(seed)
+        actions = independent_generator(seed)  # the environments take the seed's own
         cumulative = policy.cumsum(axis=1)
         states, _ = envs.reset(seed=seed)
         running = np.ones(episodes, dtype=np.bool_)
@@ -119,14 +129,16 @@ class Judge:
             running &= ~terminated
             if not running.any():
                 break
+        limit, rewards = self.max_episode_steps, self.mdp.reward[self.mdp.probability > 0]
+        paid = max(np.ptp(rewards), np.abs(rewards).max(), np.abs(rewards).min() * limit)
         return Sampled(
             episodes=episodes,
-            value=_mean(discounted),
+            discounted_return=_mean(discounted, paid),
             goal=_share(self.mdp.goal[states]),
             trap=_share(self.mdp.trap[states]),
             timeout=_share(running),
-            episode_return=_mean(total),
-            length=_mean(length),
+            episode_return=_mean(total, paid),
+            length=_mean(length, limit),
         )
 
     def _at_start(self, values: FloatArray) -> float:
@@ -140,7 +152,7 @@ def play_episode(mdp: Mdp, policy: FloatArray, max_episode_steps: int, seed: int
     env = GridWorldVectorEnv(
         1, max_episode_steps=max_episode_steps, autoreset_mode="Disabled", **mdp.settings()
     )
-    actions = np.random.default_rng(seed)
+    actions = independent_generator(seed)  # the environment takes the seed's own
     states, _ = env.reset(seed=seed)
     visited, over = [int(states[0])], False
     while not over:
@@ -154,10 +166,17 @@ def play_episode(mdp: Mdp, policy: FloatArray, max_episode_steps: int, seed: int
 _Z = 1.96  # standard deviations of the normal distribution on either side of 95 % of it
 
 
-def _mean(samples: FloatArray) -> Estimate:
-    """Normal approximation."""
-    mean, count = float(samples.mean()), len(samples)
-    half_width = _Z * float(samples.std(ddof=1)) / count**0.5 if count > 1 else math.inf
+def _mean(samples: FloatArray, unseen: float) -> Estimate:
+    """Normal approximation, widened by what rare episodes may hide, as Wilson's interval is for a share.
+
+    With n samples, the half-width is z²R/2n + z √(s²/n + z²R²/4n²): z²R/n for equal samples, z s/√n for many.
+    R is the range of the samples, or `unseen`, what an episode of a kind that was not met may differ by.
+    """
+    count, mean = len(samples), float(samples.mean())
+    spread = max(unseen, float(np.ptp(samples)))
+    variance = float(samples.var(ddof=1)) / count if count > 1 else math.inf
+    hidden = _Z**2 * spread / (2 * count)
+    half_width = hidden + math.hypot(_Z * variance**0.5, hidden)
     return Estimate(mean, mean - half_width, mean + half_width)
 
 

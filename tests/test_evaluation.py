@@ -1,15 +1,25 @@
 """Exact scores agree with played episodes and with the oracle; certificates mean what they say."""
 
+from typing import ClassVar
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from oracle import maps
+from oracle import World, maps
+from scipy.stats import binom, chi2_contingency
+from support import configure
 
+from gridworld import evaluation
+from gridworld.agents import family
 from gridworld.chain import one_hot_policy
+from gridworld.counted_env import CountedVectorEnv
 from gridworld.evaluation import Judge, play_episode
 from gridworld.layout import load, parse, shipped_layouts
-from gridworld.mdp import compile_mdp
+from gridworld.mdp import Mdp, compile_mdp
+from gridworld.observations import make_observation
+from gridworld.training import make_mdp, make_seat
+from gridworld.vector_env import GridWorldVectorEnv
 
 CLASSIC = Judge(compile_mdp(load("classic")), 0.99, 100)
 
@@ -34,9 +44,138 @@ def test_sampled_episodes_agree_with_the_exact_scores(layout: str, settings: dic
         (sampled.timeout, exact.outcome.timeout),
         (sampled.length, exact.outcome.expected_length),
         (sampled.episode_return, exact.outcome.expected_return),
+        (sampled.discounted_return, judge.discounted_return(policy)),
     ):
         half_width = (estimate.high - estimate.low) / 2
         assert abs(estimate.mean - truth) <= 2.5 * half_width
+
+
+SLIPPERY = [("four_rooms", 0.2), ("classic", 0.5), ("frozen_lake_4x4", 2 / 3)]
+
+
+@pytest.mark.parametrize(("layout", "slip"), SLIPPERY)
+def test_sampled_intervals_cover_at_their_rate(layout: str, slip: float) -> None:
+    """Over 300 seeds; shares of rare ends, and means that these carry, may be covered more often."""
+    judge = Judge(compile_mdp(load(layout), slip, step_reward=-0.01), 0.95, 60)
+    policy = np.full((judge.mdp.num_states, 4), 0.25)
+    exact, discounted = judge.score(policy).outcome, judge.discounted_return(policy)
+    seeds, covered = 300, np.zeros(5)
+    for seed in range(seeds):
+        sampled = judge.sample(policy, 400, seed)
+        pairs = (
+            (sampled.discounted_return, discounted),
+            (sampled.goal, exact.goal),
+            (sampled.timeout, exact.timeout),
+            (sampled.episode_return, exact.expected_return),
+            (sampled.length, exact.expected_length),
+        )
+        covered += [estimate.low <= truth <= estimate.high for estimate, truth in pairs]
+    assert (covered >= binom.ppf(1e-3, seeds, 0.95)).all(), covered / seeds
+
+
+def test_intervals_of_means_are_normal_where_many_episodes_vary() -> None:
+    judge = Judge(compile_mdp(load("frozen_lake_4x4"), 2 / 3, trap_reward=-1.0), 0.99, 100)
+    policy = np.full((16, 4), 0.25)
+    widths = [sampled.episode_return.high - sampled.episode_return.low
+              for sampled in (judge.sample(policy, 20_000, seed) for seed in range(3))]  # fmt: skip
+    exact = judge.score(policy).outcome
+    deviation = (exact.goal + exact.trap - (exact.goal - exact.trap) ** 2) ** 0.5
+    assert widths == pytest.approx([2 * 1.96 * deviation / 20_000**0.5] * 3, rel=0.15)
+
+
+def test_equal_episodes_do_not_prove_that_all_are_equal() -> None:
+    """A thousand walks without a fall leave room for one in 260."""
+    judge = Judge(compile_mdp(load("classic"), slip=1e-4), 0.99, 100)
+    covered = 0
+    for seed in range(60):
+        sampled = judge.sample(judge.optimal_policy(), 1000, seed)
+        covered += sampled.episode_return.low <= judge.optimum.expected_return <= sampled.episode_return.high
+    assert covered >= binom.ppf(1e-3, 60, 0.95)
+
+
+def slip_table(mdp: Mdp, walked: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
+    """(A, 3), how often each outcome followed each action, where the place reached tells which it was."""
+    table = np.zeros((4, 3), dtype=int)
+    for states, actions, reached in walked:
+        outcomes = mdp.next_state[states, actions]  # (n, 3)
+        is_told = np.array([len(set(row)) == 3 for row in outcomes.tolist()])
+        which = (outcomes == reached[:, None]).argmax(axis=1)
+        np.add.at(table, (actions[is_told], which[is_told]), 1)
+    return table
+
+
+def assert_independent(table: np.ndarray) -> None:
+    assert table.sum() > 5000
+    assert chi2_contingency(table).pvalue > 1e-4
+
+
+class Recorder(GridWorldVectorEnv):
+    """Notes every step: (states before, actions, states reached), of environments still in play."""
+
+    walked: ClassVar[list[tuple[np.ndarray, np.ndarray, np.ndarray]]]
+
+    def step(self, actions):
+        before, playing = self.states, ~self.mdp.terminal[self.states]
+        answer = super().step(actions)
+        self.walked.append((before[playing], np.asarray(actions)[playing], answer[0][playing]))
+        return answer
+
+
+@pytest.mark.parametrize(("layout", "slip"), SLIPPERY)
+@pytest.mark.parametrize("seed", [0, 7])
+def test_slips_do_not_depend_on_sampled_actions(monkeypatch, layout: str, slip: float, seed: int) -> None:
+    monkeypatch.setattr(evaluation, "GridWorldVectorEnv", Recorder)
+    judge = Judge(compile_mdp(load(layout), slip), 0.99, 100)
+    uniform = np.full((judge.mdp.num_states, 4), 0.25)
+    Recorder.walked = []
+    judge.sample(uniform, 2000, seed)
+    assert_independent(slip_table(judge.mdp, Recorder.walked))
+    Recorder.walked = []
+    for episode in range(400 if layout == "four_rooms" else 0):
+        evaluation.play_episode(judge.mdp, uniform, 100, seed=1000 * seed + episode)
+    if Recorder.walked:
+        assert_independent(slip_table(judge.mdp, Recorder.walked))
+
+
+@pytest.mark.parametrize("agent", ["dqn", "qrdqn", "ppo", "q_learning"])
+def test_slips_do_not_depend_on_the_actions_of_training(monkeypatch, agent: str) -> None:
+    """SB3 seeds the action space, from which DQN explores, with the run's seed: not the environments'."""
+    walked: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def step(self, actions):
+        before = self.states
+        answer = GridWorldVectorEnv.step(self, actions)
+        reached = answer[4]["final_obs"] if answer[4] else answer[0]
+        walked.append((before, np.asarray(actions), reached))
+        return answer
+
+    monkeypatch.setattr(CountedVectorEnv, "step", step)
+    config = configure(f"agent={agent}", "env.slip=0.3", "env=four_rooms", "total_timesteps=19200")
+    if agent == "dqn":
+        config.agent.learning_starts = 19_000
+    elif agent == "qrdqn":
+        config.agent.arguments["learning_starts"] = 19_000
+    mdp = make_mdp(config.env)
+    seat = make_seat(config, mdp, make_observation(mdp, "one_hot"))
+    family(config.agent).build(config.agent, seat).learn(config.total_timesteps, lambda steps: True)
+    assert_independent(slip_table(mdp, walked))
+
+
+@pytest.mark.parametrize("policy", ["greedy", "sampled"])
+def test_the_discounted_return_within_the_limit_equals_brute_force(policy: str) -> None:
+    world = World(("S..T", ".#..", "...G"), slip=0.2, step_reward=-0.1)
+    judge = Judge(compile_mdp(parse(world.text, "map"), **world.settings), 0.9, 7)
+    table = judge.optimal_policy() if policy == "greedy" else np.full((12, 4), 0.25)
+    ahead = dict.fromkeys(world.cells, 0.0)
+    for _ in range(7):
+        ahead = {
+            cell: 0.0
+            if world.ends(cell)
+            else sum(table[world.state(cell)][a] * world.q(ahead, cell, a, 0.9) for a in range(4))
+            for cell in world.cells
+        }
+    assert judge.discounted_return(table) == pytest.approx(ahead[0, 0], abs=1e-12)
+    assert judge.discounted_return(table) != pytest.approx(judge.score(table).value, abs=1e-4)
 
 
 def test_only_shortest_safe_ways_are_certified() -> None:

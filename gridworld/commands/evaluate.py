@@ -15,14 +15,6 @@ from gridworld.saved_run import SavedRun, choose_policy
 from gridworld.summary import circles_text
 
 _MOST_EPISODES = 1_000_000
-_LABELS = (
-    "value",
-    "goal probability",
-    "trap probability",
-    "time-out probability",
-    "return",
-    "episode length",
-)
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -44,7 +36,7 @@ def main(arguments: Sequence[str]) -> None:
     score = judge.score(policy)
     sampled = judge.sample(policy, options.episodes, options.seed)
     print(f"{options.policy} policy of {options.run} on {judge.mdp.layout.name}")
-    print(_table(judge, score, sampled))
+    print(_table(judge, policy, score, sampled))
     print(_verdict(judge, policy, score))
 
 
@@ -57,18 +49,26 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _table(judge: Judge, score: Score, sampled: Sampled) -> str:
+def _table(judge: Judge, policy: FloatArray, score: Score, sampled: Sampled) -> str:
+    """Exact scores beside the optimum, and beside sampled ones of the same horizon."""
     exact, optimum = score.outcome, judge.optimum
-    numbers = (
-        (score.value, sampled.value, judge.optimal_value),
-        (exact.goal, sampled.goal, optimum.goal),
-        (exact.trap, sampled.trap, optimum.trap),
-        (exact.timeout, sampled.timeout, optimum.timeout),
-        (exact.expected_return, sampled.episode_return, optimum.expected_return),
-        (exact.expected_length, sampled.length, optimum.expected_length),
+    within = (
+        (
+            "discounted return",
+            judge.discounted_return(policy),
+            sampled.discounted_return,
+            judge.discounted_return(judge.optimal_policy()),
+        ),
+        ("goal probability", exact.goal, sampled.goal, optimum.goal),
+        ("trap probability", exact.trap, sampled.trap, optimum.trap),
+        ("time-out probability", exact.timeout, sampled.timeout, optimum.timeout),
+        ("return", exact.expected_return, sampled.episode_return, optimum.expected_return),
+        ("episode length", exact.expected_length, sampled.length, optimum.expected_length),
     )
     lines = [f"  {'':<22}{'exact':>10}  {f'{sampled.episodes:,} episodes [95 %]':<26}{'optimum':>10}"]
-    for label, (value, estimate, best) in zip(_LABELS, numbers, strict=True):
+    lines.append(f"  {'value, no step limit':<22}{score.value:>10.4g}  {'':<26}{judge.optimal_value:>10.4g}")
+    lines.append(f"  within {judge.max_episode_steps:,} steps:")
+    for label, value, estimate, best in within:
         lines.append(f"  {label:<22}{value:>10.4g}  {estimate!s:<26}{best:>10.4g}")
     return "\n".join(lines)
 
