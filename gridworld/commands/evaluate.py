@@ -66,7 +66,8 @@ def _table(judge: Judge, policy: FloatArray, score: Score, sampled: Sampled) -> 
         ("episode length", exact.expected_length, sampled.length, optimum.expected_length),
     )
     lines = [f"  {'':<22}{'exact':>10}  {f'{sampled.episodes:,} episodes [95 %]':<26}{'optimum':>10}"]
-    lines.append(f"  {'value, no step limit':<22}{score.value:>10.4g}  {'':<26}{judge.optimal_value:>10.4g}")
+    lines.append("  without a step limit:")
+    lines.append(f"  {'value':<22}{score.value:>10.4g}  {'':<26}{judge.optimal_value:>10.4g}")
     lines.append(f"  within {judge.max_episode_steps:,} steps:")
     for label, value, estimate, best in within:
         lines.append(f"  {label:<22}{value:>10.4g}  {estimate!s:<26}{best:>10.4g}")
