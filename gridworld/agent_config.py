@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Optional, Union
 
 from gridworld.bounds import above_zero, within
+from gridworld.effects import Effect, affects
 from gridworld.errors import InputError
 
 MISSING = "???"  # OmegaConf's sign for what has to be given
@@ -20,7 +21,7 @@ Schedule = Union[int, float, str]  # noqa: UP007
 class AgentConfig:
     """What all agents share. `family` is the module in gridworld/agents that knows the algorithm."""
 
-    name: str = MISSING
+    name: str = field(default=MISSING, metadata=affects(Effect.NOTES))
     family: str = MISSING
     algorithm: str = MISSING
 
@@ -56,7 +57,8 @@ class SB3Config(AgentConfig):
     """An algorithm with Stable-Baselines3's interface: `algorithm` is its class."""
 
     family: str = "sb3"
-    log_interval: int = 1  # of SB3's learn(): episodes for DQN, iterations for PPO
+    # of SB3's learn(): episodes for DQN, iterations for PPO
+    log_interval: int = field(default=1, metadata=affects(Effect.NOTES))
     policy: str = "MlpPolicy"
 
 
@@ -64,7 +66,9 @@ class SB3Config(AgentConfig):
 class SB3ClassConfig(SB3Config):
     """Any class of Stable-Baselines3, of sb3-contrib or of one's own, by its import path."""
 
-    arguments: dict[str, Any] = field(default_factory=dict)  # of the class; it keeps its defaults
+    arguments: dict[str, Any] = field(  # of the class; it keeps its defaults
+        default_factory=dict, metadata=affects(Effect.LEARNING, stats_window_size=Effect.NOTES)
+    )
 
     @property
     def gamma(self) -> float:
@@ -80,7 +84,7 @@ class SB3CheckedConfig(SB3Config):
     learning_rate: Schedule = 1e-3  # a number, or lin_NUMBER to fall linearly to 0 at the end of training
     batch_size: int = 64
     gamma: float = 0.99
-    stats_window_size: int = 100
+    stats_window_size: int = field(default=100, metadata=affects(Effect.NOTES))
     policy_kwargs: PolicyKwargs = field(default_factory=PolicyKwargs)
 
 
@@ -151,8 +155,9 @@ class TabularControlConfig(TabularConfig):
     exploration_fraction: float = 1.0  # of training, in which epsilon falls linearly
     exploration_initial_eps: float = 1.0
     exploration_final_eps: float = 0.05
-    stats_window_size: int = 100  # episodes that the means in TensorBoard are taken over
-    log_interval: int = 100  # episodes between two points there
+    # episodes that the means in TensorBoard are taken over, and between two points there
+    stats_window_size: int = field(default=100, metadata=affects(Effect.NOTES))
+    log_interval: int = field(default=100, metadata=affects(Effect.NOTES))
 
 
 @dataclass

@@ -1,7 +1,8 @@
 """Every setting of a training run, typed: the schema that the files in `conf/` fill in.
 
 Plain dataclasses. Hydra merges the yaml files and the command line into them and refuses a misspelt key or
-a wrong type by name; `check` refuses values that make no sense together. Nothing heavy is imported here.
+a wrong type by name; `check` refuses values that make no sense together. A field's metadata says what the
+setting affects (`gridworld.effects`). Nothing heavy is imported here.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import Optional, Union
 
 from gridworld.agent_config import AgentConfig
 from gridworld.bounds import at_least, at_most, within
+from gridworld.effects import Effect, affects
 from gridworld.errors import InputError
 
 # OmegaConf reads the annotations at run time and knows no `X | None`.
@@ -48,7 +50,8 @@ class EvaluationConfig:
     """The exact evaluation."""
 
     every: int = 1000  # environment steps
-    gamma: float = 0.99  # discount of value and regret, whatever discount the agent learns with
+    # discount of value and regret, whatever discount the agent learns with
+    gamma: float = field(default=0.99, metadata=affects(Effect.TASK))
     stop_after: Optional[int] = None  # noqa: UP045  # end training at this many certificates in a row
 
 
@@ -58,7 +61,7 @@ class LoggingConfig:
 
     tensorboard: bool = True
     policy_map_every: int = 5  # evaluations between two pictures of the policy; 0 for none
-    progress: bool = True
+    progress: bool = field(default=True, metadata=affects(Effect.NOTHING))
 
 
 @dataclass
@@ -87,18 +90,18 @@ class CheckpointConfig:
 class TrainConfig:
     """One training run."""
 
-    seed: int = 0
-    total_timesteps: int = 20_000  # environment steps
+    seed: int = field(default=0, metadata=affects(Effect.SEED))
+    total_timesteps: int = field(default=20_000, metadata=affects(Effect.LENGTH))  # environment steps
     n_envs: int = 64
-    device: str = "cpu"
-    threads: int = 1  # of torch
+    device: str = field(default="cpu", metadata=affects(Effect.MACHINE))
+    threads: int = field(default=1, metadata=affects(Effect.MACHINE))  # of torch
     agent: AgentConfig = field(default_factory=AgentConfig)  # the chosen agent's own schema in its place
-    env: EnvConfig = field(default_factory=EnvConfig)
+    env: EnvConfig = field(default_factory=EnvConfig, metadata=affects(Effect.TASK))
     observation: ObservationConfig = field(default_factory=ObservationConfig)
-    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
-    logging: LoggingConfig = field(default_factory=LoggingConfig)
-    recording: RecordingConfig = field(default_factory=RecordingConfig)
-    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig, metadata=affects(Effect.JUDGING))
+    logging: LoggingConfig = field(default_factory=LoggingConfig, metadata=affects(Effect.FILES))
+    recording: RecordingConfig = field(default_factory=RecordingConfig, metadata=affects(Effect.FILES))
+    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig, metadata=affects(Effect.NOTHING))
 
 
 def check(config: TrainConfig) -> None:

@@ -29,6 +29,13 @@ class Returns(NamedTuple):
         """None where there is none."""
         return self.total / self.episodes if self.episodes else None
 
+    def merged(self, others: Returns) -> Returns:
+        """Of both."""
+        return Returns(self.episodes + others.episodes, self.total + others.total)
+
+
+NO_EPISODES = Returns(0, 0.0)
+
 
 class CountedVectorEnv(GridWorldVectorEnv):
     """A `GridWorldVectorEnv` that resets in the same step, so that every step is one somebody chose."""
@@ -88,7 +95,3 @@ class CountedVectorEnv(GridWorldVectorEnv):
         taken = Returns(self._ended, self._ended_return)
         self._ended, self._ended_return = 0, 0.0
         return taken
-
-    def put_back(self, taken: Returns) -> None:
-        """As if they had not been taken; no step was made meanwhile."""
-        self._ended, self._ended_return = taken.episodes, taken.total

@@ -15,7 +15,7 @@ import numpy as np
 from gridworld.agents import Agent, Beliefs
 from gridworld.chain import one_hot_policy
 from gridworld.config import TrainConfig
-from gridworld.counted_env import CountedVectorEnv, Returns
+from gridworld.counted_env import NO_EPISODES, CountedVectorEnv, Returns
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge, Score
 from gridworld.events import EventWriter
@@ -45,14 +45,14 @@ class _Held:
 
     step: int
     beliefs: Beliefs
-    returns: Returns
 
 
 class Curve:
     """Evaluates an agent every so many environment steps, and at the end.
 
     Two policies are scored side by side: the greedy one and the one it samples actions from. Beside them
-    stands what `envs` counted: the mean return of the training episodes since the evaluation before.
+    stands what `envs` counted: the mean return of the training episodes since the evaluation before. The one
+    at the end may come soon after that, with few episodes of its own; it takes those of the one before too.
     """
 
     def __init__(
@@ -80,6 +80,7 @@ class Curve:
         self._streak = 0
         self._next = self._every
         self._held: _Held | None = None
+        self._due = NO_EPISODES  # those of the newest evaluation that was due, held or not
         self._total = config.total_timesteps
         self.file = file if isinstance(file, Journal) else Journal(file)
         self._progress = Progress(
@@ -105,13 +106,8 @@ class Curve:
             "certified_since_step": self.certified_since_step,
             "seconds": self.seconds,
             "beliefs": None if beliefs is None else vars(beliefs).copy(),
-            "held": None
-            if held is None
-            else {
-                "step": held.step,
-                "beliefs": vars(held.beliefs).copy(),
-                "returns": held.returns._asdict(),
-            },
+            "held": None if held is None else {"step": held.step, "beliefs": vars(held.beliefs).copy()},
+            "due": self._due._asdict(),
         }
 
     def set_state(self, state: State) -> None:
@@ -121,7 +117,8 @@ class Curve:
         self.certified_since_step = state["certified_since_step"]
         self.seconds = float(state["seconds"])
         if (held := state["held"]) is not None:
-            self._held = _Held(int(held["step"]), _beliefs(held["beliefs"]), Returns(**held["returns"]))
+            self._held = _Held(int(held["step"]), _beliefs(held["beliefs"]))
+        self._due = Returns(int(state["due"]["episodes"]), float(state["due"]["total"]))
         if state["beliefs"] is not None:
             self.beliefs = _beliefs(state["beliefs"])
             self.greedy = self.judge.score(one_hot_policy(self.beliefs.greedy))
@@ -142,27 +139,26 @@ class Curve:
         self._write_held()
         if self._next <= step:
             self._next += self._every * ((step - self._next) // self._every + 1)
+            self._due = self._take_returns()
             if step < self._total:
-                self.evaluate(step)
+                self._evaluate(step, self._agent.beliefs, self._due)
             else:
-                self._held = _Held(step, self._agent.beliefs(), self._take_returns())
+                self._held = _Held(step, self._agent.beliefs())
         return self._stop_after is None or self._streak < self._stop_after
 
     def evaluate(self, step: int) -> None:
-        """Score both policies as they are after `step` steps and write a row, once a step."""
-        if self._held is not None and self._envs is not None:
-            self._envs.put_back(self._held.returns)
-        self._held = None
+        """Score both policies as they are after `step` steps, first or last, and write a row, once a step."""
+        self._held = None  # of this step, as it was before the last update
         if step != self._step:
-            self._evaluate(step, self._agent.beliefs, self._take_returns())
+            self._evaluate(step, self._agent.beliefs, self._due.merged(self._take_returns()))
 
     def _write_held(self) -> None:
         held, self._held = self._held, None
         if held is not None:
-            self._evaluate(held.step, lambda: held.beliefs, held.returns)
+            self._evaluate(held.step, lambda: held.beliefs, self._due)
 
     def _take_returns(self) -> Returns:
-        return Returns(0, 0.0) if self._envs is None else self._envs.take_returns()
+        return NO_EPISODES if self._envs is None else self._envs.take_returns()
 
     def _evaluate(self, step: int, beliefs: Callable[[], Beliefs], returns: Returns) -> None:
         started = time.perf_counter()

@@ -13,17 +13,18 @@ from typing import Any
 from gridworld.agent_config import AgentConfig, SB3Config
 from gridworld.config import TrainConfig
 from gridworld.data_files import sha256
+from gridworld.effects import Effect
 from gridworld.provenance import code, processor, versions
+from gridworld.settings import having
 
+_FIXED = frozenset(Effect) - {Effect.LENGTH, Effect.NOTHING}
 _MATTER = ("python", "gridworld", "gymnasium", "numpy", "scipy")  # to every agent
 _MATTER_TO_NETWORKS = ("stable-baselines3", "sb3-contrib", "torch")
 
 
 def settings(config: TrainConfig) -> dict[str, Any]:
-    """Those that a run cannot change on its way: all but its length, its checkpoints and its progress bar."""
-    content = dataclasses.asdict(config)
-    del content["checkpoint"], content["total_timesteps"], content["logging"]["progress"]
-    return content
+    """Those that a run cannot change on its way: all but its length, and those that leave nothing behind."""
+    return having(_FIXED, dataclasses.asdict(config))
 
 
 def identity(config: TrainConfig, layout: str) -> str:

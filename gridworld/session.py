@@ -27,6 +27,7 @@ from gridworld.identity import environment, identity
 from gridworld.journal import Journal
 from gridworld.pictures import Pictures
 from gridworld.run import Run
+from gridworld.settings import ON_RESULT, having
 from gridworld.signals import StopRequest
 from gridworld.state import State, fitting
 
@@ -234,12 +235,9 @@ def _scores(score: Score) -> dict[str, float]:
 
 
 def hparams(config: TrainConfig) -> dict[str, HParamValue]:
-    """The settings that make a difference to learning, flat: {"agent.learning_rate": 0.003, ...}."""
-    content = dataclasses.asdict(config)
-    for told_elsewhere in ("logging", "recording", "checkpoint"):
-        del content[told_elsewhere]
+    """The settings that make a difference to the result, flat: {"agent.learning_rate": 0.003, ...}."""
     return {
         key: value if value is None or isinstance(value, bool | int | float | str) else str(value)
-        for key, value in flat(content)
+        for key, value in flat(having(ON_RESULT, dataclasses.asdict(config)))
         if value != {}
     }

@@ -8,7 +8,7 @@ import pytest
 from support import LEARNING, SHORT, train_in
 
 from gridworld.counted_env import CountedVectorEnv
-from gridworld.vector_env import GridWorldVectorEnv
+from gridworld.vector_env import GridWorldVectorEnv, Step
 
 
 @pytest.mark.parametrize("dtype", [np.int64, np.int32, np.uint8])
@@ -72,3 +72,55 @@ def test_a_run_tells_what_training_brought_and_where_it_was(agent: str, tmp_path
     told = [float(row["online_return"]) for row in rows if row["online_return"]]
     assert len(told) > 5
     assert all(-40 <= value <= -1 for value in told)  # minus the episode's length
+
+
+@pytest.mark.parametrize(
+    ("words", "end"),
+    [
+        ([*SHORT["dqn"], "total_timesteps=1000"], [640, 800, 960, 1024]),
+        ([*SHORT["dqn"], "total_timesteps=955"], [640, 800, 960]),  # is due at the last step
+        ([*SHORT["dqn"], "total_timesteps=950", "agent.train_freq=7"], [640, 800, 960, 1008]),  # held at 960
+        ([*SHORT["q_learning"], "total_timesteps=1015"], [640, 800, 960, 1024]),
+        ([*SHORT["q_learning"], "total_timesteps=100"], [0, 112]),
+    ],
+    ids=["dqn", "dqn due last", "dqn due before", "q_learning", "q_learning once"],
+)
+def test_the_last_row_does_not_stand_on_the_few_episodes_since_the_row_before(
+    words: list[str], end: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where it comes before its time, it has those of the row before too; any other row has its own."""
+    ended = ended_episodes(monkeypatch)
+    world = ["env=frozen_lake_4x4", "env.max_episode_steps=6", "env.step_reward=-1"]
+    train_in(tmp_path, *words, *world, "n_envs=16", "evaluation.every=160")
+    with (tmp_path / "curve.csv").open(newline="") as file:
+        rows = [(int(row["step"]), row["online_return"]) for row in csv.DictReader(file)]
+    steps = [step for step, _ in rows]
+    assert steps[-len(end) :] == end
+    for index, (step, told) in enumerate(rows[1:], start=1):
+        is_early = step - steps[index - 1] < 160
+        since = steps[max(index - 1 - is_early, 0)]
+        own = [total for at, total in ended if steps[index - 1] < at <= step]
+        both = [total for at, total in ended if since < at <= step]
+        assert own
+        assert (len(both) > len(own)) == (is_early and index > 1)
+        assert float(told) == pytest.approx(np.mean(both))
+
+
+def ended_episodes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
+    """Filled while training: after how many steps of the batch each episode ended, and its return."""
+    ended: list[tuple[int, float]] = []
+    taken, under_way, step = 0, np.zeros(16), CountedVectorEnv.step
+
+    def watched(envs: CountedVectorEnv, actions: np.ndarray) -> Step:
+        nonlocal taken
+        observations, rewards, terminated, truncated, infos = step(envs, actions)
+        taken += len(rewards)
+        for index in range(len(rewards)):
+            under_way[index] += rewards[index]
+            if terminated[index] or truncated[index]:
+                ended.append((taken, under_way[index]))
+                under_way[index] = 0.0
+        return observations, rewards, terminated, truncated, infos
+
+    monkeypatch.setattr(CountedVectorEnv, "step", watched)
+    return ended

@@ -206,6 +206,10 @@ FLOAT = "agent.learning_rate: {type: float, low: 1e-3, high: 1e-2}"
         ),
         ("# @package tune.space\nagent.gama: {type: float, low: 0, high: 1}", "agent.gama"),
         ("# @package tune.space\nenv.slip: {type: float, low: 0, high: 1}", "is part of the task"),
+        (
+            "# @package tune.space\ncheckpoint.every: {type: int, low: 100, high: 1000}",
+            "checkpoint.every: changes nothing about what is learnt",
+        ),
     ],
 )
 def test_a_search_space_that_makes_no_sense(

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridworld.data_files import sha256
+from gridworld.effects import Effect
 from gridworld.report.reading import Evidence, Settings
+from gridworld.settings import effect_of
 
-# Settings without an influence on what is learnt, or told elsewhere: seed and task.
-_IGNORED = {"seed", "device", "threads", "evaluation.gamma"} | {
-    f"agent.{name}" for name in ("name", "log_interval", "stats_window_size")
-}
-_IGNORED_SECTIONS = ("env.", "logging.", "recording.")
+_OF_LEARNING = (Effect.LEARNING, Effect.LENGTH, Effect.JUDGING)
+_MAP = ("env.layout", "env.num_rows", "env.num_cols")
+_EMPTY = "{}"  # a mapping; in what its entries are, it is told by these
 _UNSET = "(not set)"
 _LONGEST_VALUE = 24  # characters in a label
 
@@ -83,7 +83,7 @@ def task_key(run: Evidence) -> Key:
     world = {
         name.removeprefix("env."): value
         for name, value in run.settings.items()
-        if name.startswith("env.") and name not in ("env.layout", "env.num_rows", "env.num_cols")
+        if effect_of(name) is Effect.TASK and name not in _MAP
     }
     digest = sha256(run.layout.encode())[:6]
     world |= {"layout": run.env, "map": digest, "evaluation.gamma": str(run.gamma)}
@@ -91,11 +91,11 @@ def task_key(run: Evidence) -> Key:
 
 
 def learning_key(run: Evidence) -> Key:
-    """Everything that touches learning, but the seed."""
+    """Everything that touches learning, but the seed and the task."""
     return tuple(
         (name, value)
         for name, value in sorted(run.settings.items())
-        if name not in _IGNORED and not name.startswith(_IGNORED_SECTIONS)
+        if effect_of(name) in _OF_LEARNING and value != _EMPTY
     )
 
 

@@ -16,7 +16,7 @@ _MOST_COLUMNS = 100
 
 REQUIRED = ("step", "value", "regret", "certified", "goal_probability", "return")
 SAMPLED_RETURN = "sampled_return"
-ONLINE = "online_return"  # undiscounted, of the training episodes ended since the row before; may be empty
+ONLINE = "online_return"  # undiscounted, of training episodes (`gridworld.curve`); may be empty
 _OPTIONAL = (SAMPLED_RETURN, ONLINE)
 
 

@@ -25,12 +25,12 @@ from gridworld.config import EnvConfig, TrainConfig
 from gridworld.data_files import sha256
 from gridworld.errors import InputError
 from gridworld.mdp import Mdp
+from gridworld.settings import ON_RESULT, having
 from gridworld.training import check_settings, make_mdp
 
 _LONGEST_NAME = 100  # characters of a job's folder
 _MOST_VALUES = 1_000_000  # of one key
 _HASH_SHOWN = 6  # characters of the hash in a name that needs it
-_WITHOUT_EFFECT = ("logging", "recording", "checkpoint")  # on the result
 _SEED = re.compile(r"\+*seed=")
 
 
@@ -110,8 +110,7 @@ def plan(
 
 def settings_hash(settings: dict[str, Any], layout: str) -> str:
     """Of a run's settings and its map's text; the same for settings that have been in a manifest."""
-    content = {key: value for key, value in settings.items() if key not in _WITHOUT_EFFECT}
-    text = json.dumps([content, layout], sort_keys=True, default=str)
+    text = json.dumps([having(ON_RESULT, settings), layout], sort_keys=True, default=str)
     return sha256(text.encode())[:32]
 
 

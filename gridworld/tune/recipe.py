@@ -16,12 +16,14 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from gridworld.config import TrainConfig
+from gridworld.effects import Effect
 from gridworld.experiment import without_hydra
 from gridworld.files import write_text
+from gridworld.settings import ON_RESULT, having
 from gridworld.tune.asked import Source, compose_in
 
 RECIPE = "winner"
-_NOT_OF_A_RECIPE = ("seed", "device", "threads", "logging", "recording")
+_OF_A_RECIPE = ON_RESULT - {Effect.SEED, Effect.MACHINE}
 
 
 def write_recipe(
@@ -44,10 +46,7 @@ def write_recipe(
 
 
 def _relevant(config: TrainConfig) -> dict[str, Any]:
-    content = dataclasses.asdict(config)
-    for key in _NOT_OF_A_RECIPE:
-        del content[key]
-    return content
+    return having(_OF_A_RECIPE, dataclasses.asdict(config))
 
 
 def _difference(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:

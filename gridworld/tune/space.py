@@ -22,9 +22,11 @@ from omegaconf import OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.config import TrainConfig
+from gridworld.effects import Effect
 from gridworld.errors import InputError
 from gridworld.experiment import to_config
 from gridworld.mdp import Mdp
+from gridworld.settings import effect_of
 from gridworld.training import check_settings
 from gridworld.tune.config import DimensionConfig
 
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
 Values = Mapping[str, Any]  # {"agent.learning_rate": 0.01, ...}
 
 _TYPES = ("float", "int", "categorical")
-_NOT_SEARCHED = ("seed", "total_timesteps", "device", "threads", "env", "evaluation", "logging", "recording")
+_GIVEN = (Effect.TASK, Effect.LENGTH, Effect.JUDGING, Effect.SEED)
 _CORNERS = 100
 _DIGITS = 4  # of a real number: no learning rate needs more, and recipes are read by people
 
@@ -138,8 +140,10 @@ def _check(key: str, dimension: DimensionConfig) -> None:
     kind = dimension.type
     if kind not in _TYPES:
         raise InputError(f"{key}: type={kind} must be {', '.join(_TYPES[:-1])} or {_TYPES[-1]}")
-    if key.split(".")[0] in _NOT_SEARCHED:
+    if (effect := effect_of(key)) in _GIVEN:
         raise InputError(f"{key}: is part of the task, not of what may be chosen to solve it")
+    if effect is not Effect.LEARNING:
+        raise InputError(f"{key}: changes nothing about what is learnt, so there is nothing to search")
     if kind == "categorical":
         choices = dimension.choices or []
         if len({json.dumps(choice) for choice in choices}) < max(1, len(choices)):
