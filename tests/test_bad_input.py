@@ -253,6 +253,7 @@ def test_a_folder_under_a_file_is_refused(tmp_path: Path) -> None:
         ("hydra.sweep.dir=.", "hydra.sweep.dir=.: is the current folder; name one in it, e.g. runs/mine"),
         ("hydra.sweep.dir=./used/..", "is the current folder; name one in it"),
         ("hydra.sweep.dir=../x", "hydra.sweep.dir=../x: leads out of the current folder; if that is meant"),
+        ("hydra.sweep.subdir=mine", "hydra.sweep.subdir=mine: a sweep names the folders of its jobs itself"),
         ("hydra.job.name=../x", "hydra.job.name=../x: must be a plain name, without /"),
         ("hydra.sweep.dir=used/manifest.json", "cannot be made, used/manifest.json is a file"),
         ("hydra.sweep.dir=/proc/sweep", "/proc/sweep: cannot be"),
