@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gridworld.early import at_work
-from gridworld.errors import EXIT_CODE, InputError
+from gridworld.errors import EXIT_CODE, InputError, failure
 from gridworld.terminal import prepare, tell_error
 
 Main = Callable[[Sequence[str]], None]
@@ -43,7 +43,7 @@ def run(main: Main) -> None:
         tell_error(str(error))
         sys.exit(EXIT_CODE)
     except OSError as error:
-        tell_error(f"{error.filename or 'file'}: {error.strerror}")
+        tell_error(failure(error))
         sys.exit(EXIT_CODE)
     except KeyboardInterrupt:
         sys.exit(130)
