@@ -12,7 +12,7 @@ from pathlib import Path
 
 from gridworld.early import at_work
 from gridworld.errors import EXIT_CODE, InputError, failure
-from gridworld.terminal import prepare, tell_error
+from gridworld.terminal import prepare, printing, tell_error
 
 Main = Callable[[Sequence[str]], None]
 
@@ -34,10 +34,13 @@ def parser_for_a_run(prog: str, about: str | None) -> argparse.ArgumentParser:
 
 
 def run(main: Main) -> None:
-    """Call `main`; a user's mistake ends the program with one sentence and no traceback."""
+    """Call `main`; a user's mistake ends the program with one sentence and no traceback.
+
+    So does output that could not be written, whatever exit code `main` has for what it found.
+    """
     prepare()
     try:
-        with at_work():
+        with at_work(), printing():
             main(sys.argv[1:])
     except InputError as error:
         tell_error(str(error))
