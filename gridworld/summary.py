@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from gridworld.columns import aligned
+
 Summary = dict[str, Any]
 
 _ROWS = (
@@ -18,18 +20,21 @@ def summary_text(summary: Summary, folder: str) -> str:
     """What was reached beside what could be, the verdict, and where everything is."""
     agent, env, seed = summary["agent"], summary["env"], summary["seed"]
     steps, seconds = summary["timesteps"], summary["train_seconds"]
+    rows = [["", "greedy", "sampled", "optimum"]]
+    for label, key, optimal in _ROWS:
+        numbers = (summary[key], summary["sampled"][key], summary[optimal])
+        rows.append([label, *(f"{number:.4g}" for number in numbers)])
+    regrets = (max(0.0, summary["regret"]), max(0.0, summary["sampled"]["regret"]))
+    rows.append(["regret", *(f"{regret:.3g}" for regret in regrets), "0"])
     lines = [
         f"{agent} on {env}, seed {seed}: {steps:,} steps in {seconds:.1f} s",
         "",
-        f"  {'':<18}{'greedy':>10}{'sampled':>10}{'optimum':>10}",
+        *(f"  {line}" for line in aligned(rows, ("<18", ">9", ">9", ">9"))),
+        "",
+        f"  {verdict(summary)}",
+        f"  files: {folder}",
+        f"  curves: tensorboard --logdir {folder}",
     ]
-    for label, key, optimal in _ROWS:
-        numbers = (summary[key], summary["sampled"][key], summary[optimal])
-        lines.append(f"  {label:<18}" + "".join(f"{number:>10.4g}" for number in numbers))
-    regrets = (max(0.0, summary["regret"]), max(0.0, summary["sampled"]["regret"]))
-    lines.append(f"  {'regret':<18}" + "".join(f"{regret:>10.3g}" for regret in regrets) + f"{0:>10}")
-    look = f"tensorboard --logdir {folder}"
-    lines += ["", f"  {verdict(summary)}", f"  files: {folder}", f"  curves: {look}"]
     return "\n".join(lines)
 
 

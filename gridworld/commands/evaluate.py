@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
+from gridworld.columns import aligned
 from gridworld.commands import parser_for_a_run
 from gridworld.env import GridWorldEnv
 from gridworld.errors import InputError
@@ -67,10 +68,10 @@ def _table(judge: Judge, score: Score, sampled: Sampled) -> str:
         (exact.expected_return, sampled.episode_return, optimum.expected_return),
         (exact.expected_length, sampled.length, optimum.expected_length),
     )
-    lines = [f"  {'':<22}{'exact':>10}  {f'{sampled.episodes:,} episodes [95 %]':<26}{'optimum':>10}"]
+    rows = [["", "exact", f" {sampled.episodes:,} episodes [95 %]", "optimum"]]
     for label, (value, estimate, best) in zip(_LABELS, numbers, strict=True):
-        lines.append(f"  {label:<22}{value:>10.4g}  {estimate!s:<26}{best:>10.4g}")
-    return "\n".join(lines)
+        rows.append([label, f"{value:.4g}", f" {estimate}", f"{best:.4g}"])
+    return "\n".join(f"  {line}" for line in aligned(rows, ("<22", ">9", "<27", ">9")))
 
 
 def _verdict(judge: Judge, policy: FloatArray, score: Score) -> str:
