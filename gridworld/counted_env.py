@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gridworld.mdp import NUM_ACTIONS
 from gridworld.state import State, fill
-from gridworld.vector_env import GridWorldVectorEnv, StateArray, Step
+from gridworld.vector_env import Advance, GridWorldVectorEnv, StateArray
 
 
 class Returns(NamedTuple):
@@ -57,16 +57,15 @@ class CountedVectorEnv(GridWorldVectorEnv):
         self._returns[slice(None) if mask is None else mask] = 0.0
         return answer
 
-    def step(self, actions: NDArray[Any]) -> Step:
+    def advance(self, actions: NDArray[Any]) -> Advance:
         """As ever."""
         taken = self._state * NUM_ACTIONS
-        step = super().step(actions)
+        step = super().advance(actions)
         np.add(taken, actions, out=taken, casting="unsafe")  # unsigned ones too
         np.add.at(self._flat_visits, taken, 1)
         self._returns += step[1]
-        infos = step[4]
-        if infos:
-            over = infos["_final_obs"]
+        if step[4] is not None:
+            _, over = step[4]
             returns = self._returns[over]
             self._ended += len(returns)
             self._ended_return += float(np.add.reduce(returns))

@@ -1,5 +1,10 @@
 """The one exception for what a user got wrong, and what is told like it."""
 
+from __future__ import annotations
+
+import errno
+import os
+
 
 class InputError(ValueError):
     """A mistake in a map, a setting, an action or a file, told in one sentence.
@@ -20,6 +25,18 @@ def reason(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror + (f": {error.filename}" if error.filename else "")
     return f"{type(error).__name__}: {error}"
+
+
+def failure(error: OSError) -> str:
+    """Which file, what went wrong with it, and what would be right where that is known, as a sentence."""
+    where = str(error.filename or "")
+    what = error.strerror or str(error) or type(error).__name__
+    if where and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        folder = os.path.dirname(where) or os.curdir
+        what += f"; choose another folder than {folder}, or get the right to write to it"
+    elif error.errno in (errno.ENOSPC, errno.EDQUOT):
+        what += "; make room there"
+    return f"{where}: {what}" if where else what
 
 
 EXIT_CODE = 2

@@ -25,6 +25,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.agent_config import AGENT_SCHEMAS
+from gridworld.commands import run
 from gridworld.config import TrainConfig
 from gridworld.early import at_work
 from gridworld.errors import EXIT_CODE, InputError
@@ -32,7 +33,7 @@ from gridworld.hydra_errors import refuse_added_keys, sentence, unreadable_file
 from gridworld.manual import manual
 from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, Run, alone_in, check_inside, check_new, shown
 from gridworld.sweep.config import LAUNCHER_SCHEMAS, SweepConfig
-from gridworld.terminal import prepare, tell_error
+from gridworld.terminal import prepare, printing, result_is_in_files, tell_error
 from gridworld.tune.config import SearchConfig
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -53,9 +54,11 @@ class RefuseUsedFolders(Callback):
         job_return.cfg = job_return.hydra_cfg = None
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        result_is_in_files()
         _end_unless(lambda: _check_run_folder(config))
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        result_is_in_files()
         _end_unless(lambda: _check_sweep_folder(config))
 
 
@@ -121,10 +124,10 @@ def main(conf: Path) -> None:
     """Run the command line; `conf` is the folder of the yaml files."""
     prepare()
     if {"--help", "-h"} & set(sys.argv[1:]):
-        print(manual(conf))
+        run(lambda _: print(manual(conf)))
         return
     if any(word.startswith("resume=") for word in sys.argv[1:]):
-        from gridworld.commands import resume, run
+        from gridworld.commands import resume
 
         run(resume.main)
         return
@@ -132,7 +135,7 @@ def main(conf: Path) -> None:
     asked_for_traceback = FULL_ERROR in os.environ
     os.environ[FULL_ERROR] = "1"  # so that Hydra raises its errors instead of printing them
     try:
-        with at_work(), _place:
+        with at_work(), printing(), _place:
             hydra.main(version_base="1.3", config_path=str(conf), config_name="train")(run_job)()
     except Exception as error:
         # Until a job begins, whatever goes wrong is the command line's or a yaml file's fault.

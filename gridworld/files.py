@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,15 +19,62 @@ def replacing(path: Path) -> Iterator[Path]:
     """A path beside `path` to write to; it takes `path`'s place if the block ends well, else it is gone.
 
     Neither of them is written through where it is a symbolic link: the one is made anew, the other replaced.
+    An `OSError` names `path`.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    part.unlink(missing_ok=True)
-    os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666))
-    try:
-        yield part
-        os.replace(part, path)
-    finally:
+    part = _beside(path, "part")
+    with _named_for(path, part):
         part.unlink(missing_ok=True)
+        os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666))
+        try:
+            yield part
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+@contextmanager
+def replacing_folder(folder: Path) -> Iterator[Path]:
+    """A new folder beside `folder` to fill; it takes its place if the block ends well, else it is gone.
+
+    Where `folder` is a symbolic link, the link is replaced. An `OSError` names `folder` or what is in it.
+    """
+    new, old = _beside(folder, "part"), _beside(folder, "old.part")
+    with _named_for(folder, new):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        remove(new)
+        remove(old)
+        new.mkdir()
+        try:
+            yield new
+            if os.path.lexists(folder):
+                folder.rename(old)
+            try:
+                new.rename(folder)
+            except OSError:
+                if os.path.lexists(old):
+                    old.rename(folder)
+                raise
+        finally:
+            for path in (new, old):
+                with suppress(OSError):
+                    remove(path)
+
+
+def _beside(path: Path, kind: str) -> Path:
+    """Of this process alone; what a killed one leaves of it is found by the ending `.part`."""
+    return path.with_name(f".{path.name}.{os.getpid()}.{kind}")
+
+
+@contextmanager
+def _named_for(path: Path, part: Path) -> Iterator[None]:
+    """An `OSError` of the block tells of `path`, where it tells of nothing or of `part`."""
+    try:
+        yield
+    except OSError as error:
+        where = Path(os.fsdecode(error.filename or part))
+        if where.is_relative_to(part):
+            error.filename = str(path / where.relative_to(part))
+        raise
 
 
 def remove(path: Path) -> None:

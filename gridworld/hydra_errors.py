@@ -19,7 +19,7 @@ from yaml import MarkedYAMLError, YAMLError
 import gridworld.sweep.config
 import gridworld.tune.config
 from gridworld import agent_config, config
-from gridworld.errors import InputError
+from gridworld.errors import InputError, failure
 
 _SCHEMAS = vars(config) | vars(agent_config) | vars(gridworld.sweep.config) | vars(gridworld.tune.config)
 
@@ -32,7 +32,7 @@ def sentence(error: BaseException) -> str:
     if isinstance(error, InputError):
         return message
     if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+        return failure(error)
     if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
         mark = error.problem_mark
         return f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}: is no yaml, {error.problem}"

@@ -36,6 +36,14 @@ NUM_ROWS, NUM_COLS = 5, 6  # of classic
 _TILES = "SGT#."
 
 
+class MapError(InputError):
+    """Cells that make no world. Its arguments are the map's name, what is wrong and what would be right."""
+
+    def __str__(self) -> str:
+        name, mistake, remedy = self.args
+        return f"{name}: {mistake}; {remedy}"
+
+
 @dataclass(frozen=True)
 class Layout:
     """A checked map. Raises `InputError` where it could not be played."""
@@ -76,18 +84,18 @@ class Layout:
 def classic(num_rows: int = NUM_ROWS, num_cols: int = NUM_COLS) -> Layout:
     """The GridWorld of the tutorial: start in the corner, a goal with a trap on three of its sides.
 
-    Only the cell right of the goal leads into it, so the grid needs a row above and below the traps to walk
-    around them: at least 4 rows and 4 columns.
+    Only the cell right of the goal leads into it, by a way around the traps. Raises `InputError` for a size
+    that does not hold the goal and its traps, or in which they close every way.
     """
     num_rows, num_cols = positive_int("num_rows", num_rows), positive_int("num_cols", num_cols)
-    if num_rows < 4 or num_cols < 4:
-        raise InputError(
-            f"layout classic: {num_rows} rows and {num_cols} columns are too few for a goal, its three traps "
-            "and a way around them; give at least 4 rows and 4 columns"
-        )
     row, col = num_rows // 2, num_cols - 2
     traps = ((row + 1, col), (row, col - 1), (row - 1, col))
-    return Layout(CLASSIC, num_rows, num_cols, starts=((0, 0),), goals=((row, col),), traps=traps)
+    try:
+        return Layout(CLASSIC, num_rows, num_cols, starts=((0, 0),), goals=((row, col),), traps=traps)
+    except MapError as error:
+        _, mistake, _ = error.args
+        size = f"layout classic of {num_rows} x {num_cols} cells"
+        raise InputError(f"{size}: {mistake}; give at least 4 rows and 3 columns") from None
 
 
 def parse(text: str, name: str) -> Layout:
@@ -210,9 +218,9 @@ def _check(layout: Layout) -> None:
     positive_int("num_cols", layout.num_cols)
     _check_size(name, layout.num_rows, layout.num_cols)
     if not layout.starts:
-        raise InputError(f"{name}: there is no start; mark at least one cell with 'S'")
+        raise MapError(name, "there is no start", "mark at least one cell with 'S'")
     if not layout.goals:
-        raise InputError(f"{name}: there is no goal; mark at least one cell with 'G'")
+        raise MapError(name, "there is no goal", "mark at least one cell with 'G'")
     kind: dict[Cell, str] = {}
     for what, cells in (
         ("goal", layout.goals),
@@ -221,18 +229,21 @@ def _check(layout: Layout) -> None:
         ("start", layout.starts),
     ):
         for row, col in cells:
-            where = f"{name}: row {row + 1}, column {col + 1}"
+            where = f"row {row + 1}, column {col + 1}"
             if not (0 <= row < layout.num_rows and 0 <= col < layout.num_cols):
-                raise InputError(f"{where}: this {what} lies outside the grid; move it inside")
+                raise MapError(name, f"{where}: this {what} lies outside the grid", "move it inside")
             if (row, col) in kind:
-                raise InputError(f"{where}: a {what} on a {kind[row, col]}; a cell can be one thing only")
+                raise MapError(
+                    name, f"{where}: a {what} on a {kind[row, col]}", "a cell can be one thing only"
+                )
             kind[row, col] = what
     reaching = _cells_that_reach_a_goal(layout)
     for row, col in layout.starts:
         if (row, col) not in reaching:
-            raise InputError(
-                f"{name}: no goal can be reached from the start in row {row + 1}, column {col + 1}; "
-                "open a way past the walls and traps"
+            raise MapError(
+                name,
+                f"no goal can be reached from the start in row {row + 1}, column {col + 1}",
+                "open a way past the walls and traps",
             )
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from gridworld.errors import InputError
-from gridworld.files import remove, replacing, write_bytes
+from gridworld.files import replacing, replacing_folder, write_bytes
 from gridworld.film import Film
 from gridworld.gif import encode_gif as _encode_gif
 from gridworld.png import encode_png
@@ -29,19 +29,15 @@ _RUN_LENGTHS = 3  # zlib's Z_RLE: the fastest way to store flat colour, and smal
 
 def save_pngs(film: Film, folder: Path) -> None:
     """0000.png, 0001.png, ... in `folder`, which is replaced as a whole, also where it is a link."""
-    part = folder.with_name(f".{folder.name}.part")
-    remove(part)
-    part.mkdir(parents=True)
     digits = max(4, len(str(len(film) - 1)))
     encoded: dict[int, bytes] = {}
-    for index, key in enumerate(film.keys):
-        if key not in encoded:
-            buffer = io.BytesIO()
-            film.draw(key).save(buffer, "PNG", compress_type=_RUN_LENGTHS)
-            encoded[key] = buffer.getvalue()
-        (part / f"{index:0{digits}}.png").write_bytes(encoded[key])
-    remove(folder)
-    part.rename(folder)
+    with replacing_folder(folder) as part:
+        for index, key in enumerate(film.keys):
+            if key not in encoded:
+                buffer = io.BytesIO()
+                film.draw(key).save(buffer, "PNG", compress_type=_RUN_LENGTHS)
+                encoded[key] = buffer.getvalue()
+            (part / f"{index:0{digits}}.png").write_bytes(encoded[key])
 
 
 def save_png(frame: Frame, path: Path) -> None:

@@ -215,6 +215,7 @@ def _summarise(config: TrainConfig, curve: Curve, steps: int, seconds: float) ->
         "total_timesteps": config.total_timesteps,
         "timesteps": steps,
         "gamma": config.evaluation.gamma,
+        "max_episode_steps": config.env.max_episode_steps,
         "certified": greedy.certified,
         "first_certified_step": curve.first_certified_step,
         "certified_since_step": curve.certified_since_step,

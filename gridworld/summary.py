@@ -5,32 +5,39 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-Summary = dict[str, Any]
+from gridworld.columns import aligned
 
-_ROWS = (
-    ("value", "value", "optimal_value"),
-    ("goal probability", "goal_probability", "optimal_goal_probability"),
-    ("episode length", "length", "optimal_length"),
-)
+Summary = dict[str, Any]
 
 
 def summary_text(summary: Summary, folder: str) -> str:
     """What was reached beside what could be, the verdict, and where everything is."""
     agent, env, seed = summary["agent"], summary["env"], summary["seed"]
     steps, seconds = summary["timesteps"], summary["train_seconds"]
+    rows = [
+        ["", "greedy", "sampled", "optimum"],
+        ["without a step limit:", "", "", ""],
+        _row("value", summary, "value", "optimal_value"),
+        ["regret", *(f"{max(0.0, each['regret']):.3g}" for each in (summary, summary["sampled"])), "0"],
+        [f"within {summary['max_episode_steps']:,} steps:", "", "", ""],
+        _row("goal probability", summary, "goal_probability", "optimal_goal_probability"),
+        _row("episode length", summary, "length", "optimal_length"),
+    ]
     lines = [
         f"{agent} on {env}, seed {seed}: {steps:,} steps in {seconds:.1f} s",
         "",
-        f"  {'':<18}{'greedy':>10}{'sampled':>10}{'optimum':>10}",
+        *(f"  {line}" for line in aligned(rows, ("<21", ">9", ">9", ">9"))),
+        "",
+        f"  {verdict(summary)}",
+        f"  files: {folder}",
+        f"  curves: tensorboard --logdir {folder}",
     ]
-    for label, key, optimal in _ROWS:
-        numbers = (summary[key], summary["sampled"][key], summary[optimal])
-        lines.append(f"  {label:<18}" + "".join(f"{number:>10.4g}" for number in numbers))
-    regrets = (max(0.0, summary["regret"]), max(0.0, summary["sampled"]["regret"]))
-    lines.append(f"  {'regret':<18}" + "".join(f"{regret:>10.3g}" for regret in regrets) + f"{0:>10}")
-    look = f"tensorboard --logdir {folder}"
-    lines += ["", f"  {verdict(summary)}", f"  files: {folder}", f"  curves: {look}"]
     return "\n".join(lines)
+
+
+def _row(label: str, summary: Summary, key: str, optimal: str) -> list[str]:
+    numbers = (summary[key], summary["sampled"][key], summary[optimal])
+    return [label, *(f"{number:.4g}" for number in numbers)]
 
 
 def verdict(summary: Summary) -> str:

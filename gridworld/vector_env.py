@@ -26,6 +26,8 @@ from gridworld.state import State, StateError, fill
 
 StateArray = NDArray[np.int64]
 Step = tuple[StateArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]
+Ended = tuple[StateArray, BoolArray]  # where the step led to, before any reset, and which episodes it ended
+Advance = tuple[StateArray, FloatArray, BoolArray, BoolArray, Ended | None]
 
 
 class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
@@ -38,7 +40,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
     `autoreset_mode` says what follows an episode's end, in Gymnasium's terms:
     - `NextStep` (default): the next step ignores the action and returns the new episode's start, reward 0;
     - `SameStep`: the same step returns the new start; `infos["final_obs"]` has the states where episodes
-      ended, valid where `infos["_final_obs"]` is True;
+      ended, None where none did, and `infos["_final_obs"]` is True where one did;
     - `Disabled`: nothing; `reset(options={"reset_mask": mask})` starts those environments anew.
 
     Episodes are truncated after `max_episode_steps` (None: never). The other arguments are those of
@@ -131,6 +133,17 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
 
     def step(self, actions: NDArray[Any]) -> Step:
         """Move all environments once. Raises `InputError` for an action other than 0 to 3."""
+        states, rewards, terminated, truncated, ended = self.advance(actions)
+        return states, rewards, terminated, truncated, {} if ended is None else _final_infos(*ended)
+
+    def advance(self, actions: NDArray[Any]) -> Advance:
+        """`step` in arrays alone, for training: a step that ends episodes makes no object for each of them.
+
+        Returns:
+            states, rewards, terminated and truncated, as `step` does; and, of a batch that resets in the same
+            step, the states that it led to, before that reset, and a mask of the episodes that ended, else
+            None. That is None too where no episode ended.
+        """
         index = self._state * NUM_ACTIONS
         index += self._check_actions(actions)
         starting = np.flatnonzero(self._over) if self._any_over else None
@@ -148,17 +161,17 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
             terminated[starting] = False
         truncated = self._elapsed >= self._step_limit
         over = terminated | truncated
-        infos: dict[str, Any] = {}
+        ended = None
         if self._autoreset is AutoresetMode.SAME_STEP:
             which = np.flatnonzero(over)
             if which.size:
-                infos = {"final_obs": state, "_final_obs": over}
+                ended = state, over
                 self._state = state.copy()
                 self._restart(which)
         elif self._autoreset is AutoresetMode.NEXT_STEP:
             self._over = over
             self._any_over = bool(over.any())
-        return self._state.copy(), rewards, terminated, truncated, infos
+        return self._state.copy(), rewards, terminated, truncated, ended
 
     def render(self) -> tuple[Frame, ...] | None:
         """One fresh frame per environment."""
@@ -221,3 +234,10 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
             f"actions={actions!r}: must be {self.num_envs} whole numbers, "
             "each 0 (up), 1 (right), 2 (down) or 3 (left)"
         )
+
+
+def _final_infos(states: StateArray, over: BoolArray) -> dict[str, Any]:
+    """As `gymnasium.vector.SyncVectorEnv` has them for environments without infos of their own."""
+    final_obs = np.full(len(over), None, dtype=object)
+    final_obs[over] = states[over].tolist()  # plain ints, as the single environment has them
+    return {"final_obs": final_obs, "_final_obs": over, "final_info": {}, "_final_info": over.copy()}

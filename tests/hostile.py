@@ -545,7 +545,9 @@ def recordings_that_lead_outside(run: Path, base: Path) -> None:
 def frames_that_lead_outside(run: Path, base: Path) -> None:
     (run / "recording").mkdir()
     link(run / "recording" / "frames", base / "outside")
-    link(run / "recording" / ".frames.part", base / "outside")
+    for process in range(os.getpid(), os.getpid() + 2000):  # the reader's may be guessed
+        for kind in ("part", "old.part"):
+            link(run / "recording" / f".frames.{process}.{kind}", base / "outside")
     link(run / "frames", base / "outside")
 
 

@@ -42,8 +42,9 @@ def test_same_step_restarts_at_once_and_hands_over_the_end():
     assert envs.step([RIGHT, UP])[4] == {}
     result = envs.step([RIGHT, RIGHT])
     assert lists(result) == [[0, 1], [1, 0], [True, False], [False, False]]
-    assert result[4]["_final_obs"].tolist() == [True, False]
-    assert result[4]["final_obs"][0] == 2
+    assert result[4]["final_obs"].tolist() == [2, None]
+    assert result[4]["final_info"] == {}
+    assert [result[4][mask].tolist() for mask in ("_final_obs", "_final_info")] == [[True, False]] * 2
     assert lists(envs.step([RIGHT, RIGHT]))[0] == [1, 0]
 
 
@@ -111,7 +112,8 @@ def test_returned_arrays_are_fresh(mode):
     for actions in np.random.default_rng(0).integers(4, size=(150, 4)):
         mine, theirs = touched.step(actions), left_alone.step(actions)
         assert lists(mine) == lists(theirs)
-        for part in (*mine[:4], *mine[4].values()):
+        infos = mine[4]
+        for part in (*mine[:4], *(infos[key] for key in infos if key != "final_info")):
             part[:] = 1
 
 

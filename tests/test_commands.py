@@ -1,5 +1,6 @@
 """The command lines, as a user types them: train, look, sweep, stop."""
 
+import errno
 import fcntl
 import json
 import os
@@ -21,7 +22,7 @@ from support import CONF, ROOT, SHORT, script
 import gridworld
 from gridworld.benchmark import whole
 from gridworld.benchmark.measure import QUICK, Comparison, compare
-from gridworld.commands import benchmark, evaluate
+from gridworld.commands import benchmark, evaluate, run
 from gridworld.commands import record as record_command
 from gridworld.errors import InputError
 from gridworld.manual import manual
@@ -194,6 +195,48 @@ def test_record_draws_the_maps_again(
         with pytest.raises(InputError, match=words):
             record_command.main([str(copy), "--format", "visits"])
     assert not (copy / "recording").exists()
+
+
+def test_record_says_where_it_cannot_write(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    line = [str(finished), "--format", "gif", "--out"]
+    with pytest.raises(
+        InputError, match=r"file/below: cannot be made, .*file is a file; choose another --out"
+    ):
+        record_command.main([*line, str(tmp_path / "file" / "below")])
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "access", lambda path, mode: False)
+        with pytest.raises(
+            InputError, match=rf"below: cannot be written, {tmp_path} is read-only; choose an"
+        ):
+            record_command.main([*line, str(tmp_path / "below")])
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+    def refuse(path: os.PathLike[str], flags: int, *more: object, **named: object) -> int:
+        if flags & os.O_CREAT:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), os.fspath(path))
+        return os_open(path, flags, *more, **named)
+
+    os_open = os.open
+    out = tmp_path / "below"
+    monkeypatch.setattr(sys, "argv", ["record.py", *line, str(out)])
+    monkeypatch.setattr(os, "open", refuse)  # as a file server may, whatever the permissions say
+    with pytest.raises(SystemExit) as ended:
+        run(record_command.main)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == (
+        f"error: {out}/episode.gif: Permission denied; choose another folder than {out}, "
+        "or get the right to write to it\n"
+    )
+
+
+def test_the_benchmark_looks_where_it_writes_before_it_measures(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for out, words in ((tmp_path, "is a folder; name a file in it"), (tmp_path / "file" / "x", "no folder")):
+        with pytest.raises(InputError, match=words):
+            benchmark.main(["--quick", "--out", str(out)])
 
 
 def test_a_run_whose_files_were_damaged_is_refused(finished: Path, tmp_path: Path) -> None:

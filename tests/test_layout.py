@@ -1,5 +1,7 @@
 """A map is read exactly, and what is wrong with one is said where it stands."""
 
+import itertools
+import pickle
 from pathlib import Path
 
 import pytest
@@ -7,6 +9,7 @@ from hypothesis import given
 from oracle import World, maps
 
 from gridworld import GridWorldEnv, InputError, Layout, shipped_layouts
+from gridworld.evaluation import Judge
 from gridworld.layout import classic, load, parse
 
 SHIPPED = ("aima_4x3", "classic", "cliff", "four_rooms", "frozen_lake_4x4", "frozen_lake_8x8", "maze")
@@ -136,7 +139,7 @@ def test_a_layout_is_passed_through():
     ("num_rows", "num_cols"),
     [
         *[(rows, 6) for rows in (3, 2, 1, 0, -5, 5.0, "5", True, None, float("nan"))],
-        *[(5, cols) for cols in (3, 2, 1, 0, -1, 6.5, "6", None)],
+        *[(5, cols) for cols in (2, 1, 0, -1, 6.5, "6", None)],
         (600, 600),
     ],
 )
@@ -145,6 +148,49 @@ def test_classic_refuses_what_cannot_hold_it(num_rows, num_cols):
         classic(num_rows, num_cols)
     with pytest.raises(InputError):
         GridWorldEnv(num_rows, num_cols)
+
+
+def formula(num_rows, num_cols):
+    """Rows of the specification's world of that size; None where it does not hold the goal and its traps."""
+    row, col = num_rows // 2, num_cols - 2
+    tiles = {(row, col): "G", (row + 1, col): "T", (row, col - 1): "T", (row - 1, col): "T"}
+    grid = [(r, c) for r in range(num_rows) for c in range(num_cols)]
+    if not tiles.keys() <= set(grid) - {(0, 0)}:
+        return None
+    tiles[0, 0] = "S"
+    return ["".join(tiles.get((r, c), ".") for c in range(num_cols)) for r in range(num_rows)]
+
+
+def test_classic_takes_exactly_the_sizes_that_can_be_won():
+    won = set()
+    for num_rows, num_cols in itertools.product(range(1, 13), repeat=2):
+        rows = formula(num_rows, num_cols)
+        if rows is not None and World(rows).steps_to_goal((0, 0)) is not None:
+            assert classic(num_rows, num_cols).text() == "\n".join(rows)
+            won.add((num_rows, num_cols))
+            continue
+        reason = "lies outside the grid|a start on a trap" if rows is None else "no goal can be reached"
+        with pytest.raises(InputError, match=f"{num_rows} x {num_cols} cells: .*({reason}).* 4 rows and 3"):
+            classic(num_rows, num_cols)
+    assert won == set(itertools.product(range(4, 13), range(3, 13)))  # as the sentence says
+
+
+@pytest.mark.parametrize(("num_rows", "num_cols"), [(4, 3), (5, 3), (9, 3), (4, 4)])
+def test_the_smallest_sizes_are_worlds_to_walk_through(num_rows, num_cols):
+    env, world = GridWorldEnv(num_rows, num_cols), World(formula(num_rows, num_cols))
+    state, way = env.reset()[0], world.steps_to_goal((0, 0))
+    judge = Judge(env.mdp, 0.99, 100)
+    assert judge.optimal_value == pytest.approx(0.99 ** (way - 1))
+    for _ in range(way):
+        state, reward, ended, _, _ = env.step(int(judge.optimal_policy()[state].argmax()))
+    assert (state, reward, ended) == (env.gold_state, 1, True)
+
+
+def test_a_mistake_in_a_map_passes_between_processes():
+    with pytest.raises(InputError) as told:
+        parse("S.T", "map")
+    again = pickle.loads(pickle.dumps(told.value))
+    assert str(again) == str(told.value) == "map: there is no goal; mark at least one cell with 'G'"
 
 
 @pytest.mark.parametrize(("num_rows", "num_cols"), [(7, 6), (5, 7), (4, 11), (12, 4)])

@@ -5,6 +5,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers.vector import TransformObservation
 
 import gridworld
 from gridworld import GridWorldEnv, InputError
@@ -132,6 +133,15 @@ def test_wrapped_batches_show_the_rows_of_their_states(mode):
         assert np.array_equal(observations.argmax(axis=1), envs.unwrapped.states)
         assert np.array_equal(observations.sum(axis=1), np.ones(4))
         observations, *_ = envs.step(actions)
+
+
+@pytest.mark.parametrize("kind", ["one_hot", "coordinates", "image"])
+def test_a_batch_that_resets_in_the_same_step_is_wrapped_no_more_than_gymnasium_does(kind):
+    """A vector wrapper would leave `final_obs` as it is; wrap the single environment instead."""
+    envs = gridworld.GridWorldVectorEnv(2, autoreset_mode="SameStep")
+    for wrap in (WRAPPERS[kind][1], lambda envs: TransformObservation(envs, lambda rows: rows)):
+        with pytest.raises(ValueError, match="Expected autoreset_mode to be NEXT_STEP or DISABLED"):
+            wrap(envs)
 
 
 def test_a_batch_of_another_world_is_not_wrapped():

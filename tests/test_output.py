@@ -1,4 +1,7 @@
-"""Nothing that happens to what a command prints changes what it does: no reader, terminal, UTF-8 or room."""
+"""What happens to the output changes nothing that a command does: no reader, terminal, UTF-8 or room.
+
+But where what it prints is its result, it fails at its end if that could not be written.
+"""
 
 import json
 import os
@@ -77,11 +80,56 @@ def test_names_in_a_locale_without_utf8(environment: dict[str, str], tmp_path: P
 
 
 @pytest.mark.parametrize("name", ["evaluate.py", "report.py"])
-@pytest.mark.parametrize("end", ["| true", ">/dev/full", ">&- 2>&-"])
+@pytest.mark.parametrize("end", ["| true", ">&- 2>&-"])
 def test_looking_at_a_run_ends_well_too(name: str, end: str, tmp_path: Path) -> None:
     train_in(tmp_path / "run", *SHORT["q_learning"], "recording.learning=false")
     done = shell(f"set -o pipefail; SCRIPT {name} run {end}", tmp_path)
     assert (done.returncode, done.stderr) == (0, b"")
+
+
+def written_to_a_full_disk(line: str, cwd: Path) -> list[str]:
+    """The lines on standard error of a command that fails at that."""
+    done = shell(f"{line} >/dev/full", cwd)
+    told = done.stderr.decode().splitlines()
+    assert done.returncode == 2, told
+    assert told[-1] == (
+        "error: standard output: cannot be written (No space left on device), "
+        "what was printed is not complete; send it to where there is room"
+    )
+    return told
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "scripts").glob("*.py")))
+def test_help_that_cannot_be_written_is_an_error(name: str, tmp_path: Path) -> None:
+    assert len(written_to_a_full_disk(f"SCRIPT {name} --help", tmp_path)) == 1
+
+
+@pytest.mark.parametrize("line", ["train.py --cfg job", "train.py --version", "tune.py agent=ppo --cfg"])
+def test_a_configuration_that_cannot_be_written_is_an_error(line: str, tmp_path: Path) -> None:
+    assert len(written_to_a_full_disk(f"SCRIPT {line}", tmp_path)) == 1
+    assert list(tmp_path.iterdir()) == []
+    done = shell(f"set -o pipefail; SCRIPT {line} | head -c 1", tmp_path)
+    assert (done.returncode, done.stderr, len(done.stdout)) == (0, b"", 1)
+
+
+def test_a_result_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    folder = tmp_path / "sweep" / "seed=0"
+    train_in(folder, *SHORT["q_learning"], "recording.learning=false")
+    entry = {"job": "seed=0", "hash": "x", "overrides": ["seed=0"]}
+    content = {"format": 1, "asked": [{"overrides": ["seed=0"]}], "jobs": [entry]}
+    (tmp_path / "sweep" / "sweep.json").write_text(json.dumps(content))
+    run = f"sweep/{folder.name}"
+    for line in (f"evaluate.py {run}", "jobs.py sweep", f"record.py {run} --format policy"):
+        assert len(written_to_a_full_disk(f"SCRIPT {line}", tmp_path)) == 1
+    assert (folder / "recording" / "policy.png").exists()
+
+
+def test_a_result_that_is_cut_short_is_an_error(tmp_path: Path) -> None:
+    """A disk that fills while something is printed, where the first half fitted."""
+    done = shell("ulimit -f 1; trap '' XFSZ; SCRIPT train.py --help >out", tmp_path)
+    assert done.returncode == 2
+    assert b"error: standard output: cannot be written (File too large)" in done.stderr
+    assert (tmp_path / "out").stat().st_size == 1024
 
 
 def test_a_mistake_has_its_exit_code_whoever_reads_it(tmp_path: Path) -> None:

@@ -1,7 +1,10 @@
 """Recordings keep every pixel, and files are written whole."""
 
 import contextlib
+import errno
 import io
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +12,8 @@ import pytest
 from PIL import Image
 
 from gridworld import record
-from gridworld.errors import InputError
-from gridworld.files import replacing, write_json
+from gridworld.errors import InputError, failure
+from gridworld.files import replacing, replacing_folder, write_array, write_json
 from gridworld.film import automatic_cell_size, film_of_frames, film_of_states
 from gridworld.layout import load, parse
 from gridworld.mdp import compile_mdp
@@ -129,6 +132,104 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
         raise RuntimeError
     assert path.read_text() == '{\n  "good": 1\n}\n'
     assert [entry.name for entry in tmp_path.iterdir()] == ["content.json"]
+
+
+@pytest.mark.parametrize("keep", [True, False], ids=["an older one", "none"])
+def test_a_failed_folder_leaves_the_old_one(keep: bool, tmp_path: Path) -> None:
+    folder = tmp_path / "frames"
+    if keep:
+        folder.mkdir()
+        (folder / "old").touch()
+
+    def fill() -> None:
+        with replacing_folder(folder) as part:
+            (part / "new").touch()
+            raise OSError(errno.ENOSPC, "no space", str(part / "new"))
+
+    with pytest.raises(OSError, match="no space") as told:
+        fill()
+    assert told.value.filename == str(folder / "new")
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == [
+        "frames",
+        "frames/old",
+    ] * keep
+
+
+def test_a_folder_takes_the_place_of_a_link_and_not_of_what_it_leads_to(tmp_path: Path) -> None:
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside" / "file").touch()
+    for name in ("frames", f".frames.{os.getpid()}.part", f".frames.{os.getpid()}.old.part"):
+        (tmp_path / name).symlink_to("outside")
+    record.save_pngs(film_of_states(CLASSIC, WALK[:1], 20), tmp_path / "frames")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["frames", "outside"]
+    assert [path.name for path in (tmp_path / "frames").iterdir()] == ["0000.png"]
+    assert [path.name for path in (tmp_path / "outside").iterdir()] == ["file"]
+
+
+def in_the_way(folder: Path, name: str) -> Path:
+    (folder / name / "full").mkdir(parents=True)
+    return folder / name
+
+
+def under_a_file(folder: Path, name: str) -> Path:
+    (folder / "file").touch()
+    return folder / "file" / name
+
+
+def in_no_folder(folder: Path, name: str) -> Path:
+    return folder / "nowhere" / name
+
+
+@pytest.mark.parametrize("place", [in_the_way, under_a_file, in_no_folder])
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda path: write_json(path, {}),
+        lambda path: write_array(path, np.zeros(2)),
+        lambda path: record.save_png(draw_frame(CLASSIC, 0, 20), path),
+    ],
+    ids=["json", "array", "png"],
+)
+def test_what_cannot_be_written_is_named_and_not_what_stands_beside_it(
+    write: Callable[[Path], None], place: Callable[[Path, str], Path], tmp_path: Path
+) -> None:
+    path = place(tmp_path, "thing")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(OSError, match=r".") as told:
+        write(path)
+    assert told.value.filename == str(path)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_pictures_that_cannot_be_written_are_named(tmp_path: Path) -> None:
+    path = under_a_file(tmp_path, "frames")
+    with pytest.raises(OSError, match=r".") as told:
+        record.save_pngs(film_of_states(CLASSIC, WALK[:1], 20), path)
+    assert told.value.filename in (str(path), str(path.parent))
+
+
+@pytest.mark.parametrize(
+    ("code", "where", "sentence"),
+    [
+        (
+            errno.EACCES,
+            "a/b.gif",
+            "a/b.gif: Permission denied; choose another folder than a, or get the right",
+        ),
+        (
+            errno.EROFS,
+            "b.gif",
+            "b.gif: Read-only file system; choose another folder than ., or get the right",
+        ),
+        (errno.ENOSPC, "a/b.gif", "a/b.gif: No space left on device; make room there"),
+        (errno.EISDIR, "a/b.gif", "a/b.gif: Is a directory"),
+        (errno.EIO, None, "Input/output error"),
+        (None, None, "cannot write mode P as PNG"),
+    ],
+)
+def test_a_failed_write_says_what_would_be_right(code: int | None, where: str | None, sentence: str) -> None:
+    error = OSError("cannot write mode P as PNG") if code is None else OSError(code, os.strerror(code), where)
+    assert failure(error).startswith(sentence)
 
 
 def test_a_missing_video_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

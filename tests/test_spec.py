@@ -58,7 +58,7 @@ def test_metadata():
     assert GridWorldEnv.metadata["render_fps"] == 20
 
 
-@pytest.mark.parametrize(("num_rows", "num_cols"), [(4, 4), (7, 9), (12, 5), (4, 10), (9, 4)])
+@pytest.mark.parametrize(("num_rows", "num_cols"), [(4, 3), (5, 3), (4, 4), (7, 9), (12, 5), (9, 4)])
 def test_other_sizes_follow_the_formula(num_rows, num_cols):
     env = GridWorldEnv(num_rows, num_cols)
     row, col = num_rows // 2, num_cols - 2

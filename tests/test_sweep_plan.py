@@ -155,7 +155,9 @@ def test_a_folders_name_is_safe_short_free_and_keeps_the_seed(
     ],
 )
 def test_jobs_are_composed_as_hydra_does_it(loader: ConfigLoaderImpl, overrides: list[str]) -> None:
-    master = loader.load_configuration("train", ["n_envs=2", "hydra.sweep.dir=x"], RunMode.MULTIRUN)
+    known_in_a_job = "hydra.job.id=${hydra.job.num}"
+    words = ["n_envs=2", "hydra.sweep.dir=x", known_in_a_job]
+    master = loader.load_configuration("train", words, RunMode.MULTIRUN)
     quick = SweepLoader(loader)
 
     def plain(config: DictConfig) -> object:
@@ -171,3 +173,28 @@ def test_jobs_are_composed_as_hydra_does_it(loader: ConfigLoaderImpl, overrides:
             del theirs["hydra"]
         assert plain(settings) == plain(theirs)
         assert OmegaConf.to_object(settings) == OmegaConf.to_object(theirs)
+
+
+@pytest.mark.parametrize(
+    ("word", "job", "sentence"),
+    [
+        ("hydra.sweep.subdir=mine", "seed=0", r"hydra.sweep.subdir=mine: a sweep names the folders of its"),
+        ("hydra.sweep.subdir=${seed}", "seed=0", r"hydra.sweep.subdir=\$\{seed\}: a sweep names"),
+        ("seed=1", "experiment=subdir", r"hydra.sweep.subdir=mine: a sweep names"),
+        ("seed=1", "experiment=dir", r"hydra.sweep.dir=mine: stands in a file that only some of the jobs"),
+    ],
+)
+def test_folders_that_the_sweep_would_not_use_are_refused(
+    loader: ConfigLoaderImpl, word: str, job: str, sentence: str, tmp_path: Path
+) -> None:
+    (tmp_path / "experiment").mkdir()
+    for key in ("dir", "subdir"):
+        text = f"# @package _global_\nhydra: {{sweep: {{{key}: mine}}}}\n"
+        (tmp_path / "experiment" / f"{key}.yaml").write_text(text)
+    words = [f"hydra.searchpath=[file://{tmp_path}]", word]
+    master = loader.load_configuration("train", words, RunMode.MULTIRUN)
+    with pytest.raises(InputError, match=sentence):
+        SweepLoader(loader).load_settings(master, [job])
+    for allowed in ("hydra.sweep.dir=mine", "hydra.sweep.subdir=${hydra.job.num}"):
+        master = loader.load_configuration("train", [words[0], allowed], RunMode.MULTIRUN)
+        assert SweepLoader(loader).load_settings(master, ["seed=3"]).seed == 3

@@ -178,7 +178,9 @@ def test_a_batch_learns_from_every_environment(schema: type[TabularControlConfig
     actions = draw_actions(q, 0.4, states, random.random(count))
     for done in range(0, steps, count):
         following, rewards, terminated, _, infos = envs.step(actions)
-        reached = infos.get("final_obs", following)
+        reached = following.copy()
+        if infos:
+            reached[infos["_final_obs"]] = infos["final_obs"][infos["_final_obs"]]
         epsilon = 0.4 + (0.05 - 0.4) * (done + count) / steps
         before = q.copy()
         next_actions = np.zeros(count, dtype=int)
@@ -261,11 +263,11 @@ def test_the_curves_are_means_over_the_last_episodes() -> None:
     rewards: list[float] = []
     last: deque[list[float]] = deque(maxlen=3)
     ended, expected = 0, {}
-    step = seat.envs.step
+    advance = seat.envs.advance
 
     def watched(actions: Any) -> Any:
         nonlocal ended
-        result = step(actions)
+        result = advance(actions)
         rewards.append(float(result[1][0]))
         if result[2][0] or result[3][0]:
             last.append(rewards.copy())
@@ -278,7 +280,7 @@ def test_the_curves_are_means_over_the_last_episodes() -> None:
                 )
         return result
 
-    seat.envs.step = watched  # type: ignore[method-assign]
+    seat.envs.advance = watched  # type: ignore[method-assign]
     trained(config, 1000, seat)
     assert len(written) == len(expected) > 10
     for (values, at), (mean_return, length) in zip(written, expected.values(), strict=True):

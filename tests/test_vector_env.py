@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import DictInfoToList
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracle import MOVES, worlds
@@ -24,6 +25,19 @@ def moves(num_steps, num_envs, seed=0):
 def same(results, others):
     """Equal observations, rewards and flags."""
     return all(np.array_equal(a, b) for a, b in zip(results[:4], others[:4], strict=True))
+
+
+def assert_same_infos(ours, theirs):
+    """The same keys in the same order, and in every array the same values of the same types."""
+    assert list(ours) == list(theirs)
+    for mine, other in zip(ours.values(), theirs.values(), strict=True):
+        assert type(mine) is type(other)
+        if isinstance(mine, dict):
+            assert_same_infos(mine, other)
+            continue
+        assert (mine.dtype, mine.shape) == (other.dtype, other.shape)
+        assert mine.tolist() == other.tolist()
+        assert [type(value) for value in mine.tolist()] == [type(value) for value in other.tolist()]
 
 
 @pytest.mark.parametrize("slip", [0.0, 0.4])
@@ -70,13 +84,69 @@ def test_a_deterministic_batch_equals_gymnasiums_own(layout, mode):
         assert [part.dtype for part in ours[:4]] == [part.dtype for part in theirs[:4]]
         over = ours[2] | ours[3]
         endings += over.sum()
-        if mode is AutoresetMode.SAME_STEP and over.any():
-            assert np.array_equal(ours[4]["_final_obs"], theirs[4]["_final_obs"])
-            assert ours[4]["final_obs"][over].tolist() == theirs[4]["final_obs"][over].tolist()
+        assert_same_infos(ours[4], theirs[4])
         if mode is AutoresetMode.DISABLED and over.any():
             options = {"reset_mask": over}
             assert np.array_equal(native.reset(options=options)[0], copies.reset(options=options)[0])
     assert endings > 50
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("slip", [0.0, 0.4])
+@pytest.mark.parametrize("layout", [TWO_STARTS, "frozen_lake_4x4"], ids=["two starts", "frozen lake"])
+def test_a_batch_of_one_equals_gymnasiums_own_where_chance_is_at_work(layout, slip, mode):
+    arguments = {"layout": layout, "slip": slip, "max_episode_steps": 12}
+    native = gym.make_vec("GridWorld-v0", num_envs=1, autoreset_mode=mode, **arguments)
+    single = SyncVectorEnv([lambda: gym.make("GridWorld-v0", **arguments)], autoreset_mode=mode)
+    assert np.array_equal(native.reset(seed=5)[0], single.reset(seed=5)[0])
+    for actions in moves(300, 1):
+        ours, theirs = native.step(actions), single.step(actions)
+        assert same(ours, theirs)
+        assert_same_infos(ours[4], theirs[4])
+        if mode is AutoresetMode.DISABLED and (ours[2] | ours[3]).any():
+            ours, theirs = (envs.reset(options={"reset_mask": np.array([True])}) for envs in (native, single))
+            assert np.array_equal(ours[0], theirs[0])
+            assert_same_infos(ours[1], theirs[1])
+
+
+def test_gymnasiums_wrappers_read_the_infos_of_a_native_batch():
+    arguments = {"layout": "cliff", "max_episode_steps": 7}
+    native, copies = (
+        DictInfoToList(envs)
+        for envs in (
+            gym.make_vec("GridWorld-v0", num_envs=3, autoreset_mode="SameStep", **arguments),
+            SyncVectorEnv([lambda: gym.make("GridWorld-v0", **arguments)] * 3, autoreset_mode="SameStep"),
+        )
+    )
+    native.reset(seed=0)
+    copies.reset(seed=0)
+    told = []
+    for actions in moves(40, 3):
+        told.append(native.step(actions)[4])
+        assert told[-1] == copies.step(actions)[4]
+    assert sum("final_obs" in info for infos in told for info in infos) > 10
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_step_in_arrays_is_the_same_step(mode):
+    arguments = {"slip": 0.3, "max_episode_steps": 9, "autoreset_mode": mode}
+    plain, quick = (GridWorldVectorEnv(6, **arguments) for _ in range(2))
+    plain.reset(seed=1)
+    quick.reset(seed=1)
+    endings = 0
+    for actions in moves(100, 6):
+        *expected, infos = plain.step(actions)
+        *got, ended = quick.advance(actions)
+        assert same(got, expected)
+        assert (ended is None) == (infos == {})
+        if ended is not None:
+            states, over = ended
+            assert (states.dtype, over.dtype) == (np.int64, np.bool_)
+            assert over.tolist() == infos["_final_obs"].tolist()
+            assert np.where(over, states, None).tolist() == infos["final_obs"].tolist()
+            assert np.array_equal(states[~over], got[0][~over])  # where the step led to the others
+            endings += 1
+    assert (endings > 10) == (mode is AutoresetMode.SAME_STEP)
 
 
 @settings(max_examples=40)
@@ -98,7 +168,7 @@ def test_every_transition_of_a_big_batch_is_one_of_the_rules(world, mode, seed):
     over = np.zeros(64, dtype=bool)
     for actions in moves(20, 64, seed):
         following, rewards, terminated, truncated, infos = envs.step(actions)
-        ended_at = infos.get("final_obs", following)
+        ended_at = np.where(infos["_final_obs"], infos["final_obs"], following) if infos else following
         for i, before in enumerate(zip(states.tolist(), actions.tolist(), strict=True)):
             if over[i] and mode is AutoresetMode.NEXT_STEP:
                 assert following[i] in starts

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from gridworld.columns import aligned
+
 Measure = Callable[[], float]
 
 
@@ -74,10 +76,15 @@ def lines(results: Iterator[Result]) -> Iterator[str]:
         if result.table != table:
             table = result.table
             yield ""
-            yield f"{table:<50}{'ours':>13}{'peer':>13}{'ratio':>9}  peer"
+            yield _line(table, "ours", "peer", "ratio", "peer")
         theirs = "" if result.theirs is None else _number(result.theirs)
         ratio = "" if result.ratio is None else f"{result.ratio:.2f}x"
-        yield f"  {result.name:<48}{_number(result.ours):>13}{theirs:>13}{ratio:>9}  {result.peer}".rstrip()
+        yield _line(f"  {result.name}", _number(result.ours), theirs, ratio, result.peer)
+
+
+def _line(name: str, ours: str, theirs: str, ratio: str, peer: str) -> str:
+    [line] = aligned([[name, ours, theirs, ratio, f" {peer}"]], ("<50", ">12", ">12", ">8", "<0"))
+    return line
 
 
 def _number(value: float) -> str:

@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gridworld.early import at_work
-from gridworld.errors import EXIT_CODE, InputError
-from gridworld.terminal import prepare, tell_error
+from gridworld.errors import EXIT_CODE, InputError, failure
+from gridworld.terminal import prepare, printing, tell_error
 
 Main = Callable[[Sequence[str]], None]
 
@@ -34,16 +34,19 @@ def parser_for_a_run(prog: str, about: str | None) -> argparse.ArgumentParser:
 
 
 def run(main: Main) -> None:
-    """Call `main`; a user's mistake ends the program with one sentence and no traceback."""
+    """Call `main`; a user's mistake ends the program with one sentence and no traceback.
+
+    So does output that could not be written, whatever exit code `main` has for what it found.
+    """
     prepare()
     try:
-        with at_work():
+        with at_work(), printing():
             main(sys.argv[1:])
     except InputError as error:
         tell_error(str(error))
         sys.exit(EXIT_CODE)
     except OSError as error:
-        tell_error(f"{error.filename or 'file'}: {error.strerror}")
+        tell_error(failure(error))
         sys.exit(EXIT_CODE)
     except KeyboardInterrupt:
         sys.exit(130)

@@ -13,7 +13,7 @@ from gridworld.benchmark import stepping
 from gridworld.benchmark.measure import FULL, QUICK, Result, Scale, compare, lines
 from gridworld.errors import InputError
 from gridworld.files import write_json
-from gridworld.run import check_inside
+from gridworld.run import check_inside, check_writable
 
 _TABLES = ("stepping", "training", "whole", "files")
 
@@ -28,6 +28,9 @@ def main(arguments: Sequence[str]) -> None:
     check_inside(options.out, "--out")
     if not options.out.parent.is_dir():
         raise InputError(f"--out {options.out}: there is no folder {options.out.parent}")
+    if options.out.is_dir():
+        raise InputError(f"--out {options.out}: is a folder; name a file in it")
+    check_writable(options.out.parent, "--out")
     scale = QUICK if options.quick else FULL
     results: list[Result] = []
     print(f"medians of {scale.repetitions}, one torch thread, {platform.machine()}, {os.cpu_count()} cores")

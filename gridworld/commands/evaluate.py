@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
+from gridworld.columns import aligned
 from gridworld.commands import parser_for_a_run
 from gridworld.env import GridWorldEnv
 from gridworld.errors import InputError
@@ -65,13 +66,15 @@ def _table(judge: Judge, policy: FloatArray, score: Score, sampled: Sampled) -> 
         ("return", exact.expected_return, sampled.episode_return, optimum.expected_return),
         ("episode length", exact.expected_length, sampled.length, optimum.expected_length),
     )
-    lines = [f"  {'':<22}{'exact':>10}  {f'{sampled.episodes:,} episodes [95 %]':<26}{'optimum':>10}"]
-    lines.append("  without a step limit:")
-    lines.append(f"  {'value':<22}{score.value:>10.4g}  {'':<26}{judge.optimal_value:>10.4g}")
-    lines.append(f"  within {judge.max_episode_steps:,} steps:")
+    rows = [
+        ["", "exact", f" {sampled.episodes:,} episodes [95 %]", "optimum"],
+        ["without a step limit:", "", "", ""],
+        ["value", f"{score.value:.4g}", "", f"{judge.optimal_value:.4g}"],
+        [f"within {judge.max_episode_steps:,} steps:", "", "", ""],
+    ]
     for label, value, estimate, best in within:
-        lines.append(f"  {label:<22}{value:>10.4g}  {estimate!s:<26}{best:>10.4g}")
-    return "\n".join(lines)
+        rows.append([label, f"{value:.4g}", f" {estimate}", f"{best:.4g}"])
+    return "\n".join(f"  {line}" for line in aligned(rows, ("<22", ">9", "<27", ">9")))
 
 
 def _verdict(judge: Judge, policy: FloatArray, score: Score) -> str:

@@ -7,9 +7,10 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from gridworld.columns import aligned
 from gridworld.sweep.folder import open_sweep
 from gridworld.sweep.report import counts_text
-from gridworld.sweep.table import STATUSES, Table
+from gridworld.sweep.table import STATUSES, Row, Table
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -21,13 +22,16 @@ def main(arguments: Sequence[str]) -> None:
     may_write = os.access(folder.path, os.W_OK)
     rows = table.put_right(entries) if may_write else table.look(entries)
     shown = [row for row in rows.values() if options.status in (None, row.status)]
-    width = max((len(row.job) for row in shown), default=0)
-    for row in shown:
-        seconds = f"{row.seconds:>8} s" if row.seconds else " " * 10
-        regret = f"  regret {float(row.objective):.3g}" if row.objective else ""
-        error = f"  {row.error}" if row.error else ""
-        print(f"{row.job:<{width}}  {row.status:<11}{seconds}{regret}{error}".rstrip())
+    for line in aligned([_cells(row) for row in shown], ("<0", "<12", ">9", "<0")):
+        print(line)
     print(counts_text(rows.values()))
+
+
+def _cells(row: Row) -> list[str]:
+    seconds = f"{row.seconds} s" if row.seconds else ""
+    regret = f" regret {float(row.objective):.3g}" if row.objective else ""
+    error = f" {row.error}" if row.error else ""
+    return [row.job, f" {row.status}", seconds, f"{regret} {error}" if regret and error else regret + error]
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -18,7 +18,7 @@ from gridworld.evaluation import play_episode
 from gridworld.film import Film, film_of_states
 from gridworld.pictures import MapMaker, agent_gamma
 from gridworld.render import frame_size
-from gridworld.run import check_inside
+from gridworld.run import check_inside, check_writable
 from gridworld.saved_run import SavedRun, choose_policy, read_visits
 
 MAPS = ("policy", "q_error", "visits")
@@ -30,6 +30,8 @@ def main(arguments: Sequence[str]) -> None:
     _check(options)
     folder: Path = options.out or options.run / "recording"
     saved = SavedRun(options.run, options.trust)
+    check_no_link(folder)
+    check_writable(folder, "--out")
     if options.cell_size is not None:
         frame_size(saved.mdp, options.cell_size)
     formats = list(dict.fromkeys(options.format))
@@ -38,7 +40,6 @@ def main(arguments: Sequence[str]) -> None:
     beliefs = saved.beliefs()
     film = _film(saved, beliefs, options)
     record.check_size(film, formats)
-    check_no_link(folder)
     folder.mkdir(parents=True, exist_ok=True)
     for kind in formats:
         if kind == "png":

@@ -14,12 +14,14 @@ from typing import Any
 
 from gridworld.errors import InputError
 from gridworld.run import alone_in, check_inside, read_run
+from gridworld.terminal import result_is_in_files
 
 KEY = "resume"
 
 
 def main(arguments: Sequence[str]) -> None:
     """Go on, and tell the result as a new run would."""
+    result_is_in_files()
     words = _read(arguments)
     folder = Path(words[KEY])
     check_inside(folder, KEY)

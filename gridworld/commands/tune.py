@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 from gridworld.errors import InputError
 from gridworld.manual import choices
-from gridworld.terminal import tell_error
+from gridworld.terminal import result_is_in_files, tell_error
 
 if TYPE_CHECKING:
     from gridworld.tune.asked import Asked
@@ -65,6 +65,7 @@ def main(arguments: Sequence[str]) -> None:
     if options.cfg:
         _show(asked)
         return
+    result_is_in_files()
     from gridworld.training import Interrupted
     from gridworld.tune.crew import SearchError
     from gridworld.tune.study import tune

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from gridworld.errors import InputError
-from gridworld.files import write_text
+from gridworld.files import replacing_folder, write_text
 from gridworld.report import tables
 from gridworld.report.aggregate import write_events
 from gridworld.report.page import figures, improvements, render
@@ -18,6 +16,7 @@ from gridworld.report.png import to_png
 from gridworld.report.report import Report
 from gridworld.report.table import Table, to_csv, to_markdown
 from gridworld.report.tuning import finalists_table, trials_table, winner_table
+from gridworld.run import check_writable
 
 PAGE = "report.html"
 FIGURES, TABLES, EVENTS = "figures", "tables", "tensorboard"
@@ -48,7 +47,7 @@ def write_report(report: Report, folder: Path) -> Path:
     """Write everything, in the place of an older report; returns the page's path."""
     check_out(folder)
     scenes = figures(report)
-    with _replacing_folder(folder) as new:
+    with replacing_folder(folder) as new:
         write_text(new / PAGE, render(report, scenes))
         (new / FIGURES).mkdir()
         drawn = [scene for of_task in scenes.values() for scene in of_task]
@@ -67,8 +66,12 @@ def write_report(report: Report, folder: Path) -> Path:
 
 
 def check_markers(path: Path) -> None:
-    """Raise `InputError` unless the Markdown file has the two markers, once each and in order."""
+    """Raise `InputError` unless the Markdown file has the two markers, once each and in order.
+
+    It must be possible to replace it, too.
+    """
     _around_markers(path)
+    check_writable(path.parent, "--readme")
 
 
 def write_readme(report: Report, path: Path) -> None:
@@ -120,24 +123,3 @@ def _file_names(names: Iterable[str]) -> list[str]:
             unique = f"{plain} {count}"
         out.append(unique)
     return out
-
-
-@contextmanager
-def _replacing_folder(folder: Path) -> Iterator[Path]:
-    """A new folder beside `folder`; it takes its place if the block ends well, else it is gone."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    new, old = (folder.with_name(f".{folder.name}.{os.getpid()}.{kind}") for kind in ("part", "old"))
-    new.mkdir()
-    try:
-        yield new
-        if folder.exists():
-            folder.rename(old)
-        try:
-            new.rename(folder)
-        except OSError:
-            if old.exists():
-                old.rename(folder)
-            raise
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)

@@ -7,7 +7,7 @@ of groups; values are then put into a copy, by the function that Hydra has for i
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import Any, cast
 
 from hydra._internal.config_loader_impl import ConfigLoaderImpl, get_overrides_dirname
 from hydra.core.config_loader import ConfigLoader
@@ -16,7 +16,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
+from gridworld.errors import InputError
+
 _MOST_BASES = 64
+_NUMBERED = "${hydra.job.num}"  # hydra.sweep.subdir unless somebody sets it; the sweeper has its own names
 
 
 class SweepLoader(ConfigLoaderImpl):
@@ -34,10 +37,9 @@ class SweepLoader(ConfigLoaderImpl):
         self._apply_overrides_to_config([o for o in overrides if o.input_line not in choices], config)
         tasks = [override for override in overrides if not override.is_hydra_override()]
         config.hydra.overrides.task = [override.input_line for override in tasks]
-        config.hydra.overrides.hydra = [
-            *master_config.hydra.overrides.hydra,
-            *(override.input_line for override in overrides if override.is_hydra_override()),
-        ]
+        given = cast("list[str]", OmegaConf.to_container(master_config.hydra.overrides.hydra, resolve=False))
+        own = [str(override.input_line) for override in overrides if override.is_hydra_override()]
+        config.hydra.overrides.hydra = given + own
         naming = config.hydra.job.config.override_dirname
         config.hydra.job.override_dirname = get_overrides_dirname(
             tasks, naming.exclude_keys, naming.item_sep, naming.kv_sep
@@ -46,10 +48,15 @@ class SweepLoader(ConfigLoaderImpl):
         return config
 
     def load_settings(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
-        """The same without `hydra`, which is most of it and takes as much of the time."""
+        """The same without `hydra`, which is most of it and takes as much of the time.
+
+        Raises `InputError` where the command line, or a file that it chooses, names other folders for the
+        jobs than the sweeper does.
+        """
         overrides, choices = self._parse(sweep_overrides)
         if choices not in self._settings:
             settings = copy.deepcopy(self._base(master_config, choices))
+            _refuse_own_folders(settings, master_config)
             HydraConfig.instance().set_config(settings)  # settings may refer to it: ${hydra:runtime.cwd}
             with read_write(settings), open_dict(settings):
                 del settings["hydra"]
@@ -79,3 +86,19 @@ class SweepLoader(ConfigLoaderImpl):
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_bases": {}, "_settings": {}}
+
+
+def _refuse_own_folders(settings: DictConfig, master: DictConfig) -> None:
+    own, given = (OmegaConf.to_container(c.hydra.sweep, resolve=False) for c in (settings, master))
+    assert isinstance(own, dict)
+    assert isinstance(given, dict)
+    if own.get("subdir") != _NUMBERED:
+        raise InputError(
+            f"hydra.sweep.subdir={own.get('subdir')}: a sweep names the folders of its jobs itself, by the "
+            "settings in which they differ; leave it out"
+        )
+    if own["dir"] != given["dir"]:
+        raise InputError(
+            f"hydra.sweep.dir={own['dir']}: stands in a file that only some of the jobs choose, and a sweep "
+            "has one folder; give it on the command line"
+        )

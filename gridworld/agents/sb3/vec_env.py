@@ -86,12 +86,12 @@ class GridWorldVecEnv(VecEnv):
 
     def step_states(self, actions: NDArray[Any]) -> StateStep:
         """One step of all environments, told in states instead of observations."""
-        states, rewards, terminated, truncated, ended = self.envs.step(actions)
+        states, rewards, terminated, truncated, ended = self.envs.advance(actions)
         self._returns += rewards
         self._lengths += 1
-        if not ended:
+        if ended is None:
             return StateStep(states, states, rewards, terminated, truncated, {})
-        dones, last = ended["_final_obs"], ended["final_obs"]
+        last, dones = ended
         truncated &= ~terminated
         over = np.flatnonzero(dones)
         elapsed = round(time.time() - self._started, 6)

@@ -87,11 +87,11 @@ class TabularControl:
         while goes_on and self._steps < total_timesteps:
             actions = self._actions
             step_size = self._step_size(self._steps / total_timesteps)
-            following, rewards, _, _, infos = envs.step(actions)
+            following, rewards, _, _, ended = envs.advance(actions)
             self._steps = steps = self._steps + envs.num_envs
             self.exploration_rate = self._epsilon(steps / total_timesteps)
-            over = np.flatnonzero(infos["_final_obs"]) if infos else _NONE
-            reached = infos["final_obs"] if infos else following  # before the reset of what is over
+            reached = following if ended is None else ended[0]  # before the reset of what is over
+            over = _NONE if ended is None else np.flatnonzero(ended[1])
             self._episodes.add(rewards, over)
 
             if is_sarsa:

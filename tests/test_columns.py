@@ -1,0 +1,148 @@
+"""Tables on the terminal: columns stay apart and in line, whatever numbers stand in them."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gridworld.benchmark.measure import Result, lines
+from gridworld.columns import aligned
+from gridworld.commands import evaluate
+from gridworld.commands import jobs as jobs_command
+from gridworld.evaluation import Judge
+from gridworld.layout import classic
+from gridworld.mdp import compile_mdp
+from gridworld.summary import summary_text
+from gridworld.sweep.table import Row, Table
+
+NUMBERS = st.floats() | st.sampled_from([-0.0001381, 1e-300, -1e-300, -1.234e300, float("-inf"), 0.0])
+WORDS = st.text("ab-.0", min_size=1, max_size=30)
+
+
+@given(st.lists(st.tuples(WORDS, WORDS, WORDS), max_size=5), st.integers(0, 12))
+def test_cells_are_found_again_in_line_and_a_blank_apart(
+    rows: list[tuple[str, str, str]], least: int
+) -> None:
+    told = aligned(rows, (f"<{least}", f">{least}", "<0"))
+    assert [line.split() for line in told] == [list(row) for row in rows]
+    places = [[match.span() for match in re.finditer(r"\S+", line)] for line in told]
+    assert len({place[0][0] for place in places} | {0}) == 1  # words begin in line
+    assert len({place[1][1] for place in places}) <= 1  # numbers end in line
+    assert len({place[2][0] for place in places}) <= 1
+    assert all(place[1][1] - place[0][0] > least for place in places)
+    assert all(line == line.rstrip() for line in told)
+
+
+def test_short_cells_keep_the_least_width() -> None:
+    assert aligned([["a", "1", "x"], ["bb", "", ""]], ("<4", ">3", "<9")) == ["a      1 x", "bb"]
+    assert aligned([], ("<4", ">3")) == []
+
+
+@given(st.lists(NUMBERS, min_size=9, max_size=9), st.tuples(NUMBERS, NUMBERS))
+def test_the_table_at_the_end_of_a_run(numbers: list[float], regrets: tuple[float, float]) -> None:
+    keys = ("value", "goal_probability", "length")
+    greedy, sampled, best = (dict(zip(keys, numbers[i : i + 3], strict=True)) for i in (0, 3, 6))
+    summary = {
+        **greedy,
+        **{f"optimal_{key}": value for key, value in best.items()},
+        "sampled": {**sampled, "regret": regrets[1]},
+        "regret": regrets[0],
+        "agent": "dqn",
+        "env": "classic",
+        "seed": 0,
+        "timesteps": 1,
+        "train_seconds": 0.1,
+        "certified": True,
+        "certified_since_step": 1,
+        "max_episode_steps": 100_000,
+    }
+    head, unlimited, value, regret, limited, *within = summary_text(summary, "run").splitlines()[2:9]
+    assert head.split() == ["greedy", "sampled", "optimum"]
+    assert (unlimited, limited) == ("  without a step limit:", "  within 100,000 steps:")
+    for line, key in zip([value, *within], keys, strict=True):
+        assert line.split()[-3:] == [f"{part[key]:.4g}" for part in (greedy, sampled, best)]
+    assert len(regret.split()) == 4
+    assert len({len(line) for line in (head, value, regret, *within)}) == 1
+
+
+def test_the_table_at_the_end_of_a_usual_run() -> None:
+    summary = {
+        "agent": "dqn",
+        "env": "classic",
+        "seed": 0,
+        "timesteps": 30208,
+        "train_seconds": 0.8,
+        "value": 0.93207,
+        "goal_probability": 1.0,
+        "length": 8.0,
+        "regret": 0.0,
+        "optimal_value": 0.93207,
+        "optimal_goal_probability": 1.0,
+        "optimal_length": 8.0,
+        "sampled": {"value": 0.8786, "goal_probability": 0.9737, "length": 8.392, "regret": 0.0535},
+        "certified": True,
+        "certified_since_step": 12032,
+        "max_episode_steps": 100,
+    }
+    assert summary_text(summary, "runs/a").splitlines()[2:9] == [
+        "                           greedy   sampled   optimum",
+        "  without a step limit:",
+        "  value                    0.9321    0.8786    0.9321",
+        "  regret                        0    0.0535         0",
+        "  within 100 steps:",
+        "  goal probability              1    0.9737         1",
+        "  episode length                8     8.392         8",
+    ]
+
+
+@given(NUMBERS, NUMBERS, NUMBERS)
+def test_the_table_of_a_benchmark(ours: float, theirs: float, ratio: float) -> None:
+    result = Result("stepping, per second", "n" * 60, ours, "a peer", theirs, ratio, 1)
+    _, heading, line = lines(iter([result]))
+    assert heading.split()[-4:] == ["ours", "peer", "ratio", "peer"]
+    assert len(line.split()) == 6
+    assert line.split()[3] == f"{ratio:.2f}x"
+
+
+@pytest.mark.parametrize("reward", [-1e-5, -1e12, 1e-300])
+def test_the_table_of_an_evaluation(reward: float) -> None:
+    mdp = compile_mdp(classic(), slip=0.1, step_reward=reward, goal_reward=reward, trap_reward=reward)
+    judge = Judge(mdp, 0.99, 100)
+    policy = judge.optimal_policy()
+    sampled = judge.sample(policy, 20, 0)
+    head, unlimited, value, limited, *within = evaluate._table(
+        judge, policy, judge.score(policy), sampled
+    ).splitlines()
+    assert (unlimited, limited) == ("  without a step limit:", "  within 100 steps:")
+    assert re.fullmatch(r"  value +\S+ +\S+", value)
+    assert len(within) == 6
+    for line in within:
+        assert re.fullmatch(r"  [a-z -]+ \S+  \S+ \[\S+, \S+\] +\S+", line)
+    assert len({len(line) for line in (head, value, *within)}) == 1
+
+
+def test_the_list_of_a_sweeps_jobs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [
+        Row("seed=0", "", "interrupted", "12345678.90", "", "it was stopped"),
+        Row("seed=1,agent=dqn", "", "done", "0.10", "-1e-300", ""),
+        Row("seed=2", "", "pending", "", "", ""),
+    ]
+    (tmp_path / "sweep.json").write_text(
+        '{"format": 1, "asked": [{"overrides": []}], "jobs": ['
+        + ", ".join(f'{{"job": "{row.job}", "hash": "{row.job}", "overrides": []}}' for row in rows)
+        + "]}"
+    )
+    told = {row.job: row for row in rows}
+    monkeypatch.setattr(Table, "_look_at", lambda self, entry, before: dataclasses.replace(told[entry.job]))
+    jobs_command.main([str(tmp_path)])
+    assert capsys.readouterr().out.splitlines() == [
+        "seed=0            interrupted 12345678.90 s  it was stopped",
+        "seed=1,agent=dqn  done               0.10 s  regret -1e-300",
+        "seed=2            pending",
+        "3 jobs: 1 pending, 1 done, 1 interrupted",
+    ]
