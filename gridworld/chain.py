@@ -190,7 +190,7 @@ def can_reach(mdp: Mdp, taken: BoolArray, targets: BoolArray) -> BoolArray:
     reaching = targets.copy()
     frontier: IntArray = np.flatnonzero(targets)
     while frontier.size:
-        around = np.unique(mdp.neighbour[frontier])
+        around = np.unique(mdp.predecessors(frontier))
         around = around[~reaching[around]]
         leads = (reaching[mdp.next_state[around]] & taken[around]).any(axis=(1, 2))
         frontier = around[leads]
