@@ -102,20 +102,20 @@ def test_q_learning_is_certified(task: str, seed: int, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_on_the_cliff_sarsa_earns_more_while_q_learning_finds_the_optimum(tmp_path: Path) -> None:
-    """Sutton & Barto, example 6.6: what the policy that explores earns, in the second half of training."""
+    """Sutton & Barto, example 6.6: what episodes bring in the second half of training."""
     earned: dict[str, list[float]] = {"q_learning": [], "sarsa": []}
-    for agent, means in earned.items():
+    for agent, returns in earned.items():
         for seed in range(10):
             folder = tmp_path / f"{agent}{seed}"
             summary = train_in(
                 folder,
-                *(f"experiment=cliff_{agent}_textbook", f"seed={seed}"),
-                *("total_timesteps=15000", "evaluation.every=1000", *NO_FILES),
+                *(f"experiment=cliff_walking_{agent}_textbook", f"seed={seed}", *NO_FILES),
             )
             assert summary["certified"] == (agent == "q_learning")
             with (folder / "curve.csv").open() as file:
                 rows = list(csv.DictReader(file))
-            late = [float(row["sampled_return"]) for row in rows[len(rows) // 2 :]]
-            means.append(sum(late) / len(late))
+            late = [float(row["online_return"]) for row in rows[len(rows) // 2 :] if row["online_return"]]
+            returns.append(statistics.median(late))  # now and then SARSA's values lead it astray for long
+    assert statistics.mean(earned["sarsa"]) == pytest.approx(-25, abs=3)  # as in the book's figure
+    assert statistics.mean(earned["q_learning"]) == pytest.approx(-50, abs=3)
     assert min(earned["sarsa"]) > max(earned["q_learning"])
-    assert statistics.mean(earned["sarsa"]) > statistics.mean(earned["q_learning"]) + 5
