@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import stable_baselines3
 from support import CONF, configure, train_in
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from gridworld.agents.sb3.arguments import algorithm_and_arguments
 from gridworld.manual import manual
@@ -90,6 +91,26 @@ def test_the_default_settings_are_the_librarys_own(name: str) -> None:
         if key not in ("policy", "policy_kwargs", "optimize_memory_usage"):
             assert value == parameters[key].default or not value, key
     assert config.n_envs == 1
+
+
+ON_POLICY = [recipe for recipe in RECIPES if re.search("_(a2c|ppo|trpo)(_sb3_defaults)?$", recipe)]
+
+
+@pytest.mark.parametrize("recipe", ON_POLICY)
+def test_the_librarys_own_curves_have_tens_of_points(recipe: str) -> None:
+    config = configure(f"experiment={recipe}")
+    algorithm, arguments = algorithm_and_arguments(config.agent)
+    n_steps = arguments.get("n_steps", inspect.signature(algorithm.__init__).parameters["n_steps"].default)
+    iterations = config.total_timesteps // (n_steps * config.n_envs)
+    assert 20 <= iterations // config.agent.log_interval <= 200
+
+
+@pytest.mark.parametrize("agent", ["q_learning", "sarsa", "expected_sarsa"])
+def test_a_tables_own_curves_have_tens_of_points(agent: str, tmp_path: Path) -> None:
+    train_in(tmp_path, f"agent={agent}", *NO_FILES, "logging.tensorboard=true")
+    events = EventAccumulator(str(tmp_path), size_guidance={"scalars": 0})
+    events.Reload()
+    assert 15 <= len(events.Scalars("rollout/ep_rew_mean")) <= 200
 
 
 @pytest.mark.parametrize("seed", range(3))
