@@ -1,8 +1,8 @@
 """The grid as a chart: cells in colours, numbers in them, a caption above, a legend below.
 
-The look is the environment's own frame's: the same grid, walls, traps and goals, and a border of at least a
-cell all round, which holds the words. Cells are painted by one look-up for the whole picture, so 40,000 of
-them cost no more calls than 30.
+The look is the environment's own frame's: the same grid, walls, cliffs, traps and goals, and a border of at
+least a cell all round, which holds the words. Cells are painted by one look-up for the whole picture, so
+40,000 of them cost no more calls than 30.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Canvas:
         layout, cell = self.mdp.layout, self.cell
         colours = colours.copy()
         colours[self.mdp.terminal] = PAPER
-        colours[self.mdp.wall] = drawing.WALL
+        colours[self.mdp.wall], colours[self.mdp.cliff] = drawing.WALL, drawing.CLIFF
         if not self.has_grid:
             colours[self.mdp.goal], colours[self.mdp.trap] = drawing.GOAL, drawing.TRAP
         packed = np.full((*colours.shape[:2], 4), 255, dtype=np.uint8)
@@ -214,7 +214,7 @@ def _font(size: int) -> Any:
 
 def shown(mdp: Mdp) -> BoolArray:
     """(S,), the cells that somebody can act in."""
-    return ~(mdp.terminal | mdp.wall)
+    return ~(mdp.terminal | mdp.wall | mdp.cliff)
 
 
 def short(number: float, largest: float | None = None) -> str:

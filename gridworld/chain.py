@@ -259,7 +259,7 @@ def steps_to(mdp: Mdp, taken: BoolArray, targets: BoolArray) -> IntArray:
     distance = 0
     while frontier.size:
         distance += 1
-        around = np.unique(mdp.neighbour[frontier])
+        around = np.unique(mdp.predecessors(frontier))
         around = around[steps[around] < 0]
         leads = ((steps[mdp.next_state[around]] >= 0) & taken[around]).any(axis=(1, 2))
         frontier = around[leads]

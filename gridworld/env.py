@@ -43,7 +43,8 @@ class GridWorldEnv(gym.Env[int, int]):
 
     ## Episode End
     A goal or a trap terminates. A step after that returns `(state, 0.0, True, False, {})` and changes
-    nothing. The class never truncates; the id `GridWorld-v0` does, after 100 steps.
+    nothing. A cliff does not terminate: it pays as a trap and puts the agent back on the start. The class
+    never truncates; the id `GridWorld-v0` does, after 100 steps.
 
     ## Arguments
     - `num_rows`, `num_cols`: the size of the layout `classic`; any other map has its own.

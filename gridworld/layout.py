@@ -1,15 +1,17 @@
-"""A map: which cell is floor, wall, start, goal or trap.
+"""A map: which cell is floor, wall, start, goal, trap or cliff.
 
 Maps are text, one line a row and one sign a cell:
 
     S  start (several: each episode draws one of them, uniformly)
     G  goal, ends the episode
     T  trap, ends the episode
+    C  cliff: who steps here pays as for a trap, is back at the start at once, and the episode goes on
     #  wall, cannot be entered
     .  floor
 
 `Layout` is the checked, immutable form. Whatever holds one can rely on it: there is a start and a goal, no
-cell is two things, and every start can reach a goal without stepping on a trap.
+cell is two things, every start can reach a goal without stepping on a trap or a cliff, and where there is a
+cliff, there is one start to be sent back to.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ MOVES: tuple[Cell, ...] = ((-1, 0), (0, 1), (1, 0), (0, -1))  # up, right, down,
 
 CLASSIC = "classic"
 NUM_ROWS, NUM_COLS = 5, 6  # of classic
-_TILES = "SGT#."
+_TILES = "SGTC#."
 
 
 class MapError(InputError):
@@ -55,6 +57,7 @@ class Layout:
     goals: tuple[Cell, ...]
     traps: tuple[Cell, ...] = ()
     walls: frozenset[Cell] = frozenset()
+    cliffs: tuple[Cell, ...] = ()
 
     def __post_init__(self) -> None:
         _check(self)
@@ -75,7 +78,8 @@ class Layout:
     def text(self) -> str:
         """The map as text, one line a row, no newline at the end; `parse` reads it back."""
         grid = [["."] * self.num_cols for _ in range(self.num_rows)]
-        for tile, cells in zip("SGT#", (self.starts, self.goals, self.traps, self.walls), strict=True):
+        kinds = (self.starts, self.goals, self.traps, self.cliffs, self.walls)
+        for tile, cells in zip("SGTC#", kinds, strict=True):
             for row, col in cells:
                 grid[row][col] = tile
         return "\n".join(map("".join, grid))
@@ -112,7 +116,7 @@ def parse(text: str, name: str) -> Layout:
             if tile not in found:
                 raise InputError(
                     f"{name}: row {row + 1}, column {col + 1}: unknown tile {tile!r}; "
-                    "known are S (start), G (goal), T (trap), # (wall) and . (floor)"
+                    "known are S (start), G (goal), T (trap), C (cliff), # (wall) and . (floor)"
                 )
             found[tile].append((row, col))
         if len(line) != len(lines[0]):
@@ -128,6 +132,7 @@ def parse(text: str, name: str) -> Layout:
         goals=tuple(found["G"]),
         traps=tuple(found["T"]),
         walls=frozenset(found["#"]),
+        cliffs=tuple(found["C"]),
     )
 
 
@@ -226,6 +231,7 @@ def _check(layout: Layout) -> None:
         ("goal", layout.goals),
         ("trap", layout.traps),
         ("wall", layout.walls),
+        ("cliff", layout.cliffs),
         ("start", layout.starts),
     ):
         for row, col in cells:
@@ -237,19 +243,23 @@ def _check(layout: Layout) -> None:
                     name, f"{where}: a {what} on a {kind[row, col]}", "a cell can be one thing only"
                 )
             kind[row, col] = what
+    if layout.cliffs and len(layout.starts) > 1:
+        raise MapError(
+            name, f"a cliff 'C' sends back to the start, and there are {len(layout.starts)}", "leave one 'S'"
+        )
     reaching = _cells_that_reach_a_goal(layout)
     for row, col in layout.starts:
         if (row, col) not in reaching:
             raise MapError(
                 name,
                 f"no goal can be reached from the start in row {row + 1}, column {col + 1}",
-                "open a way past the walls and traps",
+                "open a way past the walls, traps and cliffs",
             )
 
 
 def _cells_that_reach_a_goal(layout: Layout) -> set[Cell]:
-    """Breadth-first from the goals backwards; moves are symmetric between cells that are not terminal."""
-    closed = layout.walls.union(layout.traps)
+    """Breadth-first from the goals backwards; moves are symmetric between floor cells."""
+    closed = layout.walls.union(layout.traps, layout.cliffs)
     seen = set(layout.goals)
     queue = deque(layout.goals)
     while queue:

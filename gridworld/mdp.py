@@ -2,8 +2,9 @@
 
 A move succeeds with probability 1 - slip; otherwise one of the two perpendicular moves happens instead, with
 probability slip / 2 each. A move off the grid or into a wall leaves the agent where it is. The reward of a
-step is `step_reward` plus the reward of the cell entered (goal, trap, or nothing). Terminal cells and walls
-absorb: every action stays there and pays nothing.
+step is `step_reward` plus the reward of the cell entered (goal, trap, or nothing). A move into a cliff pays
+as one into a trap and leads to the start, so that nobody is ever on a cliff cell; as a state it is floor that
+no move leads to. Terminal cells and walls absorb: every action stays there and pays nothing.
 
 Reference: M. L. Puterman, Markov Decision Processes, 1994, chapter 2.
 """
@@ -40,13 +41,14 @@ class Mdp:
     step_reward: float
     goal_reward: float
     trap_reward: float
-    neighbour: IntArray  # (S, A), where a move leads, geometry alone: borders and walls, no slip, no end
+    neighbour: IntArray  # (S, A), where a move leads, geometry alone: borders and walls, no slip, fall or end
     next_state: IntArray  # (S, A, K)
     probability: FloatArray  # (S, A, K), rows sum to 1
     reward: FloatArray  # (S, A, K)
     terminal: BoolArray  # (S,), goals and traps
     goal: BoolArray  # (S,)
     wall: BoolArray  # (S,)
+    cliff: BoolArray  # (S,)
     start: FloatArray  # (S,), a distribution
 
     @property
@@ -73,6 +75,29 @@ class Mdp:
         """(S,), terminal and no goal."""
         return _frozen(self.terminal & ~self.goal)
 
+    def predecessors(self, states: IntArray) -> IntArray:
+        """States with an outcome, whatever its probability, that leads into one of these; some repeatedly.
+
+        Args:
+            states: (n,) state numbers.
+
+        Returns:
+            (m,) state numbers in no particular order.
+        """
+        sources, first = self._incoming
+        counts = first[states + 1] - first[states]
+        skipped = first[states] - (np.cumsum(counts) - counts)
+        found: IntArray = sources[np.arange(counts.sum()) + np.repeat(skipped, counts)]
+        return found
+
+    @cached_property
+    def _incoming(self) -> tuple[IntArray, IntArray]:
+        """(S * A * K,) origins of all outcomes by where they lead; (S + 1,) where a state's part begins."""
+        leads_to = self.next_state.ravel()
+        origins = np.argsort(leads_to, kind="stable") // (leads_to.size // self.num_states)
+        first = np.concatenate([[0], np.cumsum(np.bincount(leads_to, minlength=self.num_states))])
+        return _frozen(origins.astype(self.next_state.dtype)), _frozen(first)
+
 
 def compile_mdp(
     layout: Layout,
@@ -89,7 +114,14 @@ def compile_mdp(
     goal_reward = _finite("goal_reward", goal_reward)
     trap_reward = _finite("trap_reward", trap_reward)
 
-    goal, trap, wall = (_mask(layout, cells) for cells in (layout.goals, layout.traps, layout.walls))
+    if layout.cliffs and trap_reward > 0:
+        raise InputError(
+            f"trap_reward={trap_reward}: must be at most 0 where the map has a cliff, "
+            "from which the agent may fall again and again"
+        )
+    goal, trap, wall, cliff = (
+        _mask(layout, cells) for cells in (layout.goals, layout.traps, layout.walls, layout.cliffs)
+    )
     terminal = goal | trap
     absorbing = terminal | wall
     neighbour = _neighbours(layout, wall)
@@ -98,8 +130,9 @@ def compile_mdp(
     outcomes = [neighbour] if slip == 0 else [neighbour, np.roll(neighbour, -1, 1), np.roll(neighbour, 1, 1)]
     chances = [1.0] if slip == 0 else [1 - slip, slip / 2, slip / 2]
     next_state = np.stack(outcomes, axis=-1)
+    reward = (step_reward + goal_reward * goal + trap_reward * (trap | cliff))[next_state]
+    next_state[cliff[next_state]] = layout.state(layout.starts[0])  # the only one where there is a cliff
     next_state[absorbing] = np.flatnonzero(absorbing).reshape(-1, 1, 1)
-    reward = (step_reward + goal_reward * goal + trap_reward * trap)[next_state]
     reward[absorbing] = 0.0
 
     start = _mask(layout, layout.starts) / len(layout.starts)
@@ -116,6 +149,7 @@ def compile_mdp(
         terminal=_frozen(terminal),
         goal=_frozen(goal),
         wall=_frozen(wall),
+        cliff=_frozen(cliff),
         start=_frozen(start),
     )
 

@@ -30,6 +30,7 @@ Frame = NDArray[np.uint8]  # (height, width, 3), RGB
 BACKGROUND: Colour = (255, 255, 255)
 GRID_LINE: Colour = (0, 0, 0)
 WALL: Colour = (150, 150, 150)
+CLIFF: Colour = (110, 85, 65)
 TRAP: Colour = (50, 50, 50)
 GOAL: Colour = (230, 180, 50)
 AGENT: Colour = (100, 100, 220)
@@ -81,10 +82,11 @@ def surface_to_frame(surface: Any) -> Frame:
 
 
 def draw_world(surface: Any, mdp: Mdp, state: int | None, cell_size: int = CELL_SIZE) -> None:
-    """Draw background, walls, grid, traps, goals and the agent, in this order."""
+    """Draw background, walls, cliffs, grid, traps, goals and the agent, in this order."""
     surface.fill(BACKGROUND)
-    for cell in mdp.layout.walls:
-        fill_cell(surface, cell, WALL, cell_size)
+    for colour, cells in ((WALL, mdp.layout.walls), (CLIFF, mdp.layout.cliffs)):
+        for cell in cells:
+            fill_cell(surface, cell, colour, cell_size)
     draw_grid(surface, mdp, cell_size)
     draw_terminals(surface, mdp, cell_size)
     if state is not None:

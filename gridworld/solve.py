@@ -226,7 +226,7 @@ def _pick(table: FloatArray, actions: IntArray) -> FloatArray:
 
 
 def _sweep(mdp: Mdp, gamma: float) -> FloatArray:
-    """Value iteration from V = 0, each sweep only where a neighbour's value has just changed.
+    """Value iteration from V = 0, each sweep only where a successor's value has just changed.
 
     Changes are measured relative to the value, so the wave of a far goal is followed to the last cell,
     however small the discounted value has become there. Measured so, a value that fades away to 0 never
@@ -243,7 +243,7 @@ def _sweep(mdp: Mdp, gamma: float) -> FloatArray:
         v[active] = new
         affected = np.zeros(mdp.num_states, dtype=np.bool_)
         affected[changed] = True
-        affected[mdp.neighbour[changed]] = True  # moves are symmetric: predecessors are neighbours
+        affected[mdp.predecessors(changed)] = True
         active = np.flatnonzero(affected & playing)
     return v
 
@@ -254,7 +254,7 @@ def _farthest(mdp: Mdp, ends: BoolArray) -> int:
     frontier: IntArray = np.flatnonzero(ends)
     moves = 0
     while frontier.size:
-        around = np.unique(mdp.neighbour[frontier])
+        around = np.unique(mdp.predecessors(frontier))
         frontier = around[~reached[around]]
         reached[frontier] = True
         moves += 1

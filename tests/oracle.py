@@ -35,12 +35,12 @@ class World:
         return self.tile[cell] in "GT"
 
     def moved(self, cell, action):
-        """Where a move leads: a border or a wall leaves the agent where it is."""
+        """Where a move leads, before a fall: a border or a wall leaves the agent where it is."""
         target = cell[0] + MOVES[action][0], cell[1] + MOVES[action][1]
         return cell if self.tile.get(target, "#") == "#" else target
 
     def outcomes(self, cell, action):
-        """All that may happen: (probability, cell, reward, terminal), one entry per cell."""
+        """All that may happen: (probability, cell, reward, terminal), one entry per cell and reward."""
         return self.known[cell, action]
 
     def _outcomes(self, cell, action):
@@ -55,16 +55,18 @@ class World:
             if probability > 0:
                 target = self.moved(cell, direction)
                 chance[target] = chance.get(target, 0) + probability
-        entering = {"G": self.settings["goal_reward"], "T": self.settings["trap_reward"]}
-        return [
-            (
-                p,
-                target,
-                self.settings["step_reward"] + entering.get(self.tile[target], 0),
-                self.ends(target),
-            )
-            for target, p in chance.items()
-        ]
+        known = {}
+        for target, p in chance.items():
+            following, reward = self._entered(target)
+            known[following, reward] = known.get((following, reward), 0) + p
+        return [(p, following, reward, self.ends(following)) for (following, reward), p in known.items()]
+
+    def _entered(self, target):
+        """What comes of stepping onto this cell: where the agent is then, and the step's reward."""
+        goal, trap = self.settings["goal_reward"], self.settings["trap_reward"]
+        paid = {"G": goal, "T": trap, "C": trap}.get(self.tile[target], 0)
+        fell = self.tile[target] == "C"
+        return (self.starts[0] if fell else target), self.settings["step_reward"] + paid
 
     def q(self, values, cell, action, gamma):
         return sum(p * (r + gamma * values[target]) for p, target, r, _ in self.outcomes(cell, action))
@@ -114,11 +116,11 @@ class World:
         return tuple(total)
 
     def distances(self, first):
-        """Fewest steps from a cell to every cell that can be walked to without stepping on a trap."""
+        """Fewest steps from a cell to every cell that can be walked to past traps and cliffs."""
         steps, queue = {first: 0}, [first]
         for cell in queue:
             for target in (self.moved(cell, a) for a in MOVES if not self.ends(cell)):
-                if target not in steps and self.tile[target] != "T":
+                if target not in steps and self.tile[target] not in "TC":
                     steps[target] = steps[cell] + 1
                     queue.append(target)
         return steps
@@ -131,14 +133,19 @@ class World:
 
 @st.composite
 def maps(draw, max_side=4):
-    """Rows of a small valid map: one or two goals, one to three starts that can reach one, traps, walls."""
+    """Rows of a small valid map: one or two goals, traps, walls, and starts that can reach a goal.
+
+    Of these there are one to three, or only one where there are cliffs.
+    """
     height, width = draw(st.integers(1, max_side)), draw(st.integers(2, max_side))
     cells = [(r, c) for r in range(height) for c in range(width)]
-    tile = {cell: draw(st.sampled_from("...#T")) for cell in cells}
+    num_starts = draw(st.integers(1, 3))
+    floor = "...#TC" if num_starts == 1 else "...#T"
+    tile = {cell: draw(st.sampled_from(floor)) for cell in cells}
     order = draw(st.permutations(cells))
     num_goals = draw(st.integers(1, 2)) if len(cells) > 2 else 1
     goals, others = order[:num_goals], order[num_goals:]
-    starts = others[: draw(st.integers(1, 3))]
+    starts = others[:num_starts]
     tile.update(dict.fromkeys(goals, "G"))
     tile.update(dict.fromkeys(starts, "S"))
     for start in starts:
@@ -157,7 +164,7 @@ def _open_a_way(tile, start, goal):
         else:
             row += 1 if goal[0] > row else -1
     for cell in way:
-        if tile[cell] in "#T":
+        if tile[cell] in "#TC":
             tile[cell] = "."
 
 
@@ -166,16 +173,21 @@ def _rows(tile, height, width):
 
 
 def worlds(max_side=4):
-    """Random worlds: a small map, any slip, rewards of either sign."""
+    """Random worlds: a small map, any slip, rewards of either sign, but that a cliff never pays."""
     rewards = st.floats(-2, 2).map(lambda number: round(number, 3))
     return st.builds(
-        World,
+        _world,
         maps(max_side),
         slip=st.sampled_from([0.0, 0.1, 0.25, 0.6, 1.0]),
         step_reward=st.sampled_from([0.0, -0.04, 0.05]) | rewards,
         goal_reward=st.just(1.0) | rewards,
         trap_reward=st.just(-1.0) | rewards,
     )
+
+
+def _world(rows, trap_reward, **settings):
+    falls = any("C" in row for row in rows)
+    return World(rows, trap_reward=-abs(trap_reward) if falls else trap_reward, **settings)
 
 
 def policies(world):

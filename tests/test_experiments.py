@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import stable_baselines3
 from support import CONF, configure, train_in
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from gridworld.agents.sb3.arguments import algorithm_and_arguments
 from gridworld.manual import manual
@@ -92,6 +93,26 @@ def test_the_default_settings_are_the_librarys_own(name: str) -> None:
     assert config.n_envs == 1
 
 
+ON_POLICY = [recipe for recipe in RECIPES if re.search("_(a2c|ppo|trpo)(_sb3_defaults)?$", recipe)]
+
+
+@pytest.mark.parametrize("recipe", ON_POLICY)
+def test_the_librarys_own_curves_have_tens_of_points(recipe: str) -> None:
+    config = configure(f"experiment={recipe}")
+    algorithm, arguments = algorithm_and_arguments(config.agent)
+    n_steps = arguments.get("n_steps", inspect.signature(algorithm.__init__).parameters["n_steps"].default)
+    iterations = config.total_timesteps // (n_steps * config.n_envs)
+    assert 20 <= iterations // config.agent.log_interval <= 200
+
+
+@pytest.mark.parametrize("agent", ["q_learning", "sarsa", "expected_sarsa"])
+def test_a_tables_own_curves_have_tens_of_points(agent: str, tmp_path: Path) -> None:
+    train_in(tmp_path, f"agent={agent}", *NO_FILES, "logging.tensorboard=true")
+    events = EventAccumulator(str(tmp_path), size_guidance={"scalars": 0})
+    events.Reload()
+    assert 15 <= len(events.Scalars("rollout/ep_rew_mean")) <= 200
+
+
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("task", ["cliff", "four_rooms"])
 def test_q_learning_is_certified(task: str, seed: int, tmp_path: Path) -> None:
@@ -102,20 +123,20 @@ def test_q_learning_is_certified(task: str, seed: int, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_on_the_cliff_sarsa_earns_more_while_q_learning_finds_the_optimum(tmp_path: Path) -> None:
-    """Sutton & Barto, example 6.6: what the policy that explores earns, in the second half of training."""
+    """Sutton & Barto, example 6.6: what episodes bring in the second half of training."""
     earned: dict[str, list[float]] = {"q_learning": [], "sarsa": []}
-    for agent, means in earned.items():
+    for agent, returns in earned.items():
         for seed in range(10):
             folder = tmp_path / f"{agent}{seed}"
             summary = train_in(
                 folder,
-                *(f"experiment=cliff_{agent}_textbook", f"seed={seed}"),
-                *("total_timesteps=15000", "evaluation.every=1000", *NO_FILES),
+                *(f"experiment=cliff_{agent}_textbook", f"seed={seed}", *NO_FILES),
             )
             assert summary["certified"] == (agent == "q_learning")
             with (folder / "curve.csv").open() as file:
                 rows = list(csv.DictReader(file))
-            late = [float(row["sampled_return"]) for row in rows[len(rows) // 2 :]]
-            means.append(sum(late) / len(late))
+            late = [float(row["online_return"]) for row in rows[len(rows) // 2 :] if row["online_return"]]
+            returns.append(statistics.median(late))  # now and then SARSA's values lead it astray for long
+    assert statistics.mean(earned["sarsa"]) == pytest.approx(-25, abs=3)  # as in the book's figure
+    assert statistics.mean(earned["q_learning"]) == pytest.approx(-50, abs=3)
     assert min(earned["sarsa"]) > max(earned["q_learning"])
-    assert statistics.mean(earned["sarsa"]) > statistics.mean(earned["q_learning"]) + 5

@@ -12,18 +12,22 @@ from gridworld import GridWorldEnv, InputError, Layout, shipped_layouts
 from gridworld.evaluation import Judge
 from gridworld.layout import classic, load, parse
 
-SHIPPED = ("aima_4x3", "classic", "cliff", "four_rooms", "frozen_lake_4x4", "frozen_lake_8x8", "maze")
+SHIPPED = (
+    *("aima_4x3", "classic", "cliff", "cliff_walking", "four_rooms"),
+    *("frozen_lake_4x4", "frozen_lake_8x8", "maze"),
+)
 
 
 @given(maps())
 def test_every_tile_is_read_where_it_stands(rows):
     layout, world = parse("\n".join(rows), "map"), World(rows)
-    cells = {tile: {cell for cell, t in world.tile.items() if t == tile} for tile in "SGT#"}
+    cells = {tile: {cell for cell, t in world.tile.items() if t == tile} for tile in "SGTC#"}
     assert (layout.num_rows, layout.num_cols) == (len(rows), len(rows[0]))
     assert list(layout.cells()) == world.cells
     assert [layout.state(cell) for cell in world.cells] == list(range(len(world.cells)))
     assert [set(layout.starts), set(layout.goals), set(layout.traps)] == [cells[tile] for tile in "SGT"]
     assert set(layout.walls) == cells["#"]
+    assert set(layout.cliffs) == cells["C"]
     assert set(layout.terminals) == cells["G"] | cells["T"]
     assert layout.terminals[0] in cells["G"]
 
@@ -53,6 +57,8 @@ def test_text_and_parse_undo_each_other(rows):
         (b"S.#.\n..#G\n", r"no goal can be reached from the start in row 1, column 1"),
         (b"S#.S\n##.G\n", r"no goal can be reached from the start in row 1, column 1"),
         (b"..TG\nS.TT\n", r"no goal can be reached from the start in row 2, column 1"),
+        (b"..CG\nS.TC\n", r"no goal can be reached from the start in row 2, column 1"),
+        (b"S.SG\n..CS\n", r"a cliff 'C' sends back to the start, and there are 3; leave one 'S'"),
         (b"\x89PNG\r\n\x1a\n\x00\xff\xd8", r"not a text file.*byte 1 "),
         (b"S..G\xff\n", r"not a text file.*byte 5 "),
         (b"S" + b"." * 262143 + b"G", r"too large.*262144"),
@@ -217,6 +223,9 @@ def test_a_size_that_is_no_number_is_refused_for_maps_too(size):
         ({"starts": ((1, 0),)}, "row 2, column 1: a start on a wall"),
         ({"starts": ((0, 0), (0, 0))}, "row 1, column 1: a start on a start"),
         ({"traps": ((1, 2),)}, "row 2, column 3: a trap on a goal"),
+        ({"cliffs": ((1, 0),)}, "row 2, column 1: a cliff on a wall"),
+        ({"cliffs": ((0, 3),)}, "row 1, column 4: this cliff lies outside"),
+        ({"cliffs": ((0, 2),), "starts": ((0, 0), (1, 1))}, "a cliff 'C' sends back to the start"),
         ({"starts": ((2, 0),)}, "row 3, column 1: this start lies outside"),
         ({"goals": ((0, 3),)}, "row 1, column 4: this goal lies outside"),
         ({"traps": ((-1, 0),)}, "this trap lies outside"),

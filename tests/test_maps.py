@@ -17,12 +17,12 @@ from gridworld.history import History
 from gridworld.layout import load, parse
 from gridworld.mdp import Mdp, compile_mdp
 from gridworld.policy_map import DISAGREES, draw_policy_map
-from gridworld.render import GOAL, TRAP, WALL, Frame
+from gridworld.render import CLIFF, GOAL, TRAP, WALL, Frame
 from gridworld.solve import value_iteration
 from gridworld.visit_map import draw_visit_map
 
 CLASSIC = compile_mdp(load("classic"))
-WORLDS = ["classic", "four_rooms", "maze", "cliff", "aima_4x3"]
+WORLDS = ["classic", "four_rooms", "maze", "cliff", "cliff_walking", "aima_4x3"]
 
 
 def cell_pictures(mdp: Mdp, frame: Frame) -> dict[int, Frame]:
@@ -41,7 +41,7 @@ def has(picture: Frame, colour: tuple[int, ...]) -> bool:
 
 
 def playing(mdp: Mdp) -> np.ndarray:
-    return np.flatnonzero(~(mdp.terminal | mdp.wall))
+    return np.flatnonzero(~(mdp.terminal | mdp.wall | mdp.cliff))
 
 
 def lightness(ramp: np.ndarray) -> np.ndarray:
@@ -101,6 +101,8 @@ def test_policy_map_colours_cells_by_value_and_frames_mistakes(name: str) -> Non
         corner = tuple(picture[len(picture) // 6, len(picture) // 6])
         if mdp.wall[state]:
             assert corner == WALL
+        elif mdp.cliff[state]:
+            assert np.array_equal(np.unique(picture[2:-2, 2:-2].reshape(-1, 3), axis=0), [CLIFF])  # no arrow
         elif not mdp.terminal[state]:
             assert corner == tuple(colours[state])
         assert has(picture, DISAGREES) == (state == wrong)

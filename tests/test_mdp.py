@@ -45,8 +45,20 @@ def test_the_masks_and_the_start_equal_the_map(world):
     assert mdp.goal.tolist() == [tile == "G" for tile in tiles]
     assert mdp.trap.tolist() == [tile == "T" for tile in tiles]
     assert mdp.wall.tolist() == [tile == "#" for tile in tiles]
+    assert mdp.cliff.tolist() == [tile == "C" for tile in tiles]
     assert mdp.start.tolist() == [(tile == "S") / len(world.starts) for tile in tiles]
     assert mdp.start_states.tolist() == [world.state(cell) for cell in world.starts]
+
+
+@given(worlds())
+def test_predecessors_are_the_origins_of_all_outcomes(world):
+    mdp = compiled(world)
+    for state in range(mdp.num_states):
+        origins = (mdp.next_state == state).any(axis=(1, 2))
+        assert np.unique(mdp.predecessors(np.array([state]))).tolist() == np.flatnonzero(origins).tolist()
+    everything = mdp.predecessors(np.arange(mdp.num_states)[::-1])
+    assert np.bincount(everything).tolist() == [mdp.next_state[0].size] * mdp.num_states
+    assert mdp.predecessors(np.array([], dtype=np.int32)).size == 0
 
 
 @given(worlds())
@@ -59,7 +71,7 @@ def test_shapes_and_sums(world):
     assert mdp.start.sum() == pytest.approx(1, abs=1e-12)
 
 
-TABLES = ["neighbour", "next_state", "probability", "reward", "terminal", "goal", "wall", "start"]
+TABLES = ["neighbour", "next_state", "probability", "reward", "terminal", "goal", "wall", "cliff", "start"]
 
 
 @pytest.mark.parametrize("name", ["layout", "slip", "reward"])
@@ -112,3 +124,20 @@ def test_rewards_and_slip_by_hand():
     assert mdp.probability[1, 1].tolist() == [0.5, 0.25, 0.25]
     assert mdp.reward[1, 1].tolist() == pytest.approx([-3.1, -0.1, -0.1])
     assert mdp.reward[2].tolist() == [[0.0] * 3] * 4  # it is over
+
+
+def test_a_fall_by_hand():
+    mdp = compile_mdp(parse("...\nSCG", "map"), slip=0.2, step_reward=-0.5, trap_reward=-3)
+    assert mdp.next_state[3, 1].tolist() == [3, 3, 0]  # off the cliff and back; the border; floor
+    assert mdp.reward[3, 1].tolist() == [-3.5, -0.5, -0.5]
+    assert mdp.next_state[1, 2].tolist() == [3, 0, 2]
+    assert mdp.reward[1, 2].tolist() == [-3.5, -0.5, -0.5]
+    assert not mdp.terminal[[3, 4]].any()
+    assert mdp.neighbour[3, 1] == 4  # geometry alone
+
+
+def test_a_cliff_that_pays_is_refused():
+    cliff = parse("SCG\n...", "map")
+    with pytest.raises(InputError, match=r"trap_reward=0.5: must be at most 0 where the map has a cliff"):
+        compile_mdp(cliff, trap_reward=0.5)
+    assert compile_mdp(cliff, trap_reward=0).reward.max() == 1

@@ -116,6 +116,19 @@ def test_walls_fill_their_cells_in_a_colour_of_their_own():
     assert np.array_equal(frame[certain], colours[certain])
 
 
+def test_cliffs_fill_their_cells_in_another_colour():
+    rows = ("S...", ".#C.", "C..G")
+    frame = frame_of(rows, 0)
+    [wall], [cliff] = (
+        np.unique(frame[201:300, left : left + 99].reshape(-1, 3), axis=0).tolist() for left in (201, 301)
+    )
+    assert tuple(cliff) not in {WHITE, BLACK, TRAP, GOAL, AGENT, tuple(wall)}
+    assert (frame[301:400, 101:200] == cliff).all()
+    env = GridWorldEnv(render_mode="ansi", layout=parse("\n".join(rows), "map"))
+    env.reset()
+    assert env.render().splitlines() == ["A...", ".#C.", "C..G"]
+
+
 def test_every_frame_is_a_fresh_array():
     env = GridWorldEnv(render_mode="rgb_array")
     env.reset()

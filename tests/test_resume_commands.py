@@ -166,7 +166,7 @@ def test_a_finished_run_is_made_longer(tmp_path: Path, capsys: pytest.CaptureFix
     [
         (["agent=q_learning", "n_envs=16", "evaluation.every=220"], 1760, 4000),  # due at the last step
         ([*SHORT["ppo"], "evaluation.every=128"], 600, 2000),  # due thrice between 600 and 1,024, the last
-        (["agent=a2c", "n_envs=4", "agent.arguments.n_steps=8", "evaluation.every=100"], 484, 1000),
+        (["agent=a2c", "agent.arguments.learning_rate=0.005", "n_envs=4", "evaluation.every=100"], 484, 1000),
         ([*SHORT["dqn"], "n_envs=32", "agent.exploration_fraction=1e-9", "evaluation.every=500"], 1001, 1500),
     ],
     ids=["q_learning", "ppo", "a2c", "dqn"],

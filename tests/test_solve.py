@@ -51,7 +51,7 @@ def test_the_value_of_a_policy_equals_brute_force(data, world, gamma):
     assert exact == pytest.approx(np.array([slow[cell] for cell in world.cells]), abs=1e-9)
 
 
-@given(st.data(), worlds(), st.integers(0, 12))
+@given(st.data(), worlds(), st.integers(1, 12))
 def test_the_outcome_within_the_limit_equals_brute_force(data, world, max_steps):
     policy = data.draw(policies(world))
     result = Chain(compiled(world), table(world, policy)).outcome(max_steps)
