@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import hashlib
 import json
 import math
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ import numpy as np
 from support import configure
 
 from gridworld.evaluation import Judge
+from gridworld.sealing import sealed
 from gridworld.training import make_mdp
 
 _COLUMNS = ("value", "regret", "certified", "goal_probability", "trap_probability", "timeout_probability")
@@ -90,7 +92,9 @@ class Maker:
             "config": config,
         }
         (folder / "summary.json").write_text(json.dumps(summary))
-        (folder / "manifest.json").write_text(json.dumps(manifest))
+        files = ("curve.csv", "summary.json")
+        sums = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in files}
+        (folder / "manifest.json").write_text(json.dumps(sealed(manifest | {"sha256": sums})))
 
 
 def sweep(folder: Path, seeds: int = 20) -> Path:

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from gridworld.sweep.folder import open_sweep
 from gridworld.sweep.report import counts_text
-from gridworld.sweep.table import STATUSES, Table
+from gridworld.sweep.table import JOBS_CSV, STATUSES, Table
+from gridworld.terminal import printable
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -21,12 +22,15 @@ def main(arguments: Sequence[str]) -> None:
     may_write = os.access(folder.path, os.W_OK)
     rows = table.put_right(entries) if may_write else table.look(entries)
     shown = [row for row in rows.values() if options.status in (None, row.status)]
+    with_error = {row.job for row in shown if row.error}
+    verified = table.from_runs(entry for entry in entries if entry.job in with_error)
     width = max((len(row.job) for row in shown), default=0)
     for row in shown:
         seconds = f"{row.seconds:>8} s" if row.seconds else " " * 10
         regret = f"  regret {float(row.objective):.3g}" if row.objective else ""
         error = f"  {row.error}" if row.error else ""
-        print(f"{row.job:<{width}}  {row.status:<11}{seconds}{regret}{error}".rstrip())
+        alone = f" (says {JOBS_CSV} alone)" if error and verified[row.job].error != row.error else ""
+        print(printable(f"{row.job:<{width}}  {row.status:<11}{seconds}{regret}{error}{alone}".rstrip()))
     print(counts_text(rows.values()))
 
 

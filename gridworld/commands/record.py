@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gridworld import record
 from gridworld.agents import Beliefs
 from gridworld.commands import parser_for_a_run
-from gridworld.data_files import check_no_link, read_object
+from gridworld.data_files import check_no_link
 from gridworld.errors import InputError
 from gridworld.evaluation import play_episode
 from gridworld.film import Film, film_of_states
@@ -116,11 +116,11 @@ def _save_map(
 
 def _steps(saved: SavedRun) -> int:
     """How long it was trained."""
-    path = saved.run.summary_file
-    saved.run.verify(path)
-    steps = read_object(path).get("timesteps")
+    steps = saved.run.read_summary().get("timesteps")
     if not isinstance(steps, int) or isinstance(steps, bool) or steps < 0:
-        raise InputError(f"{path}: not the summary of a run, timesteps must be a whole number")
+        raise InputError(
+            f"{saved.run.summary_file}: not the summary of a run, timesteps must be a whole number"
+        )
     return steps
 
 

@@ -12,6 +12,7 @@ from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.flat import flat
 from gridworld.report.analysis import Overall, TaskAnalysis, analyse
+from gridworld.report.embed import changed_pictures
 from gridworld.report.find import find_runs
 from gridworld.report.grouping import Study, arrange
 from gridworld.report.reading import Evidence, Unusable, read
@@ -53,8 +54,11 @@ def gather(paths: Sequence[Path], seed: int = 0) -> Report:
         )
     study = arrange(runs)
     tasks, overall = analyse(study, seed)
+    changed = [told for task in tasks for result in task.results for told in changed_pictures(result)]
     tunings, unread = find_tunings(paths)
-    return Report(study, tasks, overall, unusable, (*problems, *unread), _foreign(runs), seed, tuple(tunings))
+    return Report(
+        study, tasks, overall, unusable, (*problems, *unread, *changed), _foreign(runs), seed, tuple(tunings)
+    )
 
 
 def _foreign(runs: Sequence[Evidence]) -> tuple[str, ...]:

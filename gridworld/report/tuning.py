@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gridworld.data_files import LARGEST_CSV, read_object, read_text
+from gridworld.data_files import LARGEST_CSV, as_text, read_bytes, sha256
 from gridworld.errors import InputError
 from gridworld.report.table import Cell, Table
+from gridworld.sealing import read_sealed
 
 STUDY_JSON, TRIALS_CSV = "study.json", "trials.csv"
-FORMAT = 1
+TRIALS_SUM = "trials_sha256"  # in the former, of the latter
 _SCORED = ("done", "pruned")
 
 
@@ -113,10 +114,8 @@ def trials_table(tuning: Tuning) -> Table:
 
 def _read(folder: Path) -> Tuning:
     file = folder / STUDY_JSON
-    content = read_object(file)
-    if content.get("format") != FORMAT:
-        raise InputError(f"{file}: has format {content.get('format')!r}, this version reads {FORMAT}")
-    table = read_text(folder / TRIALS_CSV, LARGEST_CSV)
+    content = read_sealed(file)
+    table = _trials(folder / TRIALS_CSV, content)
     try:
         winner = content["winner"]
         space = {str(key): _dimension(dimension) for key, dimension in content["space"].items()}
@@ -139,6 +138,17 @@ def _read(folder: Path) -> Tuning:
         )
     except (KeyError, TypeError, ValueError, AttributeError, csv.Error) as error:
         raise InputError(f"{file}: has no search that came to an end, or was changed ({error!r})") from None
+
+
+def _trials(file: Path, study: Mapping[str, Any]) -> str:
+    """The table that study.json was written beside; one of the first format does not say which."""
+    content = read_bytes(file, LARGEST_CSV)
+    if TRIALS_SUM in study and study[TRIALS_SUM] != sha256(content):
+        raise InputError(
+            f"{file}: is not the table that {STUDY_JSON} was written with; it was changed or damaged, or the "
+            "search has gone on and not come to its end"
+        )
+    return as_text(content, file)
 
 
 def _dimension(content: Mapping[str, Any]) -> dict[str, Any]:

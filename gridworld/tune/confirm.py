@@ -14,10 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gridworld.config import TrainConfig
-from gridworld.run import MANIFEST
 from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.plan import plan
-from gridworld.sweep.table import read_json
+from gridworld.sweep.table import status_in
 from gridworld.tune.worker import become_worker, is_stopped
 
 CONFIRM = "confirm"  # the runs' folder, in the study's
@@ -60,7 +59,7 @@ def work(task: Sequence[Job], worker: int, parent: int) -> None:
     while left and not is_stopped():
         left = [job for job in left if is_stopped() or _run(job)]
         # Some may be at work elsewhere, in the folder's other workers or in another command's.
-        left = [job for job in left if read_json(job.folder / MANIFEST).get("status") not in _ENDED]
+        left = [job for job in left if status_in(job.folder) not in _ENDED]
     sys.exit(0)
 
 
