@@ -265,6 +265,7 @@ def check_new(folder: Path, key: str = "hydra.run.dir") -> None:
         raise InputError(f"{folder}: is the folder of a sweep; choose another {key}")
     if used := next(folder.glob(f"*/{MANIFEST}"), None):
         raise InputError(f"{folder}: holds other runs, {used.parent} for one; name a new folder in it")
+    check_no_link(folder / "checkpoints")
     check_writable(folder, key)
 
 

@@ -16,6 +16,7 @@ from gridworld.data_files import check_no_link
 from gridworld.errors import InputError
 from gridworld.evaluation import play_episode
 from gridworld.film import Film, film_of_states
+from gridworld.inside import make_inside
 from gridworld.pictures import MapMaker, agent_gamma
 from gridworld.render import frame_size
 from gridworld.run import check_inside
@@ -38,8 +39,11 @@ def main(arguments: Sequence[str]) -> None:
     beliefs = saved.beliefs()
     film = _film(saved, beliefs, options)
     record.check_size(film, formats)
-    check_no_link(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    if options.out is None:
+        make_inside(options.run, folder.name)
+    else:
+        check_no_link(folder)
+        folder.mkdir(parents=True, exist_ok=True)
     for kind in formats:
         if kind == "png":
             path = folder / "frames"

@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.errors import InputError
-from gridworld.files import write_json
+from gridworld.files import remove, write_json
+from gridworld.inside import check_no_links, links_in
 from gridworld.lock import locked
 from gridworld.provenance import versions
 from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, check_writable
@@ -60,12 +61,20 @@ class SweepFolder:
     def check(self, jobs: Sequence[Job], extend: bool) -> None:
         """Raise `InputError` if the folder cannot be written, or is of another sweep."""
         check_writable(self.path, "hydra.sweep.dir")
+        for job in jobs:
+            if job.hash in self.entries:  # others get a folder of their own
+                self._check_no_links(self.entries[job.hash].job)
         if self.entries and not extend and not any(job.hash in self.entries for job in jobs):
             asked = self._manifest["asked"][-1]["overrides"]
             raise InputError(
                 f"{self.path}: holds the sweep '{shlex.join(asked)}', which has no job in common with this "
                 "one; choose another hydra.sweep.dir, or add hydra.sweeper.extend=true to put both into one"
             )
+
+    def _check_no_links(self, job: str) -> None:
+        """What Hydra writes before the job begins, it writes through links."""
+        for names in ((job,), (job, ".hydra")):
+            check_no_links(self.path, *names)
 
     @contextmanager
     def at_work(self) -> Iterator[None]:
@@ -81,13 +90,14 @@ class SweepFolder:
                 raise InputError(f"{self.path}: another process runs this sweep; wait for it or stop it")
             (self.path / STOP).unlink(missing_ok=True)
             for part in self.path.glob(".*.part"):  # of a process that was killed while writing
-                part.unlink(missing_ok=True)
+                remove(part)
             yield
 
     def add(self, jobs: Sequence[Job], words: Sequence[str]) -> list[Entry]:
         """Note what is asked for; returns the jobs' entries, new ones with a folder of their own."""
         taken = {entry.job.lower() for entry in self.entries.values()}
         taken |= {used.parent.name.lower() for used in self.path.glob(f"*/{MANIFEST}")}  # whosever they are
+        taken |= {name.lower() for name in links_in(self.path)}
         lines = [e.overrides for e in self.entries.values()] + [job.overrides for job in jobs]
         common = set(lines[0]).intersection(*lines)
         for job in jobs:

@@ -16,6 +16,7 @@ import optuna
 
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
+from gridworld.inside import check_no_links
 from gridworld.run import MANIFEST, SWEEP_JSON, check_writable
 from gridworld.session import hparams
 from gridworld.sweep.report import shown
@@ -23,11 +24,12 @@ from gridworld.training import make_mdp
 from gridworld.tune import confirm, verdict
 from gridworld.tune.asked import Asked, Source, search_path
 from gridworld.tune.claim import claim, is_claimed
+from gridworld.tune.confirm import CONFIRM
 from gridworld.tune.crew import SearchError, run_crew
 from gridworld.tune.finals import Final, Finalist, finalists, missing, ranking
 from gridworld.tune.finals import work as finals_work
 from gridworld.tune.progress import SearchProgress
-from gridworld.tune.recipe import RECIPE, write_recipe
+from gridworld.tune.recipe import EXPERIMENT, RECIPE, write_recipe
 from gridworld.tune.records import write_study
 from gridworld.tune.space import with_values
 from gridworld.tune.storage import begin, has_study, in_reach, open_storage, open_study, shown_url, standing
@@ -84,6 +86,8 @@ def _check_folder(folder: Path) -> None:
         if (folder / name).exists():
             raise InputError(f"{folder}: is the folder of {kind}; choose another tune.folder")
     check_writable(folder, "tune.folder")
+    for names in ((), (CONFIRM,), (EXPERIMENT,)):
+        check_no_links(folder, *names)
 
 
 def _about(asked: Asked) -> dict[str, Any]:
