@@ -29,6 +29,7 @@ from gridworld.report.metrics import online_return
 from gridworld.report.reading import Evidence, read
 from gridworld.report.report import Report, gather
 from gridworld.report.scene import text_width
+from gridworld.report.tuning import find_tunings
 from gridworld.report.writing import MARKERS
 from gridworld.run import PICTURES
 from gridworld.sealing import sealed
@@ -353,17 +354,53 @@ def test_paths_without_runs(maker: Maker, tmp_path: Path, capsys: pytest.Capture
         shutil.rmtree(tmp_path / "out")
 
 
-def test_links_are_followed_once(maker: Maker, tmp_path: Path) -> None:
+def test_a_link_that_is_named_is_followed_and_others_are_passed_over(maker: Maker, tmp_path: Path) -> None:
     run = maker.write(tmp_path / "runs" / "deep" / "one", 0, 3000)
-    (run / "up").symlink_to(tmp_path / "runs")
-    (tmp_path / "runs" / "again").symlink_to(tmp_path / "runs" / "deep")
+    maker.write(tmp_path / "mine" / "two", 1, 3000)
+    (run / "all").symlink_to("/")
+    (tmp_path / "runs" / "mine").symlink_to(tmp_path / "mine")
+    (tmp_path / "runs" / "file").symlink_to(run / "curve.csv")
     (tmp_path / "runs" / "nowhere").symlink_to(tmp_path / "gone")
     (tmp_path / "runs" / "itself").symlink_to(tmp_path / "runs" / "itself")
     (tmp_path / "linked").symlink_to(tmp_path / "runs")
-    for paths in ([tmp_path / "linked"], [tmp_path / "runs", run], [run, tmp_path / "runs", tmp_path]):
+    for paths in ([tmp_path / "linked"], [tmp_path / "runs", run], [run, tmp_path / "runs"]):
         report = gather(paths)
-        assert (len(report.study.groups), report.complete) == (1, True)
+        assert [found.seed for group in report.study.groups for found in group.runs] == [0]
+        assert report.complete
         assert not report.study.notes
+        note = report.notes[-1]
+        assert re.fullmatch(r".*/one/all( and 1 more)?: a link to a folder is not followed; .*", note)
+    (tmp_path / "runs" / "only").mkdir()
+    (tmp_path / "runs" / "only" / "x").symlink_to(tmp_path / "mine")
+    with pytest.raises(InputError, match=r"holds no run, .*only/x: a link to a folder is not followed"):
+        gather([tmp_path / "runs" / "only"])
+    assert len(gather([tmp_path / "runs" / "mine"]).study.groups[0].runs) == 1
+
+
+def test_a_study_behind_a_link_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "study.json").write_text("{}")
+    (tmp_path / "theirs" / "own").mkdir(parents=True)
+    (tmp_path / "theirs" / "own" / "study.json").write_text("{}")
+    (tmp_path / "theirs" / "linked").symlink_to(tmp_path / "mine")
+    (tmp_path / "named").symlink_to(tmp_path / "mine")
+    _, problems = find_tunings([tmp_path / "theirs", tmp_path / "named"])
+    assert [problem.split(": has no trials.csv")[0] for problem in problems] == [
+        str(tmp_path / "theirs" / "own"),
+        str(tmp_path / "named"),
+    ]
+
+
+def test_a_search_for_runs_ends(maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    maker.write(tmp_path / "0" / "run", 0, 3000)
+    for number in range(100):
+        (tmp_path / "1" / str(number)).mkdir(parents=True)
+    monkeypatch.setattr("gridworld.report.find.MOST_ENTRIES", 50)
+    report = gather([tmp_path])
+    assert report.problems == (
+        f"{tmp_path}: holds more than 50 files and folders, the rest was not searched; name the folders of "
+        "the runs",
+    )
 
 
 def test_a_folder_that_may_not_be_read(maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

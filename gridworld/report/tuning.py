@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 from gridworld.data_files import LARGEST_CSV, as_text, read_bytes, sha256
 from gridworld.errors import InputError
+from gridworld.report.find import real_folders
 from gridworld.report.table import Cell, Table
 from gridworld.sealing import read_sealed
 
@@ -71,7 +73,9 @@ def find_tunings(paths: Sequence[Path]) -> tuple[list[Tuning], list[str]]:
     found: dict[Path, Tuning] = {}
     problems = []
     for path in paths:
-        for file in (*path.glob(STUDY_JSON), *sorted(path.glob(f"*/{STUDY_JSON}"))):
+        for file in (folder / STUDY_JSON for folder in real_folders(path)):
+            if not os.path.lexists(file):
+                continue
             try:
                 found.setdefault(file.resolve(), _read(file.parent))
             except InputError as error:
