@@ -32,7 +32,7 @@ from gridworld.inside import check_no_links, remove_inside
 from gridworld.manual import manual
 from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, Run, alone_in, check_inside, check_new, shown
 from gridworld.sweep.config import LAUNCHER_SCHEMAS, SweepConfig
-from gridworld.terminal import prepare, tell_error
+from gridworld.terminal import prepare, printable, tell_error
 from gridworld.tune.config import SearchConfig
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -196,7 +196,7 @@ def run_job(settings: DictConfig) -> float:
             return _run_alone(config, folder, overrides)
     except (InputError, OSError, OmegaConfBaseException) as error:
         if is_one_of_many:
-            print(f"job {context.job.num} failed: {sentence(error)}", file=sys.stderr)
+            print(printable(f"job {context.job.num} failed: {sentence(error)}"), file=sys.stderr)
             raise JobError(sentence(error)) from None
         sys.exit(_tell(error))
 

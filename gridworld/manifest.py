@@ -32,6 +32,10 @@ def _is_list_of(kind: type) -> Callable[[Any], bool]:
     return lambda value: isinstance(value, list) and all(isinstance(each, kind) for each in value)
 
 
+def _is_map(value: Any) -> bool:
+    return _is_list_of(str)(value) and all(row.isprintable() for row in value)
+
+
 def _is_count(value: Any) -> bool:
     return value is None or (type(value) is int and value >= 0)
 
@@ -50,7 +54,7 @@ def _are_continuations(value: Any) -> bool:
 _KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "status": (_is(str), "a word"),
     "config": (_is(dict), "the run's settings; is it of another version?"),
-    "layout": (_is_list_of(str), "a list of the map's rows; is it of another version?"),
+    "layout": (_is_map, "a list of the map's rows; is it of another version?"),
     "started": (_is(str), "a date"),
     "ended": (_is(str, type(None)), "a date"),
     "error": (_is(str), "a sentence"),

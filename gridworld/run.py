@@ -44,6 +44,7 @@ from gridworld.lock import locked
 from gridworld.manifest import read_manifest
 from gridworld.provenance import describe, source_differences
 from gridworld.sealing import sealed
+from gridworld.terminal import printable
 
 MANIFEST = "manifest.json"
 CURVE = "curve.csv"
@@ -242,11 +243,11 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 def shown(folder: Path) -> str:
-    """The folder as a user would type it from here."""
+    """The folder as a user would type it from here, to be printed."""
     try:
-        return str(folder.relative_to(Path.cwd()))
+        return printable(str(folder.relative_to(Path.cwd())))
     except ValueError:
-        return str(folder)
+        return printable(str(folder))
 
 
 def check_new(folder: Path, key: str = "hydra.run.dir") -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from gridworld.terminal import printable
+
 Summary = dict[str, Any]
 
 _ROWS = (
@@ -30,7 +32,7 @@ def summary_text(summary: Summary, folder: str) -> str:
     lines.append(f"  {'regret':<18}" + "".join(f"{regret:>10.3g}" for regret in regrets) + f"{0:>10}")
     look = f"tensorboard --logdir {folder}"
     lines += ["", f"  {verdict(summary)}", f"  files: {folder}", f"  curves: {look}"]
-    return "\n".join(lines)
+    return "\n".join(map(printable, lines))
 
 
 def verdict(summary: Summary) -> str:

@@ -21,6 +21,7 @@ from gridworld.pictures import MapMaker, agent_gamma
 from gridworld.render import frame_size
 from gridworld.run import check_inside
 from gridworld.saved_run import SavedRun, choose_policy, read_visits
+from gridworld.terminal import printable
 
 MAPS = ("policy", "q_error", "visits")
 
@@ -55,7 +56,7 @@ def main(arguments: Sequence[str]) -> None:
         else:
             path = folder / f"episode.{kind}"
             record.save_animation(film, path, options.fps)
-        print(path)
+        print(printable(str(path)))
 
 
 def _parser() -> argparse.ArgumentParser:

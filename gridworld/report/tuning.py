@@ -16,6 +16,7 @@ from gridworld.errors import InputError
 from gridworld.report.find import real_folders
 from gridworld.report.table import Cell, Table
 from gridworld.sealing import read_sealed
+from gridworld.terminal import plain
 
 STUDY_JSON, TRIALS_CSV = "study.json", "trials.csv"
 TRIALS_SUM = "trials_sha256"  # in the former, of the latter
@@ -125,10 +126,10 @@ def _read(folder: Path) -> Tuning:
         space = {str(key): _dimension(dimension) for key, dimension in content["space"].items()}
         return Tuning(
             folder=folder,
-            name=str(content["study"])[:80],
-            agent=str(content["agent"])[:80],
-            env=str(content["env"])[:80],
-            sentence=str(content["confirmation"]["sentence"]),
+            name=_text(content["study"])[:80],
+            agent=_text(content["agent"])[:80],
+            env=_text(content["env"])[:80],
+            sentence=_text(content["confirmation"]["sentence"]),
             winner=int(winner["trial"]),
             values=dict(winner["values"]),
             began_from=dict(content["began_from"] or {}),
@@ -153,6 +154,12 @@ def _trials(file: Path, study: Mapping[str, Any]) -> str:
             "search has gone on and not come to its end"
         )
     return as_text(content, file)
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{str(value)[:40]} is no text")
+    return plain(value)
 
 
 def _dimension(content: Mapping[str, Any]) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from gridworld.sweep.config import SlurmConfig
 from gridworld.sweep.folder import STOP
 from gridworld.sweep.job import StopSweep
 from gridworld.sweep.worker import Hydra, run_in_turn
+from gridworld.terminal import printable
 
 Task = submitit.Job[list[str]]
 
@@ -145,7 +146,7 @@ def _results(tasks: list[Task], chunks: list[list[list[str]]], folder: Path) -> 
         results += [JobReturn(_return_value=reason, status=JobStatus.UNKNOWN) for _ in range(left)]
         if reason:
             lost = True
-            print(f"slurm: task {task.job_id} was lost: {reason}", file=sys.stderr, flush=True)
+            print(printable(f"slurm: task {task.job_id} was lost: {reason}"), file=sys.stderr, flush=True)
     if not lost:
         with contextlib.suppress(OSError):
             remove_inside(folder.parent, folder.name)  # else its logs may help

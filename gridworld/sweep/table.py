@@ -23,6 +23,7 @@ from gridworld.lock import is_locked, locked
 from gridworld.run import LOCK, MANIFEST, Run, read_run
 from gridworld.sweep.folder import Entry
 from gridworld.sweep.plan import settings_hash
+from gridworld.terminal import plain
 
 JOBS_CSV = "jobs.csv"
 TABLE_LOCK = ".jobs.lock"
@@ -72,6 +73,7 @@ class Table:
 
     def set(self, job: str, **changes: str) -> None:
         """Change a job's row. Other rows are copied as they stand: reading ten thousand takes 0.1 s."""
+        changes = {name: plain(text) for name, text in changes.items()}
         with locked(self.folder / TABLE_LOCK):
             found = self._find(job)
             if found is not None:

@@ -18,6 +18,7 @@ from gridworld.inside import check_no_links, make_inside, names_inside, remove_i
 from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.plan import plan
 from gridworld.sweep.table import status_in
+from gridworld.terminal import printable
 from gridworld.tune.worker import become_worker, is_stopped
 
 CONFIRM = "confirm"  # the runs' folder, in the study's
@@ -72,6 +73,6 @@ def _run(job: Job) -> bool:
     try:
         run_in_sweep(job.config, job.folder, [], stop_at_failure=False)
     except JobError as error:
-        print(f"{job.folder}: {error}", file=sys.stderr, flush=True)
+        print(printable(f"{job.folder}: {error}"), file=sys.stderr, flush=True)
         return False
     return True

@@ -20,6 +20,7 @@ from gridworld.inside import check_no_links
 from gridworld.run import MANIFEST, SWEEP_JSON, check_writable
 from gridworld.session import hparams
 from gridworld.sweep.report import shown
+from gridworld.terminal import printable
 from gridworld.training import make_mdp
 from gridworld.tune import confirm, verdict
 from gridworld.tune.asked import Asked, Source, search_path
@@ -180,6 +181,6 @@ def _tell(asked: Asked, values: dict[str, Any], lines: list[str]) -> None:
     print("winner:")
     for key, value in values.items():
         was = f"  (was {before[key]})" if key in before and before[key] != value else ""
-        print(f"  {key:<{width}}  {value}{was}")
-    print(*lines, sep="\n")
+        print(printable(f"  {key:<{width}}  {value}{was}"))
+    print(*map(printable, lines), sep="\n")
     print(f"  look at it: python scripts/report.py {shown(asked.folder)}", flush=True)
