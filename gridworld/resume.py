@@ -9,12 +9,13 @@ depends on nothing but its settings and its environment, and both are compared f
 from __future__ import annotations
 
 import dataclasses
+import math
 import sys
 from pathlib import Path
 from typing import Any
 
 from gridworld.agent_config import LINEAR, AgentConfig, parse_schedule
-from gridworld.checkpoint import FOLDER, Checkpoints
+from gridworld.checkpoint import FOLDER, MOST_STEPS, Checkpoints, steps_of
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.flat import flat
@@ -130,7 +131,7 @@ class Unfinished:
         folder = self.run.folder
         lengthened = _lengthened(self.run)
         for path, state in Checkpoints(folder).states():
-            reason = _why_not(state, folder, own)
+            reason = _why_not(path, state, folder, own)
             if reason is None and lengthened and state["steps"] < lengthened[-1]:  # type: ignore[index]
                 reason = f"it is from before the run was made longer, after {lengthened[-1]:,} steps"
             if reason is None:
@@ -166,7 +167,7 @@ def _lengthened(run: Run) -> list[int]:
     return [again["step"] for again in run.manifest.get("resumed", []) if "total_timesteps" in again]
 
 
-def _why_not(state: State | StateError, folder: Path, own: str) -> str | None:
+def _why_not(path: Path, state: State | StateError, folder: Path, own: str) -> str | None:
     """Why a run cannot go on from it, in words; None: it can."""
     if isinstance(state, StateError):
         return str(state)
@@ -175,6 +176,10 @@ def _why_not(state: State | StateError, folder: Path, own: str) -> str | None:
         return "it lacks what a checkpoint has"
     if state["identity"] != own:
         return "it is of another run"
+    if steps_of(path) != state["steps"] or not 0 < state["steps"] <= MOST_STEPS:
+        return "it is not of as many steps as its name says, or of more than a run can have"
+    if not math.isfinite(state["seconds"]):
+        return "it took no number of seconds"
     for name, mark in state["marks"].items():
         if not holds(folder, mark, _FILES[name]) and not (name == "events" and mark is None):
             return f"the file of the {name} is not what it was then"

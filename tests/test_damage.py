@@ -7,14 +7,18 @@ the commands read it with.
 import csv
 import dataclasses
 import json
+import os
 import random
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from runs_folder import Maker
+from hostile import seal
+from resuming import go_on, stopped_after
+from runs_folder import Maker, write_study, write_sweep
 from support import SHORT, train_in
 
 from gridworld.commands import jobs as jobs_command
@@ -29,10 +33,10 @@ from gridworld.resume import Unfinished
 from gridworld.run import PICTURES, read_run
 from gridworld.saved_run import SavedRun, read_visits
 from gridworld.sealing import sealed
+from gridworld.state import decode, encode
 from gridworld.sweep.folder import SweepFolder
-from gridworld.sweep.plan import Job, settings_hash
-from gridworld.sweep.table import FAILED, Table
-from gridworld.tune.claim import SEARCH_JSON, is_claimed
+from gridworld.sweep.table import Table
+from gridworld.tune.claim import is_claimed
 from gridworld.tune.verdict import _steps
 
 Telling = Callable[[Path], str]  # all that a command makes of a folder; raises `InputError`
@@ -43,37 +47,9 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """With a run, a sweep of three jobs and a study."""
     folder = tmp_path_factory.mktemp("good")
     train_in(folder / "run", *SHORT["sarsa"], "recording.frames=false", "recording.gif=false")
-    sweep = SweepFolder(folder / "sweep")
-    manifest = read_run(folder / "run").manifest
-    digest = settings_hash(manifest["config"], "\n".join(manifest["layout"]))
-    hashes = {"seed=0": digest, "seed=1": "1" * 32, "seed=2": "2" * 32}
-    jobs = [Job((job,), (job,), hashes[job], None, False) for job in hashes]
-    with sweep.at_work():
-        sweep.add(jobs, ["seed=0,1,2"])
-    shutil.copytree(folder / "run", folder / "sweep" / "seed=0")
-    Table(sweep.path).put_right(sweep.entries.values())
-    Table(sweep.path).set("seed=1", status=FAILED, error="agent.learning_rate=12: must be less than 10")
+    write_sweep(folder / "sweep", folder / "run")
     write_study(folder / "study")
     return folder
-
-
-def write_study(folder: Path) -> None:
-    folder.mkdir()
-    trials = "trial,status,score,certified,steps,regret,seconds,repeats,worker,error,agent.gamma\n"
-    trials += "".join(f"{n},done,0.{n}5,1/2,120,0.5,1.25,,host:1,,0.9{n}\n" for n in range(1, 6))
-    (folder / tuning.TRIALS_CSV).write_text(trials)
-    study = {
-        "study": "mine", "agent": "dqn", "env": "classic", "confirmation": {"sentence": "19 of 20 were."},
-        "winner": {"trial": 1, "score": 0.15, "values": {"agent.gamma": 0.91}}, "began_from": None,
-        "finalists": [{"trial": 1, "score": 0.15, "certified": 2, "seeds": 3}],
-        "importances": {"agent.gamma": 0.75},
-        "space": {"agent.gamma": {"type": "float", "low": 0.5, "high": 0.99, "log": False}},
-        tuning.TRIALS_SUM: sha256(trials.encode()),
-    }  # fmt: skip
-    (folder / tuning.STUDY_JSON).write_text(json.dumps(sealed(study)))
-    (folder / SEARCH_JSON).write_text(
-        json.dumps(sealed({"study": "mine", "about": {"objective": {"n": 20}}}))
-    )
 
 
 def reported(folder: Path) -> str:
@@ -256,3 +232,103 @@ def test_how_far_an_unfinished_run_came_is_told_as_not_verified(tmp_path: Path) 
     assert (
         "last evaluated after 20,000 steps, says curve.csv, which is not verified before the end" in sentence
     )
+
+
+def in_json(path: Path, **values: object) -> None:
+    path.write_text(json.dumps(sealed(json.loads(path.read_text()) | values)))
+
+
+def pipe(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+
+
+JOB = {"job": "seed=0", "hash": "1" * 32, "overrides": ["seed=0"]}
+HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "sweep.json is a pipe": (lambda sweep: pipe(sweep / "sweep.json"), "error: .*is no ordinary file"),
+    "sweep.json is nested": (
+        lambda sweep: (sweep / "sweep.json").write_text('{"a":' * 10**5),
+        r"error: .*sweep.json: damaged \(is no JSON",
+    ),
+    "overrides are numbers": (
+        lambda sweep: in_json(sweep / "sweep.json", jobs=[JOB | {"overrides": [1]}]),
+        r"error: .*sweep.json: damaged \(overrides must be what stands on a command line\)",
+    ),
+    "jobs of one folder": (
+        lambda sweep: in_json(sweep / "sweep.json", jobs=[JOB, JOB | {"hash": "2"}]),
+        r"error: .*sweep.json: damaged \(two jobs have one folder, or one hash\)",
+    ),
+    "jobs.csv is a pipe": (lambda sweep: pipe(sweep / "jobs.csv"), "3 jobs: 2 pending, 1 done"),
+    "jobs.csv is huge": (
+        lambda sweep: (sweep / "jobs.csv").write_text('job,overrides\n"' + 10**6 * "x"),
+        "3 jobs: 2 pending, 1 done",
+    ),
+    "summary.json is a pipe": (
+        lambda sweep: pipe(sweep / "seed=0" / "summary.json"),
+        "failed .*summary.json: is no ordinary file",
+    ),
+    "a regret beyond all numbers": (
+        lambda sweep: (
+            in_json(sweep / "seed=0" / "summary.json", regret=10**400),
+            seal(sweep / "seed=0", "summary.json"),
+        ),
+        "failed .*summary.json: is no JSON, .*is too large a number",
+    ),
+    "a status that is a list": (
+        lambda sweep: in_json(sweep / "seed=0" / "manifest.json", status=[]),
+        "failed .*manifest.json: status must be a word",
+    ),
+    "an error that is a number": (
+        lambda sweep: in_json(sweep / "seed=0" / "manifest.json", error=1),
+        "failed .*manifest.json: error must be a sentence",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", HOSTILE)
+def test_a_sweep_that_was_altered_is_listed_or_refused_in_a_sentence(
+    what: str, good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(good / "sweep", tmp_path / "sweep")
+    harm, words = HOSTILE[what]
+    harm(tmp_path / "sweep")
+    try:
+        jobs_command.main([str(tmp_path / "sweep")])
+        told = capsys.readouterr().out
+    except InputError as error:
+        told = f"error: {error}"
+    assert re.search(words, told), told
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("steps", 10**30), ("steps", -1), ("steps", 401), ("seconds", 1e999)]
+)
+def test_a_checkpoint_of_an_impossible_number_is_passed_over(
+    key: str, value: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["checkpoint.every=400", "recording.frames=false", "recording.gif=false"]
+    stopped_after(1, tmp_path / "run", *SHORT["sarsa"], *words)
+    (path,) = (tmp_path / "run" / "checkpoints").glob("*.state")
+    path.write_bytes(b"".join(encode(decode(path.read_bytes()) | {key: value})))
+    if value == 10**30:
+        path.rename(path.with_name(f"{value}.state"))
+    go_on(tmp_path / "run")
+    told = capsys.readouterr().err
+    assert ".state: passed over, it " in told
+    assert read_run(tmp_path / "run").is_finished
+
+
+@pytest.mark.parametrize("value", [10**400, 10**19, -(10**30)])
+@pytest.mark.parametrize("name", ["study.json", "search.json"])
+def test_a_study_with_a_number_beyond_all_is_refused(
+    value: int, name: str, good: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(good / "study", tmp_path / "study")
+    in_json(tmp_path / "study" / name, importances={"agent.gamma": value}, about={"objective": {"n": value}})
+    telling = tuned if name == "study.json" else claimed
+    with pytest.raises(InputError, match=f"{name}: is no JSON, .* is too large a number"):
+        telling(tmp_path)
+    text = (tmp_path / "study" / name).read_text()
+    (tmp_path / "study" / name).write_text(text.replace(str(value), "1e999"))
+    with pytest.raises(InputError, match=f"{name}: is no JSON, .*1e999 is too large a number"):
+        telling(tmp_path)

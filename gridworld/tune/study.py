@@ -24,6 +24,7 @@ from gridworld.terminal import printable
 from gridworld.training import make_mdp
 from gridworld.tune import confirm, verdict
 from gridworld.tune.asked import Asked, Source, search_path
+from gridworld.tune.checks import check_study, legible
 from gridworld.tune.claim import claim, is_claimed
 from gridworld.tune.confirm import CONFIRM
 from gridworld.tune.crew import SearchError, run_crew
@@ -62,15 +63,20 @@ def _begin(asked: Asked) -> Task:
     _check_folder(asked.folder)
     settings, about = asked.settings, _about(asked)
     url = settings.storage or f"sqlite:///{asked.folder.absolute() / 'study.db'}"
-    if is_claimed(asked.folder, asked.name, about) and not has_study(settings, url, asked.name):
-        raise InputError(
-            f"{asked.folder}: is of the study {asked.name}, which {shown_url(url)} does not have; "
-            "bring its database back, or choose another tune.folder"
-        )
+    if is_claimed(asked.folder, asked.name, about):
+        with legible(shown_url(url)):
+            if not has_study(settings, url, asked.name):
+                raise InputError(
+                    f"{asked.folder}: is of the study {asked.name}, which {shown_url(url)} does not have; "
+                    "bring its database back, or choose another tune.folder"
+                )
     made = not asked.folder.exists()
     asked.folder.mkdir(parents=True, exist_ok=True)
     try:
-        begin(open_storage(settings, url), asked.name, about, asked.space.parameters_of(asked.base))
+        storage = open_storage(settings, url)
+        with legible(shown_url(url)):
+            study = begin(storage, asked.name, about, asked.space.parameters_of(asked.base))
+            check_study(study, asked.space)
     except InputError:
         if made:
             with contextlib.suppress(OSError):
