@@ -25,6 +25,13 @@ _SUFFIX = ".state"
 _LEAST_SECONDS = 2.0  # between two checkpoints, where nobody says how often
 _MOST_SHARE = 0.02  # of the time may go to them then
 _MOST_BYTES = 1 << 33  # of a file
+_DIGITS = 18
+MOST_STEPS = 10**_DIGITS - 1  # of a run: as many as its files' names, and counters of 64 bits, have room for
+
+
+def steps_of(path: Path) -> int:
+    """After how many steps it is, as its name says."""
+    return int(path.stem) if path.stem.isdecimal() and len(path.stem) <= _DIGITS else -1
 
 
 class Checkpoints:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gridworld.agents import family
 from gridworld.config import TrainConfig
-from gridworld.data_files import LARGEST_CSV, read_object, read_text
+from gridworld.data_files import LARGEST_CSV, as_text
 from gridworld.event_file import read_scalars
 from gridworld.flat import flat
 from gridworld.mdp import ACTION_NAMES, Mdp
@@ -61,7 +61,7 @@ def compare(then: Run, now: Run, config: TrainConfig, mdp: Mdp) -> Iterator[Find
 
 def _curves(then: Run, now: Run) -> Finding:
     part = "learning curve"
-    before, after = (list(csv.reader(_lines(run.curve_file))) for run in (then, now))
+    before, after = (list(csv.reader(_lines(run))) for run in (then, now))
     rows: Iterator[tuple[list[str], list[str]]] = zip_longest(before, after, fillvalue=[])
     for row, (one, other) in enumerate(rows):
         for column, (old, new) in enumerate(zip_longest(one, other)):
@@ -73,8 +73,8 @@ def _curves(then: Run, now: Run) -> Finding:
     return Finding(part, f"{len(before) - 1:,} rows")
 
 
-def _lines(path: Path) -> list[str]:
-    return read_text(path, LARGEST_CSV).splitlines()
+def _lines(run: Run) -> list[str]:
+    return as_text(run.read(run.curve_file, LARGEST_CSV), run.curve_file).splitlines()
 
 
 def _cell(text: str | None) -> str:
@@ -118,7 +118,7 @@ def _visits(then: Run, now: Run, mdp: Mdp) -> Finding:
 
 
 def _summaries(then: Run, now: Run) -> Finding:
-    before, after = (_without_clock(read_object(run.summary_file)) for run in (then, now))
+    before, after = (_without_clock(run.read_summary()) for run in (then, now))
     for name in {**before, **after}:
         if before.get(name) != after.get(name):
             told = f"{str(before.get(name))[:40]} then, {str(after.get(name))[:40]} now"

@@ -1,8 +1,9 @@
 """Reading files that somebody else may have written: a run's folder is data, whoever it is from.
 
 A file is read only if it is an ordinary one of bounded size: not through a symbolic link, which could lead
-to any file of the reader's, and not a pipe or a device, which need not end. JSON may nest as deep as Python
-reads it. Nothing is resolved, imported or unpickled. Every function raises `InputError` with a sentence.
+to any file of the reader's, and not a pipe or a device, which need not end. JSON nests a hundred levels at
+most, and its numbers fit into 64 bits. Nothing is resolved, imported or unpickled. Every function raises
+`InputError` with a sentence.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import errno
 import hashlib
 import io
 import json
+import math
 import os
 import stat
 from collections.abc import Iterator
@@ -22,6 +24,8 @@ from gridworld.errors import InputError
 
 LARGEST_JSON = 4 * 2**20  # bytes
 LARGEST_CSV = 64 * 2**20
+_DEEPEST = 100  # levels of JSON; what reads it further may call itself for each
+_LARGEST_WHOLE = 2**63
 
 
 def read_bytes(path: Path, most: int) -> bytes:
@@ -32,26 +36,66 @@ def read_bytes(path: Path, most: int) -> bytes:
 
 def read_text(path: Path, most: int) -> str:
     """UTF-8 text of at most `most` bytes."""
-    try:
-        return read_bytes(path, most).decode("utf-8")
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: cannot be read, it is no UTF-8 text") from None
+    return as_text(read_bytes(path, most), path)
 
 
 def read_object(path: Path, most: int = LARGEST_JSON) -> dict[str, Any]:
     """A JSON object."""
-    text = read_text(path, most)
+    return as_object(read_bytes(path, most), path)
+
+
+def as_text(content: bytes, path: Path) -> str:
+    """The text in the bytes of a file, which an error names."""
     try:
-        content = json.loads(text, parse_constant=_refuse)
+        return content.decode("utf-8")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: cannot be read, it is no UTF-8 text") from None
+
+
+def as_object(content: bytes, path: Path) -> dict[str, Any]:
+    """The JSON object in the bytes of a file, which an error names."""
+    text = as_text(content, path)
+    try:
+        found = json.loads(text, parse_constant=_refuse, parse_float=_real, parse_int=_whole)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is no JSON, it was changed or cut off ({error})") from None
-    if not isinstance(content, dict):
+    if not isinstance(found, dict):
         raise InputError(f"{path}: holds no JSON object")
-    return content
+    if _is_deeper(found, _DEEPEST):
+        raise InputError(f"{path}: is nested too deeply, more than {_DEEPEST} levels")
+    return found
 
 
 def _refuse(constant: str) -> None:
     raise ValueError(f"JSON has no {constant}")
+
+
+def _real(text: str) -> float:
+    number = float(text)
+    if math.isinf(number):
+        raise ValueError(f"{text[:20]} is too large a number")
+    return number
+
+
+def _whole(text: str) -> int:
+    number = int(text)
+    if abs(number) >= _LARGEST_WHOLE:
+        raise ValueError(f"{text[:20]}... is too large a number")
+    return number
+
+
+def _is_deeper(content: Any, most: int) -> bool:
+    level = [content]
+    for _ in range(most):
+        level = [
+            inner
+            for outer in level
+            for inner in (outer.values() if isinstance(outer, dict) else outer)
+            if isinstance(inner, dict | list)
+        ]
+        if not level:
+            return False
+    return True
 
 
 def check_no_link(path: Path) -> None:

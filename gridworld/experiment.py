@@ -7,7 +7,6 @@ import copy
 import os
 import re
 import secrets
-import shutil
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -30,10 +29,11 @@ from gridworld.config import TrainConfig
 from gridworld.early import at_work
 from gridworld.errors import EXIT_CODE, InputError
 from gridworld.hydra_errors import refuse_added_keys, sentence, unreadable_file
+from gridworld.inside import check_no_links, remove_inside
 from gridworld.manual import manual
 from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, Run, alone_in, check_inside, check_new, shown
 from gridworld.sweep.config import LAUNCHER_SCHEMAS, SweepConfig
-from gridworld.terminal import prepare, printing, result_is_in_files, tell_error
+from gridworld.terminal import prepare, printable, printing, result_is_in_files, tell_error
 from gridworld.tune.config import SearchConfig
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -74,6 +74,8 @@ def _check_run_folder(config: DictConfig) -> None:
     check_inside(folder, "hydra.run.dir")
     _check_names(config)
     check_new(folder)
+    if config.hydra.output_subdir is not None:
+        check_no_links(folder, config.hydra.output_subdir)  # Hydra writes through them
     folder = folder.absolute()  # a job may change the current one
     _place.enter_context(_begun_in(folder))
     if (folder / MANIFEST).exists():
@@ -197,7 +199,7 @@ def run_job(settings: DictConfig) -> float:
             return _run_alone(config, folder, overrides)
     except (InputError, OSError, OmegaConfBaseException) as error:
         if is_one_of_many:
-            print(f"job {context.job.num} failed: {sentence(error)}", file=sys.stderr)
+            print(printable(f"job {context.job.num} failed: {sentence(error)}"), file=sys.stderr)
             raise JobError(sentence(error)) from None
         sys.exit(_tell(error))
 
@@ -248,7 +250,8 @@ def _discard(folder: Path) -> None:
     Only for who holds the folder's lock: another process may have come as far as this one.
     """
     if not (folder / MANIFEST).exists():
-        shutil.rmtree(folder / ".hydra", ignore_errors=True)
+        with contextlib.suppress(OSError):
+            remove_inside(folder, ".hydra")
         (folder / LOCK).unlink(missing_ok=True)
         try:
             folder.rmdir()

@@ -6,6 +6,8 @@ import sys
 import time
 from typing import Any
 
+from gridworld.terminal import printable
+
 _SECONDS_BETWEEN_LINES = 5.0
 
 
@@ -14,7 +16,7 @@ class Progress:
 
     def __init__(self, total: int, label: str, enabled: bool = True) -> None:
         self._total = total
-        self._label = label
+        self._label = label = printable(label)
         self._enabled = enabled
         self._bar: Any = None
         self._spoke = time.monotonic()

@@ -31,9 +31,9 @@ def lengths(then: Run, config: TrainConfig) -> list[int]:
 
 
 def resumptions(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """What the manifest, which may be anybody's, says of going on."""
-    resumed = manifest.get("resumed")
-    return [again for again in (resumed if isinstance(resumed, list) else []) if isinstance(again, dict)]
+    """What the manifest says of going on."""
+    found: list[dict[str, Any]] = manifest.get("resumed", [])
+    return found
 
 
 def _old_length(then: Run, again: dict[str, Any]) -> int:

@@ -9,12 +9,13 @@ depends on nothing but its settings and its environment, and both are compared f
 from __future__ import annotations
 
 import dataclasses
+import math
 import sys
 from pathlib import Path
 from typing import Any
 
 from gridworld.agent_config import LINEAR, AgentConfig, parse_schedule
-from gridworld.checkpoint import FOLDER, Checkpoints
+from gridworld.checkpoint import FOLDER, MOST_STEPS, Checkpoints, steps_of
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.flat import flat
@@ -46,7 +47,7 @@ def train_or_go_on(config: TrainConfig, run: Run, overrides: list[str]) -> Summa
 def unfinished_in(folder: Path, config: TrainConfig) -> Unfinished:
     """The unfinished run of these settings. Raises `InputError` where that in the folder is another."""
     unfinished = Unfinished(folder, trust=True)  # its classes are those of the settings, or it is refused
-    if unfinished.is_finished:
+    if unfinished.run.is_finished:
         raise InputError(f"{folder}: holds a run already; give every run a folder of its own")
     unfinished.check_same(config, check_settings(config).layout.text())
     return unfinished
@@ -57,16 +58,8 @@ class Unfinished:
 
     def __init__(self, folder: Path, trust: bool = False) -> None:
         self.run: Run = read_run(folder)
-        where = str(self.run.manifest_file)
-        if self.run.manifest.get("seal") != self.run.seal():
-            raise InputError(f"{where}: was changed or damaged since the run began; put back a good copy")
         self.config: TrainConfig = settings_of(self.run, trust)
         self.layout: Layout = layout_of(self.run, self.config)
-        _lengthened(self.run)
-
-    @property
-    def is_finished(self) -> bool:
-        return bool(self.run.manifest["status"] == "finished")
 
     def check_same(self, config: TrainConfig, layout: str) -> None:
         """Raise `InputError` unless these settings and this map are the run's own."""
@@ -92,7 +85,7 @@ class Unfinished:
     def go_on(self, total_timesteps: int | None = None, anyway: bool = False) -> Summary:
         """To the end, or to another end. `anyway`: even if the last bits will be others."""
         config, run = self.config, self.run
-        if total_timesteps is None and self.is_finished:
+        if total_timesteps is None and self.run.is_finished:
             raise InputError(
                 f"{run.folder}: is finished; to make it longer, say how long: {run.resume_words()} "
                 f"total_timesteps={2 * config.total_timesteps}"
@@ -108,7 +101,7 @@ class Unfinished:
             return carry_out(config, run, mdp, self._begin_anew)
         steps = state["steps"]
         is_shorter = config.total_timesteps != old_total and config.total_timesteps < steps
-        if is_shorter or (self.is_finished and config.total_timesteps <= old_total):
+        if is_shorter or (self.run.is_finished and config.total_timesteps <= old_total):
             raise InputError(
                 f"total_timesteps={config.total_timesteps}: {run.folder} has come to {steps:,} of "
                 f"{old_total:,} steps; it can be made longer, not shorter"
@@ -138,7 +131,7 @@ class Unfinished:
         folder = self.run.folder
         lengthened = _lengthened(self.run)
         for path, state in Checkpoints(folder).states():
-            reason = _why_not(state, folder, own)
+            reason = _why_not(path, state, folder, own)
             if reason is None and lengthened and state["steps"] < lengthened[-1]:  # type: ignore[index]
                 reason = f"it is from before the run was made longer, after {lengthened[-1]:,} steps"
             if reason is None:
@@ -154,7 +147,7 @@ class Unfinished:
 
     def _check_anew(self, total_timesteps: int | None, old_total: int) -> None:
         """Raise `InputError` where beginning anew would take a finished run away; say it where it is told."""
-        if self.is_finished:
+        if self.run.is_finished:
             raise InputError(
                 f"{self.run.folder}: is finished, and {FOLDER}/ has no checkpoint that it could go on from; "
                 f"for {self.config.total_timesteps:,} steps begin a new run in another folder"
@@ -170,17 +163,11 @@ class Unfinished:
 
 
 def _lengthened(run: Run) -> list[int]:
-    """After how many steps it was made longer, each time. Raises `InputError`: a seal can be forged."""
-    resumed = run.manifest.get("resumed", [])
-    if not isinstance(resumed, list) or not all(isinstance(again, dict) for again in resumed):
-        raise InputError(f"{run.manifest_file}: resumed must be a list of when the run went on")
-    steps = [again.get("step") for again in resumed if "total_timesteps" in again]
-    if not all(type(step) is int and step >= 0 for step in steps):
-        raise InputError(f"{run.manifest_file}: resumed must have the step after which the run went on")
-    return steps
+    """After how many steps it was made longer, each time."""
+    return [again["step"] for again in run.manifest.get("resumed", []) if "total_timesteps" in again]
 
 
-def _why_not(state: State | StateError, folder: Path, own: str) -> str | None:
+def _why_not(path: Path, state: State | StateError, folder: Path, own: str) -> str | None:
     """Why a run cannot go on from it, in words; None: it can."""
     if isinstance(state, StateError):
         return str(state)
@@ -189,6 +176,10 @@ def _why_not(state: State | StateError, folder: Path, own: str) -> str | None:
         return "it lacks what a checkpoint has"
     if state["identity"] != own:
         return "it is of another run"
+    if steps_of(path) != state["steps"] or not 0 < state["steps"] <= MOST_STEPS:
+        return "it is not of as many steps as its name says, or of more than a run can have"
+    if not math.isfinite(state["seconds"]):
+        return "it took no number of seconds"
     for name, mark in state["marks"].items():
         if not holds(folder, mark, _FILES[name]) and not (name == "events" and mark is None):
             return f"the file of the {name} is not what it was then"

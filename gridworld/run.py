@@ -14,12 +14,12 @@
     events.out...   TensorBoard's event file
 
 The manifest alone is enough to build the world and the agent again: it holds the resolved settings and
-the map's text. Of a finished run it also has the checksums of the files that hold its result.
+the map's text. Of a finished run it also has the checksums of the files that hold its result and its
+pictures. It is sealed: who reads a run, by `read_run` and `Run.read`, is told what was damaged or changed.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
 import sys
@@ -30,11 +30,21 @@ from pathlib import Path
 from typing import Any
 
 from gridworld import provenance
-from gridworld.data_files import check_no_link, file_sha256, read_object, sha256
+from gridworld.data_files import (
+    LARGEST_JSON,
+    as_object,
+    check_no_link,
+    file_sha256,
+    read_bytes,
+    sha256,
+)
 from gridworld.errors import InputError
 from gridworld.files import remove, write_bytes, write_json
 from gridworld.lock import locked
+from gridworld.manifest import read_manifest
 from gridworld.provenance import describe, source_differences
+from gridworld.sealing import sealed
+from gridworld.terminal import printable
 
 MANIFEST = "manifest.json"
 CURVE = "curve.csv"
@@ -43,10 +53,11 @@ LOCK = ".lock"  # held by the process that is at work in the folder
 SWEEP_JSON = "sweep.json"  # a sweep's folder has this instead
 SUMMARY = "summary.json"
 LARGEST_RESULT = 2**30  # bytes of a file
+PICTURES = ("policy.png", "q_error.png", "visits.png", "learning.gif")
 
 _FILES = (
-    *("curve.csv", "summary.json", "model.zip", "visits.npy", "policy.png", "q_error.png", "visits.png"),
-    *("learning.gif", "frames", "episode.gif", "episode.mp4", "checkpoints", "error.txt"),
+    *("curve.csv", "summary.json", "model.zip", "visits.npy", *PICTURES),
+    *("frames", "episode.gif", "episode.mp4", "checkpoints", "error.txt"),
 )
 
 
@@ -118,25 +129,52 @@ class Run:
             }
         self._write()
 
+    def fail(self, why: str) -> None:
+        """Record why it failed, where its own process could not."""
+        self.manifest |= {"status": "failed", "error": why}
+        self._write()
+
+    def read(self, path: Path, most: int) -> bytes:
+        """A file with a part of the result, of at most `most` bytes. Raises `InputError` for a changed one.
+
+        Only a finished run has checksums; nobody knows what the files of another should be.
+        """
+        content = read_bytes(path, most)
+        if self.is_finished:
+            self._check(path, sha256(content))
+        return content
+
+    def read_summary(self) -> dict[str, Any]:
+        """What it came to. Raises `InputError`."""
+        return as_object(self.read(self.summary_file, LARGEST_JSON), self.summary_file)
+
     def verify(self, path: Path) -> None:
         """Raise `InputError` unless the file with a part of the result is the one that the run wrote."""
-        sums = self.manifest.get("sha256")
-        noted = sums.get(path.name) if isinstance(sums, dict) else None
+        self._check(path, file_sha256(path, LARGEST_RESULT))
+
+    def pictures(self) -> dict[str, str | None]:
+        """The checksum of each that it drew; None for a run of the first format, which has none of them."""
+        if self.manifest.get("format", 1) == 1:
+            return dict.fromkeys(PICTURES)
+        sums = self.manifest.get("sha256", {})
+        return {name: sums[name] for name in PICTURES if name in sums}
+
+    @property
+    def is_finished(self) -> bool:
+        return bool(self.manifest["status"] == "finished")
+
+    def _check(self, path: Path, digest: str) -> None:
+        noted = self.manifest.get("sha256", {}).get(path.name)
         if noted is None:
             raise InputError(
                 f"{self.manifest_file}: has no checksum (sha256) of {path.name}; was the run written by "
                 "another version, or the file added to it?"
             )
-        if file_sha256(path, LARGEST_RESULT) != noted:
+        if digest != noted:
             raise InputError(
                 f"{path}: is not the file that the run wrote, its checksum is not the one in {MANIFEST}; "
                 "it was damaged or changed"
             )
-
-    def seal(self) -> str:
-        """A hash of what in the manifest decides how the run ends."""
-        content = [self.manifest.get(key) for key in ("config", "layout", "resumed")]
-        return sha256(json.dumps(content, sort_keys=True).encode())
 
     def clear(self) -> None:
         """Take away what an attempt left, all but the manifest; what is not the run's stays."""
@@ -156,7 +194,8 @@ class Run:
             write_bytes(self.folder / name, tree.diff)
 
     def _results(self) -> tuple[Path, ...]:
-        return self.curve_file, self.summary_file, self.model_file, self.visits_file
+        pictures = (self.folder / name for name in PICTURES)
+        return self.curve_file, self.summary_file, self.model_file, self.visits_file, *pictures
 
     def _tidy(self) -> None:
         """Take away what a process that was killed had half written.
@@ -169,14 +208,14 @@ class Run:
                 remove(path)
 
     def _write(self) -> None:
-        self.manifest["seal"] = self.seal()
+        self.manifest = sealed(self.manifest)
         write_json(self.manifest_file, self.manifest)
 
 
 def open_run(folder: Path) -> Run:
     """A finished run, to look at. Raises `InputError` where there is none."""
     run = read_run(folder)
-    if run.manifest["status"] != "finished":
+    if not run.is_finished:
         raise InputError(
             f"{folder}: this run is {run.manifest['status']!r}; only a finished one can be looked at"
         )
@@ -184,16 +223,13 @@ def open_run(folder: Path) -> Run:
 
 
 def read_run(folder: Path) -> Run:
-    """A run, finished or not. Raises `InputError` where there is none."""
+    """A run, finished or not. Raises `InputError` where there is none, or its manifest was changed."""
     run = Run(folder)
     if not folder.exists():
         raise InputError(f"{folder}: no such folder; give the folder of a run, e.g. one in runs/")
     if not os.path.lexists(run.manifest_file):
         raise InputError(f"{folder}: not a run's folder, it has no {MANIFEST}")
-    manifest = read_object(run.manifest_file)
-    if not {"status", "config", "layout"} <= manifest.keys():
-        raise InputError(f"{run.manifest_file}: not the manifest of a run; it lacks status, config or layout")
-    run.manifest = manifest
+    run.manifest = read_manifest(run.manifest_file)
     return run
 
 
@@ -207,11 +243,11 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 def shown(folder: Path) -> str:
-    """The folder as a user would type it from here."""
+    """The folder as a user would type it from here, to be printed."""
     try:
-        return str(folder.relative_to(Path.cwd()))
+        return printable(str(folder.relative_to(Path.cwd())))
     except ValueError:
-        return str(folder)
+        return printable(str(folder))
 
 
 def check_new(folder: Path, key: str = "hydra.run.dir") -> None:
@@ -221,7 +257,7 @@ def check_new(folder: Path, key: str = "hydra.run.dir") -> None:
     """
     if (folder / MANIFEST).exists():
         run = read_run(folder)
-        if run.manifest["status"] == "finished":
+        if run.is_finished:
             raise InputError(
                 f"{folder}: holds a run already; choose another folder, or make that run longer by "
                 f"{run.resume_words()} total_timesteps=..."
@@ -230,6 +266,7 @@ def check_new(folder: Path, key: str = "hydra.run.dir") -> None:
         raise InputError(f"{folder}: is the folder of a sweep; choose another {key}")
     if used := next(folder.glob(f"*/{MANIFEST}"), None):
         raise InputError(f"{folder}: holds other runs, {used.parent} for one; name a new folder in it")
+    check_no_link(folder / "checkpoints")
     check_writable(folder, key)
 
 

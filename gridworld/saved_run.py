@@ -22,7 +22,6 @@ from gridworld.agent_config import AGENT_SCHEMAS, AgentConfig, SB3ClassConfig
 from gridworld.agents import Beliefs, family
 from gridworld.chain import one_hot_policy
 from gridworld.config import TrainConfig, check
-from gridworld.data_files import read_bytes
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge
 from gridworld.layout import CLASSIC, Layout, load, parse
@@ -94,19 +93,14 @@ def settings_of(run: Run, trust: bool = False) -> TrainConfig:
 
 def layout_of(run: Run, config: TrainConfig) -> Layout:
     """The map that the run was trained on, under the name that its settings have for it."""
-    lines = run.manifest["layout"]
-    if not (isinstance(lines, list) and all(isinstance(line, str) for line in lines)):
-        raise InputError(f"{run.manifest_file}: layout must be a list of the map's rows")
-    return dataclasses.replace(
-        parse("\n".join(lines), f"{run.manifest_file}: layout"), name=config.env.layout
-    )
+    text = "\n".join(run.manifest["layout"])
+    return dataclasses.replace(parse(text, f"{run.manifest_file}: layout"), name=config.env.layout)
 
 
 def read_visits(run: Run, shape: tuple[int, ...]) -> NDArray[np.int64]:
     """The run's counts of visits, (S, A). Raises `InputError`."""
     path = run.visits_file
-    run.verify(path)
-    content = read_bytes(path, _LARGEST_HEADER + 8 * math.prod(shape))
+    content = run.read(path, _LARGEST_HEADER + 8 * math.prod(shape))
     try:
         visits = np.load(io.BytesIO(content), allow_pickle=False)
     except (OSError, ValueError, EOFError, MemoryError, SyntaxError):

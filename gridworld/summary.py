@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from gridworld.columns import aligned
+from gridworld.terminal import printable
 
 Summary = dict[str, Any]
 
@@ -32,7 +33,7 @@ def summary_text(summary: Summary, folder: str) -> str:
         f"  files: {folder}",
         f"  curves: tensorboard --logdir {folder}",
     ]
-    return "\n".join(lines)
+    return "\n".join(map(printable, lines))
 
 
 def _row(label: str, summary: Summary, key: str, optimal: str) -> list[str]:

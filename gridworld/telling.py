@@ -9,6 +9,7 @@ import sys
 from gridworld.run import Run, shown
 from gridworld.signals import Interrupted
 from gridworld.summary import Summary, summary_text
+from gridworld.terminal import printable
 
 
 def tell_end(summary: Summary, run: Run) -> None:
@@ -28,5 +29,5 @@ def tell_interrupted(interruption: Interrupted, run: Run) -> int:
         what = f"all {saved:,} steps are saved"
     else:
         what = f"saved are {saved:,} of its {reached:,} steps"
-    print(f"{interruption}: {what}; go on with  {run.resume_words()}", file=sys.stderr)
+    print(printable(f"{interruption}: {what}; go on with  {run.resume_words()}"), file=sys.stderr)
     return interruption.exit_code

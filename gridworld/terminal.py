@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import errno
 import io
+import logging
 import os
 import sys
 from collections.abc import Iterator
@@ -41,6 +42,7 @@ class _Forgiving(io.FileIO):
 
 def prepare() -> None:
     """Make standard output and standard error of this process such that printing to them cannot fail."""
+    logging.getLogger("gridworld").addFilter(_make_printable)
     sys.stdout = _prepared(sys.stdout, sys.__stdout__, 1)
     sys.stderr = _prepared(sys.stderr, sys.__stderr__, 2)
 
@@ -95,9 +97,27 @@ def _prepared(stream: TextIO | None, original: TextIO | None, number: int) -> Te
 
 
 def printable(text: str) -> str:
-    """Without signs that move the cursor, change colours or break the line, and of bounded length."""
-    plain = "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in text)
-    return plain if len(plain) <= _LONGEST else f"{plain[:_LONGEST]} ..."
+    """A line without signs that move the cursor, change colours or break it, and of bounded length.
+
+    Whatever a command prints goes through this if it has a name in it that is not the program's own: of a
+    folder, a job, a map or an agent, out of a file or an error.
+    """
+    shown = plain(text)
+    return shown if len(shown) <= _LONGEST else f"{shown[:_LONGEST]} ..."
+
+
+def plain(text: str) -> str:
+    """The same of any length."""
+    return text if text.isprintable() else "".join(map(_plain_sign, text))
+
+
+def _plain_sign(sign: str) -> str:
+    return sign if sign.isprintable() else repr(sign)[1:-1]
+
+
+def _make_printable(record: logging.LogRecord) -> bool:
+    record.msg, record.args = printable(record.getMessage()), ()
+    return True
 
 
 def tell_error(text: str) -> None:

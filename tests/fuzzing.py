@@ -1,10 +1,13 @@
 """Made-up maps, settings, manifests and model files, each from a seed; and what a program makes of one."""
 
+import contextlib
 import copy
 import hashlib
+import io
 import json
 import math
 import random
+import re
 import shutil
 import time
 from collections.abc import Callable
@@ -16,6 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from support import SHORT, configure
 
 from gridworld.agents import family
+from gridworld.commands import jobs as jobs_command
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge
@@ -24,8 +28,14 @@ from gridworld.layout import load
 from gridworld.mdp import compile_mdp
 from gridworld.observations import make_observation
 from gridworld.report.reading import read
+from gridworld.report.svg import to_svg
+from gridworld.report.table import to_captioned_markdown, to_csv
+from gridworld.report.tuning import TRIALS_SUM, finalists_table, find_tunings, trials_table, winner_table
+from gridworld.report.tuning_figures import tuning_figures
 from gridworld.saved_run import SavedRun
+from gridworld.sealing import sealed
 from gridworld.training import check_settings, make_seat
+from gridworld.tune.claim import is_claimed
 
 OURS = (InputError, OmegaConfBaseException)  # both end as one sentence with exit code 2
 Target = Callable[[random.Random, Path], None]
@@ -143,10 +153,17 @@ def fuzz_manifest(random: random.Random, folder: Path) -> None:
         content = json.loads(raw)
         for _ in range(random.randint(1, 3)):
             spoil(random, content.get("config", content) if random.random() < 0.7 else content)
+        if name == "manifest.json":
+            with contextlib.suppress(TypeError):  # keys that do not go together
+                content = sealed(content)
         raw = json.dumps(content, skipkeys=True).encode("utf-8", "surrogatepass")
     else:
         raw = damaged(random, raw)
     (run / name).write_bytes(raw)
+    if name != "manifest.json":
+        content = json.loads((run / "manifest.json").read_bytes())
+        content["sha256"][name] = hashlib.sha256(raw).hexdigest()
+        (run / "manifest.json").write_text(json.dumps(sealed(content)))
     assert read(run) is not None  # a report names what is wrong and goes on
     saved = SavedRun(run)
     saved.judge().score(saved.beliefs().sampled)
@@ -159,14 +176,66 @@ def fuzz_model(random: random.Random, folder: Path) -> None:
     (run / "model.zip").write_bytes(raw)
     content = json.loads((run / "manifest.json").read_text())
     content["sha256"]["model.zip"] = hashlib.sha256(raw).hexdigest()
-    (run / "manifest.json").write_text(json.dumps(content))
+    (run / "manifest.json").write_text(json.dumps(sealed(content)))
     beliefs = SavedRun(run).beliefs()
     assert all(math.isfinite(value) for value in beliefs.values)
 
 
+def fuzz_sweep(random: random.Random, folder: Path) -> None:
+    """A sweep's folder with something changed, by meaning or by bytes, as jobs.py lists it."""
+    sweep = folder / "sweep"
+    shutil.rmtree(sweep, ignore_errors=True)
+    shutil.copytree(folder / "good-sweep", sweep)
+    names = ["sweep.json", "sweep.json", "jobs.csv", "seed=0/manifest.json", "seed=0/summary.json"]
+    change(random, sweep / random.choice(names))
+    with contextlib.redirect_stdout(io.StringIO()) as told:
+        jobs_command.main([str(sweep)])
+    assert told.getvalue().replace("\n", "").isprintable()
+
+
+def fuzz_study(random: random.Random, folder: Path) -> None:
+    """A study's folder with something changed, as a report shows it."""
+    study = folder / "study"
+    shutil.rmtree(study, ignore_errors=True)
+    shutil.copytree(folder / "good-study", study)
+    change(random, study / random.choice(["study.json", "study.json", "trials.csv", "search.json"]))
+    is_claimed(study, "mine", {"objective": {"n": 20}})
+    found, problems = find_tunings([study])
+    for each in found:
+        for table in (winner_table(each), finalists_table(each), trials_table(each)):
+            to_csv(table), to_captioned_markdown(table)
+        for scene in tuning_figures(each):
+            assert not re.search(r"\b(nan|inf)\b", "".join(re.findall(r'points="[^"]*"', to_svg(scene))))
+    if problems:
+        raise InputError(problems[0])
+
+
+def change(random: random.Random, path: Path) -> None:
+    """By meaning, and mostly sealed again, or by bytes."""
+    raw = path.read_bytes()
+    if path.suffix == ".json" and random.random() < 0.8:
+        content = json.loads(raw)
+        for _ in range(random.randint(1, 2)):
+            spoil(random, content)
+        with contextlib.suppress(TypeError):  # keys that do not go together
+            content = sealed(content) if random.random() < 0.9 else content
+        path.write_bytes(json.dumps(content, skipkeys=True).encode("utf-8", "surrogatepass"))
+    else:
+        path.write_bytes(damaged(random, raw))
+    name, study = path.name, path.with_name("study.json")
+    if name == "trials.csv" and random.random() < 0.8:
+        content = json.loads(study.read_bytes()) | {TRIALS_SUM: hashlib.sha256(path.read_bytes()).hexdigest()}
+        study.write_text(json.dumps(sealed(content)))
+    if name == "summary.json":
+        manifest = path.with_name("manifest.json")
+        content = json.loads(manifest.read_bytes())
+        content["sha256"][name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        manifest.write_text(json.dumps(sealed(content)))
+
+
 def fresh_copy(random: random.Random, folder: Path) -> Path:
     """Of one of the runs that `folder` has."""
-    good = random.choice(sorted(path for path in folder.glob("good-*")))
+    good = random.choice([folder / f"good-{agent}" for agent in ("a2c", "dqn", "sarsa")])
     run = folder / "run"
     shutil.rmtree(run, ignore_errors=True)
     run.mkdir()
@@ -202,6 +271,8 @@ TARGETS: dict[str, Target] = {
     "config": fuzz_config,
     "manifest": fuzz_manifest,
     "model": fuzz_model,
+    "sweep": fuzz_sweep,
+    "study": fuzz_study,
 }
 
 

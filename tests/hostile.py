@@ -28,6 +28,7 @@ import torch
 
 from gridworld.event_file import _checksum
 from gridworld.png import _chunk
+from gridworld.sealing import sealed
 from gridworld.state import MAGIC, decode, encode
 
 SECRET = "the-secret-7f3a"
@@ -74,7 +75,7 @@ def manifest(run: Path, edit: Callable[[dict[str, Any]], object]) -> None:
     """Change the manifest."""
     content = json.loads((run / "manifest.json").read_text())
     edit(content)
-    (run / "manifest.json").write_text(json.dumps(content))
+    (run / "manifest.json").write_text(json.dumps(sealed(content)))
 
 
 def agent_has(run: Path, **values: Any) -> None:
@@ -672,28 +673,19 @@ def checkpoint_that_acts_on_the_terminal(run: Path, base: Path) -> None:
     (run / "checkpoints" / "999999999999.state").write_bytes(content)
 
 
-def resealed(run: Path, **values: Any) -> None:
-    """Change the manifest and what seals it."""
-    manifest(run, lambda content: content.update(values))
-    content = json.loads((run / "manifest.json").read_text())
-    what = [content.get(key) for key in ("config", "layout", "resumed")]
-    digest = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()
-    manifest(run, lambda content: content.update(seal=digest))
-
-
-@hostile(FINE)
+@hostile("resumed must be a list of when the run went on")
 def continuations_that_are_no_list(run: Path, base: Path) -> None:
-    resealed(run, resumed={"a": 1})
+    manifest(run, lambda content: content.update(resumed={"a": 1}))
 
 
-@hostile(FINE)
+@hostile("resumed must be a list of when the run went on")
 def continuations_without_a_step(run: Path, base: Path) -> None:
-    resealed(run, resumed=[{"total_timesteps": 1}])
+    manifest(run, lambda content: content.update(resumed=[{"total_timesteps": 1}]))
 
 
-@hostile(FINE)
+@hostile("resumed must be a list of when the run went on")
 def continuations_after_no_number_of_steps(run: Path, base: Path) -> None:
-    resealed(run, resumed=[{"total_timesteps": 1, "step": "x"}])
+    manifest(run, lambda content: content.update(resumed=[{"total_timesteps": 1, "step": "x"}]))
 
 
 @hostile("manifest.json: is no JSON")

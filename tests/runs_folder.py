@@ -2,8 +2,10 @@
 
 import csv
 import dataclasses
+import hashlib
 import json
 import math
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,8 +13,16 @@ from typing import Any
 import numpy as np
 from support import configure
 
+from gridworld.data_files import sha256
 from gridworld.evaluation import Judge
+from gridworld.report import tuning
+from gridworld.run import read_run
+from gridworld.sealing import sealed
+from gridworld.sweep.folder import SweepFolder
+from gridworld.sweep.plan import Job, settings_hash
+from gridworld.sweep.table import FAILED, Table
 from gridworld.training import make_mdp
+from gridworld.tune.claim import SEARCH_JSON
 
 _COLUMNS = ("value", "regret", "certified", "goal_probability", "trap_probability", "timeout_probability")
 _COLUMNS += ("return", "length")
@@ -90,7 +100,9 @@ class Maker:
             "config": config,
         }
         (folder / "summary.json").write_text(json.dumps(summary))
-        (folder / "manifest.json").write_text(json.dumps(manifest))
+        files = ("curve.csv", "summary.json")
+        sums = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in files}
+        (folder / "manifest.json").write_text(json.dumps(sealed(manifest | {"sha256": sums})))
 
 
 def sweep(folder: Path, seeds: int = 20) -> Path:
@@ -110,3 +122,37 @@ def sweep(folder: Path, seeds: int = 20) -> Path:
             at = 4000 + 1000 * int(rng.integers(3)) if regret == 0 else math.inf
             maker.write(folder / f"{name},cliff,{seed}", seed, at, online, regret or 70.0, agent__name=name)
     return folder
+
+
+def write_sweep(folder: Path, run: Path) -> None:
+    """Of three jobs: one is done, by a copy of the run, one failed before it began, one is to be run."""
+    sweep = SweepFolder(folder)
+    manifest = read_run(run).manifest
+    digest = settings_hash(manifest["config"], "\n".join(manifest["layout"]))
+    hashes = {"seed=0": digest, "seed=1": "1" * 32, "seed=2": "2" * 32}
+    jobs = [Job((job,), (job,), hashes[job], None, False) for job in hashes]
+    with sweep.at_work():
+        sweep.add(jobs, ["seed=0,1,2"])
+    shutil.copytree(run, folder / "seed=0")
+    Table(sweep.path).put_right(sweep.entries.values())
+    Table(sweep.path).set("seed=1", status=FAILED, error="agent.learning_rate=12: must be less than 10")
+
+
+def write_study(folder: Path) -> None:
+    """A search of five trials that came to its end."""
+    folder.mkdir()
+    trials = "trial,status,score,certified,steps,regret,seconds,repeats,worker,error,agent.gamma\n"
+    trials += "".join(f"{n},done,0.{n}5,1/2,120,0.5,1.25,,host:1,,0.9{n}\n" for n in range(1, 6))
+    (folder / tuning.TRIALS_CSV).write_text(trials)
+    study = {
+        "study": "mine", "agent": "dqn", "env": "classic", "confirmation": {"sentence": "19 of 20 were."},
+        "winner": {"trial": 1, "score": 0.15, "values": {"agent.gamma": 0.91}}, "began_from": None,
+        "finalists": [{"trial": 1, "score": 0.15, "certified": 2, "seeds": 3}],
+        "importances": {"agent.gamma": 0.75},
+        "space": {"agent.gamma": {"type": "float", "low": 0.5, "high": 0.99, "log": False}},
+        tuning.TRIALS_SUM: sha256(trials.encode()),
+    }  # fmt: skip
+    (folder / tuning.STUDY_JSON).write_text(json.dumps(sealed(study)))
+    (folder / SEARCH_JSON).write_text(
+        json.dumps(sealed({"study": "mine", "about": {"objective": {"n": 20}}}))
+    )

@@ -12,20 +12,23 @@ from pathlib import Path
 
 import pytest
 from fuzzing import TARGETS, attempt
+from runs_folder import write_study, write_sweep
 from support import SHORT, train_in
 
 COUNT = int(os.environ.get("GRIDWORLD_FUZZ", "300"))
-SHARES = {"map": 0.25, "config": 0.4, "manifest": 0.25, "model": 0.1}
+SHARES = {"map": 0.25, "config": 0.4, "manifest": 0.25, "model": 0.1, "sweep": 0.25, "study": 0.25}
 MOST_SECONDS, MOST_MEGABYTES = 1.0, 200.0
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With a good run of a network and one of a table."""
+    """With good runs of networks and of a table, a sweep and a study."""
     folder = tmp_path_factory.mktemp("fuzz")
     pictures = ["recording.frames=false", "recording.gif=false", "recording.learning=false"]
     for agent in ("dqn", "sarsa", "a2c"):
         train_in(folder / f"good-{agent}", *SHORT[agent], *pictures)
+    write_sweep(folder / "good-sweep", folder / "good-sarsa")
+    write_study(folder / "good-study")
     return folder
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hostile import seal
 from PIL import Image
 from runs_folder import Maker, sweep
 from support import SHORT, script, train_in
@@ -28,7 +29,10 @@ from gridworld.report.metrics import online_return
 from gridworld.report.reading import Evidence, read
 from gridworld.report.report import Report, gather
 from gridworld.report.scene import text_width
+from gridworld.report.tuning import find_tunings
 from gridworld.report.writing import MARKERS
+from gridworld.run import PICTURES
+from gridworld.sealing import sealed
 
 
 @pytest.fixture(scope="module")
@@ -208,11 +212,14 @@ def test_agents_meet_on_the_tasks_they_share(tmp_path: Path) -> None:
 
 
 def change(folder: Path, name: str, edit: Callable[[str], str]) -> None:
+    """Whatever can be sealed again, is."""
     (folder / name).write_text(edit((folder / name).read_text()))
+    if name != "manifest.json":
+        seal(folder, name)
 
 
 def in_json(folder: Path, name: str, **values: object) -> None:
-    change(folder, name, lambda text: json.dumps(json.loads(text) | values))
+    change(folder, name, lambda text: json.dumps(sealed(json.loads(text) | values)))
 
 
 DAMAGES: dict[str, tuple[Callable[[Path], None], str]] = {
@@ -232,7 +239,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], None], str]] = {
     "cut manifest": (lambda run: change(run, "manifest.json", lambda text: text[:200]), "is no JSON"),
     "deep manifest": (lambda run: change(run, "manifest.json", lambda _: "[" * 200_000), "is no JSON"),
     "list": (lambda run: change(run, "manifest.json", lambda _: "[]"), "holds no JSON object"),
-    "no config": (lambda run: in_json(run, "manifest.json", config=3), "has no settings under config"),
+    "no config": (lambda run: in_json(run, "manifest.json", config=3), "config must be the run's settings"),
     "no map": (lambda run: in_json(run, "manifest.json", layout="S.G"), "layout must be a list"),
     "no manifest": (lambda run: (run / "manifest.json").unlink(), "has no manifest.json"),
     "no summary": (lambda run: (run / "summary.json").unlink(), "has no summary.json"),
@@ -258,7 +265,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], None], str]] = {
         lambda run: change(run, "curve.csv", lambda text: text.replace("\n5000,", "\n500,", 1)),
         "the steps do not rise",
     ),
-    "binary": (lambda run: (run / "curve.csv").write_bytes(b"\xff\xfe\x00") and None, "is no UTF-8 text"),
+    "binary": (lambda run: seal(run, "curve.csv", b"\xff\xfe\x00"), "is no UTF-8 text"),
     "other columns": (
         lambda run: change(run, "curve.csv", lambda text: text.replace("regret", "lack")),
         "has no column regret; is it of another version?",
@@ -269,7 +276,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "more seconds than a number can hold": (
         lambda run: in_json(run, "summary.json", train_seconds=10**400),
-        "must be a number",
+        "is too large a number",
     ),
     "null optimum": (
         lambda run: in_json(run, "summary.json", optimal_value=None),
@@ -347,17 +354,53 @@ def test_paths_without_runs(maker: Maker, tmp_path: Path, capsys: pytest.Capture
         shutil.rmtree(tmp_path / "out")
 
 
-def test_links_are_followed_once(maker: Maker, tmp_path: Path) -> None:
+def test_a_link_that_is_named_is_followed_and_others_are_passed_over(maker: Maker, tmp_path: Path) -> None:
     run = maker.write(tmp_path / "runs" / "deep" / "one", 0, 3000)
-    (run / "up").symlink_to(tmp_path / "runs")
-    (tmp_path / "runs" / "again").symlink_to(tmp_path / "runs" / "deep")
+    maker.write(tmp_path / "mine" / "two", 1, 3000)
+    (run / "all").symlink_to("/")
+    (tmp_path / "runs" / "mine").symlink_to(tmp_path / "mine")
+    (tmp_path / "runs" / "file").symlink_to(run / "curve.csv")
     (tmp_path / "runs" / "nowhere").symlink_to(tmp_path / "gone")
     (tmp_path / "runs" / "itself").symlink_to(tmp_path / "runs" / "itself")
     (tmp_path / "linked").symlink_to(tmp_path / "runs")
-    for paths in ([tmp_path / "linked"], [tmp_path / "runs", run], [run, tmp_path / "runs", tmp_path]):
+    for paths in ([tmp_path / "linked"], [tmp_path / "runs", run], [run, tmp_path / "runs"]):
         report = gather(paths)
-        assert (len(report.study.groups), report.complete) == (1, True)
+        assert [found.seed for group in report.study.groups for found in group.runs] == [0]
+        assert report.complete
         assert not report.study.notes
+        note = report.notes[-1]
+        assert re.fullmatch(r".*/one/all( and 1 more)?: a link to a folder is not followed; .*", note)
+    (tmp_path / "runs" / "only").mkdir()
+    (tmp_path / "runs" / "only" / "x").symlink_to(tmp_path / "mine")
+    with pytest.raises(InputError, match=r"holds no run, .*only/x: a link to a folder is not followed"):
+        gather([tmp_path / "runs" / "only"])
+    assert len(gather([tmp_path / "runs" / "mine"]).study.groups[0].runs) == 1
+
+
+def test_a_study_behind_a_link_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "study.json").write_text("{}")
+    (tmp_path / "theirs" / "own").mkdir(parents=True)
+    (tmp_path / "theirs" / "own" / "study.json").write_text("{}")
+    (tmp_path / "theirs" / "linked").symlink_to(tmp_path / "mine")
+    (tmp_path / "named").symlink_to(tmp_path / "mine")
+    _, problems = find_tunings([tmp_path / "theirs", tmp_path / "named"])
+    assert [problem.split(": has no trials.csv")[0] for problem in problems] == [
+        str(tmp_path / "theirs" / "own"),
+        str(tmp_path / "named"),
+    ]
+
+
+def test_a_search_for_runs_ends(maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    maker.write(tmp_path / "0" / "run", 0, 3000)
+    for number in range(100):
+        (tmp_path / "1" / str(number)).mkdir(parents=True)
+    monkeypatch.setattr("gridworld.report.find.MOST_ENTRIES", 50)
+    report = gather([tmp_path])
+    assert report.problems == (
+        f"{tmp_path}: holds more than 50 files and folders, the rest was not searched; name the folders of "
+        "the runs",
+    )
 
 
 def test_a_folder_that_may_not_be_read(maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -575,6 +618,8 @@ def test_pictures_are_embedded_within_bounds(maker: Maker, tmp_path: Path) -> No
     (median / "visits.png").write_bytes((median / "policy.png").read_bytes()[:200])  # cut off
     frames = [Image.new("P", (40, 30), index) for index in (0, 1)]
     frames[0].save(median / "learning.gif", save_all=True, append_images=frames[1:])
+    for name in PICTURES:
+        seal(median, name)
     Image.new("RGB", (90, 50)).save(tmp_path / "0" / "policy.png")  # of another run
     page = (report_of(tmp_path) / "report.html").read_text()
     assert re.findall(
@@ -593,7 +638,7 @@ def test_a_curve_that_lost_its_beginning_is_named_and_the_rest_is_reported(
     for seed in range(3):
         maker.write(runs / f"run{seed}", seed, 2000)
     lines = (runs / "run0" / "curve.csv").read_text().splitlines(keepends=True)
-    (runs / "run0" / "curve.csv").write_text("".join([lines[0], *lines[2:]]))
+    change(runs / "run0", "curve.csv", lambda _: "".join([lines[0], *lines[2:]]))
     with pytest.raises(SystemExit) as end:
         command.main([str(runs)])
     assert end.value.code == 1

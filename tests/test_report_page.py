@@ -10,6 +10,7 @@ from runs_folder import Maker, sweep
 from support import SHORT, train_in
 
 from gridworld.commands import report as command
+from gridworld.sealing import sealed
 
 SIZES = {"phone": (390, 844), "desktop": (1280, 900)}
 
@@ -24,7 +25,9 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for seed in range(6):
         other.write(runs / f"faster{seed}", seed, 2000, agent__learning_rate=0.0123)
     manifest = runs / "ppo,classic,4" / "manifest.json"
-    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"status": "failed", "error": "boom"}))
+    manifest.write_text(
+        json.dumps(sealed(json.loads(manifest.read_text()) | {"status": "failed", "error": "boom"}))
+    )
     with pytest.raises(SystemExit):
         command.main([str(runs)])
     return runs / "report" / "report.html"

@@ -178,7 +178,7 @@ def test_what_differed_on_the_way_is_told(
 ) -> None:
     shutil.copytree(run, tmp_path / "run")
     again = {"step": 512, "differs": ["numpy 1 is now 2\x1b[2J"], "git": {"commit": "abc"}}
-    manifest(tmp_path / "run", lambda content: content.update(resumed=[again, "rubbish", {"step": 600}]))
+    manifest(tmp_path / "run", lambda content: content.update(resumed=[again, {"step": 600}]))
     shown = reproduce(tmp_path / "run", capsys)
     assert "    went on after step 512: numpy 1 is now 2\\x1b[2J (anyway=true)\n" in shown
     assert re.search("    went on after step 512: commit: .* then, abc now\n", shown)

@@ -1,8 +1,12 @@
 """The parts of tuning: the score, search spaces, what Optuna is told, and how trials end."""
 
+import contextlib
 import dataclasses
 import itertools
 import math
+import os
+import shutil
+import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,6 +20,8 @@ from gridworld.errors import InputError
 from gridworld.report import statistics
 from gridworld.training import check_settings
 from gridworld.tune.asked import Source, ask
+from gridworld.tune.checks import check_study, legible
+from gridworld.tune.claim import SEARCH_JSON, is_claimed
 from gridworld.tune.config import DimensionConfig, TuneConfig
 from gridworld.tune.confirm import jobs
 from gridworld.tune.crew import StorageLostError
@@ -318,3 +324,95 @@ def test_the_verdict(winner: Sequence[float], began_from: Sequence[float], verdi
     found = compare(sample(*winner), sample(*began_from), "the winner")
     assert found["verdict"] == verdict
     assert f"held-out seeds the winner {verdict} the settings" in found["sentence"]
+
+
+SQL = {
+    "a score that is no number": "UPDATE trial_values SET value = NULL",
+    "an infinite score": "UPDATE trial_values SET value = 9e999",
+    "a score of a kind that there is not": "UPDATE trial_values SET value_type = 'x'",
+    "no score": "DELETE FROM trial_values",
+    "a choice that there is not": "UPDATE trial_params SET param_value = 77",
+    "a parameter of another name": "UPDATE trial_params SET param_name = 'agent.' || param_id",
+    "no parameter": "DELETE FROM trial_params",
+    "a distribution that is no JSON": "UPDATE trial_params SET distribution_json = '{'",
+    "a distribution that there is not": 'UPDATE trial_params SET distribution_json = \'{"name": "x"}\'',
+    "an attribute that is no JSON": "UPDATE trial_user_attributes SET value_json = '['",
+    "seeds that are no list": "UPDATE trial_user_attributes SET value_json = '1'",
+    "seeds that are none": "UPDATE trial_user_attributes SET value_json = '[{\"seed\": 0}]'",
+    "a seed with a regret beyond all numbers": "UPDATE trial_user_attributes SET value_json = "
+    '\'[{"seed": 0, "certified_since": null, "regret": 1' + 400 * "0" + "}]'",
+    "no seeds": "DELETE FROM trial_user_attributes",
+    "a state that there is not": "UPDATE trials SET state = 'x'",
+    "a date that is none": "UPDATE trials SET datetime_start = 'x'",
+    "what it is about, no JSON": "UPDATE study_user_attributes SET value_json = '{'",
+    "what it is about, no object": "UPDATE study_user_attributes SET value_json = '[1]'",
+    "what it is about, nested as deep as Python goes": "UPDATE study_user_attributes SET value_json = '"
+    + 10**5 * "["
+    + "'",
+    "final seeds that are none": "INSERT INTO study_user_attributes (study_id, key, value_json) "
+    "VALUES (1, 'final trial=0,seed=9', '3')",
+    "another direction": "UPDATE study_directions SET direction = 'MAXIMIZE'",
+    "a direction that there is not": "UPDATE study_directions SET direction = 'x'",
+    "a table less": "DROP TABLE trial_values",
+    "a database of nothing": "DROP TABLE studies",
+    "what Optuna keeps of repeats": "INSERT INTO trial_system_attributes (trial_id, key, value_json) "
+    "VALUES (1, 'retry_history', '{}')",
+}
+
+
+@pytest.fixture(scope="module")
+def sqlite_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With two complete trials."""
+    file = tmp_path_factory.mktemp("study") / "study.db"
+    study = begin(open_storage(TuneConfig(), f"sqlite:///{file}"), "mine", ABOUT, None)
+    for number in (0, 1):
+        seeds = [dataclasses.asdict(SeedScore(seed, 500, 0.25)) for seed in (0, 1)]
+        study.add_trial(
+            optuna.trial.create_trial(
+                params={"agent.gamma": 0.9, "agent.learning_rate": 0.5},
+                distributions={
+                    "agent.gamma": optuna.distributions.CategoricalDistribution([0.9, 0.99]),
+                    "agent.learning_rate": optuna.distributions.FloatDistribution(0.1, 0.9),
+                },
+                value=0.25 + number,
+                user_attrs={"seeds": seeds},
+            )
+        )
+    check_study(study, TWO)
+    return file
+
+
+ABOUT = {"objective": {"seeds": [0, 1]}}
+TWO = Space(
+    {
+        "agent.gamma": DimensionConfig(type="categorical", choices=[0.9, 0.99]),
+        "agent.learning_rate": DimensionConfig(type="float", low=0.1, high=0.9),
+    },
+    "two",
+)
+
+
+@pytest.mark.parametrize("what", SQL)
+def test_a_study_whose_database_was_altered_is_refused_in_a_sentence(
+    what: str, sqlite_study: Path, tmp_path: Path
+) -> None:
+    shutil.copy(sqlite_study, tmp_path / "study.db")
+    with contextlib.closing(sqlite3.connect(tmp_path / "study.db")) as database, database:
+        database.execute(SQL[what])
+    url = f"sqlite:///{tmp_path / 'study.db'}"
+    with pytest.raises(InputError, match=r"^tune\.(storage|study)=.*") as caught, legible(url):
+        check_study(begin(open_storage(TuneConfig(), url), "mine", ABOUT, None), TWO)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b"[1]", b"\xff", b'{"study": 3}', b'{"study": "mine", "about": 3}']
+)
+def test_a_folder_that_does_not_say_whose_it_is_is_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / SEARCH_JSON).write_bytes(content)
+    with pytest.raises(InputError):
+        is_claimed(tmp_path, "mine", ABOUT)
+    (tmp_path / SEARCH_JSON).unlink()
+    os.mkfifo(tmp_path / SEARCH_JSON)
+    with pytest.raises(InputError, match=r"search\.json: is no ordinary file"):
+        is_claimed(tmp_path, "mine", ABOUT)

@@ -14,6 +14,7 @@ from gridworld.mdp import FloatArray
 from gridworld.render import has_display
 from gridworld.saved_run import SavedRun, choose_policy
 from gridworld.summary import circles_text
+from gridworld.terminal import printable
 
 _MOST_EPISODES = 1_000_000
 
@@ -36,7 +37,7 @@ def main(arguments: Sequence[str]) -> None:
         _show(judge, policy, options.seed)
     score = judge.score(policy)
     sampled = judge.sample(policy, options.episodes, options.seed)
-    print(f"{options.policy} policy of {options.run} on {judge.mdp.layout.name}")
+    print(printable(f"{options.policy} policy of {options.run} on {judge.mdp.layout.name}"))
     print(_table(judge, policy, score, sampled))
     print(_verdict(judge, policy, score))
 

@@ -10,7 +10,8 @@ from pathlib import Path
 from gridworld.columns import aligned
 from gridworld.sweep.folder import open_sweep
 from gridworld.sweep.report import counts_text
-from gridworld.sweep.table import STATUSES, Row, Table
+from gridworld.sweep.table import JOBS_CSV, STATUSES, Row, Table
+from gridworld.terminal import printable
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -22,15 +23,21 @@ def main(arguments: Sequence[str]) -> None:
     may_write = os.access(folder.path, os.W_OK)
     rows = table.put_right(entries) if may_write else table.look(entries)
     shown = [row for row in rows.values() if options.status in (None, row.status)]
-    for line in aligned([_cells(row) for row in shown], ("<0", "<12", ">9", "<0")):
-        print(line)
+    with_error = {row.job for row in shown if row.error}
+    verified = table.from_runs(entry for entry in entries if entry.job in with_error)
+    cells = [_cells(row, verified.get(row.job)) for row in shown]
+    for line in aligned(cells, ("<0", "<12", ">9", "<0")):
+        print(printable(line))
     print(counts_text(rows.values()))
 
 
-def _cells(row: Row) -> list[str]:
+def _cells(row: Row, verified: Row | None) -> list[str]:
+    """Columns of a job; an error that its own folder does not tell is marked."""
     seconds = f"{row.seconds} s" if row.seconds else ""
     regret = f" regret {float(row.objective):.3g}" if row.objective else ""
     error = f" {row.error}" if row.error else ""
+    if verified is not None and verified.error != row.error:
+        error += f" (says {JOBS_CSV} alone)"
     return [row.job, f" {row.status}", seconds, f"{regret} {error}" if regret and error else regret + error]
 
 

@@ -15,6 +15,7 @@ from gridworld.errors import InputError
 from gridworld.evaluation import Judge
 from gridworld.play import Game, Key, draw
 from gridworld.saved_run import SavedRun
+from gridworld.terminal import printable
 from gridworld.training import make_mdp
 
 _WIDEST_BOARD = 800  # pixels; two boards share twice 640
@@ -57,7 +58,7 @@ def play(game: Game, cell_size: int) -> None:
             size = (frame.shape[1], frame.shape[0])
             if window is None:
                 window = pygame.display.set_mode(size)
-                pygame.display.set_caption(f"GridWorld: {game.person.judge.mdp.layout.name}")
+                pygame.display.set_caption(printable(f"GridWorld: {game.person.judge.mdp.layout.name}"))
             window.blit(pygame.image.frombuffer(frame, size, "RGB"), (0, 0))
             pygame.display.flip()
             clock.tick(_FPS)
@@ -71,7 +72,7 @@ def play(game: Game, cell_size: int) -> None:
                 game.tick()
             if game.over and not told:
                 for player in game.players:
-                    print(f"{player.standing()}; {player.verdict()}", flush=True)
+                    print(printable(f"{player.standing()}; {player.verdict()}"), flush=True)
             told = game.over
     finally:
         pygame.quit()

@@ -12,14 +12,16 @@ from numpy.typing import NDArray
 from gridworld import record
 from gridworld.agents import Beliefs
 from gridworld.commands import parser_for_a_run
-from gridworld.data_files import check_no_link, read_object
+from gridworld.data_files import check_no_link
 from gridworld.errors import InputError
 from gridworld.evaluation import play_episode
 from gridworld.film import Film, film_of_states
+from gridworld.inside import make_inside
 from gridworld.pictures import MapMaker, agent_gamma
 from gridworld.render import frame_size
 from gridworld.run import check_inside, check_writable
 from gridworld.saved_run import SavedRun, choose_policy, read_visits
+from gridworld.terminal import printable
 
 MAPS = ("policy", "q_error", "visits")
 
@@ -40,7 +42,10 @@ def main(arguments: Sequence[str]) -> None:
     beliefs = saved.beliefs()
     film = _film(saved, beliefs, options)
     record.check_size(film, formats)
-    folder.mkdir(parents=True, exist_ok=True)
+    if options.out is None:
+        make_inside(options.run, folder.name)
+    else:
+        folder.mkdir(parents=True, exist_ok=True)
     for kind in formats:
         if kind == "png":
             path = folder / "frames"
@@ -52,7 +57,7 @@ def main(arguments: Sequence[str]) -> None:
         else:
             path = folder / f"episode.{kind}"
             record.save_animation(film, path, options.fps)
-        print(path)
+        print(printable(str(path)))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -117,11 +122,11 @@ def _save_map(
 
 def _steps(saved: SavedRun) -> int:
     """How long it was trained."""
-    path = saved.run.summary_file
-    saved.run.verify(path)
-    steps = read_object(path).get("timesteps")
+    steps = saved.run.read_summary().get("timesteps")
     if not isinstance(steps, int) or isinstance(steps, bool) or steps < 0:
-        raise InputError(f"{path}: not the summary of a run, timesteps must be a whole number")
+        raise InputError(
+            f"{saved.run.summary_file}: not the summary of a run, timesteps must be a whole number"
+        )
     return steps
 
 

@@ -38,9 +38,9 @@ def main(arguments: Sequence[str]) -> None:
     if options.readme is not None:
         write_readme(report, options.readme)
     _tell(report)
-    print(page)
+    print(printable(str(page)))
     if options.open and not webbrowser.open(page.absolute().as_uri()):
-        print(f"--open: there is no browser here; open {page} in yours", file=sys.stderr)
+        print(printable(f"--open: there is no browser here; open {page} in yours"), file=sys.stderr)
     if not report.complete:
         sys.exit(1)
 

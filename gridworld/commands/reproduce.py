@@ -42,7 +42,7 @@ def main(arguments: Sequence[str]) -> None:
     if options.keep is not None:
         check_inside(options.keep, "--keep")
         check_new(options.keep, "--keep")
-    print(f"{options.run}: {config.agent.name} on {config.env.layout}, seed {config.seed}")
+    print(printable(f"{options.run}: {config.agent.name} on {config.env.layout}, seed {config.seed}"))
     _tell_environment(list(differences(then.manifest, _here(then.manifest))))
     _tell_resumed(then.manifest)
     if shorter:

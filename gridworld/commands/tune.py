@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 from gridworld.errors import InputError
 from gridworld.manual import choices
-from gridworld.terminal import result_is_in_files, tell_error
+from gridworld.terminal import printable, result_is_in_files, tell_error
 
 if TYPE_CHECKING:
     from gridworld.tune.asked import Asked
@@ -77,7 +77,7 @@ def main(arguments: Sequence[str]) -> None:
         sys.exit(1)
     except Interrupted as interruption:
         again = shlex.join(["python", *sys.argv])
-        print(f"{interruption}; nothing that ended is lost; go on with: {again}", file=sys.stderr)
+        print(printable(f"{interruption}; nothing that ended is lost; go on with: {again}"), file=sys.stderr)
         sys.stderr.flush()
         os._exit(interruption.exit_code)  # to take the interpreter down would take seconds more
 

@@ -24,6 +24,7 @@ from gridworld.report.svg import to_svg
 from gridworld.report.table import Cell, Table, interval_text, is_text, main_text, number
 from gridworld.report.tuning import Tuning, finalists_table, trials_table, winner_table
 from gridworld.report.tuning_figures import tuning_figures
+from gridworld.terminal import plain
 
 
 def figures(report: Report) -> dict[str, list[Scene]]:
@@ -52,9 +53,9 @@ def render(report: Report, scenes: dict[str, list[Scene]]) -> str:
             *(_answer(task, report.unusable) for task in report.tasks),
         ],
         answer=tables.answer_table(report.study, report.tasks),
-        problems=report.problems,
-        warnings=[*report.study.warnings, *_doubts(report)],
-        notes=[*report.study.notes, *report.notes],
+        problems=list(map(plain, report.problems)),
+        warnings=list(map(plain, [*report.study.warnings, *_doubts(report)])),
+        notes=list(map(plain, [*report.study.notes, *report.notes])),
         tunings=[_tuning(tuning, scenes[tuning.title]) for tuning in report.tunings],
         tasks=[_task(task, scenes[task.task], look) for task in report.tasks],
         overall=tables.overall_table(report.overall) if report.overall else None,

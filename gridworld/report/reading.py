@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,16 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from gridworld.data_files import read_object
 from gridworld.errors import InputError
 from gridworld.flat import flat
 from gridworld.mdp import FloatArray
 from gridworld.report.run_files import read_curve
-from gridworld.run import CURVE, MANIFEST, SUMMARY
+from gridworld.run import CURVE, SUMMARY, Run, read_run
 from gridworld.terminal import printable
 
 _LONGEST_NAME = 80  # characters
-_LARGEST_NUMBER = sys.float_info.max  # JSON may hold whole numbers beyond it, and infinities
 _DIGITS = 9  # after the point: two ways to compute one regret differ later than that
 
 Settings = Mapping[str, str]  # flat: {"agent.gamma": "0.9"}
@@ -46,6 +43,7 @@ class Evidence:
     curve: Mapping[
         str, FloatArray
     ]  # REQUIRED, and those of the optional columns that the file has; (evaluations,)
+    pictures: Mapping[str, str | None]  # the checksum of each that the run drew; None in one of old
 
     @property
     def steps(self) -> int:
@@ -83,23 +81,21 @@ def read(folder: Path) -> Evidence | Unusable:
     """The run in `folder`, or the reason why it cannot be used."""
     agent = env = None
     try:
-        manifest = read_object(folder / MANIFEST)
-        agent, env = _peek(manifest, "agent", "name"), _peek(manifest, "env", "layout")
-        _check_ended(folder, manifest)
-        return _evidence(folder, manifest)
+        run = read_run(folder)
+        agent, env = _peek(run.manifest, "agent", "name"), _peek(run.manifest, "env", "layout")
+        _check_ended(run)
+        return _evidence(run)
     except InputError as error:
         return Unusable(folder, str(error), agent, env)
 
 
-def _evidence(folder: Path, manifest: dict[str, Any]) -> Evidence:
-    where = folder / MANIFEST
-    config, layout = manifest.get("config"), manifest.get("layout")
-    if not isinstance(config, dict) or not isinstance(config.get("env"), dict):
-        raise InputError(f"{where}: has no settings under config; is it of another version?")
-    if not (isinstance(layout, list) and all(isinstance(line, str) for line in layout)):
-        raise InputError(f"{where}: layout must be a list of the map's rows; is it of another version?")
-    summary = read_object(folder / SUMMARY)
-    curve = read_curve(folder / CURVE)
+def _evidence(run: Run) -> Evidence:
+    folder, manifest, where = run.folder, run.manifest, run.manifest_file
+    config = manifest["config"]
+    if not isinstance(config.get("env"), dict):
+        raise InputError(f"{where}: has no settings of the world under config; is it of another version?")
+    summary = run.read_summary()
+    curve = read_curve(run)
     seed = config.get("seed")
     if not isinstance(seed, int) or isinstance(seed, bool):
         raise InputError(f"{where}: config.seed={seed!r} must be a whole number")
@@ -110,34 +106,36 @@ def _evidence(folder: Path, manifest: dict[str, Any]) -> Evidence:
         seed=seed,
         settings=dict(_settings(config)),
         world=config["env"],
-        layout="\n".join(layout),
+        layout="\n".join(manifest["layout"]),
         gamma=_number(config.get("evaluation"), "gamma", f"{where}: config.evaluation"),
         optimal_value=_number(summary, "optimal_value", str(folder / SUMMARY)),
         seconds=_number(summary, "train_seconds", str(folder / SUMMARY)),
         started=str(manifest.get("started", ""))[:10],
         version=_version(manifest),
         curve=curve,
+        pictures=run.pictures(),
     )
     _check_agreement(evidence, summary)
     return evidence
 
 
-def _check_ended(folder: Path, manifest: dict[str, Any]) -> None:
-    status = manifest.get("status")
-    if status == "finished":
+def _check_ended(run: Run) -> None:
+    if run.is_finished:
         return
-    told = manifest.get("error")
-    why = f": {' '.join(str(told).split())[:300]}" if told else ""
+    status, told = run.manifest["status"], run.manifest.get("error")
+    why = f": {' '.join(told.split())[:300]}" if told else ""
     if status == "running":
         why = ": it is still going on, or was killed"
     raise InputError(
-        f"{folder}: this run is {str(status)[:_LONGEST_NAME]!r}, not finished{why}{_reached(folder)}"
+        f"{run.folder}: this run is {status[:_LONGEST_NAME]!r}, not finished{why}{_reached(run)}"
     )
 
 
-def _reached(folder: Path) -> str:
+def _reached(run: Run) -> str:
+    """How far its curve goes, which nothing vouches for until the run is finished."""
     try:
-        return f" (last evaluated after {int(read_curve(folder / CURVE)['step'][-1]):,} steps)"
+        steps = int(read_curve(run)["step"][-1])
+        return f" (last evaluated after {steps:,} steps, says {CURVE}, which is not verified before the end)"
     except InputError:
         return ""
 
@@ -147,7 +145,7 @@ def _check_agreement(run: Evidence, summary: Mapping[str, Any]) -> None:
     last = run.curve["regret"][-1]
     told = summary.get("regret")
     same = told is None and not math.isfinite(last)
-    if isinstance(told, int | float) and abs(told) <= _LARGEST_NUMBER:
+    if isinstance(told, int | float):
         same = math.isclose(told, last, rel_tol=1e-9, abs_tol=1e-12)
     if not same or summary.get("certified") != run.certified or summary.get("timesteps") != run.steps:
         raise InputError(
@@ -181,13 +179,12 @@ def _version(manifest: dict[str, Any]) -> str:
 
 def _number(content: Any, key: str, where: str) -> float:
     value = content.get(key) if isinstance(content, dict) else None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _LARGEST_NUMBER:
+    if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{where}: {key}={value!r} must be a number; is it of another version?")
     return float(value)
 
 
 def _peek(manifest: dict[str, Any], section: str, key: str) -> str | None:
-    config = manifest.get("config")
-    inner = config.get(section) if isinstance(config, dict) else None
+    inner = manifest["config"].get(section)
     value = inner.get(key) if isinstance(inner, dict) else None
     return _printable(value) if isinstance(value, str) else None

@@ -12,6 +12,7 @@ from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.flat import flat
 from gridworld.report.analysis import Overall, TaskAnalysis, analyse
+from gridworld.report.embed import changed_pictures
 from gridworld.report.find import find_runs
 from gridworld.report.grouping import Study, arrange
 from gridworld.report.reading import Evidence, Unusable, read
@@ -43,18 +44,21 @@ class Report:
 
 def gather(paths: Sequence[Path], seed: int = 0) -> Report:
     """Read and analyse all runs below the paths. Raises `InputError` where no run can be used."""
-    folders, problems = find_runs(paths)
-    outcomes = [read(folder) for folder in folders]
+    found = find_runs(paths)
+    problems = found.problems
+    outcomes = [read(folder) for folder in found.folders]
     runs = [outcome for outcome in outcomes if isinstance(outcome, Evidence)]
     unusable = tuple(outcome for outcome in outcomes if isinstance(outcome, Unusable))
     if not runs:
-        raise InputError(
-            "nothing to report: " + "; ".join([*problems, *(run.reason for run in unusable)][:20])
-        )
+        reasons = [*problems, *(run.reason for run in unusable), *found.notes]
+        raise InputError("nothing to report: " + "; ".join(reasons[:20]))
     study = arrange(runs)
     tasks, overall = analyse(study, seed)
+    problems += [told for task in tasks for result in task.results for told in changed_pictures(result)]
     tunings, unread = find_tunings(paths)
-    return Report(study, tasks, overall, unusable, (*problems, *unread), _foreign(runs), seed, tuple(tunings))
+    problems += unread
+    notes = (*found.notes, *_foreign(runs))
+    return Report(study, tasks, overall, unusable, tuple(problems), notes, seed, tuple(tunings))
 
 
 def _foreign(runs: Sequence[Evidence]) -> tuple[str, ...]:

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gridworld.data_files import LARGEST_CSV, read_text
+from gridworld.data_files import LARGEST_CSV, as_text
 from gridworld.errors import InputError
 from gridworld.mdp import FloatArray
+from gridworld.run import Run
 
 _MOST_COLUMNS = 100
 
@@ -20,9 +21,10 @@ ONLINE = "online_return"  # undiscounted, of training episodes (`gridworld.curve
 _OPTIONAL = (SAMPLED_RETURN, ONLINE)
 
 
-def read_curve(path: Path) -> dict[str, FloatArray]:
-    """The columns of a learning curve that are needed, (evaluations,) each."""
-    lines = read_text(path, LARGEST_CSV).splitlines()
+def read_curve(run: Run) -> dict[str, FloatArray]:
+    """The columns of the learning curve that are needed, (evaluations,) each."""
+    path = run.curve_file
+    lines = as_text(run.read(path, LARGEST_CSV), path).splitlines()
     if lines and lines[0].count(",") >= _MOST_COLUMNS:
         raise InputError(f"{path}: has more than {_MOST_COLUMNS} columns; is it of another version?")
     try:

@@ -6,10 +6,11 @@ import csv
 import io
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from gridworld.report.statistics import Interval, Share
+from gridworld.terminal import plain
 
 NOTHING = "\N{EN DASH}"
 _MINUS = "\N{MINUS SIGN}"
@@ -24,7 +25,7 @@ class Estimate:
 
 
 # Signs with which a name out of a run's folder could be HTML, a link, a row, or the end of a marked place.
-_MARKS = re.compile(r"""[\\|<>&`\[\]*!\n\r]""")
+_MARKS = re.compile(r"""[\\|<>&`\[\]*!\n\r]|:(?=//)|(?<=www)\.""")
 
 Cell = str | float | int | None | Share | Estimate
 
@@ -37,6 +38,13 @@ class Table:
     caption: str
     columns: Sequence[str]
     rows: Sequence[Sequence[Cell]]
+
+    def __post_init__(self) -> None:
+        """What stands in it may be anybody's: whichever way it is written, it acts on no terminal."""
+        rows = [[plain(cell) if isinstance(cell, str) else cell for cell in row] for row in self.rows]
+        object.__setattr__(self, "caption", plain(self.caption))
+        object.__setattr__(self, "columns", list(map(plain, self.columns)))
+        object.__setattr__(self, "rows", rows)
 
 
 def number(value: float) -> str:
@@ -89,10 +97,15 @@ def is_text(table: Table, column: int) -> bool:
     return bool(table.rows) and all(isinstance(row[column], str) for row in table.rows)
 
 
+def to_captioned_markdown(table: Table) -> str:
+    """A pipe table below its caption."""
+    return f"{_plain_markdown(table.caption)}\n\n{to_markdown(table)}"
+
+
 def to_markdown(table: Table) -> str:
     """A pipe table."""
     sides = ("---" if is_text(table, column) else "---:" for column in range(len(table.columns)))
-    lines = [_piped(table.columns), _piped(sides)]
+    lines = [_piped(map(_plain_markdown, table.columns)), _piped(sides)]
     lines += [
         _piped(
             _plain_markdown(cell)
@@ -146,7 +159,7 @@ def _plain(value: float) -> str:
     return "" if math.isnan(value) else f"{value:.10g}"
 
 
-def _piped(cells: Sequence[str] | Iterator[str]) -> str:
+def _piped(cells: Iterable[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 

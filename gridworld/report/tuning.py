@@ -5,17 +5,21 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gridworld.data_files import LARGEST_CSV, read_object, read_text
+from gridworld.data_files import LARGEST_CSV, as_text, read_bytes, sha256
 from gridworld.errors import InputError
+from gridworld.report.find import real_folders
 from gridworld.report.table import Cell, Table
+from gridworld.sealing import read_sealed
+from gridworld.terminal import plain
 
 STUDY_JSON, TRIALS_CSV = "study.json", "trials.csv"
-FORMAT = 1
+TRIALS_SUM = "trials_sha256"  # in the former, of the latter
 _SCORED = ("done", "pruned")
 
 
@@ -70,7 +74,9 @@ def find_tunings(paths: Sequence[Path]) -> tuple[list[Tuning], list[str]]:
     found: dict[Path, Tuning] = {}
     problems = []
     for path in paths:
-        for file in (*path.glob(STUDY_JSON), *sorted(path.glob(f"*/{STUDY_JSON}"))):
+        for file in (folder / STUDY_JSON for folder in real_folders(path)):
+            if not os.path.lexists(file):
+                continue
             try:
                 found.setdefault(file.resolve(), _read(file.parent))
             except InputError as error:
@@ -113,19 +119,17 @@ def trials_table(tuning: Tuning) -> Table:
 
 def _read(folder: Path) -> Tuning:
     file = folder / STUDY_JSON
-    content = read_object(file)
-    if content.get("format") != FORMAT:
-        raise InputError(f"{file}: has format {content.get('format')!r}, this version reads {FORMAT}")
-    table = read_text(folder / TRIALS_CSV, LARGEST_CSV)
+    content = read_sealed(file)
+    table = _trials(folder / TRIALS_CSV, content)
     try:
         winner = content["winner"]
         space = {str(key): _dimension(dimension) for key, dimension in content["space"].items()}
         return Tuning(
             folder=folder,
-            name=str(content["study"])[:80],
-            agent=str(content["agent"])[:80],
-            env=str(content["env"])[:80],
-            sentence=str(content["confirmation"]["sentence"]),
+            name=_text(content["study"])[:80],
+            agent=_text(content["agent"])[:80],
+            env=_text(content["env"])[:80],
+            sentence=_text(content["confirmation"]["sentence"]),
             winner=int(winner["trial"]),
             values=dict(winner["values"]),
             began_from=dict(content["began_from"] or {}),
@@ -139,6 +143,23 @@ def _read(folder: Path) -> Tuning:
         )
     except (KeyError, TypeError, ValueError, AttributeError, csv.Error) as error:
         raise InputError(f"{file}: has no search that came to an end, or was changed ({error!r})") from None
+
+
+def _trials(file: Path, study: Mapping[str, Any]) -> str:
+    """The table that study.json was written beside; one of the first format does not say which."""
+    content = read_bytes(file, LARGEST_CSV)
+    if TRIALS_SUM in study and study[TRIALS_SUM] != sha256(content):
+        raise InputError(
+            f"{file}: is not the table that {STUDY_JSON} was written with; it was changed or damaged, or the "
+            "search has gone on and not come to its end"
+        )
+    return as_text(content, file)
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{str(value)[:40]} is no text")
+    return plain(value)
 
 
 def _dimension(content: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from gridworld.report.aggregate import write_events
 from gridworld.report.page import figures, improvements, render
 from gridworld.report.png import to_png
 from gridworld.report.report import Report
-from gridworld.report.table import Table, to_csv, to_markdown
+from gridworld.report.table import Table, to_captioned_markdown, to_csv, to_markdown
 from gridworld.report.tuning import finalists_table, trials_table, winner_table
 from gridworld.run import check_writable
 
@@ -57,7 +57,7 @@ def write_report(report: Report, folder: Path) -> Path:
         all_tables = list(_tables(report))
         for name, table in zip(_file_names(table.name for table in all_tables), all_tables, strict=True):
             write_text(new / TABLES / f"{name}.csv", to_csv(table))
-            write_text(new / TABLES / f"{name}.md", f"{table.caption}\n\n{to_markdown(table)}")
+            write_text(new / TABLES / f"{name}.md", to_captioned_markdown(table))
         results = [(task, result) for task in report.tasks for result in task.results]
         names = _file_names(f"{result.group.agent} on {task.task}" for task, result in results)
         for name, (task, result) in zip(names, results, strict=True):

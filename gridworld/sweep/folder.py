@@ -8,8 +8,8 @@ agent=dqn,seed=0/   a job's folder, an ordinary run's
 
 from __future__ import annotations
 
-import json
 import os
+import re
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
@@ -20,14 +20,16 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.errors import InputError
-from gridworld.files import write_json
+from gridworld.files import remove, write_json
+from gridworld.inside import check_no_links, links_in
 from gridworld.lock import locked
 from gridworld.provenance import versions
 from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, check_writable
+from gridworld.sealing import read_sealed, sealed
 from gridworld.sweep.plan import Job, folder_name
 
 STOP = ".stop"  # in the sweep's folder: no more jobs are to begin, wherever they wait
-_FORMAT = 1
+_JOB = re.compile(r"[\w=+,-][\w.,=+-]*", re.ASCII)  # as `folder_name` makes them: they lead nowhere else
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class SweepFolder:
         self._manifest: dict[str, Any] = {}
         if (path / MANIFEST).exists():
             raise InputError(f"{path}: is the folder of a single run; choose another hydra.sweep.dir")
-        if (path / SWEEP_JSON).exists():
+        if os.path.lexists(path / SWEEP_JSON):
             self._load(path / SWEEP_JSON)
         elif used := next(iter(sorted(path.glob(f"*/{MANIFEST}"))), None):
             raise InputError(
@@ -59,12 +61,20 @@ class SweepFolder:
     def check(self, jobs: Sequence[Job], extend: bool) -> None:
         """Raise `InputError` if the folder cannot be written, or is of another sweep."""
         check_writable(self.path, "hydra.sweep.dir")
+        for job in jobs:
+            if job.hash in self.entries:  # others get a folder of their own
+                self._check_no_links(self.entries[job.hash].job)
         if self.entries and not extend and not any(job.hash in self.entries for job in jobs):
             asked = self._manifest["asked"][-1]["overrides"]
             raise InputError(
                 f"{self.path}: holds the sweep '{shlex.join(asked)}', which has no job in common with this "
                 "one; choose another hydra.sweep.dir, or add hydra.sweeper.extend=true to put both into one"
             )
+
+    def _check_no_links(self, job: str) -> None:
+        """What Hydra writes before the job begins, it writes through links."""
+        for names in ((job,), (job, ".hydra")):
+            check_no_links(self.path, *names)
 
     @contextmanager
     def at_work(self) -> Iterator[None]:
@@ -80,13 +90,14 @@ class SweepFolder:
                 raise InputError(f"{self.path}: another process runs this sweep; wait for it or stop it")
             (self.path / STOP).unlink(missing_ok=True)
             for part in self.path.glob(".*.part"):  # of a process that was killed while writing
-                part.unlink(missing_ok=True)
+                remove(part)
             yield
 
     def add(self, jobs: Sequence[Job], words: Sequence[str]) -> list[Entry]:
         """Note what is asked for; returns the jobs' entries, new ones with a folder of their own."""
         taken = {entry.job.lower() for entry in self.entries.values()}
         taken |= {used.parent.name.lower() for used in self.path.glob(f"*/{MANIFEST}")}  # whosever they are
+        taken |= {name.lower() for name in links_in(self.path)}
         lines = [e.overrides for e in self.entries.values()] + [job.overrides for job in jobs]
         common = set(lines[0]).intersection(*lines)
         for job in jobs:
@@ -103,8 +114,7 @@ class SweepFolder:
             now = datetime.now(UTC).isoformat(timespec="seconds")
             command = [Path(sys.argv[0]).name, *sys.argv[1:]]
             asked = [*asked, {"at": now, "overrides": list(words), "command": command}]
-        self._manifest = {
-            "format": _FORMAT,
+        content = {
             "asked": asked,
             "versions": versions(),
             "jobs": [
@@ -112,40 +122,52 @@ class SweepFolder:
                 for entry in self.entries.values()
             ],
         }
+        self._manifest = sealed(content)
         write_json(self.path / SWEEP_JSON, self._manifest)
 
     def _load(self, file: Path) -> None:
         try:
-            content = json.loads(file.read_text("utf-8"))
-            known = content["format"]
-            self.entries = {
-                item["hash"]: Entry(_plain_name(item["job"]), str(item["hash"]), tuple(item["overrides"]))
-                for item in content["jobs"]
-            }
-            if not content["asked"]:
+            content = read_sealed(file)
+            asked, entries = content.get("asked"), [_entry(item) for item in _objects(content.get("jobs"))]
+            if not asked:
                 raise ValueError("nothing was asked for")
-            for earlier in content["asked"]:
-                shlex.join(earlier["overrides"])
-        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+            for earlier in _objects(asked):
+                _words(earlier.get("overrides"))
+        except ValueError as error:  # ours is one
+            told = str(error).removeprefix(f"{file}: ")
             raise InputError(
-                f"{file}: damaged ({type(error).__name__}: {error}); put back a good copy, or choose "
-                "another hydra.sweep.dir"
+                f"{file}: damaged ({told}); put back a good copy, or choose another hydra.sweep.dir"
             ) from None
-        if known != _FORMAT:
-            raise InputError(f"{file}: has format {known}, this version reads {_FORMAT}")
+        self.entries = {entry.hash: entry for entry in entries}
+        if not len(entries) == len(self.entries) == len({entry.job.lower() for entry in entries}):
+            raise InputError(f"{file}: damaged (two jobs have one folder, or one hash)")
         self._manifest = content
 
 
 def open_sweep(path: Path) -> SweepFolder:
     """A sweep's folder, to look at. Raises `InputError` where there is none."""
-    if not (path / SWEEP_JSON).is_file():
+    if not os.path.lexists(path / SWEEP_JSON):
         reason = f"not a sweep's folder, it has no {SWEEP_JSON}" if path.exists() else "no such folder"
         raise InputError(f"{path}: {reason}; give the folder of a sweep, e.g. one in runs/")
     return SweepFolder(path)
 
 
-def _plain_name(name: str) -> str:
-    """A folder's name that leads nowhere else."""
-    if name in ("", ".", "..") or os.sep in name or "\n" in name:
-        raise ValueError(f"{name!r} is no job's folder")
-    return name
+def _entry(item: dict[str, Any]) -> Entry:
+    job, digest = item.get("job"), item.get("hash")
+    if not (isinstance(job, str) and _JOB.fullmatch(job)):
+        raise ValueError(f"{str(job)[:80]!r} is no job's folder")
+    if not isinstance(digest, str):
+        raise ValueError("a job has no hash")
+    return Entry(job, digest, _words(item.get("overrides")))
+
+
+def _objects(value: Any) -> list[dict[str, Any]]:
+    if not (isinstance(value, list) and all(isinstance(each, dict) for each in value)):
+        raise ValueError("it has no list of jobs, or of what was asked for")
+    return value
+
+
+def _words(value: Any) -> tuple[str, ...]:
+    if not (isinstance(value, list) and all(isinstance(each, str) for each in value)):
+        raise ValueError("overrides must be what stands on a command line")
+    return tuple(value)

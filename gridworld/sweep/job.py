@@ -12,11 +12,11 @@ from pathlib import Path
 
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError, MachineError, reason
-from gridworld.files import write_json, write_text
+from gridworld.files import write_text
 from gridworld.lock import locked
 from gridworld.provenance import DIFF
 from gridworld.resume import train_or_go_on
-from gridworld.run import LOCK, MANIFEST, Run
+from gridworld.run import LOCK, MANIFEST, Run, read_run
 from gridworld.signals import Interrupted
 from gridworld.sweep.table import (
     DONE,
@@ -27,8 +27,7 @@ from gridworld.sweep.table import (
     Table,
     one_line,
     outcome,
-    read_json,
-    read_manifest,
+    status_in,
 )
 
 ERROR_FILE = "error.txt"  # the traceback of what nobody foresaw
@@ -65,9 +64,8 @@ def run_in_sweep(config: TrainConfig, folder: Path, overrides: list[str], stop_a
 
 def mark_failed(folder: Path, why: str) -> None:
     """Say in the manifest, if the job came so far, what its own process did not."""
-    manifest = read_json(folder / MANIFEST)
-    if manifest.get("status") in _TO_GO_ON_WITH:
-        write_json(folder / MANIFEST, manifest | {"status": "failed", "error": why})
+    if status_in(folder) in _TO_GO_ON_WITH:
+        read_run(folder).fail(why)
 
 
 def _make_ready(folder: Path, table: Table) -> bool:
@@ -75,7 +73,7 @@ def _make_ready(folder: Path, table: Table) -> bool:
 
     A run that is finished is replaced if the table has the job as failed: then it is another job's.
     """
-    status = read_manifest(folder).get("status")
+    status = status_in(folder)
     row = table.row(folder.name)
     if status == "finished" and (row is None or row.status != FAILED):
         return False
@@ -92,7 +90,7 @@ def _run(config: TrainConfig, run: Run, overrides: list[str], table: Table) -> f
     try:
         summary = train_or_go_on(config, run, overrides)
     except Interrupted as interruption:
-        table.set(job, status=INTERRUPTED, **outcome(run.folder, run.manifest))
+        table.set(job, status=INTERRUPTED, **outcome(run))
         sys.exit(interruption.exit_code)
     except (OSError, MachineError) as error:  # no fault of the job's, which goes on later
         why = one_line(reason(error))
@@ -106,5 +104,5 @@ def _run(config: TrainConfig, run: Run, overrides: list[str], table: Table) -> f
         mark_failed(run.folder, why)  # one that could not go on says nothing itself
         table.set(job, status=FAILED, seconds=f"{time.monotonic() - started:.2f}", error=why)
         raise JobError(why) from None
-    table.set(job, status=DONE, **outcome(run.folder, run.manifest))
+    table.set(job, status=DONE, **outcome(run))
     return float(summary["regret"])

@@ -9,9 +9,9 @@ which only works where accounting is set up.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
-import shutil
 import subprocess
 import sys
 import time
@@ -24,10 +24,12 @@ from omegaconf import OmegaConf
 
 from gridworld.errors import InputError
 from gridworld.files import replacing
+from gridworld.inside import make_inside, remove_inside
 from gridworld.sweep.config import SlurmConfig
 from gridworld.sweep.folder import STOP
 from gridworld.sweep.job import StopSweep
 from gridworld.sweep.worker import Hydra, run_in_turn
+from gridworld.terminal import printable
 
 Task = submitit.Job[list[str]]
 
@@ -47,8 +49,7 @@ def launch(hydra: Hydra, settings: SlurmConfig, jobs: Sequence[Sequence[str]], f
     size = settings.jobs_per_task
     starts = range(0, len(jobs), size)
     _refuse_too_many(len(starts), len(jobs))
-    folder = hydra.sweep / _FOLDER
-    folder.mkdir(exist_ok=True)
+    folder = make_inside(hydra.sweep, _FOLDER)
     state_file = folder / f"{time.time_ns()}.state"
     with replacing(state_file) as part:
         part.write_bytes(hydra.packed())
@@ -145,9 +146,10 @@ def _results(tasks: list[Task], chunks: list[list[list[str]]], folder: Path) -> 
         results += [JobReturn(_return_value=reason, status=JobStatus.UNKNOWN) for _ in range(left)]
         if reason:
             lost = True
-            print(f"slurm: task {task.job_id} was lost: {reason}", file=sys.stderr, flush=True)
+            print(printable(f"slurm: task {task.job_id} was lost: {reason}"), file=sys.stderr, flush=True)
     if not lost:
-        shutil.rmtree(folder, ignore_errors=True)  # else its logs may help
+        with contextlib.suppress(OSError):
+            remove_inside(folder.parent, folder.name)  # else its logs may help
     return results
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from gridworld.errors import reason
 from gridworld.sweep.progress import duration
 from gridworld.sweep.table import DONE, FAILED, INTERRUPTED, JOBS_CSV, PENDING, RUNNING, STATUSES, Row
-from gridworld.terminal import tell_error
+from gridworld.terminal import printable, tell_error
 
 _MOST_LISTED = 50  # of a kind, on the terminal; jobs.csv has them all
 
@@ -58,7 +58,7 @@ def _list(what: str, rows: Sequence[Row]) -> None:
     if rows:
         print(f"{what}:", file=sys.stderr)
     for row in rows[:_MOST_LISTED]:
-        print(f"  {row.overrides}: {row.error}", file=sys.stderr)
+        print(printable(f"  {row.overrides}: {row.error}"), file=sys.stderr)
     if len(rows) > _MOST_LISTED:
         print(f"  and {len(rows) - _MOST_LISTED} more; {JOBS_CSV} has all", file=sys.stderr)
 
@@ -73,11 +73,11 @@ def command(folder: Path, *more: str) -> str:
     words = ["python", *sys.argv]
     if not any(word.startswith("hydra.sweep.dir=") for word in words):
         more = (f"hydra.sweep.dir={folder}", *more)
-    return shlex.join([*words, *(word for word in more if word not in words)])
+    return printable(shlex.join([*words, *(word for word in more if word not in words)]))
 
 
 def shown(folder: Path) -> str:
     """As a user would type it from here, quoted where a shell needs it."""
     path = folder.absolute()
     here = Path.cwd()
-    return shlex.quote(str(path.relative_to(here) if path.is_relative_to(here) else path))
+    return printable(shlex.quote(str(path.relative_to(here) if path.is_relative_to(here) else path)))

@@ -20,7 +20,6 @@ from omegaconf import DictConfig
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError, reason
 from gridworld.experiment import to_config
-from gridworld.run import MANIFEST
 from gridworld.signals import handling
 from gridworld.sweep import report
 from gridworld.sweep.compose import SweepLoader
@@ -29,7 +28,7 @@ from gridworld.sweep.folder import Entry, SweepFolder
 from gridworld.sweep.job import StopSweep, mark_failed
 from gridworld.sweep.plan import Job, expand, plan
 from gridworld.sweep.progress import SweepProgress
-from gridworld.sweep.table import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, Row, Table, one_line, read_json
+from gridworld.sweep.table import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, Row, Table, one_line, status_in
 
 _ORPHANS_END_WITHIN = 5.0  # seconds; workers of a sweep that was killed
 _STOPPED_END_WITHIN = 2.5  # seconds; those of one that is being stopped
@@ -181,7 +180,7 @@ class _Sweep:
             elif result.status is not JobStatus.UNKNOWN:
                 if not row.error:
                     self._fail(entry, f"it did not run ({result._return_value})")
-            elif read_json(self._folder.path / entry.job / MANIFEST).get("status") == "running":
+            elif status_in(self._folder.path / entry.job) == "running":
                 self._fail(entry, f"its process was lost ({result._return_value})")
 
     def _fail(self, entry: Entry, reason: str) -> None:

@@ -9,8 +9,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-import json
-import math
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,13 +16,14 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from gridworld.data_files import read_object
+from gridworld.data_files import LARGEST_CSV, read_text
 from gridworld.errors import InputError
 from gridworld.files import write_text
 from gridworld.lock import is_locked, locked
-from gridworld.run import LOCK, MANIFEST, SUMMARY
+from gridworld.run import LOCK, MANIFEST, Run, read_run
 from gridworld.sweep.folder import Entry
 from gridworld.sweep.plan import settings_hash
+from gridworld.terminal import plain
 
 JOBS_CSV = "jobs.csv"
 TABLE_LOCK = ".jobs.lock"
@@ -60,8 +59,8 @@ class Table:
     def read(self) -> dict[str, Row]:
         """As the file has them; one that cannot be read counts as empty, since it can be made again."""
         try:
-            lines = list(csv.reader(io.StringIO(self.file.read_text("utf-8"))))
-        except (FileNotFoundError, UnicodeDecodeError, csv.Error):
+            lines = list(csv.reader(io.StringIO(read_text(self.file, LARGEST_CSV))))
+        except (InputError, csv.Error):
             return {}
         if not lines or lines[0] != _COLUMNS:
             return {}
@@ -74,6 +73,7 @@ class Table:
 
     def set(self, job: str, **changes: str) -> None:
         """Change a job's row. Other rows are copied as they stand: reading ten thousand takes 0.1 s."""
+        changes = {name: plain(text) for name, text in changes.items()}
         with locked(self.folder / TABLE_LOCK):
             found = self._find(job)
             if found is not None:
@@ -88,12 +88,12 @@ class Table:
     def _find(self, job: str) -> tuple[str, Row, slice] | None:
         """(the file's text, the job's row, where in the text its line is); None if it is not that simple."""
         try:
-            text = self.file.read_text("utf-8")
-        except (FileNotFoundError, UnicodeDecodeError):
+            text = read_text(self.file, LARGEST_CSV)
+            start = text.find("\n" + _line([job, ""])[:-1]) + 1
+            stop = text.find("\n", start) + 1
+            fields = next(csv.reader([text[start:stop]]), [])
+        except (InputError, csv.Error):
             return None
-        start = text.find("\n" + _line([job, ""])[:-1]) + 1
-        stop = text.find("\n", start) + 1
-        fields = next(csv.reader([text[start:stop]]), [])
         if not start or not stop or not text.startswith(_line(_COLUMNS)) or len(fields) != len(_COLUMNS):
             return None
         return text, Row(*fields), slice(start, stop)
@@ -110,18 +110,26 @@ class Table:
         before = self.read()
         return {entry.job: self._look_at(entry, before.get(entry.job)) for entry in entries}
 
+    def from_runs(self, entries: Iterable[Entry]) -> dict[str, Row]:
+        """As the jobs' own folders have it, whatever the table says."""
+        return {entry.job: self._look_at(entry, None) for entry in entries}
+
     def _look_at(self, entry: Entry, before: Row | None) -> Row:
         folder = self.folder / entry.job
         row = Row(entry.job, one_line(" ".join(entry.overrides)))
-        manifest = read_manifest(folder)
-        status = _OF_A_RUN.get(manifest.get("status", ""), INTERRUPTED if manifest else PENDING)
-        if status in (PENDING, INTERRUPTED) and is_locked(folder / LOCK):
-            return dataclasses.replace(row, status=RUNNING)
-        if status == PENDING and before is not None and before.status == FAILED:
-            return dataclasses.replace(before, overrides=row.overrides)  # it never came to a manifest
-        row = dataclasses.replace(row, status=status, **outcome(folder, manifest))
-        if status == DONE and (error := _other_job(manifest, entry)):
-            return dataclasses.replace(row, status=FAILED, objective="", error=error)
+        try:
+            run = find_run(folder)
+            status = PENDING if run is None else _OF_A_RUN.get(run.manifest["status"], INTERRUPTED)
+            if status in (PENDING, INTERRUPTED) and is_locked(folder / LOCK):
+                return dataclasses.replace(row, status=RUNNING)
+            if run is not None:
+                row = dataclasses.replace(row, status=status, **outcome(run))
+            elif before is not None and before.status == FAILED:  # it never came to a manifest
+                return dataclasses.replace(row, status=FAILED, seconds=before.seconds, error=before.error)
+            if status == DONE and run is not None and (error := _other_job(run.manifest, entry)):
+                return dataclasses.replace(row, status=FAILED, objective="", error=error)
+        except InputError as error:  # a damaged file counts as a failed run's
+            return dataclasses.replace(row, status=FAILED, error=one_line(error))
         if before is not None and before.status == status and not row.error:
             return dataclasses.replace(row, error=before.error)  # the disk was too full for the manifest
         return row
@@ -140,17 +148,18 @@ def _line(fields: Iterable[str]) -> str:
     return text.getvalue()
 
 
-def outcome(folder: Path, manifest: dict[str, Any]) -> dict[str, str]:
-    """Seconds, objective and error of a run that ended, as far as it has them."""
-    found = {"error": one_line(manifest.get("error", ""))}
+def outcome(run: Run) -> dict[str, str]:
+    """Seconds, objective and error of a run that ended, as far as it has them. Raises `InputError`."""
+    found = {"error": one_line(run.manifest.get("error", ""))}
     try:
-        started, ended = (datetime.fromisoformat(manifest[key]) for key in ("started", "ended"))
+        started, ended = (datetime.fromisoformat(run.manifest[key]) for key in ("started", "ended"))
         found["seconds"] = f"{(ended - started).total_seconds():.2f}"
     except (KeyError, TypeError, ValueError):
         pass  # it was killed
-    regret = read_json(folder / SUMMARY).get("regret")
-    if isinstance(regret, int | float) and math.isfinite(regret):
-        found["objective"] = repr(regret)
+    if run.is_finished:
+        regret = run.read_summary().get("regret")
+        if isinstance(regret, int | float):
+            found["objective"] = repr(regret)
     return found
 
 
@@ -166,26 +175,20 @@ def _other_job(manifest: dict[str, Any], entry: Entry) -> str:
     return f"the run in {entry.job} {what}, so that it is not this job's result; move it to keep it"
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """A run's manifest; empty where there is none. One that is damaged counts as that of a failed run."""
-    if not os.path.lexists(folder / MANIFEST):
-        return {}
+def find_run(folder: Path) -> Run | None:
+    """The run in a job's folder; None where none has begun. Raises `InputError` for a damaged manifest."""
+    return read_run(folder) if os.path.lexists(folder / MANIFEST) else None
+
+
+def status_in(folder: Path) -> str:
+    """Of the run in a job's folder; "" where none has begun, "failed" for a damaged manifest."""
     try:
-        manifest = read_object(folder / MANIFEST)
-    except InputError as error:
-        return {"status": "failed", "error": str(error)}
-    return manifest or {"status": "failed", "error": f"{folder / MANIFEST}: is empty"}
+        run = find_run(folder)
+    except InputError:
+        return "failed"
+    return "" if run is None else str(run.manifest["status"])
 
 
 def one_line(text: Any) -> str:
     """Without line breaks or other control characters, for a table."""
     return " ".join("".join(c if c.isprintable() else " " for c in str(text)).split())
-
-
-def read_json(file: Path) -> dict[str, Any]:
-    """The object in a file; empty where there is none."""
-    try:
-        content = json.loads(file.read_text("utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return content if isinstance(content, dict) else {}

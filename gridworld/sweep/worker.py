@@ -22,6 +22,7 @@ from hydra.core.utils import JobReturn, JobStatus, run_job, setup_globals
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, open_dict
 
+from gridworld.files import write_bytes
 from gridworld.signals import handling
 from gridworld.sweep.folder import STOP
 from gridworld.sweep.job import StopSweep
@@ -91,7 +92,7 @@ def run_in_turn(state: bytes, sweep: Path, jobs: Sequence[Sequence[str]], first:
                 result = hydra.run(overrides, number)
                 errors.append("" if result.status is JobStatus.COMPLETED else str(result._return_value))
     except StopSweep:
-        (sweep / STOP).touch()  # for those that wait in a queue
+        write_bytes(sweep / STOP, b"")  # for those that wait in a queue
     except (SystemExit, KeyboardInterrupt):
         pass
     return errors

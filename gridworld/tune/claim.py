@@ -5,6 +5,7 @@ The storage may be elsewhere, or be deleted, while the folder keeps the tables a
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 from gridworld.errors import InputError
 from gridworld.files import write_json
 from gridworld.report.tuning import STUDY_JSON
-from gridworld.sweep.table import read_json
+from gridworld.sealing import read_sealed, sealed
 from gridworld.tune.storage import compare
 
 SEARCH_JSON = "search.json"
@@ -20,10 +21,13 @@ SEARCH_JSON = "search.json"
 
 def is_claimed(folder: Path, name: str, about: Mapping[str, Any]) -> bool:
     """Whether this study has the folder already. Raises `InputError` where it is another search's."""
-    content = read_json(folder / SEARCH_JSON) or read_json(folder / STUDY_JSON)
-    owner = content.get("study")
-    if owner is None:
+    file = next((each for each in (folder / SEARCH_JSON, folder / STUDY_JSON) if os.path.lexists(each)), None)
+    if file is None:
         return False
+    content = read_sealed(file)
+    owner = content.get("study")
+    if not isinstance(owner, str):
+        raise InputError(f"{file}: does not say whose the folder is; put back a good copy")
     if owner != name:
         raise InputError(
             f"{folder}: is the folder of the study {owner}; choose another tune.folder, "
@@ -35,4 +39,4 @@ def is_claimed(folder: Path, name: str, about: Mapping[str, Any]) -> bool:
 
 def claim(folder: Path, name: str, about: Mapping[str, Any]) -> None:
     """From now on it is this study's."""
-    write_json(folder / SEARCH_JSON, {"study": name, "about": about})
+    write_json(folder / SEARCH_JSON, sealed({"study": name, "about": about}))

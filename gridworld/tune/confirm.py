@@ -7,17 +7,18 @@ each; what is there already is kept.
 from __future__ import annotations
 
 import dataclasses
-import shutil
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from gridworld.config import TrainConfig
-from gridworld.run import MANIFEST
+from gridworld.inside import check_no_links, make_inside, names_inside, remove_inside
 from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.plan import plan
-from gridworld.sweep.table import read_json
+from gridworld.sweep.table import status_in
+from gridworld.terminal import printable
 from gridworld.tune.worker import become_worker, is_stopped
 
 CONFIRM = "confirm"  # the runs' folder, in the study's
@@ -45,12 +46,14 @@ def jobs(folder: Path, name: str, config: TrainConfig, seeds: Sequence[int]) -> 
 
 
 def prepare(folder: Path, runs: Sequence[Job]) -> None:
-    """Make room: the runs of an earlier winner go."""
-    (folder / CONFIRM).mkdir(exist_ok=True)
+    """Make room: the runs of an earlier winner go. Raises `InputError` where a link is in the way."""
+    make_inside(folder, CONFIRM)
     names = {job.folder.name for job in runs}
-    for path in (folder / CONFIRM).glob("*,seed=*"):
-        if path.name not in names:
-            shutil.rmtree(path, ignore_errors=True)
+    for name in names:
+        check_no_links(folder, CONFIRM, name)
+    for name in names_inside(folder, CONFIRM):
+        if fnmatchcase(name, "*,seed=*") and name not in names:
+            remove_inside(folder, CONFIRM, name)
 
 
 def work(task: Sequence[Job], worker: int, parent: int) -> None:
@@ -60,16 +63,16 @@ def work(task: Sequence[Job], worker: int, parent: int) -> None:
     while left and not is_stopped():
         left = [job for job in left if is_stopped() or _run(job)]
         # Some may be at work elsewhere, in the folder's other workers or in another command's.
-        left = [job for job in left if read_json(job.folder / MANIFEST).get("status") not in _ENDED]
+        left = [job for job in left if status_in(job.folder) not in _ENDED]
     sys.exit(0)
 
 
 def _run(job: Job) -> bool:
     """Whether it went well, as far as this process can tell."""
-    job.folder.mkdir(parents=True, exist_ok=True)
+    make_inside(job.folder.parents[1], CONFIRM, job.folder.name)
     try:
         run_in_sweep(job.config, job.folder, [], stop_at_failure=False)
     except JobError as error:
-        print(f"{job.folder}: {error}", file=sys.stderr, flush=True)
+        print(printable(f"{job.folder}: {error}"), file=sys.stderr, flush=True)
         return False
     return True

@@ -13,13 +13,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from gridworld.tune.score import SeedScore, score
+from gridworld.tune.score import SeedScore, read_score, score
 from gridworld.tune.trial import SEEDS
 from gridworld.tune.worker import Task, at_study, become_worker, is_stopped
 
 if TYPE_CHECKING:
     from optuna import Study
     from optuna.trial import FrozenTrial
+
+FINAL = "final "  # what the names of these attributes begin with
 
 
 @dataclass(frozen=True)
@@ -84,8 +86,8 @@ def ranking(study: Study, trials: Sequence[FrozenTrial], seeds: Sequence[int], t
     attributes = study.user_attrs
     found = []
     for trial in trials:
-        results = [SeedScore(**each) for each in trial.user_attrs[SEEDS]]
-        results += [SeedScore(**attributes[_name(trial.number, seed)]) for seed in seeds]
+        results = [read_score(each) for each in trial.user_attrs[SEEDS]]
+        results += [read_score(attributes[_name(trial.number, seed)]) for seed in seeds]
         certified = sum(result.certified_since is not None for result in results)
         value = score(results, total, len(results))
         found.append(Finalist(trial.number, value, certified, len(results)))
@@ -99,4 +101,4 @@ def missing(study: Study, trials: Sequence[FrozenTrial], seeds: Sequence[int]) -
 
 
 def _name(number: int, seed: int) -> str:
-    return f"final trial={number},seed={seed}"
+    return f"{FINAL}trial={number},seed={seed}"

@@ -19,10 +19,12 @@ from gridworld.config import TrainConfig
 from gridworld.effects import Effect
 from gridworld.experiment import without_hydra
 from gridworld.files import write_text
+from gridworld.inside import make_inside
 from gridworld.settings import ON_RESULT, having
 from gridworld.tune.asked import Source, compose_in
 
 RECIPE = "winner"
+EXPERIMENT = "experiment"  # the folder that it is in, in the study's
 _OF_A_RECIPE = ON_RESULT - {Effect.SEED, Effect.MACHINE}
 
 
@@ -36,8 +38,7 @@ def write_recipe(
     lines = ["# @package _global_", f"# {about}", "defaults:"]
     lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
     lines += ["  - _self_", "", OmegaConf.to_yaml(OmegaConf.create(values)) if values else ""]
-    path = folder / "experiment" / f"{RECIPE}.yaml"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path = make_inside(folder, EXPERIMENT) / f"{RECIPE}.yaml"
     write_text(path, "\n".join(lines))
     own = dataclasses.replace(source, own=(*source.own, folder))
     again = without_hydra(compose_in(own, "train", [f"experiment={RECIPE}"]))

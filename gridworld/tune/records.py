@@ -16,9 +16,11 @@ from typing import Any
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
+from gridworld.data_files import LARGEST_CSV, file_sha256
 from gridworld.files import write_json, write_text
 from gridworld.provenance import versions
-from gridworld.report.tuning import FORMAT, STUDY_JSON, TRIALS_CSV
+from gridworld.report.tuning import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
+from gridworld.sealing import sealed
 from gridworld.tune.asked import Asked
 from gridworld.tune.space import Space
 from gridworld.tune.storage import is_lost
@@ -83,23 +85,21 @@ def _row(trial: FrozenTrial) -> dict[str, Any]:
 
 def write_study(asked: Asked, study: optuna.Study, outcome: dict[str, Any]) -> None:
     """What was searched and what came of it."""
-    write_json(
-        asked.folder / STUDY_JSON,
-        {
-            "format": FORMAT,
-            "study": asked.name,
-            "agent": asked.base.agent.name,
-            "env": asked.base.env.layout,
-            "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-            "versions": versions() | {"optuna": optuna.__version__},
-            "total_timesteps": asked.base.total_timesteps,
-            "seeds": list(asked.seeds),
-            "space": asked.space.plain(),
-            "began_from": asked.space.parameters_of(asked.base),
-            "importances": importances(study),
-            **outcome,
-        },
-    )
+    content = {
+        "study": asked.name,
+        "agent": asked.base.agent.name,
+        "env": asked.base.env.layout,
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "versions": versions() | {"optuna": optuna.__version__},
+        "total_timesteps": asked.base.total_timesteps,
+        "seeds": list(asked.seeds),
+        "space": asked.space.plain(),
+        "began_from": asked.space.parameters_of(asked.base),
+        "importances": importances(study),
+        **outcome,
+        TRIALS_SUM: file_sha256(asked.folder / TRIALS_CSV, LARGEST_CSV),
+    }
+    write_json(asked.folder / STUDY_JSON, sealed(content))
 
 
 def importances(study: optuna.Study) -> dict[str, float]:

@@ -12,8 +12,12 @@ certified yet, less regret, so that a search has something to follow.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
+
+_MOST_STEPS = 2**63
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,16 @@ class SeedScore:
         if self.certified_since is not None:
             return 0.5 * min(self.certified_since / total, 1.0)
         return 0.5 + 0.5 * (1.0 - 1.0 / (1.0 + max(self.regret, 0.0)))
+
+
+def read_score(content: Any) -> SeedScore:
+    """That of a storage, which may be anybody's. Raises `ValueError`."""
+    if isinstance(content, dict) and content.keys() == {"seed", "certified_since", "regret"}:
+        seed, since, regret = content["seed"], content["certified_since"], content["regret"]
+        is_step = since is None or (type(since) is int and 0 <= since < _MOST_STEPS)
+        if type(seed) is int and is_step and type(regret) is float and math.isfinite(regret):
+            return SeedScore(seed, since, regret)
+    raise ValueError(f"{str(content)[:80]} is not how a seed stands")
 
 
 def score(seeds: Sequence[SeedScore], total: int, of: int) -> float:

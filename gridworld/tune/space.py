@@ -189,7 +189,10 @@ def _suggest(trial: Trial, key: str, dimension: DimensionConfig) -> Any:
 
 def _value(dimension: DimensionConfig, parameter: Any) -> Any:
     if dimension.type == "categorical":
-        return next(choice for choice in dimension.choices or [] if _token(choice) == parameter)
+        found = [choice for choice in dimension.choices or [] if _token(choice) == parameter]
+        if not found:
+            raise ValueError(f"{str(parameter)[:40]} is none of the choices")
+        return found[0]
     if dimension.type == "int":
         return int(parameter)
     return min(max(float(f"{parameter:.{_DIGITS}g}"), dimension.low or 0.0), dimension.high or 0.0)

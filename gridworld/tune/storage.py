@@ -135,7 +135,9 @@ def has_study(settings: TuneConfig, url: str, name: str) -> bool:
         return name in optuna.get_all_study_names(open_storage(settings, url))
 
 
-def begin(storage: RDBStorage, name: str, about: Mapping[str, Any], first: dict[str, Any] | None) -> None:
+def begin(
+    storage: RDBStorage, name: str, about: Mapping[str, Any], first: dict[str, Any] | None
+) -> optuna.Study:
     """Make the study, with `first` as its first trial, or see that it is the same search.
 
     Raises `InputError` where the study of that name searches something else.
@@ -152,6 +154,7 @@ def begin(storage: RDBStorage, name: str, about: Mapping[str, Any], first: dict[
             study.enqueue_trial(first, skip_if_exists=True)
         study.set_user_attr(_ABOUT, about)
     compare(name, study.user_attrs[_ABOUT], about)
+    return study
 
 
 def standing(study: optuna.Study) -> Standing:
@@ -219,8 +222,10 @@ def _pruner(settings: TuneConfig) -> optuna.pruners.BasePruner:
     return optuna.pruners.MedianPruner(n_warmup_steps=settings.reports // 2)
 
 
-def compare(name: str, before: Mapping[str, Any], about: Mapping[str, Any]) -> None:
+def compare(name: str, before: Any, about: Mapping[str, Any]) -> None:
     """Raise `InputError` for the first difference between what a study was begun with, and now."""
+    if not (isinstance(before, dict) and all(isinstance(was, dict) for was in before.values())):
+        raise InputError(f"tune.study={name}: does not say what it searches, it was changed or damaged")
     now = json.loads(json.dumps(about))
     for part, was in before.items():
         is_now = now.get(part, {})

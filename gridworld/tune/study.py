@@ -16,18 +16,22 @@ import optuna
 
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
+from gridworld.inside import check_no_links
 from gridworld.run import MANIFEST, SWEEP_JSON, check_writable
 from gridworld.session import hparams
 from gridworld.sweep.report import shown
+from gridworld.terminal import printable
 from gridworld.training import make_mdp
 from gridworld.tune import confirm, verdict
 from gridworld.tune.asked import Asked, Source, search_path
+from gridworld.tune.checks import check_study, legible
 from gridworld.tune.claim import claim, is_claimed
+from gridworld.tune.confirm import CONFIRM
 from gridworld.tune.crew import SearchError, run_crew
 from gridworld.tune.finals import Final, Finalist, finalists, missing, ranking
 from gridworld.tune.finals import work as finals_work
 from gridworld.tune.progress import SearchProgress
-from gridworld.tune.recipe import RECIPE, write_recipe
+from gridworld.tune.recipe import EXPERIMENT, RECIPE, write_recipe
 from gridworld.tune.records import write_study
 from gridworld.tune.space import with_values
 from gridworld.tune.storage import begin, has_study, in_reach, open_storage, open_study, shown_url, standing
@@ -59,15 +63,20 @@ def _begin(asked: Asked) -> Task:
     _check_folder(asked.folder)
     settings, about = asked.settings, _about(asked)
     url = settings.storage or f"sqlite:///{asked.folder.absolute() / 'study.db'}"
-    if is_claimed(asked.folder, asked.name, about) and not has_study(settings, url, asked.name):
-        raise InputError(
-            f"{asked.folder}: is of the study {asked.name}, which {shown_url(url)} does not have; "
-            "bring its database back, or choose another tune.folder"
-        )
+    if is_claimed(asked.folder, asked.name, about):
+        with legible(shown_url(url)):
+            if not has_study(settings, url, asked.name):
+                raise InputError(
+                    f"{asked.folder}: is of the study {asked.name}, which {shown_url(url)} does not have; "
+                    "bring its database back, or choose another tune.folder"
+                )
     made = not asked.folder.exists()
     asked.folder.mkdir(parents=True, exist_ok=True)
     try:
-        begin(open_storage(settings, url), asked.name, about, asked.space.parameters_of(asked.base))
+        storage = open_storage(settings, url)
+        with legible(shown_url(url)):
+            study = begin(storage, asked.name, about, asked.space.parameters_of(asked.base))
+            check_study(study, asked.space)
     except InputError:
         if made:
             with contextlib.suppress(OSError):
@@ -84,6 +93,8 @@ def _check_folder(folder: Path) -> None:
         if (folder / name).exists():
             raise InputError(f"{folder}: is the folder of {kind}; choose another tune.folder")
     check_writable(folder, "tune.folder")
+    for names in ((), (CONFIRM,), (EXPERIMENT,)):
+        check_no_links(folder, *names)
 
 
 def _about(asked: Asked) -> dict[str, Any]:
@@ -176,6 +187,6 @@ def _tell(asked: Asked, values: dict[str, Any], lines: list[str]) -> None:
     print("winner:")
     for key, value in values.items():
         was = f"  (was {before[key]})" if key in before and before[key] != value else ""
-        print(f"  {key:<{width}}  {value}{was}")
-    print(*lines, sep="\n")
+        print(printable(f"  {key:<{width}}  {value}{was}"))
+    print(*map(printable, lines), sep="\n")
     print(f"  look at it: python scripts/report.py {shown(asked.folder)}", flush=True)

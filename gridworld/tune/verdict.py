@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from gridworld.errors import InputError
 from gridworld.mdp import FloatArray
 from gridworld.report import statistics
 from gridworld.report.table import number, steps_up_to
-from gridworld.run import SUMMARY
-from gridworld.sweep.table import read_json
+from gridworld.sweep.table import find_run
 from gridworld.tune.confirm import Job
 
 
@@ -38,7 +38,7 @@ class Sample:
 
 
 def sample(runs: Sequence[Job]) -> Sample:
-    """A run that failed was not certified."""
+    """A run that failed was not certified. Raises `InputError` where one's files were changed."""
     steps = np.array([_steps(job.folder) for job in runs])
     certified = int(np.isfinite(steps).sum())
     return Sample(statistics.share(certified, len(steps)), steps, runs[0].config.total_timesteps)
@@ -92,5 +92,10 @@ def _plain(of: Sample) -> dict[str, Any]:
 
 
 def _steps(folder: Path) -> float:
-    since = read_json(folder / SUMMARY).get("certified_since_step")
+    run = find_run(folder)
+    if run is None or not run.is_finished:
+        return math.inf
+    since = run.read_summary().get("certified_since_step")
+    if since is not None and (type(since) is not int or since < 0):
+        raise InputError(f"{run.summary_file}: certified_since_step must be a number of steps, or null")
     return math.inf if since is None else float(since)
