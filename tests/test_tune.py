@@ -18,6 +18,7 @@ from support import CONF, ROOT, script
 from gridworld.commands import report as report_command
 from gridworld.commands import tune as tune_command
 from gridworld.errors import InputError
+from gridworld.sealing import sealed
 from gridworld.tune.storage import open_study
 from gridworld.tune.trial import ERROR
 from gridworld.tune.worker import Task
@@ -96,11 +97,15 @@ def test_a_changed_study_is_reported_as_damaged(studied: Path, tmp_path: Path) -
 
     study = json.loads((studied / "study" / "study.json").read_text())
     study["space"]["agent.learning_rate"]["low"] = "<b>"
-    (tmp_path / "study.json").write_text(json.dumps(study))
     (tmp_path / "trials.csv").write_bytes((studied / "study" / "trials.csv").read_bytes())
-    found, problems = find_tunings([tmp_path])
-    assert not found
-    assert "study.json: has no search that came to an end, or was changed" in problems[0]
+    for content, words in (
+        (study, "study.json: was changed or damaged, its seal is not that of its content"),
+        (sealed(study), "study.json: has no search that came to an end, or was changed"),
+    ):
+        (tmp_path / "study.json").write_text(json.dumps(content))
+        found, problems = find_tunings([tmp_path])
+        assert not found
+        assert words in problems[0]
 
 
 @pytest.mark.parametrize(
