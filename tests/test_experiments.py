@@ -34,7 +34,8 @@ def test_a_recipe_trains_as_its_name_says(recipe: str, tmp_path: Path) -> None:
     """Long enough for a first update: past learning_starts, and through a rollout."""
     summary = train_in(tmp_path, f"experiment={recipe}", "total_timesteps=200", *NO_FILES)
     config = configure(f"experiment={recipe}")
-    assert recipe == f"{config.env.layout}_{config.agent.name}"
+    task = config.env.layout.removesuffix("_walking")  # the textbook's own rule for the same task
+    assert recipe == f"{task}_{config.agent.name}"
     assert summary["timesteps"] == 0 or int(summary["timesteps"]) >= 200
 
 
