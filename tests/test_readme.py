@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from support import ROOT
+from support import ROOT, train_in
 
 README = (ROOT / "README.md").read_text("utf-8")
 
@@ -65,6 +65,13 @@ def test_every_other_command_runs(clone: Path) -> None:
             command += " --inspect"  # reads the same folder, and ends
         run(command, clone)
     assert (clone / "runs" / "mine" / "recording" / "episode.apng").exists()
+
+
+@pytest.mark.slow
+def test_the_run_on_coordinates_ends_certified(tmp_path: Path) -> None:
+    """On 19 of 20 held-out seeds, and on the one that the command names, which is the default."""
+    [command] = [command for command in COMMANDS if "observation=coordinates" in command]
+    assert train_in(tmp_path, *command.split()[2:], "recording.learning=false")["certified"]
 
 
 def test_its_python_runs(monkeypatch: pytest.MonkeyPatch) -> None:
