@@ -46,21 +46,25 @@ def algorithm_and_arguments(config: SB3Config) -> tuple[type[BaseAlgorithm], Arg
         arguments = _convert(config.arguments, "agent.arguments.")
     else:
         assert isinstance(config, SB3CheckedConfig)
-        algorithm = _with_engine(config)
+        algorithm = getattr(stable_baselines3, config.algorithm)
         fields = (field.name for field in dataclasses.fields(config) if field.name not in _OWN_FIELDS)
         arguments = _convert({name: getattr(config, name) for name in fields}, "agent.")
     arguments["policy"] = _policy(config, algorithm)
+    if isinstance(config, SB3CheckedConfig):
+        algorithm = _with_engine(config, algorithm, arguments)
     return algorithm, arguments
 
 
-def _with_engine(config: SB3CheckedConfig) -> type[BaseAlgorithm]:
+def _with_engine(
+    config: SB3CheckedConfig, algorithm: type[BaseAlgorithm], arguments: Arguments
+) -> type[BaseAlgorithm]:
     """SB3's own class, or the one that runs the network once per state where that gives the same."""
     if config.engine == "tabulated":
-        reason = why_not(config)
+        own = (algorithm.policy_aliases["MlpPolicy"], algorithm.policy_aliases["CnnPolicy"])
+        reason = why_not(config, arguments["policy_kwargs"], arguments["policy"] in own)
         if reason is None:
             return TabulatedDQN if config.algorithm == "DQN" else TabulatedPPO
         print(f"engine: stock, since {reason}", file=sys.stderr)
-    algorithm: type[BaseAlgorithm] = getattr(stable_baselines3, config.algorithm)
     return algorithm
 
 
