@@ -65,7 +65,7 @@ class Descent:
         # As torch.nn.utils.clip_grad_norm_ does it.
         norm = self._gradient.norm().item()
         if not norm < math.inf:
-            raise FloatingPointError("the gradient is")
+            raise FloatingPointError("the gradient is no finite number")
         scale = max_grad_norm / (norm + 1e-6)
         if scale < 1:
             self._gradient *= scale
