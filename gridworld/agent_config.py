@@ -11,6 +11,7 @@ from gridworld.effects import Effect, affects
 from gridworld.errors import InputError
 
 MISSING = "???"  # OmegaConf's sign for what has to be given
+MOST_KEPT = 10**9  # episodes that a mean is taken over
 LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end, as RL Zoo writes it
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
@@ -208,7 +209,7 @@ def parse_schedule(key: str, value: Schedule) -> tuple[float, bool]:
     linear = isinstance(value, str) and value.startswith(LINEAR)
     try:
         number = float(value.removeprefix(LINEAR) if isinstance(value, str) and linear else value)
-    except ValueError:
+    except (ValueError, OverflowError):
         number = math.nan
     if not 0 <= number < math.inf or (isinstance(value, str) and not linear):
         raise InputError(

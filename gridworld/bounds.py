@@ -29,3 +29,9 @@ def within(key: str, value: float, low: float, high: float) -> None:
     """Refuse a value outside [low, high], or NaN."""
     if not low <= value <= high:
         raise InputError(f"{key}={value}: must be from {low} to {high}")
+
+
+def within_size(key: str, value: float, least: float, most: float, why: str = "") -> None:
+    """Refuse a value that is neither 0 nor of a size in [least, most], or NaN."""
+    if value != 0 and not least <= abs(value) <= most:
+        raise InputError(f"{key}={value}: must be 0 or of a size from {least:g} to {most:g}{why}")

@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from gridworld.bounds import within_size
 from gridworld.errors import InputError
 from gridworld.layout import MOVES, Cell, Layout
 
@@ -29,6 +30,9 @@ BoolArray = NDArray[np.bool_]
 Table = TypeVar("Table", bound=NDArray[Any])
 
 NUM_ACTIONS = len(MOVES)
+# Of a reward, unless it is 0: the squared sum of 100,000 of the largest is a number, and the smallest is told
+# from what has faded away.
+LEAST_REWARD, MOST_REWARD = 1e-100, 1e100
 ACTION_NAMES = ("up", "right", "down", "left")
 
 
@@ -110,9 +114,9 @@ def compile_mdp(
     slip = _finite("slip", slip)
     if not 0 <= slip <= 1:
         raise InputError(f"slip={slip}: must be a probability, from 0 to 1")
-    step_reward = _finite("step_reward", step_reward)
-    goal_reward = _finite("goal_reward", goal_reward)
-    trap_reward = _finite("trap_reward", trap_reward)
+    step_reward = _reward("step_reward", step_reward)
+    goal_reward = _reward("goal_reward", goal_reward)
+    trap_reward = _reward("trap_reward", trap_reward)
 
     if layout.cliffs and trap_reward > 0:
         raise InputError(
@@ -175,6 +179,12 @@ def _neighbours(layout: Layout, wall: BoolArray) -> IntArray:
         target = row * layout.num_cols + col
         table[:, action] = np.where(wall[target], states, target)
     return table
+
+
+def _reward(what: str, value: Any) -> float:
+    number = _finite(what, value)
+    within_size(what, number, LEAST_REWARD, MOST_REWARD)
+    return number
 
 
 def _finite(what: str, value: Any) -> float:

@@ -53,6 +53,8 @@ def carry_out(
     observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
     judge = Judge(mdp, config.evaluation.gamma, config.env.max_episode_steps)
     log = AgentLog()
+    if state is None:
+        _rehearse(config, mdp, observation)
     seat = make_seat(config, mdp, observation, log)
     agent = family(config.agent).build(config.agent, seat)
 
@@ -79,6 +81,15 @@ def carry_out(
     session.checkpoints.keep(1)
     run.end("finished", None, **_progress(session))
     return summary
+
+
+def _rehearse(config: TrainConfig, mdp: Mdp, observation: ObservationTable) -> None:
+    """Have the agent's family try out what it cannot judge otherwise, on environments that are for that."""
+
+    def seat(num_envs: int) -> Seat:
+        return make_seat(dataclasses.replace(config, n_envs=num_envs), mdp, observation)
+
+    family(config.agent).rehearse(config, seat)
 
 
 def _unwritable(run: Run, error: OSError) -> MachineError:

@@ -2,10 +2,15 @@
 
 import json
 import os
+import warnings
 from pathlib import Path
 
 import pytest
-from support import script
+from support import SHORT, configure, script, train_in
+
+from gridworld.errors import InputError
+from gridworld.run import Run
+from gridworld.training import train
 
 YAMLS: dict[str, bytes] = {
     "agent/broken.yaml": b"a: [1\nb: 2\n",
@@ -173,6 +178,61 @@ TRAIN_WITH_SB3 = [
     ("device=abacus", "device=abacus: must be auto, cpu, cuda or cuda:N"),
     ("observation=image agent.policy=CnnPolicy observation.cell_size=4", "32 x 28 pixels are too small"),
 ]
+
+
+# (settings, words of the sentence): of the right type, and beyond what any number here holds
+ABSURD = [
+    *(
+        (f"agent={agent} env.{name}={value}", f"{name}={float(value)}: must be 0 or of a size from {bounds}")
+        for agent, least, most, cut in (("q_learning", 1e-100, 1e100, 1), ("dqn", 1e-30, 1e15, 100))
+        for name, times in (("step_reward", cut), ("goal_reward", 1), ("trap_reward", 1))
+        for value in ("1e307", "-1e307", "1e-320")
+        for bounds in [f"{least:g} to {most / times:g}"]
+    ),
+    (
+        "agent=a2c env.goal_reward=1e20",
+        "env.goal_reward=1e+20: must be 0 or of a size from 1e-30 to 1e+15, for",
+    ),
+    ("agent=q_learning agent.initial_value=1e307", "agent.initial_value=1e+307: must be 0 or of a size from"),
+    (f"agent.learning_rate={10**400}", "must be a number of at least 0, or lin_NUMBER"),
+    (f"agent.stats_window_size={10**30}", "must be from 1 to 1000000000"),
+    (f"agent=sarsa agent.stats_window_size={10**30}", "must be from 1 to 1000000000"),
+    (f"agent.n_steps={10**30}", "must be from 1 to 100000"),
+    (f"agent.train_freq={10**30}", "must be at most 100000"),
+    (f"agent=qrdqn +agent.arguments.train_freq={10**30}", "must be at most 100000"),
+    ("agent=qrdqn +agent.arguments.tau=1e307", "agent.arguments.tau=1e+307: must be from 0 to 1"),
+    ("agent=ppo agent.clip_range=1e307", "agent.clip_range=1e+307: must be at most 1000000000000000"),
+    (
+        "agent=ppo agent.clip_range_vf=lin_1e307",
+        "agent.clip_range_vf=1e+307: must be at most 1000000000000000",
+    ),
+    (f"agent=ppo agent.stats_window_size={10**400}", "must be from 1 to 1000000000"),
+]
+
+
+@pytest.mark.parametrize(("line", "words"), ABSURD, ids=lambda value: str(value)[:60])
+def test_an_absurd_number_is_refused_before_it_is_used(line: str, words: str, tmp_path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(InputError) as mistake:
+            train(configure(*line.split()), Run(tmp_path), [])
+    assert words in str(mistake.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_largest_rewards_are_calculated_with_without_an_overflow(tmp_path: Path) -> None:
+    """The smallest, too: they are no nothing."""
+    quiet = ["recording.learning=false", "recording.frames=false", "recording.gif=false"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        for agent, size in (("q_learning", 1e100), ("q_learning", 1e-100), ("ppo", 1e15), ("ppo", 1e-30)):
+            rewards = [
+                f"env.goal_reward={size}",
+                f"env.trap_reward={-size}",
+                f"env.step_reward={-size / 100 if size > 1 else 0}",
+            ]
+            summary = train_in(tmp_path / f"{agent} {size}", *SHORT[agent], *rewards, *quiet)
+            assert summary["optimal_goal_probability"] == 1
 
 
 @pytest.fixture(scope="module")

@@ -47,13 +47,14 @@ def assert_same_state(one: torch.optim.Optimizer, other: torch.optim.Optimizer) 
 
 @pytest.mark.parametrize("largest_norm", [0.5, 100.0], ids=["clipped", "whole"])
 @pytest.mark.parametrize("options", ["defaults", "options"])
-@pytest.mark.parametrize("name", ELEMENTWISE)
-def test_every_elementwise_optimiser_steps_as_by_itself(name: str, options: str, largest_norm: float) -> None:
-    arguments = OPTIONS.get(name, {}) if options == "options" else {}
+@pytest.mark.parametrize("kind", ELEMENTWISE)
+def test_every_elementwise_optimiser_steps_as_by_itself(
+    kind: type[torch.optim.Optimizer], options: str, largest_norm: float
+) -> None:
+    arguments = OPTIONS.get(kind.__name__, {}) if options == "options" else {}
     ours, theirs = network(), network()
-    optimizers = [
-        getattr(torch.optim, name)(net.parameters(), lr=0.01, **arguments) for net in (ours, theirs)
-    ]
+    make: Any = kind
+    optimizers = [make(net.parameters(), lr=0.01, **arguments) for net in (ours, theirs)]
     descent = Descent(optimizers[0])
     for seed in range(6):
         for optimizer in optimizers:

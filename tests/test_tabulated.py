@@ -1,5 +1,7 @@
 """The tabulated engine is SB3, only faster: same losses, same gradients, same files, same interface."""
 
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,9 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from support import DEEP, SHORT, configure, train_in
 
 from gridworld import GridWorldVectorEnv
+from gridworld.agent_config import SB3Config
 from gridworld.agents.sb3 import tabulated
+from gridworld.agents.sb3.arguments import algorithm_and_arguments
 from gridworld.agents.sb3.tabulated_dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated_ppo import TabulatedPPO
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
@@ -183,6 +187,7 @@ def share_replay(ours: TabulatedDQN, theirs: DQN) -> None:
         ("one_hot", {"max_grad_norm": 1e-3, "gamma": 0.5}),
         ("one_hot", {"policy_kwargs": {"net_arch": []}}),
         ("none", {"policy_kwargs": {"net_arch": [8], "activation_fn": torch.nn.Tanh}}),
+        ("one_hot", {"policy_kwargs": {"activation_fn": torch.nn.PReLU}}),
     ],
     ids=str,
 )
@@ -289,24 +294,102 @@ def test_both_engines_train_and_leave_the_same_kind_of_run(agent: str, tmp_path:
     assert runs[0]["timesteps"] == runs[1]["timesteps"]
 
 
-@pytest.mark.parametrize(
-    ("overrides", "reason"),
-    [
-        (["agent.n_steps=3"], "agent.n_steps above 1"),
-        (["agent.policy_kwargs.activation_fn=torch.nn.RReLU"], "agent.policy_kwargs.activation_fn="),
-        (
-            ["agent.replay_buffer_class=stable_baselines3.common.buffers.ReplayBuffer"],
-            "agent.replay_buffer_class is not the plain replay buffer",
-        ),
-    ],
-)
+OWN_MODULES = """
+import torch
+from stable_baselines3.dqn.policies import DQNPolicy
+from torch import nn
+
+class Calm(nn.Module):  # draws at random, in either mode
+    def forward(self, x):
+        return x.relu() + 0.1 * torch.randn_like(x)
+
+class Centred(nn.Module):  # looks at the other rows
+    def forward(self, x):
+        return x - x.mean(dim=0)
+
+class ReLU(nn.ReLU):  # is not what it is called
+    def forward(self, x):
+        return super().forward(x) + self.training
+
+class Policy(DQNPolicy):
+    pass
+
+class Adam(torch.optim.Adam):
+    pass
+"""
+
+
+@pytest.fixture
+def own_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Makes `own_modules` importable."""
+    (tmp_path / "modules").mkdir()
+    (tmp_path / "modules" / "own_modules.py").write_text(OWN_MODULES)
+    monkeypatch.syspath_prepend(str(tmp_path / "modules"))
+    yield
+    sys.modules.pop("own_modules", None)
+
+
+REASONS = {
+    "agent.n_steps=3": "agent.n_steps above 1",
+    **{
+        f"agent.policy_kwargs.activation_fn={name}": f"agent.policy_kwargs.activation_fn={name} is not known"
+        for name in (
+            *("torch.nn.RReLU", "torch.nn.Dropout", "torch.nn.Softmax", "own_modules.Calm"),
+            *("own_modules.Centred", "own_modules.ReLU"),
+        )
+    },
+    "agent.policy=own_modules.Policy": "agent.policy=own_modules.Policy may compute more",
+    "agent.policy_kwargs.optimizer_class=own_modules.Adam": "agent.policy_kwargs.optimizer_class=own_mo",
+    "agent.policy_kwargs.optimizer_class=torch.optim.Rprop": "agent.policy_kwargs.optimizer_class=torch",
+    "agent.replay_buffer_class=stable_baselines3.common.buffers.ReplayBuffer": (
+        "agent.replay_buffer_class is not the plain replay buffer"
+    ),
+}
+
+
+@pytest.mark.parametrize(("setting", "reason"), REASONS.items())
+@pytest.mark.usefixtures("own_modules")
 def test_what_it_does_not_cover_falls_back_and_says_why(
-    overrides: list[str], reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    setting: str, reason: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    train_in(tmp_path, *SHORT["dqn"], *overrides)
+    config = configure("agent=dqn", setting).agent
+    assert isinstance(config, SB3Config)
+    assert algorithm_and_arguments(config)[0] is DQN
     assert f"engine: stock, since {reason}" in capsys.readouterr().err
 
 
-def test_the_default_settings_are_covered(capsys: pytest.CaptureFixture[str]) -> None:
-    for agent in DEEP:
-        assert tabulated.why_not(configure(f"agent={agent}").agent) is None  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    "settings",
+    [
+        [],
+        ["agent.policy_kwargs.activation_fn=torch.nn.modules.activation.GELU"],
+        ["agent.policy_kwargs.optimizer_class=torch.optim.adamw.AdamW", "agent.policy_kwargs.net_arch=[]"],
+    ],
+)
+@pytest.mark.parametrize(("agent", "engine"), [("dqn", TabulatedDQN), ("ppo", TabulatedPPO)])
+def test_what_is_known_is_covered(agent: str, engine: type, settings: list[str]) -> None:
+    config = configure(f"agent={agent}", *settings).agent
+    assert isinstance(config, SB3Config)
+    assert algorithm_and_arguments(config)[0] is engine
+
+
+def test_a_policy_of_sb3s_by_its_path_is_covered() -> None:
+    for agent, path in (("dqn", "dqn.policies.DQNPolicy"), ("ppo", "common.policies.ActorCriticPolicy")):
+        config = configure(f"agent={agent}", f"agent.policy=stable_baselines3.{path}").agent
+        assert isinstance(config, SB3Config)
+        assert algorithm_and_arguments(config)[0] in (TabulatedDQN, TabulatedPPO)
+
+
+@pytest.mark.parametrize("kind", tabulated.ACTIVATIONS)
+def test_an_activation_that_is_covered_is_a_function_of_each_number(kind: type[torch.nn.Module]) -> None:
+    """The same in both modes, alone and among others, time and again, and nothing is drawn."""
+    chance, module = torch.get_rng_state(), kind()
+    x = torch.linspace(-4, 4, 42).reshape(6, 7)
+    expected = module.train()(x)
+    for _ in range(2):
+        assert torch.equal(module(x), expected)
+    module.eval()
+    assert torch.allclose(module(x.flip(0).t().contiguous()).t().flip(0), expected, atol=1e-6)
+    assert torch.allclose(torch.stack([module(row) for row in x]), expected, atol=1e-6)
+    assert torch.equal(torch.get_rng_state(), chance)
+    assert not list(module.buffers())

@@ -1,8 +1,9 @@
 """Agents: whatever learns. One algorithm family per folder or module; nothing outside knows how it works.
 
-A family is a module `gridworld.agents.<family>` with three functions, found by the `family` of its config:
+A family is a module `gridworld.agents.<family>` with four functions, found by the `family` of its config:
 
     check(config)                    raises InputError for settings that could not train
+    rehearse(config, make_seat)      the same for those that show it only when they are tried out
     build(config, seat) -> Agent     an agent that is ready to learn
     weights(path, most) -> arrays    what a model file of at most so many bytes holds, by name
 """
@@ -86,9 +87,11 @@ class Agent(Protocol):
 
 
 class Family(Protocol):
-    """The three functions of an algorithm family's module."""
+    """The four functions of an algorithm family's module."""
 
     def check(self, config: TrainConfig) -> None: ...
+
+    def rehearse(self, config: TrainConfig, make_seat: Callable[[int], Seat]) -> None: ...
 
     def build(self, config: AgentConfig, seat: Seat) -> Agent: ...
 

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gridworld.agents.sb3.checks import check
+from gridworld.agent_config import SB3CheckedConfig
+from gridworld.agents.sb3.checks import check, left_to_the_class
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
     from typing import Any
 
@@ -17,8 +19,18 @@ if TYPE_CHECKING:
 
     from gridworld.agent_config import AgentConfig
     from gridworld.agents import Agent, Seat
+    from gridworld.config import TrainConfig
 
-__all__ = ["build", "check", "weights"]
+__all__ = ["build", "check", "rehearse", "weights"]
+
+
+def rehearse(config: TrainConfig, make_seat: Callable[[int], Seat]) -> None:
+    """Have a copy make a first update, where there is a setting that only its class can judge."""
+    if isinstance(config.agent, SB3CheckedConfig) and not left_to_the_class(config.agent):
+        return
+    from gridworld.agents.sb3.rehearsal import rehearse
+
+    rehearse(config, make_seat)
 
 
 def build(config: AgentConfig, seat: Seat) -> Agent:

@@ -17,6 +17,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import LinearSchedule
 
 from gridworld.agent_config import SB3CheckedConfig, SB3ClassConfig, SB3Config, parse_schedule
+from gridworld.agents.sb3.checks import SCHEDULES
 from gridworld.agents.sb3.tabulated import why_not
 from gridworld.agents.sb3.tabulated_dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated_ppo import TabulatedPPO
@@ -26,7 +27,6 @@ Arguments = dict[str, Any]
 
 # Fields of the config that are ours, not arguments of the algorithm's class.
 _OWN_FIELDS = {"name", "family", "algorithm", "engine", "log_interval"}
-_SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
 _MOST_LAYERS, _WIDEST_LAYER = 16, 4096
 _PLAIN_TYPES = (bool, int, float, str)
 _KINDS: dict[str, type] = {
@@ -46,21 +46,25 @@ def algorithm_and_arguments(config: SB3Config) -> tuple[type[BaseAlgorithm], Arg
         arguments = _convert(config.arguments, "agent.arguments.")
     else:
         assert isinstance(config, SB3CheckedConfig)
-        algorithm = _with_engine(config)
+        algorithm = getattr(stable_baselines3, config.algorithm)
         fields = (field.name for field in dataclasses.fields(config) if field.name not in _OWN_FIELDS)
         arguments = _convert({name: getattr(config, name) for name in fields}, "agent.")
     arguments["policy"] = _policy(config, algorithm)
+    if isinstance(config, SB3CheckedConfig):
+        algorithm = _with_engine(config, algorithm, arguments)
     return algorithm, arguments
 
 
-def _with_engine(config: SB3CheckedConfig) -> type[BaseAlgorithm]:
+def _with_engine(
+    config: SB3CheckedConfig, algorithm: type[BaseAlgorithm], arguments: Arguments
+) -> type[BaseAlgorithm]:
     """SB3's own class, or the one that runs the network once per state where that gives the same."""
     if config.engine == "tabulated":
-        reason = why_not(config)
+        own = (algorithm.policy_aliases["MlpPolicy"], algorithm.policy_aliases["CnnPolicy"])
+        reason = why_not(config, arguments["policy_kwargs"], arguments["policy"] in own)
         if reason is None:
             return TabulatedDQN if config.algorithm == "DQN" else TabulatedPPO
         print(f"engine: stock, since {reason}", file=sys.stderr)
-    algorithm: type[BaseAlgorithm] = getattr(stable_baselines3, config.algorithm)
     return algorithm
 
 
@@ -99,7 +103,7 @@ def _convert(given: Arguments, where: str) -> Arguments:
     """Yaml's plain values as what SB3 takes; `where` names them in messages."""
     converted = {}
     for name, value in given.items():
-        if name in _SCHEDULES and isinstance(value, str):
+        if name in SCHEDULES and isinstance(value, str):
             value = LinearSchedule(parse_schedule(where + name, value)[0], 0.0, 1.0)
         elif name == "train_freq" and isinstance(value, list):
             value = tuple(value)

@@ -175,10 +175,15 @@ def _parts_of_code(value: Any) -> Iterator[tuple[str, Any, Put]]:
         yield "keywords", value.keywords, _cannot
 
 
+def is_of_a_library(kind: type) -> bool:
+    """Whether it is nobody's own class."""
+    return kind.__module__.partition(".")[0] in (*_LIBRARIES, _OURS, "sb3_contrib")
+
+
 def _parts_of_class(kind: type) -> Iterator[tuple[str, Any, Put]]:
     """What classes of one's own keep for all their objects; the libraries' keep nothing."""
     for base in kind.__mro__:
-        if base.__module__.partition(".")[0] in (*_LIBRARIES, _OURS, "sb3_contrib"):
+        if is_of_a_library(base):
             continue
         for name, value in list(vars(base).items()):
             hidden = name.startswith("__") or inspect.isroutine(value) or inspect.isdatadescriptor(value)

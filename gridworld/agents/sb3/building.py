@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 
 from gridworld.agent_config import SB3Config
 from gridworld.agents import Seat
@@ -14,6 +15,20 @@ from gridworld.errors import InputError
 from gridworld.observations import ObservationTable
 
 _SMALLEST_IMAGE = 36  # pixels that SB3's NatureCNN needs on each side
+
+
+class UnfitError(InputError):
+    """The class itself refuses its settings, or fails at them: it `told` so."""
+
+    def __init__(self, config: SB3Config, told: str) -> None:
+        super().__init__(f"agent={config.name}: {config.algorithm} {told}")
+        self.told = told
+
+
+def said(error: Exception) -> str:
+    """An exception of a library in one line."""
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
 
 
 def make_model(config: SB3Config, seat: Seat) -> BaseAlgorithm:
@@ -32,12 +47,13 @@ def make_model(config: SB3Config, seat: Seat) -> BaseAlgorithm:
             f"agent={config.name}: its buffers do not fit into memory; take a smaller agent.buffer_size, "
             "agent.n_steps or n_envs, or another observation"
         ) from None
-    except (AssertionError, AttributeError, LookupError, ValueError, TypeError, RuntimeError) as error:
-        lines = str(error).strip().splitlines() or [type(error).__name__]
-        raise InputError(f"agent={config.name}: {config.algorithm} cannot be built: {lines[0]}") from error
+    except Exception as error:  # the class may be anybody's
+        raise UnfitError(config, f"cannot be built: {said(error)}") from error
+    if not isinstance(getattr(model, "policy", None), BasePolicy):
+        raise UnfitError(config, "cannot be built: it makes no policy")
     reason = why_unreadable(model.policy)
     if reason is not None:
-        raise InputError(f"agent={config.name}: {config.algorithm} {reason}")
+        raise UnfitError(config, reason)
     return model
 
 

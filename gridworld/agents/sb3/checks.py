@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
 from gridworld.agent_config import (
+    MOST_KEPT,
     DQNConfig,
     PPOConfig,
     SB3CheckedConfig,
@@ -14,8 +16,8 @@ from gridworld.agent_config import (
     check_exploration,
     parse_schedule,
 )
-from gridworld.bounds import above_zero, at_least, within
-from gridworld.config import TrainConfig
+from gridworld.bounds import above_zero, at_least, at_most, within, within_size
+from gridworld.config import MOST_STEPS, EnvConfig, TrainConfig
 from gridworld.errors import InputError
 
 # Arguments that count something, by the names that SB3 and sb3-contrib give them.
@@ -23,6 +25,14 @@ _COUNTS = (
     *("n_steps", "batch_size", "sub_sampling_factor", "n_epochs", "n_critic_updates", "cg_max_steps"),
     *("buffer_size", "target_update_interval", "stats_window_size", "n_quantiles"),
 )
+SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
+_ORDINARY = 1e3  # a rate or a coefficient; beyond, numbers of 32 bits may come to their end
+_LEAST_REWARD, _MOST_RETURN = 1e-30, 1e15
+# Those that are a share or a probability.
+_SHARES = {
+    *("gamma", "gae_lambda", "tau"),
+    *("exploration_fraction", "exploration_initial_eps", "exploration_final_eps"),
+}
 ENGINES = ("tabulated", "stock")
 
 # Arguments of an SB3 class that are settings of the run, and where they stand.
@@ -42,10 +52,40 @@ def check(config: TrainConfig) -> None:
     assert isinstance(agent, SB3Config)
     at_least("agent.log_interval", agent.log_interval, 1)
     _check_observation(agent, config.observation.kind)
+    _check_rewards(config.env)
     if isinstance(agent, SB3ClassConfig):
         _check_class(agent, config.n_envs)
     elif isinstance(agent, SB3CheckedConfig):
         _check_fields(agent, config)
+
+
+def _check_rewards(env: EnvConfig) -> None:
+    """An episode's return and its square must be numbers of 32 bits."""
+    for name, times in (("step_reward", env.max_episode_steps), ("goal_reward", 1), ("trap_reward", 1)):
+        value, why = getattr(env, name), ", for networks calculate in 32 bits"
+        if math.isfinite(value):  # or the world says so
+            within_size(f"env.{name}", value, _LEAST_REWARD, _MOST_RETURN / times, why)
+
+
+def left_to_the_class(agent: SB3CheckedConfig) -> list[str]:
+    """The settings that only SB3 or torch can judge, by making an update with them."""
+    plain = type(agent)()
+    return [
+        field.name
+        for field in dataclasses.fields(agent)
+        if not _is_judged(field.name, getattr(agent, field.name), getattr(plain, field.name))
+    ]
+
+
+def _is_judged(name: str, value: Any, default: Any) -> bool:
+    """Whether the checks here are all there is to say of it."""
+    if value == default or name in ("name", "family", "algorithm", "engine", "train_freq"):
+        return True
+    if name == "policy":
+        return "." not in value
+    if name in SCHEDULES:
+        return parse_schedule(name, value)[0] <= _ORDINARY
+    return isinstance(value, int) or (isinstance(value, float) and abs(value) <= _ORDINARY)
 
 
 def _check_observation(agent: SB3Config, kind: str) -> None:
@@ -73,9 +113,10 @@ def _check_class(agent: SB3ClassConfig, n_envs: int) -> None:
     _check_numbers("agent.arguments", agent.arguments)
     if "train_freq" in agent.arguments:
         _check_train_freq("agent.arguments.train_freq", agent.arguments["train_freq"], n_envs)
-    gamma = agent.arguments.get("gamma", 0.99)
-    if isinstance(gamma, bool) or not isinstance(gamma, int | float) or not 0 <= gamma <= 1:
-        raise InputError(f"agent.arguments.gamma={gamma}: must be from 0 to 1")
+    for name in sorted(agent.arguments.keys() & _SHARES):
+        value = agent.arguments[name]
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
+            raise InputError(f"agent.arguments.{name}={value}: must be from 0 to 1")
 
 
 def _check_fields(agent: SB3CheckedConfig, config: TrainConfig) -> None:
@@ -84,7 +125,7 @@ def _check_fields(agent: SB3CheckedConfig, config: TrainConfig) -> None:
     parse_schedule("agent.learning_rate", agent.learning_rate)
     at_least("agent.batch_size", agent.batch_size, 1)
     within("agent.gamma", agent.gamma, 0, 1)
-    at_least("agent.stats_window_size", agent.stats_window_size, 1)
+    within("agent.stats_window_size", agent.stats_window_size, 1, MOST_KEPT)
     if isinstance(agent, DQNConfig):
         _check_dqn(agent, config)
     elif isinstance(agent, PPOConfig):
@@ -111,7 +152,7 @@ def _check_dqn(agent: DQNConfig, config: TrainConfig) -> None:
     within("agent.tau", agent.tau, 0, 1)
     _check_train_freq("agent.train_freq", agent.train_freq, config.n_envs)
     at_least("agent.gradient_steps", agent.gradient_steps, -1)
-    at_least("agent.n_steps", agent.n_steps, 1)
+    within("agent.n_steps", agent.n_steps, 1, MOST_STEPS)
     at_least("agent.target_update_interval", agent.target_update_interval, 1)
     check_exploration(agent)
     above_zero("agent.max_grad_norm", agent.max_grad_norm)
@@ -132,6 +173,7 @@ def _check_train_freq(key: str, value: Any, n_envs: int) -> None:
     count, unit = value if isinstance(value, list | tuple) and len(value) == 2 else (value, "step")
     if isinstance(count, bool) or not isinstance(count, int) or count < 1 or unit not in ("step", "episode"):
         raise InputError(f"{key}={value}: must be a whole number of at least 1, or [N,step] or [N,episode]")
+    at_most(key, count, MOST_STEPS)
     if unit == "episode" and n_envs > 1:
         raise InputError(
             f"{key}={value}: SB3 counts episodes with one environment only; "
@@ -154,9 +196,10 @@ def _check_ppo(agent: PPOConfig, config: TrainConfig) -> None:
             "must be at least 2, or set agent.normalize_advantage=false"
         )
     within("agent.gae_lambda", agent.gae_lambda, 0, 1)
-    parse_schedule("agent.clip_range", agent.clip_range)
-    if agent.clip_range_vf is not None:
-        parse_schedule("agent.clip_range_vf", agent.clip_range_vf)
+    for name in ("clip_range", "clip_range_vf"):
+        value = getattr(agent, name)
+        if value is not None:
+            at_most(f"agent.{name}", parse_schedule(f"agent.{name}", value)[0], _MOST_RETURN)
     at_least("agent.ent_coef", agent.ent_coef, 0)
     at_least("agent.vf_coef", agent.vf_coef, 0)
     above_zero("agent.max_grad_norm", agent.max_grad_norm)

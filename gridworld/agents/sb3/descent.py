@@ -19,7 +19,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-ELEMENTWISE = ("Adadelta", "Adagrad", "Adam", "AdamW", "Adamax", "NAdam", "RAdam", "RMSprop", "SGD")
+ELEMENTWISE: tuple[type[torch.optim.Optimizer], ...] = (
+    *(torch.optim.Adadelta, torch.optim.Adagrad, torch.optim.Adam, torch.optim.AdamW, torch.optim.Adamax),
+    *(torch.optim.NAdam, torch.optim.RAdam, torch.optim.RMSprop, torch.optim.SGD),
+)
 
 
 class Descent:
@@ -62,7 +65,7 @@ class Descent:
         # As torch.nn.utils.clip_grad_norm_ does it.
         norm = self._gradient.norm().item()
         if not norm < math.inf:
-            raise FloatingPointError("the gradient is")
+            raise FloatingPointError("the gradient is no finite number")
         scale = max_grad_norm / (norm + 1e-6)
         if scale < 1:
             self._gradient *= scale

@@ -8,9 +8,15 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, cast
 
+import numpy as np
 import torch
 from stable_baselines3.common.policies import BasePolicy
 from torch import Tensor, nn
+
+from gridworld.observations import ObservationTable
+
+_ASKED = 512  # states
+_PART = 3
 
 
 class Reading(NamedTuple):
@@ -35,6 +41,26 @@ def why_unreadable(policy: BasePolicy) -> str | None:
         f"has a policy ({type(policy).__name__}) that tells neither probabilities and values nor Q values "
         "of a state, so it cannot be evaluated exactly"
     )
+
+
+def why_no_table(policy: BasePolicy, observation: ObservationTable) -> str | None:
+    """Why its answers are no function of the state, or None where they are: asked twice, and less at once."""
+    states = np.arange(min(observation.num_states, _ASKED))
+    with torch.no_grad():
+        once, again, part = (
+            read(policy, policy.obs_to_tensor(observation.rows(some))[0])
+            for some in (states, states, states[::_PART])
+        )
+    for one, other, fewer in zip(once, again, part, strict=True):
+        if one is None or other is None or fewer is None:
+            continue
+        same = torch.allclose(one, other, rtol=0, atol=0, equal_nan=True)
+        if not same or not torch.allclose(one[::_PART], fewer, rtol=1e-3, atol=1e-4, equal_nan=True):
+            return (
+                "does not always give the same answer in the same state, so no table of it can be evaluated "
+                "exactly"
+            )
+    return None
 
 
 def read(policy: BasePolicy, observations: Any) -> Reading:

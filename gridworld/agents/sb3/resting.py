@@ -95,7 +95,7 @@ class Resting(BaseCallback):
             "loop": self._loop.get_state(),
             "seconds": (time.time_ns() - self.model.start_time) / 1e9,
             "chance": global_state(),
-            "torch": _torch_state(),
+            "torch": torch_state(),
         }
 
     def _audit(self) -> Audit:
@@ -115,34 +115,42 @@ class Resting(BaseCallback):
         self.model.start_time = time.time_ns() - int(state["seconds"] * 1e9)
         self._loop.set_state(state["loop"])
         set_global_state(state["chance"])
-        _set_torch_state(state["torch"])
+        set_torch_state(state["torch"])
 
 
 def check_finite(model: BaseAlgorithm) -> None:
     """Raise `InputError` if the last update left weights or a loss that are no finite numbers."""
-    finite = all(bool(torch.isfinite(weights).all()) for weights in model.policy.parameters())
-    losses = [v for key, v in model.logger.name_to_value.items() if "loss" in key]
-    if not finite or not all(math.isfinite(loss) for loss in losses):
-        what = "a loss is" if finite else "the network's weights are"
+    what = not_finite(model)
+    if what is not None:
         raise diverged(model, what)
+
+
+def not_finite(model: BaseAlgorithm) -> str | None:
+    """What the last update left that is no finite number; None: nothing."""
+    if not all(bool(torch.isfinite(weights).all()) for weights in model.policy.parameters()):
+        return "the network's weights are no finite number"
+    losses = [v for key, v in model.logger.name_to_value.items() if "loss" in key]
+    return None if all(math.isfinite(loss) for loss in losses) else "a loss is no finite number"
 
 
 def diverged(model: BaseAlgorithm, what: str) -> InputError:
     """What to say of numbers that are not finite."""
     return InputError(
-        f"training diverged at update {model._n_updates:,}, after {model.num_timesteps:,} steps: {what} "
-        "no finite number; try a smaller learning rate"
+        f"training diverged at update {model._n_updates:,}, after {model.num_timesteps:,} steps: {what}; "
+        "try a smaller learning rate"
     )
 
 
-def _torch_state() -> State:
+def torch_state() -> State:
+    """Where torch's generators stand."""
     state: State = {"cpu": torch.get_rng_state().numpy().copy()}
     if torch.cuda.is_available() and torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
         state["cuda"] = [device.cpu().numpy().copy() for device in torch.cuda.get_rng_state_all()]
     return state
 
 
-def _set_torch_state(state: State) -> None:
+def set_torch_state(state: State) -> None:
+    """Put them where they stood."""
     torch.set_rng_state(torch.from_numpy(state["cpu"]))
     if "cuda" in state:
         torch.cuda.set_rng_state_all([torch.from_numpy(device) for device in state["cuda"]])

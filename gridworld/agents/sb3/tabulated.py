@@ -16,6 +16,7 @@ layer is a look-up as well, and no matrix of S x S is ever made.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, cast
 
 import numpy as np
@@ -29,19 +30,38 @@ from gridworld.agents.sb3.vec_env import StateStep
 from gridworld.mdp import IntArray
 from gridworld.observations import ObservationTable
 
-_RANDOM_LAYERS = ("Dropout", "RReLU")
+# Of torch.nn, what maps every number by itself, in training as in evaluation, and never draws at random.
+ACTIVATIONS = (
+    *(nn.CELU, nn.ELU, nn.GELU, nn.Hardshrink, nn.Hardsigmoid, nn.Hardswish, nn.Hardtanh, nn.Identity),
+    *(nn.LeakyReLU, nn.LogSigmoid, nn.Mish, nn.PReLU, nn.ReLU, nn.ReLU6, nn.SELU, nn.SiLU, nn.Sigmoid),
+    *(nn.Softplus, nn.Softshrink, nn.Softsign, nn.Tanh, nn.Tanhshrink),
+)
 _FEW_STATES = 1024  # up to here all states are cheaper than finding out which ones a batch holds
 
 
-def why_not(config: SB3CheckedConfig) -> str | None:
-    """Why these settings need SB3's own loop, or None where the tabulated one gives the same."""
-    activation = config.policy_kwargs.activation_fn or ""
-    if any(name in activation for name in _RANDOM_LAYERS):
-        return f"agent.policy_kwargs.activation_fn={activation} draws at random for every sample"
+def why_not(config: SB3CheckedConfig, classes: Mapping[str, type], is_own_policy: bool) -> str | None:
+    """Why these settings need SB3's own loop, or None where the tabulated one gives the same.
+
+    It does where the network's outputs at a state follow from the parameters and that state alone: whatever
+    the mode, the other states of the batch and the passes before. That is known of SB3's own networks with
+    the classes that are listed; of any other class it is not, whatever its name.
+
+    Args:
+        config: the agent's settings.
+        classes: those of its `policy_kwargs`, imported.
+        is_own_policy: whether its policy is one of the algorithm's own.
+    """
+    if not is_own_policy:
+        return f"agent.policy={config.policy} may compute more than a function of the state"
+    if classes.get("activation_fn", nn.ReLU) not in ACTIVATIONS:
+        return (
+            f"agent.policy_kwargs.activation_fn={config.policy_kwargs.activation_fn} is not known to give "
+            "the same for the same number always"
+        )
     if config.policy_kwargs.features_extractor_class is not None:
         return "agent.policy_kwargs.features_extractor_class may keep more than a function of the state"
-    optimizer = config.policy_kwargs.optimizer_class
-    if optimizer not in (None, *(f"torch.optim.{name}" for name in ELEMENTWISE)):
+    if classes.get("optimizer_class", torch.optim.Adam) not in ELEMENTWISE:
+        optimizer = config.policy_kwargs.optimizer_class
         return f"agent.policy_kwargs.optimizer_class={optimizer} may look at more than a weight at a time"
     if isinstance(config, DQNConfig):
         if config.replay_buffer_class is not None or config.replay_buffer_kwargs:

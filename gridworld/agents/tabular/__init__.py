@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from gridworld.agents.tabular.checks import check
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
     from typing import Any
 
@@ -17,8 +18,13 @@ if TYPE_CHECKING:
 
     from gridworld.agent_config import AgentConfig
     from gridworld.agents import Agent, Seat
+    from gridworld.config import TrainConfig
 
-__all__ = ["build", "check", "weights"]
+__all__ = ["build", "check", "rehearse", "weights"]
+
+
+def rehearse(config: TrainConfig, make_seat: Callable[[int], Seat]) -> None:
+    """Nothing is left to try out: `check` judges every setting."""
 
 
 def build(config: AgentConfig, seat: Seat) -> Agent:

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import math
 
-from gridworld.agent_config import TabularConfig, TabularControlConfig, check_exploration, parse_schedule
-from gridworld.bounds import at_least, within
+from gridworld.agent_config import (
+    MOST_KEPT,
+    TabularConfig,
+    TabularControlConfig,
+    check_exploration,
+    parse_schedule,
+)
+from gridworld.bounds import at_least, within, within_size
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
+from gridworld.mdp import LEAST_REWARD, MOST_REWARD
 
 
 def check(config: TrainConfig) -> None:
@@ -36,6 +43,7 @@ def _check_control(agent: TabularControlConfig) -> None:
     within("agent.learning_rate_power", agent.learning_rate_power, 0, 1)
     if not math.isfinite(agent.initial_value):
         raise InputError(f"agent.initial_value={agent.initial_value}: must be a finite number")
+    within_size("agent.initial_value", agent.initial_value, LEAST_REWARD, MOST_REWARD)
     check_exploration(agent)
-    at_least("agent.stats_window_size", agent.stats_window_size, 1)
+    within("agent.stats_window_size", agent.stats_window_size, 1, MOST_KEPT)
     at_least("agent.log_interval", agent.log_interval, 1)

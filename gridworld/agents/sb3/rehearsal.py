@@ -1,0 +1,158 @@
+"""A first update on a copy, before a run begins: settings that only the class can judge are judged there.
+
+The copy has environments of its own, few of them, and its rollout and batches are cut short, so that it
+takes some hundredths of a second. Nothing that the run depends on is touched. Where the copy fails, another
+one with the run's own sizes is asked before anything is refused. The setting to blame is found by leaving out
+one after the other: without it, the update can be made.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import dataclasses
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
+
+from gridworld.agent_config import SB3CheckedConfig, SB3ClassConfig, SB3Config
+from gridworld.agents import Seat
+from gridworld.agents.sb3.arguments import algorithm_and_arguments
+from gridworld.agents.sb3.building import UnfitError, make_model, said
+from gridworld.agents.sb3.checks import left_to_the_class
+from gridworld.agents.sb3.reading import why_no_table
+from gridworld.agents.sb3.resting import not_finite
+from gridworld.agents.sb3.untouched import untouched
+from gridworld.config import TrainConfig
+from gridworld.errors import InputError
+
+_FEW_ENVS, _FEW_SAMPLES, _FEW_STEPS = 64, 256, 4
+_REPEATS = ("n_epochs", "gradient_steps", "n_critic_updates")  # of an update, by the names that classes use
+
+MakeSeat = Callable[[int], Seat]  # with so many environments of its own
+
+
+def rehearse(config: TrainConfig, make_seat: MakeSeat) -> None:
+    """Raise `InputError` where the configured class cannot make a first update with its settings."""
+    agent = config.agent
+    assert isinstance(agent, SB3Config)
+    torch.set_num_threads(config.threads)
+    with untouched():  # what is imported may draw, too
+        algorithm, arguments = algorithm_and_arguments(agent)
+    with untouched(algorithm, *_classes(arguments)):
+        rehearsal = _Rehearsal(config, make_seat)
+        fault = rehearsal.fault(agent, is_short=True) and rehearsal.fault(agent, is_short=False)
+        culprit = fault and next(
+            (setting for setting, other in _others(agent) if rehearsal.works(other)), None
+        )
+    if culprit:
+        raise InputError(f"{culprit}: {agent.algorithm} {fault}; without this setting it can")
+    if fault:
+        raise InputError(f"agent={agent.name}: {agent.algorithm} {fault}")
+
+
+@dataclass(frozen=True)
+class _Rehearsal:
+    config: TrainConfig
+    make_seat: MakeSeat
+
+    def works(self, agent: SB3Config) -> bool:
+        try:
+            return self.fault(agent, is_short=True) is None
+        except InputError:
+            return False
+
+    def fault(self, agent: SB3Config, is_short: bool) -> str | None:
+        """What goes wrong by the end of the first update; None: nothing. Raises `InputError` if we know."""
+        num_envs = self.config.n_envs
+        seat = self.make_seat(min(num_envs, _FEW_ENVS) if is_short else num_envs)
+        try:
+            model = make_model(agent, seat)
+        except UnfitError as error:
+            return error.told
+        if is_short:
+            _shorten(model)
+        model.set_logger(Logger(folder=None, output_formats=[]))
+        problem = why = None
+        try:
+            model.learn(self.config.total_timesteps, _UntilUpdated(), agent.log_interval)
+            why = why_no_table(model.policy, seat.observation)
+        except Exception as error:  # the class may be anybody's
+            problem = said(error)
+        with contextlib.suppress(ValueError):  # weights may still have no shape
+            problem = not_finite(model) or problem
+        return why if problem is None else f"cannot make its first update: {problem}"
+
+
+class _UntilUpdated(BaseCallback):
+    """Ends training at the first step after an update."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._is_updated = False
+
+    def _on_rollout_start(self) -> None:
+        self._is_updated = self.model.num_timesteps > max(getattr(self.model, "learning_starts", 0), 0)
+
+    def _on_step(self) -> bool:
+        return not self._is_updated
+
+
+def _shorten(model: Any) -> None:
+    """Cut down what an update takes in, and how often it goes over it."""
+    if isinstance(getattr(model, "rollout_buffer", None), RolloutBuffer):
+        batch = min(getattr(model, "batch_size", 0), _FEW_SAMPLES)
+        if batch:
+            model.batch_size = batch
+        steps = min(model.n_steps, max(_FEW_STEPS, -(-batch // model.n_envs)))
+        model.n_steps = model.rollout_buffer.buffer_size = steps
+    if isinstance(getattr(model, "train_freq", None), TrainFreq):
+        count = min(model.train_freq.frequency, _FEW_STEPS)
+        model.train_freq = TrainFreq(count, TrainFrequencyUnit.STEP)
+        model.learning_starts = 0
+    for name in _REPEATS:
+        if isinstance(getattr(model, name, None), int):
+            setattr(model, name, min(getattr(model, name), 1))
+
+
+def _classes(arguments: Any) -> Iterator[type]:
+    if isinstance(arguments, type):
+        yield arguments
+    elif isinstance(arguments, dict):
+        for value in arguments.values():
+            yield from _classes(value)
+
+
+def _others(agent: SB3Config) -> Iterator[tuple[str, SB3Config]]:
+    """(`key=value`, the agent without it) of every setting that only its class can judge."""
+    if isinstance(agent, SB3ClassConfig):
+        for where, holder in (("", ()), ("policy_kwargs.", ("policy_kwargs",))):
+            for name, value in _inner(agent.arguments, holder).items():
+                other = copy.deepcopy(agent)
+                del _inner(other.arguments, holder)[name]
+                if name != "policy_kwargs":
+                    yield f"agent.arguments.{where}{name}={value}", other
+        return
+    assert isinstance(agent, SB3CheckedConfig)
+    for name in left_to_the_class(agent):
+        value, default = getattr(agent, name), getattr(type(agent)(), name)
+        if name != "policy_kwargs":
+            yield f"agent.{name}={value}", dataclasses.replace(agent, **{name: default})
+            continue
+        for key in vars(value):
+            given, plain = getattr(value, key), getattr(default, key)
+            if given != plain:
+                kwargs = dataclasses.replace(value, **{key: plain})
+                yield f"agent.{name}.{key}={given}", dataclasses.replace(agent, policy_kwargs=kwargs)
+
+
+def _inner(arguments: dict[str, Any], path: tuple[str, ...]) -> dict[str, Any]:
+    for name in path:
+        arguments = arguments.get(name) or {}
+    return arguments
