@@ -35,6 +35,9 @@ def make_model(config: SB3Config, seat: Seat) -> BaseAlgorithm:
     except (AssertionError, AttributeError, LookupError, ValueError, TypeError, RuntimeError) as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
         raise InputError(f"agent={config.name}: {config.algorithm} cannot be built: {lines[0]}") from error
+    if model.observation_space._np_random is not None:
+        # A network for images is shown a random one to see its size; SB3 seeds the actions' space only.
+        model.observation_space.seed(seat.seed)
     reason = why_unreadable(model.policy)
     if reason is not None:
         raise InputError(f"agent={config.name}: {config.algorithm} {reason}")
