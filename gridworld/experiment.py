@@ -26,7 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.agent_config import AGENT_SCHEMAS
 from gridworld.config import TrainConfig
-from gridworld.early import at_work
+from gridworld.early import AtWork
 from gridworld.errors import EXIT_CODE, InputError
 from gridworld.hydra_errors import refuse_added_keys, sentence, unreadable_file
 from gridworld.manual import manual
@@ -132,7 +132,7 @@ def main(conf: Path) -> None:
     asked_for_traceback = FULL_ERROR in os.environ
     os.environ[FULL_ERROR] = "1"  # so that Hydra raises its errors instead of printing them
     try:
-        with at_work(), _place:
+        with AtWork(), _place:
             hydra.main(version_base="1.3", config_path=str(conf), config_name="train")(run_job)()
     except Exception as error:
         # Until a job begins, whatever goes wrong is the command line's or a yaml file's fault.

@@ -289,10 +289,10 @@ class Last:
     def __del__(self, kill=os.kill, here=os.getpid(), number=int(sys.argv[2])):
         kill(here, number)
 last = Last()
-from gridworld.early import at_work, listen
+from gridworld.early import AtWork, listen
 listen()
 try:
-    with at_work():
+    with AtWork():
         print("begun")
         if sys.argv[1] == "at work":
             os.kill(os.getpid(), int(sys.argv[2]))
@@ -317,6 +317,24 @@ def test_a_signal_that_comes_early_or_late(when: str, number: signal.Signals) ->
     assert done.returncode == 128 + number
     assert done.stdout == "begun\n"
     assert "Traceback" not in done.stderr
+
+
+IMPORTED_TO_LISTEN = """
+import sys, gridworld
+before = {*sys.modules}
+import gridworld.early
+print(*{*sys.modules} - before)
+"""
+
+
+def test_listening_waits_for_no_import() -> None:
+    command = [sys.executable, "-c", IMPORTED_TO_LISTEN]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert {*done.stdout.split()} <= {"gridworld.early", "atexit", "_signal"}
+    for path in (ROOT / "scripts").glob("*.py"):
+        code = [line for line in path.read_text().splitlines()[1:] if line]
+        assert code[0] == "from gridworld.early import listen"
+        assert code[2] == "    listen()  # before what takes time to import"
 
 
 def test_where_no_rest_comes_the_last_checkpoint_counts(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from gridworld.early import at_work
+from gridworld.early import AtWork
 from gridworld.errors import EXIT_CODE, InputError
 from gridworld.terminal import prepare, tell_error
 
@@ -37,7 +37,7 @@ def run(main: Main) -> None:
     """Call `main`; a user's mistake ends the program with one sentence and no traceback."""
     prepare()
     try:
-        with at_work():
+        with AtWork():
             main(sys.argv[1:])
     except InputError as error:
         tell_error(str(error))
