@@ -27,8 +27,10 @@ from omegaconf.errors import OmegaConfBaseException
 from gridworld.agent_config import AGENT_SCHEMAS
 from gridworld.config import TrainConfig
 from gridworld.early import AtWork
-from gridworld.errors import EXIT_CODE, InputError
+from gridworld.errors import EXIT_CODE, FolderLostError, InputError
+from gridworld.files import make_folder, tidy
 from gridworld.hydra_errors import refuse_added_keys, sentence, unreadable_file
+from gridworld.lock import check_ours
 from gridworld.manual import manual
 from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, Run, alone_in, check_inside, check_new, shown
 from gridworld.sweep.config import LAUNCHER_SCHEMAS, SweepConfig
@@ -80,9 +82,11 @@ def _check_run_folder(config: DictConfig) -> None:
 
 
 def _check_same(config: DictConfig, folder: Path) -> None:
+    from gridworld.recovery import is_begun
     from gridworld.resume import unfinished_in
 
-    unfinished_in(folder, without_hydra(copy.deepcopy(config)))
+    if is_begun(folder):
+        unfinished_in(folder, without_hydra(copy.deepcopy(config)))
 
 
 @contextlib.contextmanager
@@ -91,7 +95,8 @@ def _begun_in(folder: Path) -> Iterator[None]:
 
     Raises `InputError` where another process has it, which is left alone.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder.parent)
+    folder.mkdir(exist_ok=True)
     with alone_in(folder):
         try:
             yield
@@ -194,9 +199,20 @@ def run_job(settings: DictConfig) -> float:
             return _run_alone(config, folder, overrides)
     except (InputError, OSError, OmegaConfBaseException) as error:
         if is_one_of_many:
+            _stop_if_lost(folder)
             print(f"job {context.job.num} failed: {sentence(error)}", file=sys.stderr)
             raise JobError(sentence(error)) from None
         sys.exit(_tell(error))
+
+
+def _stop_if_lost(folder: Path) -> None:
+    """End the sweep that the job is one of, where the sweep's folder is no longer its own."""
+    from gridworld.sweep.job import StopSweep
+
+    try:
+        check_ours(folder)
+    except FolderLostError as error:
+        raise StopSweep(str(error)) from None
 
 
 def _run_alone(config: TrainConfig, folder: Path, overrides: list[str]) -> float:
@@ -244,10 +260,12 @@ def _discard(folder: Path) -> None:
 
     Only for who holds the folder's lock: another process may have come as far as this one.
     """
-    if not (folder / MANIFEST).exists():
+    with contextlib.suppress(FolderLostError):
+        check_ours(folder / MANIFEST)
+        if (folder / MANIFEST).exists():
+            return
+        tidy(folder)
         shutil.rmtree(folder / ".hydra", ignore_errors=True)
         (folder / LOCK).unlink(missing_ok=True)
-        try:
+        with contextlib.suppress(OSError):
             folder.rmdir()
-        except OSError:
-            return

@@ -6,6 +6,7 @@ PNG, APNG and GIF keep every pixel exact. MP4 needs PyAV (the extra `video`).
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Collection
 from importlib.util import find_spec
 from pathlib import Path
@@ -29,7 +30,7 @@ _RUN_LENGTHS = 3  # zlib's Z_RLE: the fastest way to store flat colour, and smal
 
 def save_pngs(film: Film, folder: Path) -> None:
     """0000.png, 0001.png, ... in `folder`, which is replaced as a whole, also where it is a link."""
-    part = folder.with_name(f".{folder.name}.part")
+    part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
     remove(part)
     part.mkdir(parents=True)
     digits = max(4, len(str(len(film) - 1)))

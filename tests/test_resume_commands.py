@@ -128,18 +128,33 @@ def test_a_start_that_comes_to_nothing_leaves_no_folder(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_a_killed_process_had_half_written_is_taken_away(tmp_path: Path) -> None:
+    """Also where it was killed before there was a manifest."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    half = folder / ".manifest.json.12345.part"
+    half.write_text("{")
+    (folder / ".notes.part").write_text("mine")
+    refused = script("train.py", *WORDS, "hydra.run.dir=run", "seed=-1", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert [path.name for path in folder.iterdir()] == [".notes.part"]
+    half.write_text("{")
+    begin(folder, *WORDS)
+    assert [path.name for path in folder.rglob("*.part")] == [".notes.part"]
+
+
 def test_a_lock_on_a_file_that_was_taken_away_is_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whoever had the lock deletes its file between our opening it and our having it."""
     path, take, taken = tmp_path / LOCK, lock._take, 0
 
-    def late(file: int, wait: float | None) -> bool:
+    def late(file: int, wait: float | None, how: int) -> bool:
         nonlocal taken
         taken += 1
         if taken == 1:
             path.unlink()
-        return take(file, wait)
+        return take(file, wait, how)
 
     monkeypatch.setattr(lock, "_take", late)
     with locked(path, wait=0) as first, locked(path, wait=0) as second:

@@ -226,6 +226,8 @@ def test_what_is_taken_out_is_refused(agent: str, tmp_path: Path) -> None:
     own = identity(configure(*RUNS[agent], *LESS), "S.....\n....T.\n...TG.\n....T.\n......")
     entries, accepted = 0, []
     for path in leaves(whole):
+        if path == ("manifest",):
+            continue  # a copy, which older ones do not have
         if path[:3] == ("agent", "model", "values") and zlib.crc32(path[-1].encode()) % 20:
             continue  # all of these are guarded by their count
         wrong, entries = changed(whole, path), entries + 1

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from gridworld.config import TrainConfig
-from gridworld.errors import InputError, MachineError, reason
+from gridworld.errors import FolderLostError, InputError, MachineError, reason
 from gridworld.files import write_json, write_text
 from gridworld.lock import locked
 from gridworld.provenance import DIFF
@@ -67,7 +67,7 @@ def mark_failed(folder: Path, why: str) -> None:
     """Say in the manifest, if the job came so far, what its own process did not."""
     manifest = read_json(folder / MANIFEST)
     if manifest.get("status") in _TO_GO_ON_WITH:
-        write_json(folder / MANIFEST, manifest | {"status": "failed", "error": why})
+        write_json(folder / MANIFEST, manifest | {"status": "failed", "error": why}, durable=True)
 
 
 def _make_ready(folder: Path, table: Table) -> bool:
@@ -101,9 +101,10 @@ def _run(config: TrainConfig, run: Run, overrides: list[str], table: Table) -> f
     except Exception as error:
         why = one_line(reason(error))
         if not isinstance(error, InputError):
-            with contextlib.suppress(OSError):  # the reason is worth more than its traceback
+            with contextlib.suppress(OSError, FolderLostError):  # the reason is worth more than its traceback
                 write_text(run.folder / ERROR_FILE, traceback.format_exc())
-        mark_failed(run.folder, why)  # one that could not go on says nothing itself
+        with contextlib.suppress(FolderLostError):
+            mark_failed(run.folder, why)  # one that could not go on says nothing itself
         table.set(job, status=FAILED, seconds=f"{time.monotonic() - started:.2f}", error=why)
         raise JobError(why) from None
     table.set(job, status=DONE, **outcome(run.folder, run.manifest))

@@ -11,18 +11,17 @@ import dataclasses
 import io
 import json
 import math
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from gridworld.data_files import read_object
 from gridworld.errors import InputError
 from gridworld.files import write_text
 from gridworld.lock import is_locked, locked
-from gridworld.run import LOCK, MANIFEST, SUMMARY
+from gridworld.recovery import manifest_of
+from gridworld.run import LOCK, SUMMARY
 from gridworld.sweep.folder import Entry
 from gridworld.sweep.plan import settings_hash
 
@@ -102,7 +101,7 @@ class Table:
         """Write the rows of these jobs anew, as their folders have it."""
         with locked(self.folder / TABLE_LOCK):
             rows = self.look(entries)
-            self._write(rows.values())
+            self._write(rows.values(), durable=True)
         return rows
 
     def look(self, entries: Iterable[Entry]) -> dict[str, Row]:
@@ -126,9 +125,9 @@ class Table:
             return dataclasses.replace(row, error=before.error)  # the disk was too full for the manifest
         return row
 
-    def _write(self, rows: Iterable[Row]) -> None:
+    def _write(self, rows: Iterable[Row], durable: bool = False) -> None:
         lines = [_line(_COLUMNS), *(_line(dataclasses.astuple(row)) for row in rows)]
-        write_text(self.file, "".join(lines))
+        write_text(self.file, "".join(lines), durable)
 
 
 _COLUMNS = [field.name for field in dataclasses.fields(Row)]
@@ -167,14 +166,14 @@ def _other_job(manifest: dict[str, Any], entry: Entry) -> str:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """A run's manifest; empty where there is none. One that is damaged counts as that of a failed run."""
-    if not os.path.lexists(folder / MANIFEST):
-        return {}
+    """A run's manifest, or a checkpoint's copy of it; empty where there is none.
+
+    One that is damaged, without a copy, counts as that of a failed run.
+    """
     try:
-        manifest = read_object(folder / MANIFEST)
+        return manifest_of(folder)
     except InputError as error:
         return {"status": "failed", "error": str(error)}
-    return manifest or {"status": "failed", "error": f"{folder / MANIFEST}: is empty"}
 
 
 def one_line(text: Any) -> str:

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gridworld.config import TrainConfig
+from gridworld.files import make_folder
+from gridworld.lock import check_ours
 from gridworld.run import MANIFEST
 from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.plan import plan
@@ -46,7 +48,7 @@ def jobs(folder: Path, name: str, config: TrainConfig, seeds: Sequence[int]) -> 
 
 def prepare(folder: Path, runs: Sequence[Job]) -> None:
     """Make room: the runs of an earlier winner go."""
-    (folder / CONFIRM).mkdir(exist_ok=True)
+    make_folder(folder / CONFIRM)
     names = {job.folder.name for job in runs}
     for path in (folder / CONFIRM).glob("*,seed=*"):
         if path.name not in names:
@@ -66,6 +68,7 @@ def work(task: Sequence[Job], worker: int, parent: int) -> None:
 
 def _run(job: Job) -> bool:
     """Whether it went well, as far as this process can tell."""
+    check_ours(job.folder)
     job.folder.mkdir(parents=True, exist_ok=True)
     try:
         run_in_sweep(job.config, job.folder, [], stop_at_failure=False)

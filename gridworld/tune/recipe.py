@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 
 from gridworld.config import TrainConfig
 from gridworld.experiment import without_hydra
-from gridworld.files import write_text
+from gridworld.files import make_folder, write_text
 from gridworld.tune.asked import Source, compose_in
 
 RECIPE = "winner"
@@ -35,8 +35,8 @@ def write_recipe(
     lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
     lines += ["  - _self_", "", OmegaConf.to_yaml(OmegaConf.create(values)) if values else ""]
     path = folder / "experiment" / f"{RECIPE}.yaml"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, "\n".join(lines))
+    make_folder(path.parent)
+    write_text(path, "\n".join(lines), durable=True)
     own = dataclasses.replace(source, own=(*source.own, folder))
     again = without_hydra(compose_in(own, "train", [f"experiment={RECIPE}"]))
     assert _relevant(again) == _relevant(config), f"{path} does not say what the winner is"
