@@ -9,14 +9,14 @@ A checkpoint that is damaged, or whose files are, is passed over for the one bef
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from gridworld.data_files import check_no_link, read_bytes
 from gridworld.errors import InputError
-from gridworld.files import remove, replacing
+from gridworld.files import remove, replacing, sync_folder
+from gridworld.lock import check_ours
 from gridworld.state import State, StateError, decode, encode
 
 FOLDER = "checkpoints"
@@ -44,16 +44,14 @@ class Checkpoints:
     def save(self, steps: int, state: State, durable: bool = True, small: bool = False) -> None:
         """Write one; `durable`, it survives a power cut; `small`, it takes longer and less space."""
         check_no_link(self.folder)
+        check_ours(self.folder)
+        is_new = not self.folder.exists()
         self.folder.mkdir(exist_ok=True)
-        path = self._path(steps)
-        with replacing(path) as part, part.open("wb") as file:
+        with replacing(self._path(steps), durable) as part, part.open("wb") as file:
             for piece in encode(state, compress=small):
                 file.write(piece)
-            file.flush()
-            if durable:
-                os.fsync(file.fileno())
-        if durable:
-            _sync_folder(self.folder)
+        if durable and is_new:
+            sync_folder(self.folder.parent)
         self.newest = steps
         self.keep(_KEPT)
 
@@ -109,11 +107,3 @@ class Pace:
         """One was taken, and that long it took."""
         self._last = steps
         self._at = time.monotonic() + max(_LEAST_SECONDS, seconds / _MOST_SHARE)
-
-
-def _sync_folder(folder: Path) -> None:
-    file = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(file)
-    finally:
-        os.close(file)

@@ -18,6 +18,10 @@ class MachineError(InputError):
     """A disk was full or gone. What was begun is an interrupted run, and goes on once that is put right."""
 
 
+class FolderLostError(InputError):
+    """The folder that this process was at work in is gone, or is another process's by now."""
+
+
 def reason(error: BaseException) -> str:
     """What went wrong, for a sentence."""
     if isinstance(error, InputError):

@@ -26,10 +26,12 @@ from omegaconf.errors import OmegaConfBaseException
 from gridworld.agent_config import AGENT_SCHEMAS
 from gridworld.commands import run
 from gridworld.config import TrainConfig
-from gridworld.early import at_work
-from gridworld.errors import EXIT_CODE, InputError
+from gridworld.early import AtWork
+from gridworld.errors import EXIT_CODE, FolderLostError, InputError
+from gridworld.files import make_folder, tidy
 from gridworld.hydra_errors import refuse_added_keys, sentence, unreadable_file
 from gridworld.inside import check_no_links, remove_inside
+from gridworld.lock import check_ours
 from gridworld.manual import manual
 from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, Run, alone_in, check_inside, check_new, shown
 from gridworld.sweep.config import LAUNCHER_SCHEMAS, SweepConfig
@@ -85,9 +87,11 @@ def _check_run_folder(config: DictConfig) -> None:
 
 
 def _check_same(config: DictConfig, folder: Path) -> None:
+    from gridworld.recovery import is_begun
     from gridworld.resume import unfinished_in
 
-    unfinished_in(folder, without_hydra(copy.deepcopy(config)))
+    if is_begun(folder):
+        unfinished_in(folder, without_hydra(copy.deepcopy(config)))
 
 
 @contextlib.contextmanager
@@ -96,7 +100,8 @@ def _begun_in(folder: Path) -> Iterator[None]:
 
     Raises `InputError` where another process has it, which is left alone.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder.parent)
+    folder.mkdir(exist_ok=True)
     with alone_in(folder):
         try:
             yield
@@ -137,7 +142,7 @@ def main(conf: Path) -> None:
     asked_for_traceback = FULL_ERROR in os.environ
     os.environ[FULL_ERROR] = "1"  # so that Hydra raises its errors instead of printing them
     try:
-        with at_work(), printing(), _place:
+        with AtWork(), printing(), _place:
             hydra.main(version_base="1.3", config_path=str(conf), config_name="train")(run_job)()
     except Exception as error:
         # Until a job begins, whatever goes wrong is the command line's or a yaml file's fault.
@@ -199,9 +204,20 @@ def run_job(settings: DictConfig) -> float:
             return _run_alone(config, folder, overrides)
     except (InputError, OSError, OmegaConfBaseException) as error:
         if is_one_of_many:
+            _stop_if_lost(folder)
             print(printable(f"job {context.job.num} failed: {sentence(error)}"), file=sys.stderr)
             raise JobError(sentence(error)) from None
         sys.exit(_tell(error))
+
+
+def _stop_if_lost(folder: Path) -> None:
+    """End the sweep that the job is one of, where the sweep's folder is no longer its own."""
+    from gridworld.sweep.job import StopSweep
+
+    try:
+        check_ours(folder)
+    except FolderLostError as error:
+        raise StopSweep(str(error)) from None
 
 
 def _run_alone(config: TrainConfig, folder: Path, overrides: list[str]) -> float:
@@ -249,11 +265,13 @@ def _discard(folder: Path) -> None:
 
     Only for who holds the folder's lock: another process may have come as far as this one.
     """
-    if not (folder / MANIFEST).exists():
+    with contextlib.suppress(FolderLostError):
+        check_ours(folder / MANIFEST)
+        if (folder / MANIFEST).exists():
+            return
+        tidy(folder)
         with contextlib.suppress(OSError):
             remove_inside(folder, ".hydra")
         (folder / LOCK).unlink(missing_ok=True)
-        try:
+        with contextlib.suppress(OSError):
             folder.rmdir()
-        except OSError:
-            return

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from gridworld.errors import InputError
+from gridworld.lock import check_ours
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
 
@@ -25,6 +26,7 @@ def make_inside(top: Path, *names: str) -> Path:
 
     Raises `InputError` where one of the names is a link, or no folder.
     """
+    check_ours(top.joinpath(*names))
     with _opened(top, names, make=True):
         return top.joinpath(*names)
 
@@ -34,6 +36,7 @@ def remove_inside(top: Path, *names: str) -> None:
 
     Raises `InputError` where the folder that it is in is reached through a link.
     """
+    check_ours(top.joinpath(*names))
     *above, last = names
     with contextlib.suppress(FileNotFoundError), _opened(top, above) as folder:
         if stat.S_ISDIR(os.lstat(last, dir_fd=folder).st_mode):

@@ -17,6 +17,8 @@ from typing import Any
 
 from gridworld.data_files import open_ordinary, open_to_go_on
 from gridworld.errors import InputError
+from gridworld.files import sync_folder
+from gridworld.lock import check_ours
 
 _PIECE = 1 << 20  # bytes read at once
 
@@ -31,6 +33,7 @@ class Journal:
 
     def __init__(self, path: Path, mark: dict[str, Any] | None = None) -> None:
         self.path = path
+        check_ours(path)
         self._file = _new(path) if mark is None else open_to_go_on(path)
         self._sum = hashlib.sha256()
         self.length = 0
@@ -59,8 +62,10 @@ class Journal:
 
     def sync(self) -> None:
         """Let the file survive a power cut; one that somebody deleted meanwhile is put back first."""
-        self._put_back()
+        is_new = self._put_back()
         os.fsync(self._file.fileno())
+        if is_new:
+            sync_folder(self.path.parent)
 
     def close(self) -> None:
         """No more will be written."""
@@ -70,11 +75,12 @@ class Journal:
             finally:
                 self._file.close()
 
-    def _put_back(self) -> None:
-        """An open file outlives its name, so that nothing of it is lost."""
+    def _put_back(self) -> bool:
+        """Whether the file had to be: an open one outlives its name, so that nothing of it is lost."""
+        check_ours(self.path)
         try:
             if os.path.samestat(os.lstat(self.path), os.fstat(self._file.fileno())):
-                return
+                return False
             if self.path.is_symlink():
                 self.path.unlink()
         except FileNotFoundError:
@@ -90,6 +96,7 @@ class Journal:
         self._file, self.length = again, 0
         self._sum = hashlib.sha256()
         self.append(content or b"")
+        return True
 
 
 def holds(folder: Path, mark: Any, pattern: str) -> bool:

@@ -1,7 +1,13 @@
-"""A lock on a file. The operating system lets go of it when the process ends, however that ends."""
+"""A lock on a file. The operating system lets go of it when the process ends, however that ends.
+
+A lock is on a file, not on its name. Who deletes the folder and begins anew at the same path has a lock on
+another file, and the process that was at work there would write into a stranger's folder. So whoever writes
+by path asks first whether the folders above are still this process's: `check_ours`.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import time
@@ -9,23 +15,30 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gridworld.errors import InputError
+from gridworld.errors import FolderLostError, InputError
 
 _SECONDS_BETWEEN_TRIES = 0.02
 _FLAGS = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # no link is followed, no pipe waited for
 
+Held = dict[str, int]  # paths of lock files, and their inodes: in use as long as somebody has the file open
+
+_held: Held = {}  # by this process, or by the one that it works for
+
 
 @contextmanager
-def locked(path: Path, wait: float | None = None) -> Iterator[bool]:
+def locked(path: Path, wait: float | None = None, shared: bool = False) -> Iterator[bool]:
     """Whether the lock is ours for the block; waits up to `wait` seconds, with None for ever.
 
-    The file is made where there is none, and stays. Raises `InputError` where the file system has no locks.
+    A `shared` one keeps out nobody who shares it. The file is made where there is none, and stays. Raises
+    `InputError` where the file system has no locks.
     """
+    check_ours(path)
+    how = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     while True:
         file = os.open(path, os.O_RDWR | os.O_CREAT | _FLAGS, 0o666)
         try:
             try:
-                is_ours = _take(file, wait)
+                is_ours = _take(file, wait, how)
             except OSError as error:
                 raise InputError(
                     f"{path}: this file system has no locks ({error.strerror}); choose a folder on one that "
@@ -33,10 +46,59 @@ def locked(path: Path, wait: float | None = None) -> Iterator[bool]:
                 ) from None
             if is_ours and not _is_at(file, path):
                 continue  # who had it before took the file away; a lock on that keeps nobody out
-            yield is_ours
+            with _noted(path, file) if is_ours else contextlib.nullcontext():
+                yield is_ours
             return
         finally:
             os.close(file)
+
+
+def check_ours(path: Path) -> None:
+    """Raise `FolderLostError` where `path` is in a folder that was this process's and is so no more.
+
+    Asked before every write by path. One in a folder that nobody holds is free to all. Of several folders one
+    in the other the innermost has to be there: then so are the others.
+    """
+    where = os.path.abspath(path)
+    above = [(*os.path.split(lock), inode) for lock, inode in tuple(_held.items())]
+    above = [each for each in above if where.startswith(each[0] + os.sep)]
+    innermost = max((folder for folder, _, _ in above), key=len, default="")
+    for folder, name, inode in above:
+        if folder == innermost and _inode(os.path.join(folder, name)) != inode:
+            raise FolderLostError(
+                f"{folder}: is no longer this process's, {name} in it was removed or replaced while it was "
+                "at work there; it ends and writes nothing more"
+            )
+
+
+def held() -> Held:
+    """What this process holds, for those that work for it: see `work_for`."""
+    return dict(_held)
+
+
+def work_for(holder: Held) -> None:
+    """Take what another process holds for held by this one too, as long as that one lives."""
+    _held.update(holder)
+
+
+@contextmanager
+def _noted(path: Path, file: int) -> Iterator[None]:
+    where, before = os.path.abspath(path), dict(_held)
+    _held[where] = os.fstat(file).st_ino
+    try:
+        yield
+    finally:
+        if where in before:  # a shared one, which this process has twice
+            _held[where] = before[where]
+        else:
+            del _held[where]
+
+
+def _inode(path: str) -> int | None:
+    try:
+        return os.lstat(path).st_ino
+    except (FileNotFoundError, NotADirectoryError):
+        return None
 
 
 def is_locked(path: Path) -> bool:
@@ -61,14 +123,14 @@ def _is_at(file: int, path: Path) -> bool:
         return False
 
 
-def _take(file: int, wait: float | None) -> bool:
+def _take(file: int, wait: float | None, how: int) -> bool:
     if wait is None:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        fcntl.flock(file, how)
         return True
     end = time.monotonic() + wait
     while True:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, how | fcntl.LOCK_NB)
         except BlockingIOError:
             if time.monotonic() >= end:
                 return False

@@ -6,8 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from gridworld.data_files import LARGEST_JSON, read_object
 from gridworld.errors import InputError
-from gridworld.sealing import read_sealed
+from gridworld.sealing import check_seal
 
 _FIRST_SEAL = ("config", "layout", "resumed")  # what that of a run of the first format is over
 _NEEDED = ("status", "config", "layout")
@@ -15,7 +16,12 @@ _NEEDED = ("status", "config", "layout")
 
 def read_manifest(path: Path) -> dict[str, Any]:
     """The content. Raises `InputError` where that is not what a run wrote."""
-    content = read_sealed(path, _FIRST_SEAL)
+    return check_manifest(read_object(path, LARGEST_JSON), path)
+
+
+def check_manifest(content: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The same for what was read already from the file, which an error names."""
+    check_seal(content, path, _FIRST_SEAL)
     if not content.keys() >= set(_NEEDED):
         raise InputError(f"{path}: not the manifest of a run; it lacks status, config or layout")
     for key, (fits, what) in _KINDS.items():

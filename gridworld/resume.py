@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,8 @@ from gridworld.identity import environment, identity, settings
 from gridworld.journal import holds
 from gridworld.layout import Layout
 from gridworld.provenance import git, source_differences
-from gridworld.run import CURVE, EVENTS, Run, read_run
+from gridworld.recovery import is_begun, run_to_go_on
+from gridworld.run import CURVE, EVENTS, Run
 from gridworld.saved_run import layout_of, settings_of
 from gridworld.session import CONTENT, Summary
 from gridworld.state import State, StateError
@@ -35,8 +37,11 @@ _FILES = {"curve": CURVE, "events": EVENTS}  # names that a checkpoint's marks m
 
 def train_or_go_on(config: TrainConfig, run: Run, overrides: list[str]) -> Summary:
     """Train, or go on with the unfinished run in the folder. Raises `InputError` if that is another."""
-    if not run.manifest_file.exists():
-        return train(config, run, overrides)
+    if not is_begun(run.folder):
+        is_empty = os.path.lexists(run.manifest_file)
+        if is_empty:
+            _say(f"{run.manifest_file}: is empty, and nothing of the run was saved; it begins anew")
+        return train(config, run, overrides, replace=is_empty)
     unfinished = unfinished_in(run.folder, config)
     unfinished.config = config
     run.manifest = unfinished.run.manifest
@@ -54,10 +59,10 @@ def unfinished_in(folder: Path, config: TrainConfig) -> Unfinished:
 
 
 class Unfinished:
-    """A run's folder to go on in. Raises `InputError` where the manifest is none, or is not what it was."""
+    """A run's folder to go on in. Raises `InputError` as `run_to_go_on` does."""
 
     def __init__(self, folder: Path, trust: bool = False) -> None:
-        self.run: Run = read_run(folder)
+        self.run: Run = run_to_go_on(folder)
         self.config: TrainConfig = settings_of(self.run, trust)
         self.layout: Layout = layout_of(self.run, self.config)
 
@@ -158,7 +163,6 @@ class Unfinished:
     def _begin_anew(self) -> None:
         run, content = self.run, dataclasses.asdict(self.config)
         overrides = run.manifest.get("overrides", [])
-        run.clear()
         run.start(content, self.layout.text(), overrides, replace=True)
 
 
@@ -171,7 +175,7 @@ def _why_not(path: Path, state: State | StateError, folder: Path, own: str) -> s
     """Why a run cannot go on from it, in words; None: it can."""
     if isinstance(state, StateError):
         return str(state)
-    kinds = {key: type(value) for key, value in state.items()}
+    kinds = {"manifest": str} | {key: type(value) for key, value in state.items()}
     if kinds != CONTENT or state["marks"].keys() != _FILES.keys():
         return "it lacks what a checkpoint has"
     if state["identity"] != own:

@@ -20,11 +20,11 @@ pictures. It is sealed: who reads a run, by `read_run` and `Run.read`, is told w
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shlex
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,7 @@ from gridworld.data_files import (
     sha256,
 )
 from gridworld.errors import InputError
-from gridworld.files import remove, write_bytes, write_json
+from gridworld.files import json_text, remove, sync, sync_folder, tidy, write_bytes, write_json
 from gridworld.lock import locked
 from gridworld.manifest import read_manifest
 from gridworld.provenance import describe, source_differences
@@ -73,11 +73,16 @@ class Run:
         self.visits_file = folder / "visits.npy"
         self.frames_folder = folder / "frames"
         self.manifest: dict[str, Any] = {}
+        self._is_settled = False
 
     def start(
         self, config: dict[str, Any], layout_text: str, overrides: list[str], replace: bool = False
     ) -> None:
-        """Write the manifest of a run that begins now. Raises `InputError` if the folder has one to keep."""
+        """Write the manifest of a run that begins now, and clear away what it may `replace`.
+
+        Raises `InputError` if the folder has one to keep. A new run loses nothing by a power cut before it is
+        saved; only where it replaces another is its manifest on disk from the start. See `settle`.
+        """
         self.manifest = {
             "status": "running",
             "started": _now(),
@@ -92,7 +97,10 @@ class Run:
         }
         if not replace and self.manifest_file.exists():
             raise InputError(f"{self.folder}: holds a run already; give every run a folder of its own")
-        self._write()
+        if replace:
+            self.clear()
+        self._tidy()
+        self._write(durable=replace)
         self._keep_diff(self.manifest["git"])
 
     def go_on(self, step: int, total_timesteps: int, differs: list[str]) -> None:
@@ -104,7 +112,7 @@ class Run:
         tree = provenance.git(f"source-{step}.diff")
         if any(source_differences(self.git(), tree)):
             again["git"] = tree
-            self._keep_diff(tree)
+            self._keep_diff(tree, durable=True)
         if total_timesteps != (old := self.manifest["config"]["total_timesteps"]):
             again |= {"total_timesteps": total_timesteps, "instead_of": old}
             self.manifest["config"]["total_timesteps"] = total_timesteps
@@ -113,19 +121,37 @@ class Run:
         self.manifest.pop("error", None)
         self._write()
 
+    def settle(self, *files: Path) -> None:
+        """Let the manifest, then these files, and all names in the folder survive a power cut."""
+        if self._is_settled and not files:
+            return
+        own = [] if self._is_settled else [self.manifest_file, *self.folder.glob("source*.diff")]
+        sync([*own, *files], self.folder)
+        if not self._is_settled:
+            sync_folder(self.folder.parent)
+        self._is_settled = True
+
+    def text(self) -> str:
+        """The manifest as its file has it."""
+        return json_text(sealed(self.manifest))
+
     def git(self) -> Any:
         """The source tree that it ran with last, as `provenance.git` has it."""
         told = [self.manifest, *self.manifest.get("resumed", [])]
         return next((again["git"] for again in reversed(told) if "git" in again), None)
 
     def end(self, status: str, error: str | None = None, **more: int | None) -> None:
-        """Record how it ended: finished, interrupted or failed; with the steps `reached` and saved."""
+        """Record how it ended: finished, interrupted or failed; with the steps `reached` and saved.
+
+        Of one that finished, the results are to survive a power cut already: see `settle`.
+        """
         self.manifest |= {"status": status, "ended": _now(), **more}
         if error is not None:
             self.manifest["error"] = error
         if status == "finished":
+            checked = (*self.results(), *(self.folder / name for name in PICTURES))
             self.manifest["sha256"] = {
-                path.name: file_sha256(path, LARGEST_RESULT) for path in self._results() if path.exists()
+                path.name: file_sha256(path, LARGEST_RESULT) for path in checked if path.exists()
             }
         self._write()
 
@@ -161,7 +187,7 @@ class Run:
 
     @property
     def is_finished(self) -> bool:
-        return bool(self.manifest["status"] == "finished")
+        return bool(self.manifest.get("status") == "finished")
 
     def _check(self, path: Path, digest: str) -> None:
         noted = self.manifest.get("sha256", {}).get(path.name)
@@ -187,15 +213,15 @@ class Run:
         """The command that goes on with it."""
         return f"python scripts/train.py resume={shlex.quote(shown(self.folder))}"
 
-    def _keep_diff(self, git: dict[str, Any] | None) -> None:
+    def _keep_diff(self, git: dict[str, Any] | None, durable: bool = False) -> None:
         """Write what was changed since the commit, where the manifest says that a file has it."""
         tree, name = provenance.source(), ((git or {}).get("diff") or {}).get("file")
         if tree is not None and name is not None:
-            write_bytes(self.folder / name, tree.diff)
+            write_bytes(self.folder / name, tree.diff, durable)
 
-    def _results(self) -> tuple[Path, ...]:
-        pictures = (self.folder / name for name in PICTURES)
-        return self.curve_file, self.summary_file, self.model_file, self.visits_file, *pictures
+    def results(self) -> tuple[Path, ...]:
+        """The files that hold the result."""
+        return self.curve_file, self.summary_file, self.model_file, self.visits_file
 
     def _tidy(self) -> None:
         """Take away what a process that was killed had half written.
@@ -203,13 +229,12 @@ class Run:
         Raises `InputError` where the checkpoints' folder is a link: what it leads to is not the run's.
         """
         check_no_link(self.folder / "checkpoints")
-        for pattern in (".*.part", "checkpoints/.*.part"):
-            for path in self.folder.glob(pattern):
-                remove(path)
+        for folder in (self.folder, self.folder / "checkpoints"):
+            tidy(folder)
 
-    def _write(self) -> None:
+    def _write(self, durable: bool = True) -> None:
         self.manifest = sealed(self.manifest)
-        write_json(self.manifest_file, self.manifest)
+        write_json(self.manifest_file, self.manifest, durable)
 
 
 def open_run(folder: Path) -> Run:
@@ -224,16 +249,21 @@ def open_run(folder: Path) -> Run:
 
 def read_run(folder: Path) -> Run:
     """A run, finished or not. Raises `InputError` where there is none, or its manifest was changed."""
+    check_is_run(folder)
     run = Run(folder)
-    if not folder.exists():
-        raise InputError(f"{folder}: no such folder; give the folder of a run, e.g. one in runs/")
-    if not os.path.lexists(run.manifest_file):
-        raise InputError(f"{folder}: not a run's folder, it has no {MANIFEST}")
     run.manifest = read_manifest(run.manifest_file)
     return run
 
 
-@contextmanager
+def check_is_run(folder: Path) -> None:
+    """Raise `InputError` where there is no run's folder, whatever is in its manifest."""
+    if not folder.exists():
+        raise InputError(f"{folder}: no such folder; give the folder of a run, e.g. one in runs/")
+    if not os.path.lexists(folder / MANIFEST):
+        raise InputError(f"{folder}: not a run's folder, it has no {MANIFEST}")
+
+
+@contextlib.contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
     """Hold the run's folder for this process. Raises `InputError` where another one has it."""
     with locked(folder / LOCK, wait=0) as is_ours:
@@ -256,7 +286,9 @@ def check_new(folder: Path, key: str = "hydra.run.dir") -> None:
     Whether an unfinished one is the same is seen when the settings are known.
     """
     if (folder / MANIFEST).exists():
-        run = read_run(folder)
+        run = Run(folder)
+        with contextlib.suppress(InputError):  # one that is damaged may go on, which is seen later
+            run = read_run(folder)
         if run.is_finished:
             raise InputError(
                 f"{folder}: holds a run already; choose another folder, or make that run longer by "

@@ -31,7 +31,11 @@ def read_sealed(path: Path, parts: tuple[str, ...] = ()) -> dict[str, Any]:
 
     One of the first format, or of none, is taken as it is; with `parts`, if the seal is that of these.
     """
-    content = read_object(path, LARGEST_JSON)
+    return check_seal(read_object(path, LARGEST_JSON), path, parts)
+
+
+def check_seal(content: dict[str, Any], path: Path, parts: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The same for what was read already from the file, which an error names."""
     found = content.get("format", 1)
     if type(found) is not int or not 1 <= found <= FORMAT:
         raise InputError(f"{path}: has format {str(found)[:20]}, this version reads 1 to {FORMAT}")

@@ -21,7 +21,7 @@ from gridworld.curve import CHARTS, GREEDY, Curve
 from gridworld.errors import InputError
 from gridworld.evaluation import Judge, Score
 from gridworld.events import EventWriter, HParamValue
-from gridworld.files import write_array, write_json
+from gridworld.files import in_background, write_array, write_json
 from gridworld.flat import flat
 from gridworld.identity import environment, identity
 from gridworld.journal import Journal
@@ -42,6 +42,7 @@ CONTENT = {  # of a checkpoint
     **dict.fromkeys(("steps", "total_timesteps"), int),
     "identity": str,
     "seconds": float,
+    "manifest": str,  # as the run's was then; older ones have none
 }
 _log = logging.getLogger("gridworld")
 
@@ -154,8 +155,10 @@ class Session:
             for journal in journals.values():
                 if journal is not None:
                     journal.sync()
+            self._run.settle()
         state = {
             **self._origin,
+            "manifest": self._run.text(),
             "steps": steps,
             "total_timesteps": self._config.total_timesteps,
             "seconds": time.perf_counter() - self._started,
@@ -175,20 +178,23 @@ class Session:
         summary = _summarise(self._config, curve, steps, seconds)
         write_json(self._run.summary_file, _plain(summary))
         assert curve.beliefs is not None
-        self._pictures.finish(steps, curve.beliefs, visits)
+        with in_background(lambda: self._run.settle(*self._run.results())):
+            self._pictures.finish(steps, curve.beliefs, visits)
         return summary
 
     def _close(self, succeeded: bool) -> None:
         """Close what is open; on a full disk, without a last word."""
         closing = [self.curve.close]
         if self._events is not None:
-            closing += [lambda: self._end_session(succeeded), self._events.close]
+            closing += [lambda: self._end_session(succeeded), self._events.journal.sync, self._events.close]
+        failures: list[Exception] = []
         for close in closing:
             try:
                 close()
-            except (OSError, InputError):
-                if succeeded:
-                    raise
+            except (OSError, InputError) as error:
+                failures.append(error)
+        if succeeded and failures:
+            raise failures[0]
 
     def _end_session(self, succeeded: bool) -> None:
         assert self._events is not None

@@ -31,17 +31,22 @@ def make_mdp(env: EnvConfig, layout: Layout | None = None) -> Mdp:
 
 
 def train(
-    config: TrainConfig, run: Run, overrides: list[str], world: Callable[[EnvConfig], Mdp] = make_mdp
+    config: TrainConfig,
+    run: Run,
+    overrides: list[str],
+    world: Callable[[EnvConfig], Mdp] = make_mdp,
+    replace: bool = False,
 ) -> Summary:
     """Train, evaluate and record as configured; everything it writes goes to the run's folder.
 
-    `world` makes the configured world, or has it at hand. Raises `InputError` for a mistake in the settings,
-    before anything is written, and `Interrupted`.
+    `world` makes the configured world, or has it at hand; `replace` clears away what the folder has of an
+    earlier run. Raises `InputError` for a mistake in the settings, before anything is written, and
+    `Interrupted`.
     """
     mdp = check_settings(config, world)
 
     def begin() -> None:
-        run.start(dataclasses.asdict(config), mdp.layout.text(), overrides)
+        run.start(dataclasses.asdict(config), mdp.layout.text(), overrides, replace)
 
     return carry_out(config, run, mdp, begin)
 

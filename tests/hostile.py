@@ -9,6 +9,7 @@ stranger's manifest are the stranger's. `base` is the folder that the run is in;
 """
 
 import base64
+import contextlib
 import hashlib
 import io
 import json
@@ -72,10 +73,25 @@ class Bomb:
 
 
 def manifest(run: Path, edit: Callable[[dict[str, Any]], object]) -> None:
-    """Change the manifest."""
+    """Change the manifest, and the copies that checkpoints have of it, which are sealed."""
     content = json.loads((run / "manifest.json").read_text())
     edit(content)
     (run / "manifest.json").write_text(json.dumps(sealed(content)))
+    for path in run.glob("checkpoints/*.state"):
+        if not path.is_file():
+            continue
+        state = decode(path.read_bytes())
+        copy = json.loads(state["manifest"])
+        with contextlib.suppress(KeyError):  # a copy has no checksums of results
+            edit(copy)
+        copied(run, json.dumps(sealed(copy)))
+
+
+def copied(run: Path, text: str) -> None:
+    """Change the copies alone."""
+    for path in run.glob("checkpoints/*.state"):
+        state = decode(path.read_bytes())
+        path.write_bytes(b"".join(encode(state | {"manifest": text})))
 
 
 def agent_has(run: Path, **values: Any) -> None:
@@ -461,7 +477,9 @@ def settings_nested_as_deep_as_json_goes(run: Path, base: Path) -> None:
     text = (run / "manifest.json").read_text()
     deep = '{"a":' * 900 + "1" + "}" * 900
     at = text.index('"arguments": {') + len('"arguments": {')
-    (run / "manifest.json").write_text(f'{text[:at]}"deep": {deep},{text[at:]}')
+    text = f'{text[:at]}"deep": {deep},{text[at:]}'
+    (run / "manifest.json").write_text(text)
+    copied(run, text)
 
 
 @hostile("manifest.json: is a symbolic link")
@@ -686,6 +704,12 @@ def continuations_without_a_step(run: Path, base: Path) -> None:
 @hostile("resumed must be a list of when the run went on")
 def continuations_after_no_number_of_steps(run: Path, base: Path) -> None:
     manifest(run, lambda content: content.update(resumed=[{"total_timesteps": 1, "step": "x"}]))
+
+
+@hostile("manifest.json: is no JSON")
+def copy_of_the_manifest_that_is_none(run: Path, base: Path) -> None:
+    (run / "manifest.json").write_bytes(b"")
+    copied(run, "[" * 100_000)
 
 
 @hostile("manifest.json: is no JSON")

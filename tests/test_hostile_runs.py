@@ -43,7 +43,7 @@ FIRST = {
     *("picture_that_is_the_secret", "frames_that_lead_outside", "files_that_lead_outside"),
     *("mark_of_a_curve_outside", "mark_of_events_outside", "checkpoints_that_lead_outside"),
     *("curve_that_waits_for_a_writer", "checkpoint_that_is_a_folder", "checkpoint_that_acts_on_the_terminal"),
-    *("continuations_without_a_step", "numbers_that_json_has_not"),
+    *("continuations_without_a_step", "numbers_that_json_has_not", "copy_of_the_manifest_that_is_none"),
     *("report_that_leads_outside", "yaml_that_runs_and_grows", "event_of_an_exabyte"),
 }
 ALL = os.environ.get("GRIDWORLD_HOSTILE") == "all"

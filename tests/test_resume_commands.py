@@ -128,18 +128,33 @@ def test_a_start_that_comes_to_nothing_leaves_no_folder(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_a_killed_process_had_half_written_is_taken_away(tmp_path: Path) -> None:
+    """Also where it was killed before there was a manifest."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    half = folder / ".manifest.json.12345.part"
+    half.write_text("{")
+    (folder / ".notes.part").write_text("mine")
+    refused = script("train.py", *WORDS, "hydra.run.dir=run", "seed=-1", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert [path.name for path in folder.iterdir()] == [".notes.part"]
+    half.write_text("{")
+    begin(folder, *WORDS)
+    assert [path.name for path in folder.rglob("*.part")] == [".notes.part"]
+
+
 def test_a_lock_on_a_file_that_was_taken_away_is_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whoever had the lock deletes its file between our opening it and our having it."""
     path, take, taken = tmp_path / LOCK, lock._take, 0
 
-    def late(file: int, wait: float | None) -> bool:
+    def late(file: int, wait: float | None, how: int) -> bool:
         nonlocal taken
         taken += 1
         if taken == 1:
             path.unlink()
-        return take(file, wait)
+        return take(file, wait, how)
 
     monkeypatch.setattr(lock, "_take", late)
     with locked(path, wait=0) as first, locked(path, wait=0) as second:
@@ -289,10 +304,10 @@ class Last:
     def __del__(self, kill=os.kill, here=os.getpid(), number=int(sys.argv[2])):
         kill(here, number)
 last = Last()
-from gridworld.early import at_work, listen
+from gridworld.early import AtWork, listen
 listen()
 try:
-    with at_work():
+    with AtWork():
         print("begun")
         if sys.argv[1] == "at work":
             os.kill(os.getpid(), int(sys.argv[2]))
@@ -317,6 +332,24 @@ def test_a_signal_that_comes_early_or_late(when: str, number: signal.Signals) ->
     assert done.returncode == 128 + number
     assert done.stdout == "begun\n"
     assert "Traceback" not in done.stderr
+
+
+IMPORTED_TO_LISTEN = """
+import sys, gridworld
+before = {*sys.modules}
+import gridworld.early
+print(*{*sys.modules} - before)
+"""
+
+
+def test_listening_waits_for_no_import() -> None:
+    command = [sys.executable, "-c", IMPORTED_TO_LISTEN]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert {*done.stdout.split()} <= {"gridworld.early", "atexit", "_signal"}
+    for path in (ROOT / "scripts").glob("*.py"):
+        code = [line for line in path.read_text().splitlines()[1:] if line]
+        assert code[0] == "from gridworld.early import listen"
+        assert code[2] == "    listen()  # before what takes time to import"
 
 
 def test_where_no_rest_comes_the_last_checkpoint_counts(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ import pytest
 from resuming import begin, differences, go_on, left_behind
 from support import SHORT
 
-from gridworld import checkpoint, session
+from gridworld import checkpoint, files, session
 from gridworld.agents.sb3.agent import SB3Agent
 from gridworld.checkpoint import Checkpoints
 from gridworld.journal import Journal
@@ -97,9 +97,9 @@ POINTS: list[tuple[Any, str, bool, int]] = [
     (Journal, "append", True, 12),
     (Journal, "sync", True, 3),
     (checkpoint, "encode", False, 2),
-    (checkpoint.os, "replace", False, 5),
-    (checkpoint.os, "fsync", True, 7),
-    (checkpoint, "_sync_folder", False, 3),
+    (files.os, "replace", False, 5),
+    (files.os, "fsync", True, 7),
+    (files, "sync_folder", False, 3),
     (Checkpoints, "keep", False, 4),
     (SB3Agent, "save", True, 1),
     (session, "write_json", False, 1),

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from resuming import begin, differences, go_on, left_behind, stopped_after
+from resuming import begin, differences, go_on, last_state, left_behind, stopped_after
 from support import SHORT, configure
 
 from gridworld.checkpoint import Checkpoints, Pace
@@ -226,6 +226,8 @@ def test_what_is_taken_out_is_refused(agent: str, tmp_path: Path) -> None:
     own = identity(configure(*RUNS[agent], *LESS), "S.....\n....T.\n...TG.\n....T.\n......")
     entries, accepted = 0, []
     for path in leaves(whole):
+        if path == ("manifest",):
+            continue  # a copy, which older ones do not have
         if path[:3] == ("agent", "model", "values") and zlib.crc32(path[-1].encode()) % 20:
             continue  # all of these are guarded by their count
         wrong, entries = changed(whole, path), entries + 1
@@ -234,3 +236,11 @@ def test_what_is_taken_out_is_refused(agent: str, tmp_path: Path) -> None:
             accepted.append(".".join(path))
     assert entries > 25
     assert accepted == []
+
+
+def test_equal_runs_on_images_have_equal_states(tmp_path: Path) -> None:
+    """SB3 shows a network for images a random one, from a generator that nobody else seeds."""
+    words = ["agent=a2c", "observation=image", "agent.policy=CnnPolicy", "total_timesteps=40", "n_envs=4"]
+    for name in ("one", "other"):
+        begin(tmp_path / name, *words, *LESS)
+    assert differences(last_state(tmp_path / "one"), last_state(tmp_path / "other")) == []

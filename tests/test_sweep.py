@@ -6,6 +6,7 @@ import fcntl
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -216,7 +217,22 @@ def test_a_job_with_a_damaged_manifest_is_told(keep: int, tmp_path: Path) -> Non
     assert sweep("seed=0,1", cwd=tmp_path).returncode == 0
     file = tmp_path / "sweep" / "seed=0" / "manifest.json"
     file.write_bytes(file.read_bytes()[:keep])
+    shutil.rmtree(file.parent / "checkpoints")  # which have a copy of it
     check_told_and_begun_anew(tmp_path, "manifest.json: is no JSON, it was changed or cut off")
+
+
+def test_a_job_with_a_damaged_manifest_goes_on_by_a_checkpoints(tmp_path: Path) -> None:
+    assert sweep("seed=0,1", cwd=tmp_path).returncode == 0
+    file = tmp_path / "sweep" / "seed=0" / "manifest.json"
+    file.write_bytes(b"")
+    curve = (file.parent / "curve.csv").read_bytes()
+    again = sweep("seed=0,1", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert "1 to run" in again.stderr
+    assert "manifest.json: is no JSON" in again.stderr
+    assert "; goes by the copy in checkpoints/" in again.stderr
+    assert statuses(tmp_path / "sweep") == {"seed=0": "done", "seed=1": "done"}
+    assert (file.parent / "curve.csv").read_bytes() == curve
 
 
 def check_told_and_begun_anew(cwd: Path, why: str) -> None:
@@ -367,7 +383,7 @@ def test_a_file_system_without_locks_is_told(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.parametrize(
-    "damage", ["", "{", "[]", '{"format": 1}', '{"format": 1, "asked": [], "jobs": [{}]}']
+    "damage", ["[]", "null", '{"format": 1}', '{"format": 1, "asked": [], "jobs": [{}]}']
 )
 def test_a_damaged_sweep_is_refused_and_left_alone(damage: str, tmp_path: Path) -> None:
     (tmp_path / "sweep").mkdir()

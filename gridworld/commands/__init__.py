@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from gridworld.early import at_work
+from gridworld.early import AtWork
 from gridworld.errors import EXIT_CODE, InputError, failure
 from gridworld.terminal import prepare, printing, tell_error
 
@@ -40,7 +40,7 @@ def run(main: Main) -> None:
     """
     prepare()
     try:
-        with at_work(), printing():
+        with AtWork(), printing():
             main(sys.argv[1:])
     except InputError as error:
         tell_error(str(error))

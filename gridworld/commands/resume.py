@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.errors import InputError
-from gridworld.run import alone_in, check_inside, read_run
+from gridworld.run import alone_in, check_inside, check_is_run
 from gridworld.terminal import result_is_in_files
 
 KEY = "resume"
@@ -25,7 +25,7 @@ def main(arguments: Sequence[str]) -> None:
     words = _read(arguments)
     folder = Path(words[KEY])
     check_inside(folder, KEY)
-    read_run(folder)  # before anything is written there
+    check_is_run(folder)  # before anything is written there
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: is read-only; copy the run to where you may write and resume= the copy")
 

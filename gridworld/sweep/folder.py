@@ -8,25 +8,28 @@ agent=dqn,seed=0/   a job's folder, an ordinary run's
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from gridworld.data_files import LARGEST_JSON, read_bytes
 from gridworld.errors import InputError
-from gridworld.files import remove, write_json
+from gridworld.files import make_folder, tidy, write_json
 from gridworld.inside import check_no_links, links_in
 from gridworld.lock import locked
 from gridworld.provenance import versions
+from gridworld.recovery import find_run, is_begun
 from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, check_writable
 from gridworld.sealing import read_sealed, sealed
-from gridworld.sweep.plan import Job, folder_name
+from gridworld.sweep.plan import Job, folder_name, settings_hash
+from gridworld.terminal import printable
 
 STOP = ".stop"  # in the sweep's folder: no more jobs are to begin, wherever they wait
 _JOB = re.compile(r"[\w=+,-][\w.,=+-]*", re.ASCII)  # as `folder_name` makes them: they lead nowhere else
@@ -47,6 +50,7 @@ class SweepFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.entries: dict[str, Entry] = {}  # by hash, in the order they were asked for
+        self.damage: str | None = None  # of sweep.json; the jobs' folders tell what was in it
         self._manifest: dict[str, Any] = {}
         if (path / MANIFEST).exists():
             raise InputError(f"{path}: is the folder of a single run; choose another hydra.sweep.dir")
@@ -65,7 +69,7 @@ class SweepFolder:
             if job.hash in self.entries:  # others get a folder of their own
                 self._check_no_links(self.entries[job.hash].job)
         if self.entries and not extend and not any(job.hash in self.entries for job in jobs):
-            asked = self._manifest["asked"][-1]["overrides"]
+            asked = self._manifest["asked"][-1]["overrides"] if self._manifest else []
             raise InputError(
                 f"{self.path}: holds the sweep '{shlex.join(asked)}', which has no job in common with this "
                 "one; choose another hydra.sweep.dir, or add hydra.sweeper.extend=true to put both into one"
@@ -76,11 +80,11 @@ class SweepFolder:
         for names in ((job,), (job, ".hydra")):
             check_no_links(self.path, *names)
 
-    @contextmanager
+    @contextlib.contextmanager
     def at_work(self) -> Iterator[None]:
         """Make the folder, and keep other sweeps out of it. Raises `InputError` if one is there."""
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
+            make_folder(self.path)
         except OSError as error:
             raise InputError(
                 f"{self.path}: cannot be made ({error.strerror}); choose another hydra.sweep.dir"
@@ -89,14 +93,15 @@ class SweepFolder:
             if not is_ours:
                 raise InputError(f"{self.path}: another process runs this sweep; wait for it or stop it")
             (self.path / STOP).unlink(missing_ok=True)
-            for part in self.path.glob(".*.part"):  # of a process that was killed while writing
-                remove(part)
+            tidy(self.path)
+            if self.damage is not None:
+                print(printable(f"{self.damage}; written again from the jobs' folders"), file=sys.stderr)
             yield
 
     def add(self, jobs: Sequence[Job], words: Sequence[str]) -> list[Entry]:
         """Note what is asked for; returns the jobs' entries, new ones with a folder of their own."""
         taken = {entry.job.lower() for entry in self.entries.values()}
-        taken |= {used.parent.name.lower() for used in self.path.glob(f"*/{MANIFEST}")}  # whosever they are
+        taken |= {folder.name.lower() for folder in self._runs()}  # whosever they are
         taken |= {name.lower() for name in links_in(self.path)}
         lines = [e.overrides for e in self.entries.values()] + [job.overrides for job in jobs]
         common = set(lines[0]).intersection(*lines)
@@ -123,9 +128,13 @@ class SweepFolder:
             ],
         }
         self._manifest = sealed(content)
-        write_json(self.path / SWEEP_JSON, self._manifest)
+        write_json(self.path / SWEEP_JSON, self._manifest, durable=True)
 
     def _load(self, file: Path) -> None:
+        if _is_cut_off(file):  # as a power cut leaves it
+            self.damage = f"{file}: is empty or cut off"
+            self.entries = self._entries_of_runs()
+            return
         try:
             content = read_sealed(file)
             asked, entries = content.get("asked"), [_entry(item) for item in _objects(content.get("jobs"))]
@@ -143,13 +152,41 @@ class SweepFolder:
             raise InputError(f"{file}: damaged (two jobs have one folder, or one hash)")
         self._manifest = content
 
+    def _runs(self) -> list[Path]:
+        """The folders in which a run began."""
+        files = sorted(self.path.glob(f"*/{MANIFEST}"))
+        return [file.parent for file in files if file.stat().st_size or is_begun(file.parent)]
+
+    def _entries_of_runs(self) -> dict[str, Entry]:
+        """The jobs that have begun, as their own folders have it, in that order."""
+        found = []
+        for folder in self._runs():
+            with contextlib.suppress(InputError, LookupError):
+                run = find_run(folder)
+                if run is not None:
+                    digest = settings_hash(run.manifest["config"], "\n".join(run.manifest["layout"]))
+                    entry = Entry(folder.name, digest, tuple(run.manifest["overrides"]))
+                    found.append((run.manifest["started"], entry))
+        return {entry.hash: entry for _, entry in sorted(found, key=lambda pair: pair[0])}
+
+
+def _is_cut_off(file: Path) -> bool:
+    """Whether a file of JSON has lost its end, or all of it."""
+    with contextlib.suppress(InputError):
+        content = read_bytes(file, LARGEST_JSON).strip(b"\0 \n")
+        return not content or (content.startswith(b"{") and not content.endswith(b"}"))
+    return False
+
 
 def open_sweep(path: Path) -> SweepFolder:
     """A sweep's folder, to look at. Raises `InputError` where there is none."""
     if not os.path.lexists(path / SWEEP_JSON):
         reason = f"not a sweep's folder, it has no {SWEEP_JSON}" if path.exists() else "no such folder"
         raise InputError(f"{path}: {reason}; give the folder of a sweep, e.g. one in runs/")
-    return SweepFolder(path)
+    folder = SweepFolder(path)
+    if folder.damage is not None:
+        raise InputError(f"{folder.damage}; the sweep's own command writes it again")
+    return folder
 
 
 def _entry(item: dict[str, Any]) -> Entry:

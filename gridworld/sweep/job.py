@@ -11,12 +11,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from gridworld.config import TrainConfig
-from gridworld.errors import InputError, MachineError, reason
+from gridworld.errors import FolderLostError, InputError, MachineError, reason
 from gridworld.files import write_text
 from gridworld.lock import locked
 from gridworld.provenance import DIFF
+from gridworld.recovery import find_run
 from gridworld.resume import train_or_go_on
-from gridworld.run import LOCK, MANIFEST, Run, read_run
+from gridworld.run import LOCK, MANIFEST, Run
 from gridworld.signals import Interrupted
 from gridworld.sweep.table import (
     DONE,
@@ -64,8 +65,10 @@ def run_in_sweep(config: TrainConfig, folder: Path, overrides: list[str], stop_a
 
 def mark_failed(folder: Path, why: str) -> None:
     """Say in the manifest, if the job came so far, what its own process did not."""
-    if status_in(folder) in _TO_GO_ON_WITH:
-        read_run(folder).fail(why)
+    with contextlib.suppress(InputError):  # a damaged manifest is left as it is
+        run = find_run(folder)
+        if run is not None and run.manifest["status"] in _TO_GO_ON_WITH:
+            run.fail(why)
 
 
 def _make_ready(folder: Path, table: Table) -> bool:
@@ -99,9 +102,10 @@ def _run(config: TrainConfig, run: Run, overrides: list[str], table: Table) -> f
     except Exception as error:
         why = one_line(reason(error))
         if not isinstance(error, InputError):
-            with contextlib.suppress(OSError):  # the reason is worth more than its traceback
+            with contextlib.suppress(OSError, FolderLostError):  # the reason is worth more than its traceback
                 write_text(run.folder / ERROR_FILE, traceback.format_exc())
-        mark_failed(run.folder, why)  # one that could not go on says nothing itself
+        with contextlib.suppress(FolderLostError):
+            mark_failed(run.folder, why)  # one that could not go on says nothing itself
         table.set(job, status=FAILED, seconds=f"{time.monotonic() - started:.2f}", error=why)
         raise JobError(why) from None
     table.set(job, status=DONE, **outcome(run))

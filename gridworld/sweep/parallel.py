@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from hydra.core.utils import JobReturn
 from joblib import Parallel, delayed
 
+from gridworld.lock import Held, held, work_for
 from gridworld.process import end_with, parent_died
 from gridworld.sweep.worker import Hydra, unpack
 
@@ -23,15 +24,16 @@ def launch(hydra: Hydra, n_jobs: int, jobs: Sequence[Sequence[str]], first: int)
     state, parent = hydra.packed(), os.getpid()
     return list(
         Parallel(n_jobs=n_jobs, backend="loky", batch_size=1)(
-            delayed(_run)(state, parent, list(overrides), number)
+            delayed(_run)(state, parent, held(), list(overrides), number)
             for number, overrides in enumerate(jobs, first)
         )
     )
 
 
-def _run(state: bytes, parent: int, overrides: list[str], number: int) -> JobReturn:
+def _run(state: bytes, parent: int, holder: Held, overrides: list[str], number: int) -> JobReturn:
     if parent != os.getpid():  # which it is when there is one worker only
         _end_with(parent)
+        work_for(holder)
     try:
         return unpack(state).run(overrides, number)
     except SystemExit:

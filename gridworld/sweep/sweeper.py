@@ -18,7 +18,7 @@ from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig
 
 from gridworld.config import TrainConfig
-from gridworld.errors import InputError, reason
+from gridworld.errors import EXIT_CODE, FolderLostError, InputError, reason
 from gridworld.experiment import to_config
 from gridworld.signals import handling
 from gridworld.sweep import report
@@ -29,6 +29,7 @@ from gridworld.sweep.job import StopSweep, mark_failed
 from gridworld.sweep.plan import Job, expand, plan
 from gridworld.sweep.progress import SweepProgress
 from gridworld.sweep.table import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, Row, Table, one_line, status_in
+from gridworld.terminal import tell_error
 
 _ORPHANS_END_WITHIN = 5.0  # seconds; workers of a sweep that was killed
 _STOPPED_END_WITHIN = 2.5  # seconds; those of one that is being stopped
@@ -67,6 +68,9 @@ def run_sweep(
     except OSError as error:
         report.tell_stopped_by(error, folder.path)
         code = 1
+    except FolderLostError as error:
+        tell_error(str(error))
+        code = EXIT_CODE
     if code:
         raise SystemExit(code)
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
@@ -20,7 +19,8 @@ from gridworld.data_files import LARGEST_CSV, read_text
 from gridworld.errors import InputError
 from gridworld.files import write_text
 from gridworld.lock import is_locked, locked
-from gridworld.run import LOCK, MANIFEST, Run, read_run
+from gridworld.recovery import find_run
+from gridworld.run import LOCK, Run
 from gridworld.sweep.folder import Entry
 from gridworld.sweep.plan import settings_hash
 from gridworld.terminal import plain
@@ -102,7 +102,7 @@ class Table:
         """Write the rows of these jobs anew, as their folders have it."""
         with locked(self.folder / TABLE_LOCK):
             rows = self.look(entries)
-            self._write(rows.values())
+            self._write(rows.values(), durable=True)
         return rows
 
     def look(self, entries: Iterable[Entry]) -> dict[str, Row]:
@@ -134,9 +134,9 @@ class Table:
             return dataclasses.replace(row, error=before.error)  # the disk was too full for the manifest
         return row
 
-    def _write(self, rows: Iterable[Row]) -> None:
+    def _write(self, rows: Iterable[Row], durable: bool = False) -> None:
         lines = [_line(_COLUMNS), *(_line(dataclasses.astuple(row)) for row in rows)]
-        write_text(self.file, "".join(lines))
+        write_text(self.file, "".join(lines), durable)
 
 
 _COLUMNS = [field.name for field in dataclasses.fields(Row)]
@@ -173,11 +173,6 @@ def _other_job(manifest: dict[str, Any], entry: Entry) -> str:
         lengths = []
     what = f"was made {lengths[-1]} steps long" if lengths else "has other settings than the job"
     return f"the run in {entry.job} {what}, so that it is not this job's result; move it to keep it"
-
-
-def find_run(folder: Path) -> Run | None:
-    """The run in a job's folder; None where none has begun. Raises `InputError` for a damaged manifest."""
-    return read_run(folder) if os.path.lexists(folder / MANIFEST) else None
 
 
 def status_in(folder: Path) -> str:

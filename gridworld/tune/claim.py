@@ -39,4 +39,4 @@ def is_claimed(folder: Path, name: str, about: Mapping[str, Any]) -> bool:
 
 def claim(folder: Path, name: str, about: Mapping[str, Any]) -> None:
     """From now on it is this study's."""
-    write_json(folder / SEARCH_JSON, sealed({"study": name, "about": about}))
+    write_json(folder / SEARCH_JSON, sealed({"study": name, "about": about}), durable=True)

@@ -12,7 +12,10 @@ from collections.abc import Callable, Iterator
 from multiprocessing.context import SpawnProcess
 from typing import Any
 
+from gridworld.errors import FolderLostError
+from gridworld.lock import Held, held, work_for
 from gridworld.signals import StopRequest
+from gridworld.terminal import tell_error
 
 Work = Callable[[Any, int, int], None]  # (task, number of the worker, process id of the parent)
 
@@ -65,11 +68,20 @@ def run_crew(work: Work, task: Any, workers: int, look: Callable[[], None]) -> N
 
 def _start(work: Work, task: Any, number: int) -> SpawnProcess:
     process = multiprocessing.get_context("spawn").Process(
-        target=work, args=(task, number, os.getpid()), daemon=True
+        target=_work, args=(work, held(), task, number, os.getpid()), daemon=True
     )
     with _ctrl_c_is_ours():
         process.start()
     return process
+
+
+def _work(work: Work, holder: Held, task: Any, number: int, parent: int) -> None:
+    work_for(holder)
+    try:
+        work(task, number, parent)
+    except FolderLostError as error:
+        tell_error(str(error))
+        sys.exit(1)
 
 
 @contextlib.contextmanager

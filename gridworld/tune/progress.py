@@ -61,7 +61,7 @@ class SearchProgress:
         """The table as it stands."""
         if self._shown:
             print(f"\r{_CLEAR_TO_END}", end="", file=sys.stderr, flush=True)
-        write_trials(self._asked.folder, self._study, self._asked.space)
+        write_trials(self._asked.folder, self._study, self._asked.space, durable=True)
 
     def _line(self, now: float) -> str:
         counts = standing(self._study)

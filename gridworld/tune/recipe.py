@@ -39,7 +39,7 @@ def write_recipe(
     lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
     lines += ["  - _self_", "", OmegaConf.to_yaml(OmegaConf.create(values)) if values else ""]
     path = make_inside(folder, EXPERIMENT) / f"{RECIPE}.yaml"
-    write_text(path, "\n".join(lines))
+    write_text(path, "\n".join(lines), durable=True)
     own = dataclasses.replace(source, own=(*source.own, folder))
     again = without_hydra(compose_in(own, "train", [f"experiment={RECIPE}"]))
     assert _relevant(again) == _relevant(config), f"{path} does not say what the winner is"

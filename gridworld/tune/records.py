@@ -47,8 +47,8 @@ _STATUSES = {
 }
 
 
-def write_trials(folder: Path, study: optuna.Study, space: Space) -> None:
-    """A row per trial, with its values as a run would get them."""
+def write_trials(folder: Path, study: optuna.Study, space: Space, durable: bool = False) -> None:
+    """A row per trial, with its values as a run would get them; `durable` as for `replacing`."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*_FIELDS, *space.dimensions])
@@ -58,7 +58,7 @@ def write_trials(folder: Path, study: optuna.Study, space: Space) -> None:
         writer.writerow(
             [*(row[name] for name in _FIELDS), *(values.get(key, "") for key in space.dimensions)]
         )
-    write_text(folder / TRIALS_CSV, text.getvalue())
+    write_text(folder / TRIALS_CSV, text.getvalue(), durable)
 
 
 def _row(trial: FrozenTrial) -> dict[str, Any]:
@@ -99,7 +99,7 @@ def write_study(asked: Asked, study: optuna.Study, outcome: dict[str, Any]) -> N
         **outcome,
         TRIALS_SUM: file_sha256(asked.folder / TRIALS_CSV, LARGEST_CSV),
     }
-    write_json(asked.folder / STUDY_JSON, sealed(content))
+    write_json(asked.folder / STUDY_JSON, sealed(content), durable=True)
 
 
 def importances(study: optuna.Study) -> dict[str, float]:

@@ -9,6 +9,7 @@ import math
 import shlex
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,10 @@ import optuna
 
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
+from gridworld.files import make_folder, tidy
 from gridworld.inside import check_no_links
-from gridworld.run import MANIFEST, SWEEP_JSON, check_writable
+from gridworld.lock import locked
+from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, check_writable
 from gridworld.session import hparams
 from gridworld.sweep.report import shown
 from gridworld.terminal import printable
@@ -41,9 +44,29 @@ from gridworld.tune.worker import Task, search
 
 def tune(asked: Asked, source: Source) -> None:
     """Run what the study lacks. Raises `InputError`, nothing run, `SearchError` and `Interrupted`."""
-    task = _begin(asked)
-    with in_reach(task.url):
-        _search(asked, source, task)
+    _check_folder(asked.folder)
+    with _at_work(asked.folder):
+        task = _begin(asked)
+        with in_reach(task.url):
+            _search(asked, source, task)
+
+
+@contextlib.contextmanager
+def _at_work(folder: Path) -> Iterator[None]:
+    """Make the folder and hold it, beside others at the same study; one that stays empty is removed."""
+    make_folder(folder)
+    lock = folder / LOCK
+    try:
+        with locked(lock, wait=0) as is_alone:
+            if is_alone:
+                tidy(folder)
+        with locked(lock, shared=True):
+            yield
+    finally:
+        with contextlib.suppress(OSError):
+            if [path.name for path in folder.iterdir()] == [LOCK]:
+                lock.unlink()
+                folder.rmdir()
 
 
 def _search(asked: Asked, source: Source, task: Task) -> None:
@@ -60,7 +83,6 @@ def _search(asked: Asked, source: Source, task: Task) -> None:
 
 def _begin(asked: Asked) -> Task:
     """Make the folder and the study, or see that they are of this search."""
-    _check_folder(asked.folder)
     settings, about = asked.settings, _about(asked)
     url = settings.storage or f"sqlite:///{asked.folder.absolute() / 'study.db'}"
     if is_claimed(asked.folder, asked.name, about):
@@ -70,18 +92,10 @@ def _begin(asked: Asked) -> Task:
                     f"{asked.folder}: is of the study {asked.name}, which {shown_url(url)} does not have; "
                     "bring its database back, or choose another tune.folder"
                 )
-    made = not asked.folder.exists()
-    asked.folder.mkdir(parents=True, exist_ok=True)
-    try:
-        storage = open_storage(settings, url)
-        with legible(shown_url(url)):
-            study = begin(storage, asked.name, about, asked.space.parameters_of(asked.base))
-            check_study(study, asked.space)
-    except InputError:
-        if made:
-            with contextlib.suppress(OSError):
-                asked.folder.rmdir()
-        raise
+    storage = open_storage(settings, url)
+    with legible(shown_url(url)):
+        study = begin(storage, asked.name, about, asked.space.parameters_of(asked.base))
+        check_study(study, asked.space)
     claim(asked.folder, asked.name, about)
     objective = Objective(asked.measured, asked.space, asked.seeds, settings.reports, settings.stop_after)
     deadline = time.time() + (settings.timeout or math.inf)

@@ -13,9 +13,9 @@ import numpy as np
 
 from gridworld.errors import InputError
 from gridworld.mdp import FloatArray
+from gridworld.recovery import find_run
 from gridworld.report import statistics
 from gridworld.report.table import number, steps_up_to
-from gridworld.sweep.table import find_run
 from gridworld.tune.confirm import Job
 
 

@@ -51,6 +51,9 @@ def make_model(config: SB3Config, seat: Seat) -> BaseAlgorithm:
         raise UnfitError(config, f"cannot be built: {said(error)}") from error
     if not isinstance(getattr(model, "policy", None), BasePolicy):
         raise UnfitError(config, "cannot be built: it makes no policy")
+    if model.observation_space._np_random is not None:
+        # A network for images is shown a random one to see its size; SB3 seeds the actions' space only.
+        model.observation_space.seed(seat.seed)
     reason = why_unreadable(model.policy)
     if reason is not None:
         raise UnfitError(config, reason)
