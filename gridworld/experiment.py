@@ -143,6 +143,7 @@ def main(conf: Path) -> None:
     os.environ[FULL_ERROR] = "1"  # so that Hydra raises its errors instead of printing them
     try:
         with AtWork(), printing(), _place:
+            _take_in_recipe()
             hydra.main(version_base="1.3", config_path=str(conf), config_name="train")(run_job)()
     except Exception as error:
         # Until a job begins, whatever goes wrong is the command line's or a yaml file's fault.
@@ -156,6 +157,14 @@ def main(conf: Path) -> None:
     except KeyboardInterrupt:
         print("interrupted before training began", file=sys.stderr)
         sys.exit(130)
+
+
+def _take_in_recipe() -> None:
+    """Put what `recipe=` says into the command line, as Hydra and the records of a run see it."""
+    if any(word.startswith("recipe=") for word in sys.argv[1:]):
+        from gridworld.recipe import with_recipe
+
+        sys.argv[1:] = with_recipe(sys.argv[1:])
 
 
 def _own_folders(words: list[str]) -> Iterator[Path]:

@@ -14,7 +14,7 @@ SPACES = "tune"  # the group of search spaces, which is tune.py's
 _TEXT = """\
 Train an agent on a GridWorld whose optimum is known exactly.
 
-usage: python scripts/train.py [-m] [group=choice ...] [key=value ...]
+usage: python scripts/train.py [-m] [recipe=FILE] [group=choice ...] [key=value ...]
        python scripts/train.py resume=RUN [total_timesteps=N]
 
 Choices:
@@ -37,6 +37,10 @@ ends as if nothing had happened. With resume=RUN beside it:
   trust=true              import classes that are neither ours nor one of the libraries'
   anyway=true             with other versions or another processor: the last bits may differ
 
+What tune.py found, recipe=FILE (the study's folder, or the yaml in it), is read as data, whoever made it, and
+what stands beside it goes before it; trust=true as above. --config-dir FOLDER is for yaml files of your own:
+Hydra reads them, and they can have it run code.
+
 Sweeps (-m):
   hydra.sweep.dir        the folder to write to; the same one again runs what is not done yet
   hydra/launcher=joblib  as many jobs at once as there are cores, or hydra.launcher.n_jobs
@@ -56,6 +60,8 @@ Examples:
       go on with a run that was interrupted
   python scripts/train.py experiment=cliff_dqn
       a recipe: that agent and that task, with settings that were tuned for them
+  python scripts/train.py recipe=runs/tune_ppo_maze seed=3
+      the winner of a study
   python scripts/train.py -m 'experiment=glob(cliff_*)' seed='range(20)'
       every recipe of a task, with twenty seeds each
 

@@ -84,7 +84,7 @@ def settings_of(run: Run, trust: bool = False) -> TrainConfig:
     try:
         check(config)
         if not trust:
-            _check_imports(dataclasses.asdict(config.agent), str(run.manifest_file))
+            check_imports(dataclasses.asdict(config.agent), str(run.manifest_file), "--trust")
         family(config.agent).check(config)
     except RecursionError:
         raise InputError(f"{run.manifest_file}: config is nested too deeply") from None
@@ -113,18 +113,21 @@ def read_visits(run: Run, shape: tuple[int, ...]) -> NDArray[np.int64]:
     return counts
 
 
-def _check_imports(settings: Any, where: str, key: str = "") -> None:
-    """Refuse an import path that leads out of the libraries an agent is made of, however deep it stands."""
+def check_imports(settings: Any, where: str, allow: str, key: str = "") -> None:
+    """Refuse an import path that leads out of the libraries an agent is made of, however deep it stands.
+
+    Raises `InputError`; `allow` is the word that would allow it.
+    """
     if isinstance(settings, dict):
         for name, value in settings.items():
-            _check_imports(value, where, str(name))
+            check_imports(value, where, allow, str(name))
     elif isinstance(settings, list):
         for value in settings:
-            _check_imports(value, where, key)
+            check_imports(value, where, allow, key)
     elif _is_foreign(key, settings):
         raise InputError(
-            f"{where}: {key}={settings[:80]} is from none of {', '.join(_LIBRARIES)}; add --trust to import "
-            "it all the same, if you trust whoever made this run"
+            f"{where}: {key}={settings[:80]} is from none of {', '.join(_LIBRARIES)}; add {allow} to import "
+            "it all the same, if you trust whoever made this"
         )
 
 
@@ -145,7 +148,7 @@ def read_config(content: Any, where: str) -> TrainConfig:
     algorithm, any_class = agent.get("algorithm"), SB3ClassConfig if "arguments" in agent else None
     schema = next((s for s in AGENT_SCHEMAS.values() if s.algorithm == algorithm), any_class)
     if schema is None:
-        raise InputError(f"{where}: config.agent.algorithm={_shown(algorithm)} is not known here")
+        raise InputError(f"{where}: config.agent.algorithm={shown(algorithm)} is not known here")
     config = _read(TrainConfig, content, f"{where}: config", {AgentConfig: schema})
     assert isinstance(config, TrainConfig)
     return config
@@ -155,7 +158,7 @@ def _read(schema: type, content: Any, where: str, stand_in: dict[type, type]) ->
     hints = get_type_hints(schema)
     if not isinstance(content, dict) or content.keys() != hints.keys():
         if not isinstance(content, dict):
-            raise InputError(f"{where}: must be settings, is {_shown(content)}")
+            raise InputError(f"{where}: must be settings, is {shown(content)}")
         odd = sorted(content.keys() ^ hints.keys())[0]
         fault = "lacks" if odd in hints else "has an unknown key"
         raise InputError(f"{where}: {fault} {odd[:80]}; was the run written by another version?")
@@ -165,26 +168,27 @@ def _read(schema: type, content: Any, where: str, stand_in: dict[type, type]) ->
         if dataclasses.is_dataclass(kind):
             assert isinstance(kind, type)
             values[name] = _read(kind, value, f"{where}.{name}", stand_in)
-        elif _fits(value, kind):
+        elif fits(value, kind):
             values[name] = value
         else:
-            raise InputError(f"{where}.{name}={_shown(value)}: must be {getattr(kind, '__name__', kind)}")
+            raise InputError(f"{where}.{name}={shown(value)}: must be {getattr(kind, '__name__', kind)}")
     return schema(**values)
 
 
-def _fits(value: Any, hint: Any) -> bool:
+def fits(value: Any, hint: Any) -> bool:
+    """Whether a plain value is of the type that a field of a schema is annotated with."""
     if hint is Any:
         return True
     origin = get_origin(hint)
     if origin in (Union, types.UnionType):
-        return any(_fits(value, choice) for choice in get_args(hint))
+        return any(fits(value, choice) for choice in get_args(hint))
     kind = origin or hint
     if isinstance(value, bool):
         return kind is bool
     return isinstance(value, (int, float) if kind is float else kind)
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
     """For a message; what holds others may hold any number of them."""
     return f"a {type(value).__name__}" if isinstance(value, list | dict) else repr(value)[:80]
 

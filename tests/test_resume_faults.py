@@ -1,7 +1,6 @@
 """What goes wrong around a run: a full disk, lost files, numbers that are none. It says so and can go on."""
 
 import errno
-import importlib
 import os
 import random
 import resource
@@ -16,7 +15,7 @@ from typing import Any
 
 import pytest
 from resuming import begin, differences, go_on, left_behind, stopped_after
-from support import ROOT, SHORT, configure, script
+from support import ROOT, SHORT, script
 
 from gridworld import checkpoint, run
 from gridworld.agents.sb3.tabulated_dqn import TabulatedDQN
@@ -225,77 +224,3 @@ def test_a_damaged_folder_ends_the_same_or_is_refused(calm: dict[str, Any], tmp_
             assert differences(left_behind(folder), calm) == [], what
         shutil.rmtree(folder)
     assert all("manifest.json" in what for what in refused), refused
-
-
-HIDING = """
-import itertools
-from stable_baselines3 import A2C
-
-class Counting(A2C):
-    def __init__(self, *arguments, **options):
-        super().__init__(*arguments, **options)
-        self.numbers = itertools.count()
-
-class OwnLoop(A2C):
-    def learn(self, total_timesteps, callback=None, **options):
-        memory = []
-        return super().learn(total_timesteps, callback, **options)
-
-class Closing(A2C):
-    def __init__(self, *arguments, **options):
-        super().__init__(*arguments, **options)
-        lines = iter("abc")
-        self.next_line = lambda: next(lines)
-
-class Kept(A2C):
-    seen = 0
-    def train(self):
-        Kept.seen += 1
-        self.ent_coef = 0.01 * (Kept.seen % 7)
-        self.half = [self.ent_coef, {"a": (1, self.ent_coef)}]
-        super().train()
-"""
-
-
-def any_class(algorithm: str) -> list[str]:
-    names = configure("agent=a2c").agent.arguments.keys() - {"gamma"}  # type: ignore[attr-defined]
-    removed = [f"~agent.arguments.{name}" for name in sorted(names)]
-    return [*SHORT["a2c"], *LESS, f"agent.algorithm={algorithm}", *removed, "checkpoint.every=100"]
-
-
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        (
-            "Counting",
-            "the model cannot be saved, numbers is a itertools.count and what it holds cannot be seen",
-        ),
-        ("OwnLoop", "OwnLoop.learn() has a variable memory of its own, a list; train without checkpoints by"),
-        ("Closing", "next_line.<lines> is a builtins.str_ascii_iterator and what it holds cannot be seen"),
-    ],
-)
-def test_hidden_state_is_found_and_refused(
-    name: str, expected: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "hiding.py").write_text(HIDING)
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(InputError) as refused:
-        begin(tmp_path / "run", *any_class(f"hiding.{name}"))
-    assert expected in str(refused.value)
-    begin(tmp_path / "without", *any_class(f"hiding.{name}"), "checkpoint.every=null")
-
-
-def test_a_class_of_ones_own_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "hiding.py").write_text(HIDING)
-    monkeypatch.syspath_prepend(tmp_path)
-    masked = [*any_class("sb3_contrib.MaskablePPO"), "+agent.arguments.n_steps=16"]
-    for words in (any_class("hiding.Kept"), [*masked, "agent.log_interval=3"]):
-        begin(tmp_path / "calm", *words)
-        calm = left_behind(tmp_path / "calm")
-        importlib.import_module("hiding").Kept.seen = 0  # as in a process of its own
-        stopped_after(2, tmp_path / "run", *words)
-        importlib.import_module("hiding").Kept.seen = 0
-        go_on(tmp_path / "run")
-        assert differences(left_behind(tmp_path / "run"), calm) == []
-        shutil.rmtree(tmp_path / "calm")
-        shutil.rmtree(tmp_path / "run")

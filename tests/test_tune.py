@@ -42,6 +42,7 @@ def studied(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = script("tune.py", *QUICK, "tune.trials=6", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert "held-out seeds" in done.stdout
+    assert "  train it: python scripts/train.py recipe=study\n" in done.stdout
     return folder
 
 
@@ -62,11 +63,14 @@ def test_a_search_leaves_a_row_per_trial_and_a_verdict(studied: Path) -> None:
     assert seeds == ["seed=3", "seed=4"]
 
 
-def test_its_winner_is_a_recipe_of_train_py(studied: Path) -> None:
-    arguments = ("--config-dir", "study/experiment/..", "experiment=winner", "hydra.run.dir=won")
-    done = script("train.py", *arguments, "recording.gif=false", cwd=studied)
+@pytest.mark.parametrize(
+    "words", [["recipe=study"], ["--config-dir", "study/experiment/..", "experiment=winner"]]
+)
+def test_its_winner_is_a_recipe_of_train_py(words: list[str], studied: Path) -> None:
+    out = f"hydra.run.dir=won by {len(words)}"
+    done = script("train.py", *words, out, "recording.gif=false", cwd=studied)
     assert done.returncode == 0, done.stderr
-    config = json.loads((studied / "won" / "manifest.json").read_text())["config"]
+    config = json.loads((studied / f"won by {len(words)}" / "manifest.json").read_text())["config"]
     winner = json.loads((studied / "study" / "study.json").read_text())["winner"]
     for key, value in winner["values"].items():
         assert config["agent"][key.removeprefix("agent.")] == value, key

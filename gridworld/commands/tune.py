@@ -40,7 +40,7 @@ keys, beside all of train.py's (defaults in conf/tune.yaml):
 examples:
   python scripts/tune.py agent=ppo env=four_rooms
       a hundred trials of three seeds; then
-  python scripts/train.py --config-dir runs/tune_ppo_four_rooms experiment=winner
+  python scripts/train.py recipe=runs/tune_ppo_four_rooms
   python scripts/tune.py experiment=maze_ppo tune.trials=300 tune.study=maze
       begins from a recipe
   python scripts/tune.py agent=ppo tune=mine --config-dir my_conf

@@ -29,11 +29,11 @@ from gridworld.config import TrainConfig
 from gridworld.errors import InputError
 from gridworld.experiment import register_schemas, slug, without_hydra
 from gridworld.hydra_errors import sentence
+from gridworld.recipe import CHOSEN, with_recipe
 from gridworld.training import check_settings
 from gridworld.tune.config import TuneConfig
 from gridworld.tune.space import Space
 
-CHOSEN = ("agent", "env", "observation")
 _SAMPLERS = ("tpe", "random")
 _PRUNERS = ("median", "hyperband", "none")
 _LARGEST_SEED = 2**32
@@ -96,7 +96,7 @@ def ask(source: Source, words: Sequence[str]) -> Asked:
     """Compose and check everything. Raises `InputError`."""
     register_schemas()
     try:
-        of_search, of_run = _divide(words)
+        of_search, of_run = _divide(with_recipe(words))
         whole = compose_in(source, "train", of_run)
         choices = {group: str(whole.hydra.runtime.choices[group]) for group in CHOSEN}
         base = without_hydra(whole)

@@ -1,9 +1,10 @@
 """The winner as a recipe: a yaml in the study's folder that train.py takes.
 
-    python scripts/train.py --config-dir runs/STUDY experiment=winner
+    python scripts/train.py recipe=runs/STUDY
 
 It names the agent, the world and the observation, and every value in which the winner differs from these.
-Where one of them is in a folder of the user's own, train.py needs that too.
+Where one of them is in a folder of the user's own, train.py needs that too. `gridworld.recipe` reads it as
+data. In a study of one's own, Hydra takes it as well: --config-dir runs/STUDY experiment=winner.
 """
 
 from __future__ import annotations
@@ -20,11 +21,12 @@ from gridworld.effects import Effect
 from gridworld.experiment import without_hydra
 from gridworld.files import write_text
 from gridworld.inside import make_inside
+from gridworld.recipe import IN_A_STUDY, overrides
 from gridworld.settings import ON_RESULT, having
 from gridworld.tune.asked import Source, compose_in
 
-RECIPE = "winner"
-EXPERIMENT = "experiment"  # the folder that it is in, in the study's
+EXPERIMENT, _FILE = IN_A_STUDY
+RECIPE = Path(_FILE).stem
 _OF_A_RECIPE = ON_RESULT - {Effect.SEED, Effect.MACHINE}
 
 
@@ -32,17 +34,18 @@ def write_recipe(
     folder: Path, source: Source, choices: Mapping[str, str], config: TrainConfig, about: str
 ) -> Path:
     """Write it and make sure that it comes to `config` again; returns its path."""
-    overrides = [f"{group}={choice}" for group, choice in choices.items()]
-    bare = without_hydra(compose_in(source, "train", overrides))
+    chosen = [f"{group}={choice}" for group, choice in choices.items()]
+    bare = without_hydra(compose_in(source, "train", chosen))
     values = _difference(_relevant(bare), _relevant(config))
     lines = ["# @package _global_", f"# {about}", "defaults:"]
     lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
     lines += ["  - _self_", "", OmegaConf.to_yaml(OmegaConf.create(values)) if values else ""]
-    path = make_inside(folder, EXPERIMENT) / f"{RECIPE}.yaml"
+    path = make_inside(folder, EXPERIMENT) / _FILE
     write_text(path, "\n".join(lines), durable=True)
     own = dataclasses.replace(source, own=(*source.own, folder))
-    again = without_hydra(compose_in(own, "train", [f"experiment={RECIPE}"]))
-    assert _relevant(again) == _relevant(config), f"{path} does not say what the winner is"
+    for words in ([f"experiment={RECIPE}"], overrides(path, trust=True)):
+        again = without_hydra(compose_in(own, "train", words))
+        assert _relevant(again) == _relevant(config), f"{path} does not say what the winner is"
     return path
 
 

@@ -20,6 +20,7 @@ from gridworld.errors import InputError
 from gridworld.files import make_folder, tidy
 from gridworld.inside import check_no_links
 from gridworld.lock import locked
+from gridworld.recipe import TRUST, overrides
 from gridworld.run import LOCK, MANIFEST, SWEEP_JSON, check_writable
 from gridworld.session import hparams
 from gridworld.sweep.report import shown
@@ -34,7 +35,7 @@ from gridworld.tune.crew import SearchError, run_crew
 from gridworld.tune.finals import Final, Finalist, finalists, missing, ranking
 from gridworld.tune.finals import work as finals_work
 from gridworld.tune.progress import SearchProgress
-from gridworld.tune.recipe import EXPERIMENT, RECIPE, write_recipe
+from gridworld.tune.recipe import EXPERIMENT, write_recipe
 from gridworld.tune.records import write_study
 from gridworld.tune.space import with_values
 from gridworld.tune.storage import begin, has_study, in_reach, open_storage, open_study, shown_url, standing
@@ -164,11 +165,20 @@ def _conclude(asked: Asked, study: optuna.Study, source: Source, ranked: list[Fi
         "confirmation": confirmed,
     }
     write_study(asked, study, outcome)
-    own = [search_path(source.own)] if source.own else []
-    line = shlex.join(
-        ["python", "scripts/train.py", "--config-dir", shown(asked.folder), f"experiment={RECIPE}", *own]
+    line = f"python scripts/train.py recipe={shown(asked.folder)} {shlex.join(_beside(recipe, source))}"
+    _tell(
+        asked, values, [confirmed["sentence"], f"  recipe: {shown(recipe)}", f"  train it: {line.rstrip()}"]
     )
-    _tell(asked, values, [confirmed["sentence"], f"  recipe: {shown(recipe)}", f"  train it: {line}"])
+
+
+def _beside(recipe: Path, source: Source) -> list[str]:
+    """What the recipe takes besides: folders of the user's own, and trust in classes of the user's own."""
+    words = [search_path(source.own)] if source.own else []
+    try:
+        overrides(recipe)
+    except InputError:
+        words.append(f"{TRUST}=true")
+    return words
 
 
 def _tuned(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:

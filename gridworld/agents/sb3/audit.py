@@ -5,24 +5,26 @@ put back: numbers, text, arrays, tensors, generators, optimisers, and containers
 `policy.q_net.q_net.0.weight`. What is neither such a value nor an object made of such values (an iterator, an
 open file, a C structure) could hide state, so a model that has one is refused before training begins.
 
-What is not looked for: global variables of the module that a class of one's own comes from.
+What classes of one's own and their functions hold is among it, and what has changed in the libraries' classes
+since training started (`gridworld.agents.sb3.classes`). Not looked for are global variables of the module
+that a class of one's own is from, what only they lead to, and attributes of the libraries' functions.
 """
 
 from __future__ import annotations
 
 import enum
 import functools
-import inspect
 import random
 import types
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from gridworld.agents.sb3.classes import Classes, Put, cannot_put, parts_of_function
 from gridworld.agents.sb3.values import Values
 from gridworld.errors import InputError
 from gridworld.state import State, StateError
@@ -34,25 +36,23 @@ _CODE = (
 _FIXED = (np.dtype, torch.device, torch.dtype, torch.layout, slice, range, enum.Enum)  # and immutable
 _CHANCE = (np.random.Generator, np.random.RandomState, random.Random, torch.Generator)
 _LEAVES = (Tensor, np.ndarray, torch.optim.Optimizer, *_CHANCE, *_FIXED)
-_LIBRARIES = ("builtins", "collections", "abc", "typing", "numpy", "torch", "gymnasium", "stable_baselines3")
-_OURS = "gridworld"
-
-Put = Callable[[Any], None]
 
 
 class Audit:
     """The values and objects of a model, by their paths. `constants` are made by whoever builds it."""
 
-    def __init__(self, model: Any, constants: list[Any], values: Values) -> None:
+    def __init__(self, model: Any, constants: list[Any], values: Values, classes: Classes) -> None:
         self.leaves: dict[str, tuple[Any, Put]] = {}
         self.objects: dict[str, str] = {}  # path: class
         self.same: dict[str, str] = {}  # path: that of the same array, tensor or container
         self._values = values
+        self._classes = classes
         self._constants = {id(constant) for constant in constants}
         self._holders: dict[str, Any] = {}
         self._seen: dict[int, str] = {}
+        self._looked_at: set[int] = set()  # classes
         self._keep: list[Any] = []  # what was made for looking, so that its id stays its own
-        self._visit(model, "", _cannot)
+        self._visit(model, "", cannot_put)
 
     def state(self) -> State:
         """Every value, and what the whole is made of."""
@@ -128,7 +128,8 @@ class Audit:
     def _parts(self, value: Any, path: str, put: Put) -> Iterator[tuple[str, Any, Put]]:
         """(name, value, what puts another there) of everything that an object or container holds."""
         if isinstance(value, _CODE):
-            yield from _parts_of_code(value)
+            self._holders[path] = value
+            yield from self._parts_of_class(value, path) if isinstance(value, type) else _parts_of_code(value)
             return
         kind = type(value)
         self.objects[path] = f"{kind.__module__}.{kind.__qualname__}"
@@ -151,46 +152,38 @@ class Audit:
             for name, child in vars(value).items():
                 if name not in derived:
                     yield name, child, functools.partial(setattr, value, name)
-            yield from _parts_of_class(kind)
+            yield from self._parts_of_class(kind, path)
         elif not isinstance(value, dict | list | tuple | deque):
             slots = [name for c in kind.__mro__ for name in _slots(c)]
-            if not slots:
+            if not slots and kind is not object:
                 raise _hidden(path, value, "what it holds cannot be seen")
             for name in slots:
                 if hasattr(value, name):
                     yield name, getattr(value, name), functools.partial(setattr, value, name)
 
+    def _parts_of_class(self, kind: type, path: str) -> Iterator[tuple[str, Any, Put]]:
+        """What a class keeps for all its objects, each class once."""
+        for base, parts in self._classes.parts(kind):
+            if id(base) in self._looked_at:
+                continue
+            self._looked_at.add(id(base))
+            holder = f"<{base.__qualname__}>"
+            self._holders[f"{path}.{holder}" if path else holder] = base
+            for name, value, put in parts:
+                yield f"{holder}.{name}", value, put
+
 
 def _parts_of_code(value: Any) -> Iterator[tuple[str, Any, Put]]:
     """What a function remembers: the variables it closes over, its own object, its arguments."""
     if isinstance(value, types.FunctionType):
-        for name, cell in zip(value.__code__.co_freevars, value.__closure__ or (), strict=True):
-            if name != "__class__":
-                yield f"<{name}>", cell.cell_contents, functools.partial(setattr, cell, "cell_contents")
+        yield from parts_of_function(value)
     elif isinstance(value, types.MethodType):
-        yield "__self__", value.__self__, _cannot
+        yield "__func__", value.__func__, cannot_put
+        yield "__self__", value.__self__, cannot_put
     elif isinstance(value, functools.partial):
-        yield "func", value.func, _cannot
-        yield "args", value.args, _cannot
-        yield "keywords", value.keywords, _cannot
-
-
-def is_of_a_library(kind: type) -> bool:
-    """Whether it is nobody's own class."""
-    return kind.__module__.partition(".")[0] in (*_LIBRARIES, _OURS, "sb3_contrib")
-
-
-def _parts_of_class(kind: type) -> Iterator[tuple[str, Any, Put]]:
-    """What classes of one's own keep for all their objects; the libraries' keep nothing."""
-    for base in kind.__mro__:
-        if is_of_a_library(base):
-            continue
-        for name, value in list(vars(base).items()):
-            hidden = name.startswith("__") or inspect.isroutine(value) or inspect.isdatadescriptor(value)
-            if not (
-                hidden or isinstance(value, (classmethod, staticmethod, type)) or name.startswith("_abc_")
-            ):
-                yield f"<{base.__qualname__}>.{name}", value, functools.partial(setattr, base, name)
+        yield "func", value.func, cannot_put
+        yield "args", value.args, cannot_put
+        yield "keywords", value.keywords, cannot_put
 
 
 def _slots(kind: type) -> tuple[str, ...]:
@@ -207,10 +200,6 @@ def _putter(container: Any, index: int, put: Put) -> Put:
 
         return replace
     return functools.partial(container.__setitem__, index)
-
-
-def _cannot(value: Any) -> None:
-    raise StateError("it cannot be replaced")
 
 
 def _has_state(value: Any) -> bool:

@@ -18,6 +18,7 @@ from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 
 from gridworld.agents.sb3.audit import Audit
+from gridworld.agents.sb3.classes import Classes
 from gridworld.agents.sb3.loop import Loop
 from gridworld.agents.sb3.values import Values
 from gridworld.chance import global_state, set_global_state
@@ -44,6 +45,7 @@ class Resting(BaseCallback):
         self._root = root
         self._loop: Loop | None = None
         self._objects: dict[str, str] = {}
+        self._classes = Classes()
         self.state: State | None = None  # to go on from
         self.goes_on = True
 
@@ -54,6 +56,11 @@ class Resting(BaseCallback):
     def _on_training_start(self) -> None:
         if self._at_rest is None and self.state is None:
             return
+        if self._loop is not None:
+            raise InputError(
+                "checkpoint.every: the model cannot be saved, its learn() starts training twice; train "
+                "without checkpoints by checkpoint.every=null"
+            )
         self._loop = Loop(self._root, 3, [self.model, self, self.model.env, self.training_env])
         audit = self._audit()
         audit.state()
@@ -65,6 +72,8 @@ class Resting(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         check_finite(self.model)
+        if self._loop is not None:
+            self._loop.check(2)
         if self._at_rest is not None:
             self._at_rest(self.model.num_timesteps)
 
@@ -99,7 +108,8 @@ class Resting(BaseCallback):
         }
 
     def _audit(self) -> Audit:
-        return Audit(self.model, [self._observation, self.model.logger.output_formats], self._values)
+        constants = [self._observation, self.model.logger.output_formats]
+        return Audit(self.model, constants, self._values, self._classes)
 
     def _restore(self, state: State) -> None:
         assert self._loop is not None

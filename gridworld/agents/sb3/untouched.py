@@ -19,7 +19,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from gridworld.agents.sb3.audit import is_of_a_library
+from gridworld.agents.sb3.classes import is_known
 from gridworld.agents.sb3.resting import set_torch_state, torch_state
 from gridworld.chance import global_state, set_global_state
 
@@ -48,7 +48,7 @@ def untouched(*classes: type) -> Iterator[None]:
 
 def _holders(classes: Iterable[type]) -> Iterator[Any]:
     """The modules of those that are nobody's library, and all classes that are defined there."""
-    own = [base for each in classes for base in each.__mro__ if not is_of_a_library(base)]
+    own = [base for each in classes for base in each.__mro__ if not is_known(base.__module__)]
     modules = dict.fromkeys(base.__module__ for base in own)
     found = [sys.modules[name] for name in modules if name in sys.modules]
     yield from found
