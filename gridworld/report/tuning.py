@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gridworld.data_files import LARGEST_CSV, as_text, read_bytes, sha256
+from gridworld.data_files import LARGEST_CSV, as_table, read_bytes, sha256
 from gridworld.errors import InputError
 from gridworld.report.find import real_folders
 from gridworld.report.table import Cell, Table
@@ -153,7 +153,7 @@ def _trials(file: Path, study: Mapping[str, Any]) -> str:
             f"{file}: is not the table that {STUDY_JSON} was written with; it was changed or damaged, or the "
             "search has gone on and not come to its end"
         )
-    return as_text(content, file)
+    return as_table(content, file)
 
 
 def _text(value: Any) -> str:
