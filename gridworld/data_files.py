@@ -109,6 +109,20 @@ def _is_deeper(content: Any, most: int) -> bool:
     return True
 
 
+def check_yaml(folder: Path) -> None:
+    """Raise `InputError` where a yaml file of a configuration's folder is no ordinary one, or far too large.
+
+    Hydra reads what it finds, through links too, to the end of what need not have any.
+    """
+    for depth in ("", "*/", "*/*/"):  # as deep as its groups are
+        for file in sorted(folder.glob(f"{depth}*.yaml")):
+            found = file.stat() if file.exists() else None
+            if found is not None and not stat.S_ISREG(found.st_mode):
+                raise InputError(f"{file}: is no ordinary file; give a yaml file, or take it away")
+            if found is not None and found.st_size > LARGEST_JSON:
+                raise InputError(f"{file}: is larger than {_size(LARGEST_JSON)}, which is no configuration")
+
+
 def check_no_link(path: Path) -> None:
     """Raise `InputError` where writing to `path` would follow a symbolic link out of the folder it is in."""
     if path.is_symlink():

@@ -26,6 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 from gridworld.agent_config import AGENT_SCHEMAS
 from gridworld.commands import run
 from gridworld.config import TrainConfig
+from gridworld.data_files import check_yaml
 from gridworld.early import at_work
 from gridworld.errors import EXIT_CODE, InputError
 from gridworld.hydra_errors import refuse_added_keys, sentence, unreadable_file
@@ -138,6 +139,8 @@ def main(conf: Path) -> None:
     os.environ[FULL_ERROR] = "1"  # so that Hydra raises its errors instead of printing them
     try:
         with at_work(), printing(), _place:
+            for folder in _own_folders(sys.argv[1:]):
+                check_yaml(folder)
             hydra.main(version_base="1.3", config_path=str(conf), config_name="train")(run_job)()
     except Exception as error:
         # Until a job begins, whatever goes wrong is the command line's or a yaml file's fault.

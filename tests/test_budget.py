@@ -1,19 +1,22 @@
 """The budget of memory that commands have for what they read, and the lines that tell of what takes long."""
 
+import json
 import re
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support import SHORT, train_in
+from support import SHORT, script, train_in
 
 from gridworld import budget
 from gridworld.budget import VARIABLE, BudgetError, check_memory, limited, patient
 from gridworld.commands import evaluate
-from gridworld.data_files import as_object, as_table
+from gridworld.data_files import as_object, as_table, check_yaml, sha256
 from gridworld.errors import InputError
+from gridworld.report.tuning import find_tunings
 from gridworld.saved_run import SavedRun
+from gridworld.sealing import sealed
 from gridworld.state import decode, encode
 
 
@@ -100,3 +103,35 @@ def test_a_command_is_limited_while_it_is_at_work(tmp_path: Path, monkeypatch: p
     monkeypatch.setenv(VARIABLE, "much")
     with pytest.raises(InputError, match="GRIDWORLD_BUDGET=much"):
         evaluate.main([str(tmp_path), "--episodes", "5"])
+
+
+@pytest.mark.parametrize("name", ["train.py", "tune.py"])
+def test_yaml_that_need_not_end_is_not_read(name: str, tmp_path: Path) -> None:
+    (tmp_path / "mine" / "experiment").mkdir(parents=True)
+    (tmp_path / "mine" / "experiment" / "winner.yaml").symlink_to("/dev/zero")
+    ended = script(name, "--config-dir", "mine", "experiment=winner", cwd=tmp_path)
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr == (
+        "error: mine/experiment/winner.yaml: is no ordinary file; give a yaml file, or take it away\n"
+    )
+
+
+def test_yaml_of_gigabytes_is_not_read(tmp_path: Path) -> None:
+    with (tmp_path / "a.yaml").open("wb") as file:
+        file.truncate(5 * 2**20)
+    with pytest.raises(InputError, match=r"a\.yaml: is larger than 4 MiB"):
+        check_yaml(tmp_path)
+
+
+def test_a_study_of_too_many_trials_is_told_and_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = "trial,status,score\n" + "".join(f"{number},done,0.5\n" for number in range(10_000))
+    (tmp_path / "trials.csv").write_text(table)
+    study = sealed({"study": "mine", "trials_sha256": sha256(table.encode())})
+    (tmp_path / "study.json").write_text(json.dumps(study))
+    monkeypatch.setenv(VARIABLE, "50MB")
+    with limited():
+        found, problems = find_tunings([tmp_path])
+    assert found == []
+    assert "trials.csv: would take about 60 MB of memory" in problems[0]
