@@ -23,6 +23,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
+from gridworld.budget import check_memory
 from gridworld.mdp import FloatArray
 
 _ACCURACY = 1e-11
@@ -83,6 +84,7 @@ class BandedElimination:
         self._order = reverse_cuthill_mckee(weights)
         ordered = weights[self._order][:, self._order].tocoo()
         size, band = len(leak), int(np.abs(ordered.row - ordered.col).max(initial=0))
+        check_memory(f"the exact solution of a world of {size:,} states", 8 * size * (2 * band + 1))
         stored = np.zeros((size, 2 * band + 1))
         stored[ordered.row, ordered.col - ordered.row + band] = ordered.data
         down, right = stored.strides

@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from gridworld.budget import BudgetError
 from gridworld.data_files import check_no_link, read_bytes
 from gridworld.errors import InputError
 from gridworld.files import remove, replacing, sync_folder
@@ -69,7 +70,9 @@ class Checkpoints:
         """Each file with what is in it, newest first."""
         for path in self.files():
             try:
-                yield path, decode(read_bytes(path, _MOST_BYTES))
+                yield path, decode(read_bytes(path, _MOST_BYTES), path)
+            except BudgetError:
+                raise
             except InputError as error:
                 yield path, StateError(str(error).removeprefix(f"{path}: "))
             except StateError as error:

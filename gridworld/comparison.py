@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gridworld.agents import family
 from gridworld.config import TrainConfig
-from gridworld.data_files import LARGEST_CSV, as_text
+from gridworld.data_files import LARGEST_CSV, as_table
 from gridworld.event_file import read_scalars
 from gridworld.flat import flat
 from gridworld.mdp import ACTION_NAMES, Mdp
@@ -46,7 +46,8 @@ def check_whole(then: Run, config: TrainConfig) -> None:
     for path in (then.curve_file, then.model_file, then.visits_file, then.summary_file):
         then.verify(path)
     if config.logging.tensorboard:
-        _points(then.folder)
+        for _ in _points(then.folder):
+            pass
 
 
 def compare(then: Run, now: Run, config: TrainConfig, mdp: Mdp) -> Iterator[Finding]:
@@ -74,7 +75,7 @@ def _curves(then: Run, now: Run) -> Finding:
 
 
 def _lines(run: Run) -> list[str]:
-    return as_text(run.read(run.curve_file, LARGEST_CSV), run.curve_file).splitlines()
+    return as_table(run.read(run.curve_file, LARGEST_CSV), run.curve_file).splitlines()
 
 
 def _cell(text: str | None) -> str:
@@ -132,20 +133,22 @@ def _without_clock(summary: dict[str, Any]) -> dict[str, Any]:
 
 def _scalars(then: Run, now: Run) -> Finding:
     part = "TensorBoard points"
-    before, after = (_points(run.folder) for run in (then, now))
-    if not before:
+    pairs = zip_longest(*(_points(run.folder) for run in (then, now)))
+    if next(_points(then.folder), None) is None:
         return Finding(part, "the run's folder has no event file any more", None)
-    for old, new in zip_longest(before, after):
+    count = 0
+    for old, new in pairs:
+        count += 1
         if old != new and not (old and new and old[:2] == new[:2] and math.isnan(old[2] + new[2])):
             tag, step, _ = old or new or ("", 0, 0.0)
             told = f"{old[2] if old else 'nothing'} then, {new[2] if new else 'nothing'} now"
             if old and new and old[:2] != new[:2]:
                 told = f"{old[0][:80]} at step {old[1]} then, {new[0]} at step {new[1]} now"
             return Finding(part, f"first at step {step}, {tag[:80]}: {told}", False)
-    return Finding(part, f"{len(before):,} points")
+    return Finding(part, f"{count:,} points")
 
 
-def _points(folder: Path) -> list[tuple[str, int, float]]:
-    """(tag, step, value) in the order in which they were written."""
+def _points(folder: Path) -> Iterator[tuple[str, int, float]]:
+    """(tag, step, value) in the order in which they were written, one after the other."""
     points = (point for path in sorted(folder.glob(EVENTS)) for point in read_scalars(path))
-    return [point for point in points if not point[0].startswith(CLOCK_TAGS)]
+    return (point for point in points if not point[0].startswith(CLOCK_TAGS))

@@ -20,23 +20,27 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from gridworld.budget import check_memory
 from gridworld.errors import InputError
 
 LARGEST_JSON = 4 * 2**20  # bytes
 LARGEST_CSV = 64 * 2**20
 _DEEPEST = 100  # levels of JSON; what reads it further may call itself for each
 _LARGEST_WHOLE = 2**63
+# Bytes of memory that a byte of text may come to as Python's objects: short strings in short lists.
+_AS_CSV, AS_JSON = 64, 48
 
 
-def read_bytes(path: Path, most: int) -> bytes:
-    """The whole content, at most `most` bytes."""
+def read_bytes(path: Path, most: int, copies: int = 1) -> bytes:
+    """The whole content, at most `most` bytes; so many copies of it there will be."""
     with _opened(path, most) as file:
+        check_memory(path, copies * os.fstat(file.fileno()).st_size)
         return file.read(most)
 
 
-def read_text(path: Path, most: int) -> str:
-    """UTF-8 text of at most `most` bytes."""
-    return as_text(read_bytes(path, most), path)
+def read_table(path: Path) -> str:
+    """The text of a table (CSV)."""
+    return as_table(read_bytes(path, LARGEST_CSV), path)
 
 
 def read_object(path: Path, most: int = LARGEST_JSON) -> dict[str, Any]:
@@ -52,8 +56,15 @@ def as_text(content: bytes, path: Path) -> str:
         raise InputError(f"{path}: cannot be read, it is no UTF-8 text") from None
 
 
+def as_table(content: bytes, path: Path) -> str:
+    """The text of a table (CSV), which is to be taken apart into rows and cells."""
+    check_memory(path, _AS_CSV * len(content))
+    return as_text(content, path)
+
+
 def as_object(content: bytes, path: Path) -> dict[str, Any]:
     """The JSON object in the bytes of a file, which an error names."""
+    check_memory(path, AS_JSON * len(content))
     text = as_text(content, path)
     try:
         found = json.loads(text, parse_constant=_refuse, parse_float=_real, parse_int=_whole)
@@ -96,6 +107,20 @@ def _is_deeper(content: Any, most: int) -> bool:
         if not level:
             return False
     return True
+
+
+def check_yaml(folder: Path) -> None:
+    """Raise `InputError` where a yaml file of a configuration's folder is no ordinary one, or far too large.
+
+    Hydra reads what it finds, through links too, to the end of what need not have any.
+    """
+    for depth in ("", "*/", "*/*/"):  # as deep as its groups are
+        for file in sorted(folder.glob(f"{depth}*.yaml")):
+            found = file.stat() if file.exists() else None
+            if found is not None and not stat.S_ISREG(found.st_mode):
+                raise InputError(f"{file}: is no ordinary file; give a yaml file, or take it away")
+            if found is not None and found.st_size > LARGEST_JSON:
+                raise InputError(f"{file}: is larger than {_size(LARGEST_JSON)}, which is no configuration")
 
 
 def check_no_link(path: Path) -> None:

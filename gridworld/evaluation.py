@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gridworld.budget import patient
 from gridworld.chain import Chain, Outcome, check_policy, one_hot_policy
 from gridworld.chance import independent_generator
 from gridworld.layout import Cell
@@ -80,9 +81,11 @@ class Judge:
     def __init__(self, mdp: Mdp, gamma: float, max_episode_steps: int) -> None:
         self.mdp = mdp
         self.max_episode_steps = max_episode_steps
-        self.solution: Solution = value_iteration(mdp, gamma)
+        with patient(f"solving the world, {mdp.num_states:,} states"):
+            self.solution: Solution = value_iteration(mdp, gamma)
         self.optimal_value = self._at_start(self.solution.v)
-        self.optimum: Outcome = Chain(mdp, self.optimal_policy()).outcome(max_episode_steps)
+        with patient(f"following the optimum for up to {max_episode_steps:,} steps"):
+            self.optimum: Outcome = Chain(mdp, self.optimal_policy()).outcome(max_episode_steps)
 
     def optimal_policy(self) -> FloatArray:
         """(S, A), deterministic: the first of the optimal actions."""

@@ -8,6 +8,7 @@ pure Python, which takes the interpreter from whoever trains: as long as two eva
 
 from __future__ import annotations
 
+import io
 import os
 import socket
 import struct
@@ -21,11 +22,12 @@ from google.protobuf.message import DecodeError
 from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.compat.proto.summary_pb2 import Summary
 
-from gridworld.data_files import read_bytes
+from gridworld.budget import check_memory
+from gridworld.data_files import open_ordinary
 from gridworld.errors import InputError
 from gridworld.journal import Journal
 
-LARGEST = 2**28  # bytes of a file that is read
+_AS_EVENT = 48  # bytes of memory that a byte of a record may come to, in a list of empty values
 _HEADER, _FOOTER = 12, 4  # bytes before and after an event
 _VERSION = "brain.Event:2"
 _MASK_DELTA = 0xA282EAD8
@@ -34,27 +36,34 @@ _MASK_DELTA = 0xA282EAD8
 def read_scalars(path: Path) -> Iterator[tuple[str, int, float]]:
     """(tag, step, value) of every scalar, in the order in which they were written.
 
-    Raises `InputError` for a file that is too large, cut off or damaged; a record's length is believed only
-    as far as there are bytes.
+    One after the other, without holding the file. Raises `InputError` for one that is cut off or damaged; a
+    record's length is believed only as far as there are bytes.
     """
-    content = memoryview(read_bytes(path, LARGEST))
-    start = 0
-    while start < len(content):
-        frame = bytes(content[start : start + _HEADER])
-        if len(frame) < _HEADER or _checksum(frame[:8]) != frame[8:]:
-            raise InputError(f"{path}: is damaged or cut off after {start:,} bytes")
-        end = start + _HEADER + struct.unpack("<Q", frame[:8])[0]
-        record, checksum = bytes(content[start + _HEADER : end]), bytes(content[end : end + _FOOTER])
-        try:
-            if _checksum(record) != checksum:
-                raise DecodeError
-            event = Event.FromString(record)
-        except DecodeError:
-            raise InputError(f"{path}: is damaged or cut off after {start:,} bytes") from None
-        for value in event.summary.value:
-            if value.HasField("simple_value"):
-                yield value.tag, event.step, value.simple_value
-        start = end + _FOOTER
+    with open_ordinary(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        while (start := file.tell()) < size:
+            try:
+                event = Event.FromString(_record(file, size, path))
+            except DecodeError:
+                raise InputError(f"{path}: is damaged or cut off after {start:,} bytes") from None
+            for value in event.summary.value:
+                if value.HasField("simple_value"):
+                    yield value.tag, event.step, value.simple_value
+
+
+def _record(file: io.BufferedReader, size: int, path: Path) -> bytes:
+    """The next record of a file of that size. Raises `DecodeError`."""
+    frame = file.read(_HEADER)
+    if len(frame) < _HEADER or _checksum(frame[:8]) != frame[8:]:
+        raise DecodeError
+    length: int = struct.unpack("<Q", frame[:8])[0]
+    if length > size - file.tell():
+        raise DecodeError
+    check_memory(path, _AS_EVENT * length)
+    record = file.read(length)
+    if _checksum(record) != file.read(_FOOTER):
+        raise DecodeError
+    return record
 
 
 class EventFile:

@@ -26,6 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 from gridworld.agent_config import AGENT_SCHEMAS
 from gridworld.commands import run
 from gridworld.config import TrainConfig
+from gridworld.data_files import check_yaml
 from gridworld.early import AtWork
 from gridworld.errors import EXIT_CODE, FolderLostError, InputError
 from gridworld.files import make_folder, tidy
@@ -144,6 +145,8 @@ def main(conf: Path) -> None:
     try:
         with AtWork(), printing(), _place:
             _take_in_recipe()
+            for folder in _own_folders(sys.argv[1:]):
+                check_yaml(folder)
             hydra.main(version_base="1.3", config_path=str(conf), config_name="train")(run_job)()
     except Exception as error:
         # Until a job begins, whatever goes wrong is the command line's or a yaml file's fault.

@@ -17,6 +17,8 @@ cliff, there is one start to be sent back to.
 from __future__ import annotations
 
 import operator
+import os
+import stat
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -193,8 +195,9 @@ def _read(layout: str | PathLike[str]) -> Layout:
     path = Path(given)
     try:
         # A row may end in blanks or \r\n; far more than that is no map, and is not read.
-        with path.open("rb") as file:
-            raw = file.read(4 * MAX_CELLS + 1)
+        with open(path, "rb", opener=_without_waiting) as file:
+            is_ordinary = stat.S_ISREG(os.fstat(file.fileno()).st_mode)
+            raw = file.read(4 * MAX_CELLS + 1) if is_ordinary else b""
     except (FileNotFoundError, NotADirectoryError, ValueError):
         shipped = ", ".join(shipped_layouts())
         raise InputError(f"layout {given!r}: neither a shipped layout ({shipped}) nor a file") from None
@@ -202,12 +205,19 @@ def _read(layout: str | PathLike[str]) -> Layout:
         raise InputError(
             f"layout {given!r}: the map cannot be read ({error.strerror}); give a readable text file"
         ) from None
+    if not is_ordinary:  # a pipe or a device, which need not end
+        raise InputError(f"layout {given!r}: is no ordinary file; give a readable text file")
     if len(raw) > 4 * MAX_CELLS:
         raise InputError(f"{given}: the map is too large; at most {MAX_CELLS} cells fit")
     try:
         return parse(raw.decode("utf-8-sig"), name=given)
     except UnicodeDecodeError as error:
         raise InputError(f"{given}: not a text file (byte {error.start + 1} is not UTF-8)") from None
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    """Open a file; a pipe too is opened at once, whether somebody writes into it or not."""
+    return os.open(path, flags | os.O_NONBLOCK)
 
 
 def _check_size(name: str, num_rows: int, num_cols: int) -> None:

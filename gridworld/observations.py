@@ -23,6 +23,7 @@ from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
 from gridworld import render as drawing
+from gridworld.budget import check_memory
 from gridworld.errors import InputError
 from gridworld.layout import positive_int
 from gridworld.mdp import IntArray, Mdp
@@ -30,6 +31,7 @@ from gridworld.mdp import IntArray, Mdp
 IMAGE_CELL_SIZE = 8  # pixels; 5x6 cells and their border make 56 x 64, enough for SB3's NatureCNN
 
 _MAX_TABLE_BYTES = 2**30
+_OF_A_FRAME = 140  # bytes that a space, a sample of it and a network make of each of a frame's
 _SMALL_TABLE_BYTES = 2**24  # up to here a table is kept, beyond it one-hot rows are made when asked for
 
 
@@ -85,8 +87,10 @@ def image(mdp: Mdp, cell_size: int = IMAGE_CELL_SIZE) -> ObservationTable:
             f"observation image: {mdp.num_states} frames of {width} x {height} pixels take "
             f"{size / 2**30:.1f} GiB, more than 1; take a cell_size below {cell_size} or another observation"
         )
-    frames = np.stack([drawing.draw_frame(mdp, state, cell_size) for state in range(mdp.num_states)])
-    pixels = np.ascontiguousarray(frames.transpose(0, 3, 1, 2))
+    check_memory(f"observation image, cells of {cell_size} pixels", size + _OF_A_FRAME * 3 * width * height)
+    pixels = np.empty((mdp.num_states, 3, height, width), dtype=np.uint8)
+    for state, frame in enumerate(pixels):
+        frame[...] = drawing.draw_frame(mdp, state, cell_size).transpose(2, 0, 1)
     return _table("image", spaces.Box(0, 255, pixels.shape[1:], np.uint8), mdp, pixels)
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.agent_config import LINEAR, AgentConfig, parse_schedule
+from gridworld.budget import patient
 from gridworld.checkpoint import FOLDER, MOST_STEPS, Checkpoints, steps_of
 from gridworld.config import TrainConfig
 from gridworld.errors import InputError
@@ -99,7 +100,8 @@ class Unfinished:
         config.total_timesteps = old_total if total_timesteps is None else total_timesteps
         mdp = check_settings(config, lambda env: make_mdp(env, self.layout))
         self._look_at_map()
-        state = self._newest(identity(config, mdp.layout.text()))
+        with patient(f"reading the checkpoints of {run.folder}"):
+            state = self._newest(identity(config, mdp.layout.text()))
         differs = [] if state is None else _differences(state["environment"], config.agent, run, anyway)
         if state is None:
             self._check_anew(total_timesteps, old_total)

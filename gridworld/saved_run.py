@@ -68,8 +68,9 @@ class SavedRun:
             self.mdp, self.config.observation.kind, self.config.observation.cell_size
         )
         self.run.verify(self.run.model_file)
+        few = dataclasses.replace(self.config, n_envs=min(self.config.n_envs, 2))
         agent = family(self.config.agent).build(
-            self.config.agent, make_seat(self.config, self.mdp, observation)
+            self.config.agent, dataclasses.replace(make_seat(few, self.mdp, observation), only_asked=True)
         )
         agent.load(self.run.model_file)
         return agent.beliefs()

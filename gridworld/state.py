@@ -24,6 +24,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gridworld.budget import BudgetError, check_memory
+from gridworld.data_files import AS_JSON
+
 State = dict[str, Any]
 
 MAGIC = b"gridworld state\x01"
@@ -62,10 +65,10 @@ def encode(state: State, compress: bool = False) -> list[bytes | memoryview]:
     return [MAGIC, checksum.digest(), *pieces]
 
 
-def decode(data: bytes) -> State:
+def decode(data: bytes, name: object = "a state") -> State:
     """The state in these bytes. Raises `StateError` for any others.
 
-    Arrays are as large as they say; memory is used only for what is not zero in them.
+    `name` is for a `BudgetError`. Arrays are as large as they say; memory is used only for what is not zero.
     """
     if data[: len(MAGIC)] != MAGIC:
         raise StateError("it does not begin as a state does")
@@ -77,20 +80,13 @@ def decode(data: bytes) -> State:
         (length,) = struct.unpack_from("<Q", body)
         if length > min(_MOST_JSON, len(body) - 8):
             raise StateError("its parts do not fit together")
+        check_memory(name, AS_JSON * length)
         content = json.loads(bytes(body[8 : 8 + length]))
-        arrays = _read_arrays(content["arrays"], body[8 + length :])
+        arrays = _read_arrays(content["arrays"], body[8 + length :], name)
         state = _unfold(content["state"], arrays)
-    except StateError:
+    except (StateError, BudgetError):
         raise
-    except (
-        ValueError,
-        TypeError,
-        LookupError,
-        RecursionError,
-        MemoryError,
-        struct.error,
-        zlib.error,
-    ) as error:
+    except _NONSENSE as error:
         raise StateError(f"its content makes no sense ({type(error).__name__})") from None
     if not isinstance(state, dict):
         raise StateError("its content is no state")
@@ -120,7 +116,10 @@ def fitting() -> Iterator[None]:
         yield
     except StateError:
         raise
-    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+    except (
+        *(ArithmeticError, AttributeError, LookupError, MemoryError),
+        *(RuntimeError, TypeError, ValueError),
+    ) as error:
         raise StateError(f"{type(error).__name__}: {error}") from error
 
 
@@ -177,7 +176,7 @@ def _unpacked(body: memoryview) -> memoryview:
     return memoryview(content)
 
 
-def _read_arrays(table: list[Any], data: memoryview) -> list[NDArray[Any]]:
+def _read_arrays(table: list[Any], data: memoryview, name: object) -> list[NDArray[Any]]:
     arrays, start, total = [], 0, 0
     for code, shape, stored in table:
         if code not in _DTYPES or len(shape) > _MOST_DIMENSIONS:
@@ -189,6 +188,7 @@ def _read_arrays(table: list[Any], data: memoryview) -> list[NDArray[Any]]:
         total += nbytes
         if total > _MOST_MEMORY or stored > nbytes or start + stored > len(data):
             raise StateError("it has more in it than fits")
+        check_memory(name, total + len(data))
         whole = np.zeros(nbytes, dtype=np.uint8)
         whole[:stored] = np.frombuffer(data[start : start + stored], dtype=np.uint8)
         arrays.append(whole.view(dtype).reshape(shape))

@@ -44,16 +44,17 @@ class Hostile:
     spoil: Spoil  # (run, base)
     agent: str  # whose run it is made of
     words: str  # of evaluate's answer
+    megabytes: int = 200  # that a command may take
 
 
 CATALOGUE: list[Hostile] = []
 
 
-def hostile(words: str, agent: str = "sarsa") -> Callable[[Spoil], Spoil]:
+def hostile(words: str, agent: str = "sarsa", megabytes: int = 200) -> Callable[[Spoil], Spoil]:
     """Put the function into the catalogue; evaluate's answer has `words`, or is as for a good run."""
 
     def add(spoil: Spoil) -> Spoil:
-        CATALOGUE.append(Hostile(spoil.__name__, spoil, agent, words))
+        CATALOGUE.append(Hostile(spoil.__name__, spoil, agent, words, megabytes))
         return spoil
 
     return add
@@ -444,7 +445,7 @@ def a_trillion_environments(run: Path, base: Path) -> None:
     manifest(run, lambda content: content["config"].update(n_envs=10**12))
 
 
-@hostile("do not fit into memory", "dqn")
+@hostile(FINE, "dqn")
 def a_replay_of_a_trillion_steps(run: Path, base: Path) -> None:
     agent_has(run, buffer_size=10**13)
 
@@ -457,6 +458,44 @@ def a_network_of_a_trillion_weights(run: Path, base: Path) -> None:
 @hostile("env.max_episode_steps=1000000000000: must be at most")
 def an_episode_of_a_trillion_steps(run: Path, base: Path) -> None:
     manifest(run, lambda content: content["config"]["env"].update(max_episode_steps=10**12))
+
+
+def seen_as_image(run: Path, cell_size: int) -> None:
+    """Have the agent see frames."""
+    agent_has(run, policy="CnnPolicy")
+    manifest(run, lambda c: c["config"]["observation"].update(kind="image", cell_size=cell_size))
+
+
+@hostile("its network: would take about", "qrdqn", 1000)
+def ten_million_quantiles(run: Path, base: Path) -> None:
+    agent_has(run, arguments={"policy_kwargs": {"n_quantiles": 10_000_000}})
+
+
+@hostile("image, cells of 400 pixels: would take about", "dqn", 1000)
+def images_of_cells_of_400_pixels(run: Path, base: Path) -> None:
+    seen_as_image(run, 400)
+
+
+@hostile("its network: would take about", "dqn", 1000)
+def images_that_fill_the_memory(run: Path, base: Path) -> None:
+    seen_as_image(run, 4)
+    manifest(run, lambda c: c.update(layout=["S" + "." * 64 + "G"] * 66))
+
+
+@hostile("its network: would take about", "dqn", 1000)
+def sixteen_layers_of_4096(run: Path, base: Path) -> None:
+    manifest(run, lambda c: c["config"]["agent"]["policy_kwargs"].update(net_arch=[4096] * 16))
+
+
+@hostile("its network, asked about every state: would take about", "qrdqn", 1000)
+def many_quantiles_of_every_state(run: Path, base: Path) -> None:
+    agent_has(run, arguments={"policy_kwargs": {"n_quantiles": 20_000}})
+    manifest(run, lambda c: c.update(layout=["S" + "." * 62 + "G"] * 64))
+
+
+@hostile(FINE, "dqn", 1000)
+def a_replay_of_gigabytes(run: Path, base: Path) -> None:
+    agent_has(run, buffer_size=500_000_000)
 
 
 # ---- the manifest as a file --------------------------------------------------------------------------------
@@ -613,6 +652,30 @@ def event_of_an_exabyte(run: Path, base: Path) -> None:
     next(run.glob("events*")).write_bytes(length + _checksum(length) + b"x")
 
 
+def record(content: bytes) -> bytes:
+    """A record of an event file."""
+    length = struct.pack("<Q", len(content))
+    return b"".join([length, _checksum(length), content, _checksum(content)])
+
+
+@hostile(FINE, megabytes=1000)
+def event_of_many_empty_values(run: Path, base: Path) -> None:
+    values = b"\n\0" * 20_000_000  # a protocol buffer's field 1, empty
+    length = b"\x80\xb4\x89\x13"  # 40,000,000 in sevens of bits
+    next(run.glob("events*")).write_bytes(record(b"\x2a" + length + values))
+
+
+@hostile(FINE, megabytes=1000)
+def a_million_events(run: Path, base: Path) -> None:
+    event = record(b"\x10\x01\x2a\x0a\n\x08\n\x01a\x15\0\0\x80\x3f")  # step 1, a = 1
+    next(run.glob("events*")).write_bytes(event * 1_000_000)
+
+
+@hostile(FINE, megabytes=1000)
+def curve_of_millions_of_short_rows(run: Path, base: Path) -> None:
+    seal(run, "curve.csv", b"ab,12\n" * 10_000_000)
+
+
 @hostile(FINE)
 def events_that_wait_for_a_writer(run: Path, base: Path) -> None:
     os.mkfifo(run / "events.out.tfevents.0.a.1")
@@ -689,6 +752,27 @@ def checkpoint_that_acts_on_the_terminal(run: Path, base: Path) -> None:
     body = b"-" + struct.pack("<Q", len(tree)) + tree + b"0"
     content = MAGIC + hashlib.sha256(body).digest() + body
     (run / "checkpoints" / "999999999999.state").write_bytes(content)
+
+
+def forged_checkpoint(run: Path, text: bytes, rest: bytes = b"") -> None:
+    """A newest one of this JSON and these bytes of arrays, whose checksum is right."""
+    body = b"-" + struct.pack("<Q", len(text)) + text + rest
+    (run / "checkpoints" / "999999999999.state").write_bytes(MAGIC + hashlib.sha256(body).digest() + body)
+
+
+@hostile(FINE, megabytes=1000)
+def checkpoint_of_seven_gigabytes(run: Path, base: Path) -> None:
+    sparse(run / "checkpoints" / "999999999999.state", 7 * 2**30)
+
+
+@hostile(FINE, megabytes=1000)
+def checkpoint_of_sixty_megabytes_of_json(run: Path, base: Path) -> None:
+    forged_checkpoint(run, b'{"arrays":[],"state":{"a":[' + b"[],[]," * 10_000_000 + b"[]]}}")
+
+
+@hostile(FINE, megabytes=1000)
+def checkpoint_of_zeros_that_are_left_out(run: Path, base: Path) -> None:
+    forged_checkpoint(run, b'{"arrays":[["<f8",[30000000000],0]],"state":{"a":{"@":0}}}')
 
 
 @hostile("resumed must be a list of when the run went on")

@@ -1,6 +1,7 @@
 """A map is read exactly, and what is wrong with one is said where it stands."""
 
 import itertools
+import os
 import pickle
 from pathlib import Path
 
@@ -104,6 +105,14 @@ def test_a_missing_map_lists_the_shipped_ones(name):
     with pytest.raises(InputError, match="shipped") as error:
         load(name)
     assert all(shipped in str(error.value) for shipped in SHIPPED)
+
+
+def test_what_need_not_end_is_no_map(tmp_path):
+    (tmp_path / "link").symlink_to("/dev/zero")
+    os.mkfifo(tmp_path / "pipe")
+    for path in ("/dev/zero", tmp_path / "link", tmp_path / "pipe"):
+        with pytest.raises(InputError, match="is no ordinary file"):
+            load(path)
 
 
 def test_a_directory_is_no_map(tmp_path):

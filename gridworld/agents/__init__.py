@@ -53,6 +53,7 @@ class Seat:
     device: str
     threads: int = 1  # of the agent's numerical library
     write_scalars: WriteScalars | None = None  # takes the agent's own training metrics
+    only_asked: bool = False  # it will not learn, and needs no room for what it would meet
 
 
 class Agent(Protocol):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
+from gridworld.budget import limited, patient
 from gridworld.columns import aligned
 from gridworld.commands import parser_for_a_run
 from gridworld.env import GridWorldEnv
@@ -19,6 +20,7 @@ from gridworld.terminal import printable
 _MOST_EPISODES = 1_000_000
 
 
+@limited()
 def main(arguments: Sequence[str]) -> None:
     """Print the scores."""
     options = _parser().parse_args(arguments)
@@ -30,16 +32,19 @@ def main(arguments: Sequence[str]) -> None:
         raise InputError(
             "--render human: there is no display to open a window on; set DISPLAY, or use record.py"
         )
-    saved = SavedRun(options.run, options.trust)
-    judge = saved.judge(options.layout)
-    policy = choose_policy(saved.beliefs(), options.policy)
+    with patient(f"evaluating {options.run}"):
+        saved = SavedRun(options.run, options.trust)
+        judge = saved.judge(options.layout)
+        policy = choose_policy(saved.beliefs(), options.policy)
     if options.render == "human":
         _show(judge, policy, options.seed)
-    score = judge.score(policy)
-    sampled = judge.sample(policy, options.episodes, options.seed)
+    with patient(f"evaluating {options.run}"):
+        score = judge.score(policy)
+        sampled = judge.sample(policy, options.episodes, options.seed)
+        table, verdict = _table(judge, policy, score, sampled), _verdict(judge, policy, score)
     print(printable(f"{options.policy} policy of {options.run} on {judge.mdp.layout.name}"))
-    print(_table(judge, policy, score, sampled))
-    print(_verdict(judge, policy, score))
+    print(table)
+    print(verdict)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -7,6 +7,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from gridworld.budget import limited, patient
 from gridworld.columns import aligned
 from gridworld.sweep.folder import open_sweep
 from gridworld.sweep.report import counts_text
@@ -14,6 +15,7 @@ from gridworld.sweep.table import JOBS_CSV, STATUSES, Row, Table
 from gridworld.terminal import printable
 
 
+@limited()
 def main(arguments: Sequence[str]) -> None:
     """Print a row per job, in the order in which they were asked for, and their number."""
     options = _parser().parse_args(arguments)
@@ -21,7 +23,8 @@ def main(arguments: Sequence[str]) -> None:
     table = Table(folder.path)
     entries = folder.entries.values()
     may_write = os.access(folder.path, os.W_OK)
-    rows = table.put_right(entries) if may_write else table.look(entries)
+    with patient(f"reading the jobs of {options.sweep}"):
+        rows = table.put_right(entries) if may_write else table.look(entries)
     shown = [row for row in rows.values() if options.status in (None, row.status)]
     with_error = {row.job for row in shown if row.error}
     verified = table.from_runs(entry for entry in entries if entry.job in with_error)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gridworld import render as drawing
+from gridworld.budget import limited, patient
 from gridworld.chain import one_hot_policy
 from gridworld.config import EnvConfig, EvaluationConfig
 from gridworld.errors import InputError
@@ -24,11 +25,13 @@ _TICKS = 5  # frames between two steps of an agent that walks on alone
 _WORLD = ("num_rows", "num_cols", "slip", "step_reward", "goal_reward", "trap_reward")
 
 
+@limited()
 def main(arguments: Sequence[str]) -> None:
     """Open the window and play until it is closed."""
     options = _parser().parse_args(arguments)
     _check(options)
-    game = _game(options)
+    with patient("solving the world"):
+        game = _game(options)
     mdp, boards = game.person.judge.mdp, len(game.players)
     cell_size = options.cell_size or drawing.fitting_cell_size(mdp, _WIDEST_BOARD if boards == 1 else 640)
     drawing.frame_size(mdp, cell_size)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gridworld import record
 from gridworld.agents import Beliefs
+from gridworld.budget import limited, patient
 from gridworld.commands import parser_for_a_run
 from gridworld.data_files import check_no_link
 from gridworld.errors import InputError
@@ -26,10 +27,16 @@ from gridworld.terminal import printable
 MAPS = ("policy", "q_error", "visits")
 
 
+@limited()
 def main(arguments: Sequence[str]) -> None:
     """Write the files and name them."""
     options = _parser().parse_args(arguments)
     _check(options)
+    with patient(f"recording {options.run}"):
+        _record(options)
+
+
+def _record(options: argparse.Namespace) -> None:
     folder: Path = options.out or options.run / "recording"
     saved = SavedRun(options.run, options.trust)
     check_no_link(folder)

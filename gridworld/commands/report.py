@@ -13,6 +13,7 @@ import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 
+from gridworld.budget import limited, patient
 from gridworld.errors import InputError
 from gridworld.report.report import Report, gather
 from gridworld.report.writing import MARKERS, check_markers, check_out, write_readme, write_report
@@ -22,6 +23,7 @@ from gridworld.terminal import printable
 _MOST_TOLD = 20  # sentences on standard error; the page has them all
 
 
+@limited()
 def main(arguments: Sequence[str]) -> None:
     """Write the report and name it."""
     options = _parser().parse_args(arguments)
@@ -33,8 +35,10 @@ def main(arguments: Sequence[str]) -> None:
     check_out(out)
     if options.readme is not None:
         check_markers(options.readme)
-    report = gather(options.runs, options.seed)
-    page = write_report(report, out)
+    with patient("reading the runs"):
+        report = gather(options.runs, options.seed)
+    with patient("writing the report"):
+        page = write_report(report, out)
     if options.readme is not None:
         write_readme(report, options.readme)
     _tell(report)

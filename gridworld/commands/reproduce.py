@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from gridworld.budget import limited, patient
 from gridworld.comparison import Finding, check_whole, compare
 from gridworld.config import RecordingConfig, TrainConfig
 from gridworld.errors import InputError
@@ -31,13 +32,15 @@ from gridworld.training import Interrupted, make_mdp
 DIFFERENT = 1  # exit code
 
 
+@limited()
 def main(arguments: Sequence[str]) -> None:
     """Train again and print the comparison. Ends the program with `DIFFERENT` if anything differs."""
     options = _parser().parse_args(arguments)
     then = open_run(options.run)
     config = settings_of(then, options.trust)
     layout = layout_of(then, config)
-    check_whole(then, config)  # training may take hours
+    with patient(f"reading {options.run}"):
+        check_whole(then, config)  # training may take hours
     *shorter, _ = lengths(then, config)
     if options.keep is not None:
         check_inside(options.keep, "--keep")
@@ -96,7 +99,8 @@ def _again(then: Run, now: Run, config: TrainConfig, layout: Layout, trust: bool
     if mistake is not None:
         print(f"  it did not come to its end this time: {printable(mistake)}")
         return False
-    findings = list(compare(then, now, config, mdp))
+    with patient("comparing"):
+        findings = list(compare(then, now, config, mdp))
     for finding in findings:
         _tell(finding)
     verdicts = {finding.same for finding in findings}

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from gridworld.budget import limited
 from gridworld.errors import InputError
 from gridworld.run import alone_in, check_inside, check_is_run
 from gridworld.terminal import result_is_in_files
@@ -19,6 +20,7 @@ from gridworld.terminal import result_is_in_files
 KEY = "resume"
 
 
+@limited()
 def main(arguments: Sequence[str]) -> None:
     """Go on, and tell the result as a new run would."""
     result_is_in_files()

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gridworld.data_files import check_yaml
 from gridworld.errors import InputError
 from gridworld.manual import choices
 from gridworld.terminal import printable, result_is_in_files, tell_error
@@ -58,6 +59,8 @@ def main(arguments: Sequence[str]) -> None:
         raise InputError("tune.py: optuna is not installed; pip install 'gridworld[tune]'")
     if options.config_dir is not None and not options.config_dir.is_dir():
         raise InputError(f"--config-dir {options.config_dir}: no such folder")
+    if options.config_dir is not None:
+        check_yaml(options.config_dir)
     from gridworld.tune.asked import Source, ask
 
     source = Source(conf, (options.config_dir,) if options.config_dir else ())

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gridworld.data_files import LARGEST_CSV, as_text
+from gridworld.data_files import LARGEST_CSV, as_table
 from gridworld.errors import InputError
 from gridworld.mdp import FloatArray
 from gridworld.run import Run
@@ -24,7 +24,7 @@ _OPTIONAL = (SAMPLED_RETURN, ONLINE)
 def read_curve(run: Run) -> dict[str, FloatArray]:
     """The columns of the learning curve that are needed, (evaluations,) each."""
     path = run.curve_file
-    lines = as_text(run.read(path, LARGEST_CSV), path).splitlines()
+    lines = as_table(run.read(path, LARGEST_CSV), path).splitlines()
     if lines and lines[0].count(",") >= _MOST_COLUMNS:
         raise InputError(f"{path}: has more than {_MOST_COLUMNS} columns; is it of another version?")
     try:

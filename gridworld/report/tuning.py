@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gridworld.data_files import LARGEST_CSV, as_text, read_bytes, sha256
+from gridworld.budget import check_memory
+from gridworld.data_files import LARGEST_CSV, as_table, read_bytes, sha256
 from gridworld.errors import InputError
 from gridworld.report.find import real_folders
 from gridworld.report.table import Cell, Table
@@ -21,6 +22,7 @@ from gridworld.terminal import plain
 STUDY_JSON, TRIALS_CSV = "study.json", "trials.csv"
 TRIALS_SUM = "trials_sha256"  # in the former, of the latter
 _SCORED = ("done", "pruned")
+_OF_A_TRIAL = 6000  # bytes of memory that one comes to in the tables and figures of a page
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,7 @@ def _read(folder: Path) -> Tuning:
     file = folder / STUDY_JSON
     content = read_sealed(file)
     table = _trials(folder / TRIALS_CSV, content)
+    check_memory(folder / TRIALS_CSV, _OF_A_TRIAL * table.count("\n"))
     try:
         winner = content["winner"]
         space = {str(key): _dimension(dimension) for key, dimension in content["space"].items()}
@@ -153,7 +156,7 @@ def _trials(file: Path, study: Mapping[str, Any]) -> str:
             f"{file}: is not the table that {STUDY_JSON} was written with; it was changed or damaged, or the "
             "search has gone on and not come to its end"
         )
-    return as_text(content, file)
+    return as_table(content, file)
 
 
 def _text(value: Any) -> str:

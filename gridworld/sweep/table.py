@@ -15,7 +15,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from gridworld.data_files import LARGEST_CSV, read_text
+from gridworld.data_files import read_table
 from gridworld.errors import InputError
 from gridworld.files import write_text
 from gridworld.lock import is_locked, locked
@@ -59,7 +59,7 @@ class Table:
     def read(self) -> dict[str, Row]:
         """As the file has them; one that cannot be read counts as empty, since it can be made again."""
         try:
-            lines = list(csv.reader(io.StringIO(read_text(self.file, LARGEST_CSV))))
+            lines = list(csv.reader(io.StringIO(read_table(self.file))))
         except (InputError, csv.Error):
             return {}
         if not lines or lines[0] != _COLUMNS:
@@ -88,7 +88,7 @@ class Table:
     def _find(self, job: str) -> tuple[str, Row, slice] | None:
         """(the file's text, the job's row, where in the text its line is); None if it is not that simple."""
         try:
-            text = read_text(self.file, LARGEST_CSV)
+            text = read_table(self.file)
             start = text.find("\n" + _line([job, ""])[:-1]) + 1
             stop = text.find("\n", start) + 1
             fields = next(csv.reader([text[start:stop]]), [])

@@ -18,6 +18,7 @@ from gridworld.agents.sb3.building import make_model
 from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters, reason
 from gridworld.agents.sb3.reading import Reading, of_q, read
 from gridworld.agents.sb3.resting import Resting, check_finite, diverged
+from gridworld.agents.sb3.size import CHUNK
 from gridworld.agents.sb3.tabulated_dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated_ppo import TabulatedPPO
 from gridworld.bounds import within
@@ -27,7 +28,6 @@ from gridworld.files import replacing
 from gridworld.mdp import FloatArray, IntArray
 from gridworld.state import State
 
-_CHUNK = 4096  # states a forward pass
 # A model file holds the optimiser's numbers beside every weight, and what SB3 pickles: the last
 # observations, say.
 _BYTES_A_BYTE = 16
@@ -70,7 +70,7 @@ class SB3Agent:
     def beliefs(self) -> Beliefs:
         states = np.arange(self.observation.num_states)
         with torch.no_grad():
-            parts = [self._read(states[start : start + _CHUNK]) for start in range(0, len(states), _CHUNK)]
+            parts = [self._read(states[start : start + CHUNK]) for start in range(0, len(states), CHUNK)]
         values, probabilities, q = (_joined(part) for part in zip(*parts, strict=True))
         assert values is not None
         if probabilities is not None:

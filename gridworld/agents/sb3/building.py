@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
+import warnings
+
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from gridworld.agent_config import SB3Config
 from gridworld.agents import Seat
-from gridworld.agents.sb3.arguments import algorithm_and_arguments
+from gridworld.agents.sb3.arguments import Arguments, algorithm_and_arguments
 from gridworld.agents.sb3.reading import why_unreadable
+from gridworld.agents.sb3.size import NoBuffer, check_model, weighed
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.errors import InputError
 from gridworld.observations import ObservationTable
@@ -41,7 +45,13 @@ def make_model(config: SB3Config, seat: Seat) -> BaseAlgorithm:
     device = _device(seat.device)
     envs = GridWorldVecEnv(seat.envs, seat.observation)
     try:
-        model = algorithm(env=envs, seed=seat.seed, device=device, **arguments)
+        with weighed(config.name, seat.observation), warnings.catch_warnings():
+            if seat.only_asked:
+                warnings.simplefilter("ignore")  # of rollouts that there will not be
+                arguments |= _without_buffers(algorithm)
+            model = algorithm(env=envs, seed=seat.seed, device=device, **arguments)
+    except InputError:
+        raise
     except MemoryError:
         raise InputError(
             f"agent={config.name}: its buffers do not fit into memory; take a smaller agent.buffer_size, "
@@ -54,10 +64,17 @@ def make_model(config: SB3Config, seat: Seat) -> BaseAlgorithm:
     if model.observation_space._np_random is not None:
         # A network for images is shown a random one to see its size; SB3 seeds the actions' space only.
         model.observation_space.seed(seat.seed)
+    check_model(model, config.name, seat.observation)
     reason = why_unreadable(model.policy)
     if reason is not None:
         raise UnfitError(config, reason)
     return model
+
+
+def _without_buffers(algorithm: type[BaseAlgorithm]) -> Arguments:
+    """The arguments by which a model keeps nothing of what it meets."""
+    taken = inspect.signature(algorithm).parameters
+    return {name: NoBuffer for name in ("replay_buffer_class", "rollout_buffer_class") if name in taken}
 
 
 def keep_compiler_out() -> None:

@@ -81,7 +81,7 @@ class TabulatedDQN(DQN):
 
     def _setup_model(self) -> None:
         observation = self.env.observation
-        self.replay_buffer_class = StateReplayBuffer
+        self.replay_buffer_class = self.replay_buffer_class or StateReplayBuffer
         self.replay_buffer_kwargs = {"num_states": observation.num_states}
         super()._setup_model()
         self.policy.set_training_mode(False)  # SB3's networks know no difference; switching takes time

@@ -63,7 +63,7 @@ class TabulatedPPO(PPO):
     derived = ("descent", "inputs", "_old")  # from the rest: no part of a checkpoint
 
     def _setup_model(self) -> None:
-        self.rollout_buffer_class = StateRolloutBuffer
+        self.rollout_buffer_class = self.rollout_buffer_class or StateRolloutBuffer
         super()._setup_model()
         self.policy.set_training_mode(False)  # SB3's networks know no difference; switching takes time
         self.descent = Descent(self.policy.optimizer)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gridworld.agents.sb3.tabulated import smallest_integer
+from gridworld.budget import check_memory
 from gridworld.chance import generator_state, plain_state, set_generator_state, set_plain_state
 from gridworld.observations import ObservationTable
 from gridworld.state import StateError, filled
@@ -214,7 +215,9 @@ class Values:
             raise StateError("rows of observations must have the observation's shape")
         if len(states) and int(states.max()) >= self._observation.num_states:
             raise StateError(f"states must be below {self._observation.num_states}")
-        array = np.zeros((count, *self._row), dtype=self._observation.space.dtype)
+        row = np.zeros(self._row, dtype=self._observation.space.dtype)
+        check_memory("the observations in its checkpoint", count * row.nbytes)
+        array = np.zeros((count, *self._row), dtype=row.dtype)
         self._observation.rows(states.astype(np.int64), out=array[: len(states)])
         return array.reshape(shape)
 

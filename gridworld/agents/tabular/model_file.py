@@ -61,7 +61,7 @@ def read_model(path: Path, algorithm: str, like: Mapping[str, NDArray[Any]]) -> 
 
 def read_arrays(path: Path, most: int, algorithm: str = "a table") -> dict[str, NDArray[Any]]:
     """All arrays of a model file of at most `most` bytes. Raises `InputError`."""
-    content = read_bytes(path, most)
+    content = read_bytes(path, most, copies=3)  # beside it a member and the array in it
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             infos = archive.infolist()
