@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 
 from gridworld.agent_config import AGENT_SCHEMAS, MISSING, AgentConfig
 from gridworld.config import TrainConfig
-from gridworld.data_files import read_text
+from gridworld.data_files import as_text, read_bytes
 from gridworld.errors import InputError
 from gridworld.saved_run import check_imports, fits, shown
 
@@ -91,7 +91,7 @@ def overrides(path: Path, trust: bool = False) -> list[str]:
 
 
 def _read(path: Path) -> Any:
-    text = read_text(path, _LARGEST)
+    text = as_text(read_bytes(path, _LARGEST), path)
     try:
         _check_syntax(text, path)
         return OmegaConf.to_container(OmegaConf.create(text)) if text.strip() else None
