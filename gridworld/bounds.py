@@ -6,6 +6,8 @@ import math
 
 from gridworld.errors import InputError
 
+NEAREST_GAMMA = 1 - 1e-11  # to 1, but for 1 itself
+
 
 def at_least(key: str, value: float, bound: float) -> None:
     """Refuse a value that is below the bound, infinite or NaN."""
@@ -35,3 +37,13 @@ def within_size(key: str, value: float, least: float, most: float, why: str = ""
     """Refuse a value that is neither 0 nor of a size in [least, most], or NaN."""
     if value != 0 and not least <= abs(value) <= most:
         raise InputError(f"{key}={value}: must be 0 or of a size from {least:g} to {most:g}{why}")
+
+
+def discount(key: str, value: float) -> None:
+    """Refuse a value outside [0, 1], or one so near to 1 that double precision loses the cost of a step."""
+    within(key, value, 0, 1)
+    if NEAREST_GAMMA < value < 1:
+        raise InputError(
+            f"{key}={value}: is so near to 1 that rounding hides what a step costs; must be 1, or at most "
+            f"{NEAREST_GAMMA}"
+        )

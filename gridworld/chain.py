@@ -22,12 +22,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gridworld.absorption import Absorption, factor
+from gridworld.bounds import discount
 from gridworld.errors import InputError
 from gridworld.layout import positive_int
 from gridworld.mdp import NUM_ACTIONS, BoolArray, FloatArray, IntArray, Mdp
 
 ORDINARY_GAMMA = 0.9999  # up to here a plain solution of the linear system is accurate
-_DENSE_STATES = 512  # up to here a dense matrix is both faster and small
+DENSE_STATES = 512  # up to here a dense matrix is both faster and small
 _STEPS_AT_ONCE = 32  # of an episode, before looking whether it can still go on
 
 
@@ -67,7 +68,7 @@ class Chain:
     def _transition(self) -> Any:
         size, weight = self.mdp.num_states, self._weight
         rows = np.broadcast_to(np.arange(size)[:, None, None], weight.shape)
-        if size <= _DENSE_STATES:
+        if size <= DENSE_STATES:
             index = (rows * size + self.mdp.next_state).ravel()
             return np.bincount(index, weight.ravel(), size * size).reshape(size, size)
         from scipy.sparse import csr_array
@@ -214,9 +215,10 @@ class Chain:
 
 
 def check_gamma(gamma: float) -> float:
-    """A discount as a float in [0, 1]; `InputError` otherwise."""
+    """A discount as a float in [0, 1]; `InputError` otherwise, or where the cost of a step would get lost."""
     if isinstance(gamma, bool) or not isinstance(gamma, int | float | np.number) or not 0 <= gamma <= 1:
         raise InputError(f"gamma={gamma!r}: a discount must be a number from 0 to 1")
+    discount("gamma", float(gamma))
     return float(gamma)
 
 

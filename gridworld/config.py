@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Optional, Union
 
 from gridworld.agent_config import AgentConfig
-from gridworld.bounds import at_least, at_most, within
+from gridworld.bounds import at_least, at_most, discount, within
 from gridworld.effects import Effect, affects
 from gridworld.errors import InputError
 
@@ -117,7 +117,7 @@ def check(config: TrainConfig) -> None:
     check_step_limit(config.env)
     at_least("observation.cell_size", config.observation.cell_size, 1)
     at_least("evaluation.every", config.evaluation.every, 1)
-    within("evaluation.gamma", config.evaluation.gamma, 0, 1)
+    discount("evaluation.gamma", config.evaluation.gamma)
     if config.evaluation.stop_after is not None:
         at_least("evaluation.stop_after", config.evaluation.stop_after, 1)
     at_least("logging.policy_map_every", config.logging.policy_map_every, 0)

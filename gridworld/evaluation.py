@@ -141,7 +141,7 @@ class Judge:
             trap=_share(self.mdp.trap[states]),
             timeout=_share(running),
             episode_return=_mean(total, paid),
-            length=_mean(length, limit),
+            length=_mean(length, limit, 0.0, limit),
         )
 
     def _at_start(self, values: FloatArray) -> float:
@@ -169,18 +169,19 @@ def play_episode(mdp: Mdp, policy: FloatArray, max_episode_steps: int, seed: int
 _Z = 1.96  # standard deviations of the normal distribution on either side of 95 % of it
 
 
-def _mean(samples: FloatArray, unseen: float) -> Estimate:
+def _mean(samples: FloatArray, unseen: float, least: float = -math.inf, most: float = math.inf) -> Estimate:
     """Normal approximation, widened by what rare episodes may hide, as Wilson's interval is for a share.
 
     With n samples, the half-width is z²R/2n + z √(s²/n + z²R²/4n²): z²R/n for equal samples, z s/√n for many.
-    R is the range of the samples, or `unseen`, what an episode of a kind that was not met may differ by.
+    R is the range of the samples, or `unseen`, what an episode of a kind that was not met may differ by. No
+    sample is below `least` or above `most`.
     """
     count, mean = len(samples), float(samples.mean())
     spread = max(unseen, float(np.ptp(samples)))
     variance = float(samples.var(ddof=1)) / count if count > 1 else math.inf
     hidden = _Z**2 * spread / (2 * count)
     half_width = hidden + math.hypot(_Z * variance**0.5, hidden)
-    return Estimate(mean, mean - half_width, mean + half_width)
+    return Estimate(mean, max(least, mean - half_width), min(most, mean + half_width))
 
 
 def _share(hits: BoolArray) -> Estimate:

@@ -29,16 +29,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridworld.chain import ORDINARY_GAMMA, Chain, Evaluation, check_gamma, one_hot_policy, steps_to
+from gridworld.chain import (
+    DENSE_STATES,
+    ORDINARY_GAMMA,
+    Chain,
+    Evaluation,
+    check_gamma,
+    one_hot_policy,
+    steps_to,
+)
 from gridworld.errors import InputError
-from gridworld.mdp import BoolArray, FloatArray, IntArray, Mdp
+from gridworld.mdp import NUM_ACTIONS, BoolArray, FloatArray, IntArray, Mdp
 
 # Two actions whose values agree to this relative precision are equally good. Rounding stays far below it.
 TIE = 1e-9
 
 _SWEEP_TOLERANCE = 1e-3  # sweeps need only find a good policy; the rest is solved exactly
 _IMPROVEMENT = 1e-11
-_VISIBLE = 1e-13  # relative; less than that is rounding
+# Relative; less than that is rounding: of elimination without subtractions, of sparse factors, of slopes.
+_VISIBLE, _VISIBLE_IN_LARGE, _SAME_SLOPE = 8e-15, 1e-13, 1e-11
+_KEPT = 1e-10  # relative; a policy that loses more was no improvement
 _PATIENT = 100.0  # steps; a longer horizon, 1 / (1 - γ), adds up more of what counts as a tie in one step
 _NOTHING = 1e-290  # a value that has faded so far is 0: the smallest numbers of all never get smaller
 
@@ -91,39 +101,58 @@ def _solve_discounted(mdp: Mdp, gamma: float, greedy: IntArray) -> Solution:
 
 
 def _solve_by_value_and_slope(mdp: Mdp, gamma: float, greedy: IntArray) -> Solution:
-    """Policy iteration from `greedy` (S,): the larger value first, of equal values the smaller slope."""
-    seen = set()
+    """Policy iteration from `greedy` (S,): the larger value first, of equal values the smaller slope.
+
+    Slopes are looked at once no value can be improved. Values that look equal may differ by less than is
+    visible: actions that turn out to be worse are taken back, and are out of the choice from then on.
+    """
+    worse = np.zeros((mdp.num_states, NUM_ACTIONS), dtype=np.bool_)
+    seen: set[bytes] = set()
+    found = Chain(mdp, one_hot_policy(greedy)).evaluation(gamma, with_slope=True)
     while True:
-        found = Chain(mdp, one_hot_policy(greedy)).evaluation(gamma, with_slope=True)
         seen.add(greedy.tobytes())
-        optimal, greedy = _best_actions(mdp, found, gamma, greedy)
-        if greedy.tobytes() in seen:  # no better action anywhere; by rounding, perhaps one met before
+        optimal, improved = _best_actions(mdp, found, gamma, greedy, worse)
+        if improved.tobytes() in seen:  # no better action anywhere; by rounding, perhaps one met before
             return Solution(gamma, found.value, _backup(mdp, found.value, gamma), optimal, found.scale)
+        then = Chain(mdp, one_hot_policy(improved)).evaluation(gamma, with_slope=True)
+        with np.errstate(invalid="ignore"):
+            is_kept = then.value >= found.value - _KEPT * found.scale
+        if (is_kept | np.isneginf(found.value)).all():
+            greedy, found = improved, then
+        else:
+            changed = np.flatnonzero(improved != greedy)
+            worse[changed, improved[changed]] = True
 
 
-def _best_actions(mdp: Mdp, found: Evaluation, gamma: float, greedy: IntArray) -> tuple[BoolArray, IntArray]:
+def _best_actions(
+    mdp: Mdp, found: Evaluation, gamma: float, greedy: IntArray, worse: BoolArray
+) -> tuple[BoolArray, IntArray]:
     """The actions (S, A) that are best as one step before a policy, and the policy (S,) to go on with.
 
-    `found` is of the policy `greedy` (S,), whose actions stay unless others are better by more than rounding.
+    `found` is of the policy `greedy` (S,), whose actions stay unless others are better by more than rounding;
+    `worse` (S, A) are known not to be.
     """
     assert found.slope is not None
     assert found.slope_scale is not None
     lost = ~np.isfinite(found.value)
+    visible = _VISIBLE if mdp.num_states <= DENSE_STATES else _VISIBLE_IN_LARGE
     gain, rounding = _advantage(mdp, found.value, found.scale, gamma, mdp.reward, np.abs(mdp.reward))
     next_value, next_scale = (table[mdp.next_state] for table in (found.value, found.scale))
     delay, delay_rounding = _advantage(mdp, found.slope, found.slope_scale, gamma, next_value, next_scale)
+    rounding, delay_rounding = visible * rounding, _SAME_SLOPE * delay_rounding
+    gain[worse] = -np.inf
 
     as_good = gain >= -rounding
     better = gain > rounding
     as_good[np.arange(len(greedy)), greedy] = True
     as_good[lost] = True
-    best = np.where(better.any(axis=1), gain.argmax(axis=1), greedy)
     delay = np.where(as_good, delay, np.inf)
-    soonest = delay.argmin(axis=1)
-    is_sooner = _pick(delay, soonest) < -_pick(delay_rounding, soonest)
-    best = np.where(better.any(axis=1) | lost | ~is_sooner, best, soonest)
     optimal = as_good & ((delay <= delay_rounding) | lost[:, None])
-    return optimal, best
+    if better.any():
+        return optimal, np.where(better.any(axis=1), gain.argmax(axis=1), greedy)
+    soonest = delay.argmin(axis=1)
+    is_sooner = ~lost & (_pick(delay, soonest) < -_pick(delay_rounding, soonest))
+    return optimal, np.where(is_sooner, soonest, greedy)
 
 
 def _advantage(
@@ -134,10 +163,10 @@ def _advantage(
     reward: FloatArray,
     reward_scale: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Σ_k p_k [ r_k + γ x(next_k) - x(s) ] (S, A) for rewards r (S, A, K) and values x (S,); its rounding.
+    """Σ_k p_k [ r_k + γ x(next_k) - x(s) ] (S, A) for rewards r (S, A, K) and values x (S,); its size.
 
-    Summed up as differences of values, it is exact also where all but a tiny part stays where it is. What the
-    policy's own actions differ from 0 is rounding; of an action without a finite value it is -inf.
+    Summed up as differences of values, it is exact also where all but a tiny part stays where it is; of an
+    action without a finite value it is -inf. Its size is what its rounding is relative to.
     """
     here, there = values[:, None, None], values[mdp.next_state]
     moved = mdp.next_state != np.arange(mdp.num_states)[:, None, None]
@@ -151,14 +180,14 @@ def _advantage(
     over = mdp.terminal | mdp.wall
     gained[unknown], rounding[unknown] = -np.inf, 0.0
     gained[over] = rounding[over] = 0.0
-    return gained, _VISIBLE * rounding
+    return gained, rounding
 
 
 def _better_of(mdp: Mdp, one: IntArray, other: IntArray) -> IntArray:
     """The actions (S,) of `one` where it is worth more without discount, else of `other`."""
     first, second = (Chain(mdp, one_hot_policy(each)).evaluation(1.0) for each in (one, other))
     with np.errstate(invalid="ignore"):
-        better = first.value > second.value + _VISIBLE * (first.scale + second.scale)
+        better = first.value > second.value + _VISIBLE_IN_LARGE * (first.scale + second.scale)
     better |= np.isneginf(second.value) & np.isfinite(first.value)
     actions: IntArray = np.where(better, one, other)
     return actions
@@ -174,8 +203,8 @@ def _resting_policy(mdp: Mdp) -> IntArray:
     going_on = _staying(mdp, possible, playing, np.ones(possible.shape[:2], dtype=np.bool_))
     if (going_on & (possible & (mdp.reward > 0)).any(axis=2)).any():
         raise InputError(
-            f"gamma=1 with step_reward={mdp.step_reward}: the return grows without end; "
-            "take a gamma below 1 or a step_reward of at most 0"
+            f"gamma=1 with step_reward={mdp.step_reward}: who goes on for ever is paid on the way, so "
+            "that the return may grow without end; take a gamma below 1 or a step_reward of at most 0"
         )
     free = ~np.asarray((possible & (mdp.reward != 0)).any(axis=2))
     resting = _staying(mdp, possible, playing, free)

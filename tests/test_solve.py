@@ -66,7 +66,7 @@ def test_large_worlds_are_solved_as_small_ones(data, world, gamma):
     dense = solve.value_iteration(mdp, gamma), Chain(mdp, policy).value(gamma)
     short = Chain(mdp, policy).outcome(7)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(chain, "_DENSE_STATES", 0)
+        patch.setattr(chain, "DENSE_STATES", 0)
         sparse = solve.value_iteration(mdp, gamma), Chain(mdp, policy).value(gamma)
         assert vars(Chain(mdp, policy).outcome(7)) == pytest.approx(vars(short), abs=1e-12)
     assert sparse[0].q == pytest.approx(dense[0].q, abs=1e-11)

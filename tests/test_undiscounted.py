@@ -126,7 +126,7 @@ def test_who_has_time_takes_no_risk():
     assert not Judge(compile_mdp(load("classic"), slip=1e-4), 1.0, 100).score(shortest).certified
 
 
-@pytest.mark.parametrize("gamma", [0.99999, 1 - 1e-8, 1 - 1e-10, 1 - 1e-13, 1 - 2**-53, 1.0])
+@pytest.mark.parametrize("gamma", [0.99999, 1 - 1e-8, 1 - 1e-10, 1 - 1e-11, 1.0])
 @pytest.mark.parametrize("layout", ["classic", "four_rooms", "maze", "frozen_lake_8x8"])
 def test_the_optimum_moves_however_little_a_step_costs(gamma, layout):
     judge = Judge(compile_mdp(load(layout)), gamma, 1000)
@@ -140,9 +140,9 @@ def test_the_optimum_moves_however_little_a_step_costs(gamma, layout):
 def test_discounts_just_below_one_are_told_from_each_other():
     """Patience pays where waiting costs less than the risk: exactly from where arithmetic says."""
     mdp = compile_mdp(load("classic"), slip=1e-6)
-    values = [Judge(mdp, gamma, 100).optimal_value for gamma in (1 - 1e-8, 1 - 1e-11, 1 - 1e-13, 1.0)]
+    values = [Judge(mdp, gamma, 100).optimal_value for gamma in (1 - 1e-8, 1 - 1e-10, 1 - 1e-11, 1.0)]
     assert values == sorted(values)
-    for gamma, value in zip((1 - 1e-8, 1 - 1e-11, 1 - 1e-13), values[:-1], strict=True):
+    for gamma, value in zip((1 - 1e-8, 1 - 1e-10, 1 - 1e-11), values[:-1], strict=True):
         assert value >= float(Fraction(gamma) ** 7) * (1 - 4e-6)  # that of hurrying
 
 
@@ -171,7 +171,7 @@ def test_large_worlds_are_as_exact_as_small_ones_near_one(monkeypatch):
     for gamma in (1 - 1e-7, 1.0):
         dense, optimum = Chain(mdp, policy).value(gamma), value_iteration(mdp, gamma)
         with monkeypatch.context() as patch:
-            patch.setattr("gridworld.chain._DENSE_STATES", 0)
+            patch.setattr("gridworld.chain.DENSE_STATES", 0)
             assert Chain(mdp, policy).value(gamma) == pytest.approx(dense, rel=1e-9)
             sparse = value_iteration(mdp, gamma)
         assert sparse.v == pytest.approx(optimum.v, rel=1e-11)
@@ -180,8 +180,30 @@ def test_large_worlds_are_as_exact_as_small_ones_near_one(monkeypatch):
 
 def test_where_nobody_can_go_on_for_ever_a_positive_step_reward_has_an_optimum():
     forced = compile_mdp(parse("SG", "map"), slip=0.0, step_reward=0.5)
-    with pytest.raises(InputError, match="grows without end"):
+    with pytest.raises(InputError, match="may grow without end"):
         value_iteration(forced, 1.0)  # a bump into the border earns too
     ended = compile_mdp(parse("TSG", "map"), slip=1.0, step_reward=0.5)
-    with pytest.raises(InputError, match="grows without end"):
+    with pytest.raises(InputError, match="may grow without end"):
         value_iteration(ended, 1.0)  # so does right or left, which slips up or down
+
+
+@pytest.mark.parametrize(
+    ("rows", "slip", "step", "goal", "trap", "best"),
+    [
+        ("...#\n.#..\n.SCG", 2**-24, 0.0, 1.0, -100.0, 1.0),  # wait until the world slips past the cliff
+        (".#GS.\nGS.G.", 0.0, -1e-12, -5.0, -1.0, -5.000000000001),  # a step is nearly nothing beside the end
+        (".GT.\nSG..", 0.0, -(2.0**-40), -8.0, -1.0, -8 - 2.0**-40),
+        (".GT.\nSG..", 0.0, -1e-18, -8.0, -1.0, -8.0),  # and here nothing that a number could hold
+        ("..TC\n..T.\nG.S.", 0.0, -1e-9, -5.0, -1e8, -5.000000002),
+    ],
+)
+def test_what_hardly_shows_in_a_value_still_decides(rows, slip, step, goal, trap, best):
+    judge = Judge(compile_mdp(parse(rows, "map"), slip, step, goal, trap), 1.0, 100)
+    assert judge.optimal_value == pytest.approx(best, rel=1e-13)
+    assert judge.score(judge.optimal_policy()).certified
+
+
+@pytest.mark.parametrize("gamma", [1 - 1e-12, 1 - 2**-46, 1 - 2**-53])
+def test_a_discount_that_rounding_hides_is_refused(gamma):
+    with pytest.raises(InputError, match="so near to 1 that rounding hides"):
+        value_iteration(compile_mdp(load("classic")), gamma)
