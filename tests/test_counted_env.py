@@ -8,7 +8,7 @@ import pytest
 from support import LEARNING, SHORT, train_in
 
 from gridworld.counted_env import CountedVectorEnv
-from gridworld.vector_env import GridWorldVectorEnv, Step
+from gridworld.vector_env import Advance
 
 
 @pytest.mark.parametrize("dtype", [np.int64, np.int32, np.uint8])
@@ -109,18 +109,18 @@ def test_the_last_row_does_not_stand_on_the_few_episodes_since_the_row_before(
 def ended_episodes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
     """Filled while training: after how many steps of the batch each episode ended, and its return."""
     ended: list[tuple[int, float]] = []
-    taken, under_way, step = 0, np.zeros(16), CountedVectorEnv.step
+    taken, under_way, advance = 0, np.zeros(16), CountedVectorEnv.advance
 
-    def watched(envs: CountedVectorEnv, actions: np.ndarray) -> Step:
+    def watched(envs: CountedVectorEnv, actions: np.ndarray) -> Advance:
         nonlocal taken
-        observations, rewards, terminated, truncated, infos = step(envs, actions)
+        states, rewards, terminated, truncated, over = advance(envs, actions)
         taken += len(rewards)
         for index in range(len(rewards)):
             under_way[index] += rewards[index]
             if terminated[index] or truncated[index]:
                 ended.append((taken, under_way[index]))
                 under_way[index] = 0.0
-        return observations, rewards, terminated, truncated, infos
+        return states, rewards, terminated, truncated, over
 
-    monkeypatch.setattr(CountedVectorEnv, "step", watched)
+    monkeypatch.setattr(CountedVectorEnv, "advance", watched)
     return ended

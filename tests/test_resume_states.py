@@ -222,7 +222,8 @@ def test_what_is_left_out_is_missed(agent: str, tmp_path: Path, monkeypatch: pyt
 def test_what_is_taken_out_is_refused(agent: str, tmp_path: Path) -> None:
     """Item by item: there is no default that could hide a loss."""
     stopped_after(1, tmp_path / "run", *RUNS[agent], *LESS, "checkpoint.every=600")
-    whole = decode(Checkpoints(tmp_path / "run").files()[0].read_bytes())
+    file = Checkpoints(tmp_path / "run").files()[0]
+    whole = decode(file.read_bytes())
     own = identity(configure(*RUNS[agent], *LESS), "S.....\n....T.\n...TG.\n....T.\n......")
     entries, accepted = 0, []
     for path in leaves(whole):
@@ -231,7 +232,7 @@ def test_what_is_taken_out_is_refused(agent: str, tmp_path: Path) -> None:
         if path[:3] == ("agent", "model", "values") and zlib.crc32(path[-1].encode()) % 20:
             continue  # all of these are guarded by their count
         wrong, entries = changed(whole, path), entries + 1
-        refused = _why_not(wrong, tmp_path / "run", own) is not None
+        refused = _why_not(file, wrong, tmp_path / "run", own) is not None
         if not refused and ends(tmp_path / "run", tmp_path / "copy", wrong) is not None:
             accepted.append(".".join(path))
     assert entries > 25

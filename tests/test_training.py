@@ -18,6 +18,7 @@ from gridworld.errors import InputError
 from gridworld.evaluation import Judge
 from gridworld.observations import one_hot
 from gridworld.saved_run import SavedRun
+from gridworld.sealing import sealed
 from gridworld.training import make_mdp
 
 FILES = {
@@ -199,7 +200,7 @@ def test_a_manifest_cannot_import_what_it_likes(tmp_path: Path) -> None:
     train_in(tmp_path, *SHORT["dqn"])
     manifest = json.loads((tmp_path / "manifest.json").read_text())
     manifest["config"]["agent"]["policy_kwargs"]["activation_fn"] = "this.Foo"
-    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    (tmp_path / "manifest.json").write_text(json.dumps(sealed(manifest)))
     with pytest.raises(InputError, match=r"activation_fn=this\.Foo is from none of torch"):
         SavedRun(tmp_path)
     assert "this" not in sys.modules

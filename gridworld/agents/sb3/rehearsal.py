@@ -1,9 +1,10 @@
 """A first update on a copy, before a run begins: settings that only the class can judge are judged there.
 
-The copy has environments of its own, few of them, and its rollout and batches are cut short, so that it
-takes some hundredths of a second. Nothing that the run depends on is touched. Where the copy fails, another
-one with the run's own sizes is asked before anything is refused. The setting to blame is found by leaving out
-one after the other: without it, the update can be made.
+Algorithms of the libraries alone are rehearsed: one's own may do anything while it trains, which should not
+be done twice. The copy has environments of its own, few of them, and its rollout and batches are cut short,
+so that it takes some hundredths of a second. Nothing that the run depends on is touched. Where the copy fails,
+another one with the run's own sizes is asked before anything is refused. The setting to blame is found by
+leaving out one after the other: without it, the update can be made.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from gridworld.agents import Seat
 from gridworld.agents.sb3.arguments import algorithm_and_arguments
 from gridworld.agents.sb3.building import UnfitError, make_model, said
 from gridworld.agents.sb3.checks import left_to_the_class
+from gridworld.agents.sb3.classes import is_known
 from gridworld.agents.sb3.reading import why_no_table
 from gridworld.agents.sb3.resting import not_finite
 from gridworld.agents.sb3.untouched import untouched
@@ -45,7 +47,9 @@ def rehearse(config: TrainConfig, make_seat: MakeSeat) -> None:
     torch.set_num_threads(config.threads)
     with untouched():  # what is imported may draw, too
         algorithm, arguments = algorithm_and_arguments(agent)
-    with untouched(algorithm, *_classes(arguments)):
+    if not is_known(algorithm.__module__):
+        return
+    with untouched(*_classes(arguments)):
         rehearsal = _Rehearsal(config, make_seat)
         fault = rehearsal.fault(agent, is_short=True) and rehearsal.fault(agent, is_short=False)
         culprit = fault and next(
