@@ -8,7 +8,7 @@ import pytest
 from support import LEARNING, SHORT, train_in
 
 from gridworld.counted_env import CountedVectorEnv
-from gridworld.vector_env import Advance
+from gridworld.vector_env import Advance, GridWorldVectorEnv
 
 
 @pytest.mark.parametrize("dtype", [np.int64, np.int32, np.uint8])
