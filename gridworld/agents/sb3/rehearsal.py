@@ -3,8 +3,8 @@
 Algorithms of the libraries alone are rehearsed: one's own may do anything while it trains, which should not
 be done twice. The copy has environments of its own, few of them, and its rollout and batches are cut short,
 so that it takes some hundredths of a second. Nothing that the run depends on is touched. Where the copy
-fails, another one with the run's own sizes is asked before anything is refused. The setting to blame is found by
-leaving out one after the other: without it, the update can be made.
+fails, another one with the run's own sizes is asked before anything is refused. The setting to blame is found
+by leaving out one after the other: without it, the update can be made.
 """
 
 from __future__ import annotations
