@@ -133,15 +133,16 @@ class Judge:
             if not running.any():
                 break
         limit, rewards = self.max_episode_steps, self.mdp.reward[self.mdp.probability > 0]
-        paid = max(np.ptp(rewards), np.abs(rewards).max(), np.abs(rewards).min() * limit)
+        paid = max(np.ptp(rewards), np.abs(rewards).max())  # what one step may change
+        at_most = max(paid, np.abs(rewards).min() * limit)  # ... and going on to the limit, or not
         return Sampled(
             episodes=episodes,
-            discounted_return=_mean(discounted, paid),
+            discounted_return=_mean(discounted, paid, at_most),
             goal=_share(self.mdp.goal[states]),
             trap=_share(self.mdp.trap[states]),
             timeout=_share(running),
-            episode_return=_mean(total, paid),
-            length=_mean(length, limit, 0.0, limit),
+            episode_return=_mean(total, paid, at_most),
+            length=_mean(length, 0.0, limit, (0.0, limit)),
         )
 
     def _at_start(self, values: FloatArray) -> float:
@@ -166,22 +167,25 @@ def play_episode(mdp: Mdp, policy: FloatArray, max_episode_steps: int, seed: int
     return np.array(visited)
 
 
+_UNBOUNDED = (-math.inf, math.inf)
 _Z = 1.96  # standard deviations of the normal distribution on either side of 95 % of it
 
 
-def _mean(samples: FloatArray, unseen: float, least: float = -math.inf, most: float = math.inf) -> Estimate:
+def _mean(
+    samples: FloatArray, unseen: float, unseen_if_equal: float, bounds: tuple[float, float] = _UNBOUNDED
+) -> Estimate:
     """Normal approximation, widened by what rare episodes may hide, as Wilson's interval is for a share.
 
     With n samples, the half-width is z²R/2n + z √(s²/n + z²R²/4n²): z²R/n for equal samples, z s/√n for many.
-    R is the range of the samples, or `unseen`, what an episode of a kind that was not met may differ by. No
-    sample is below `least` or above `most`.
+    R is the range of the samples, at least `unseen`; where all are equal, `unseen_if_equal`. No sample is
+    outside the bounds.
     """
-    count, mean = len(samples), float(samples.mean())
-    spread = max(unseen, float(np.ptp(samples)))
+    count, mean, seen = len(samples), float(samples.mean()), float(np.ptp(samples))
+    spread = max(unseen, seen) if seen else unseen_if_equal
     variance = float(samples.var(ddof=1)) / count if count > 1 else math.inf
     hidden = _Z**2 * spread / (2 * count)
     half_width = hidden + math.hypot(_Z * variance**0.5, hidden)
-    return Estimate(mean, max(least, mean - half_width), min(most, mean + half_width))
+    return Estimate(mean, max(bounds[0], mean - half_width), min(bounds[1], mean + half_width))
 
 
 def _share(hits: BoolArray) -> Estimate:
