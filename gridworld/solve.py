@@ -86,8 +86,8 @@ def _solve_discounted(mdp: Mdp, gamma: float, greedy: IntArray) -> Solution:
     seen = set()
     precision = min(1.0, _PATIENT * (1 - gamma))
     while True:
-        chain = Chain(mdp, one_hot_policy(greedy)).evaluation(gamma)
-        v, scale = chain.value, chain.scale
+        found = Chain(mdp, one_hot_policy(greedy)).evaluation(gamma)
+        v, scale = found.value, found.scale
         q = _backup(mdp, v, gamma)
         q_scale = _backup(mdp, scale, gamma, magnitude=True)
         best = np.argmax(q, axis=1)
