@@ -30,8 +30,9 @@ if TYPE_CHECKING:
     from gridworld.envs.vector_env import GridWorldVectorEnv
     from gridworld.errors import InputError
     from gridworld.world.evaluation import Evaluator, Score
+    from gridworld.world.grid import compile_mdp
     from gridworld.world.layout import Layout, load, shipped_layouts
-    from gridworld.world.mdp import Mdp, compile_mdp
+    from gridworld.world.mdp import Mdp
 
 __version__ = "0.1.0"
 
@@ -51,7 +52,7 @@ _HOME = {
     "VectorCoordinateObservation": "envs.observations",
     "VectorImageObservation": "envs.observations",
     "VectorOneHotObservation": "envs.observations",
-    "compile_mdp": "world.mdp",
+    "compile_mdp": "world.grid",
     "compose": "api.settings",
     "evaluate": "api.scores",
     "load": "world.layout",

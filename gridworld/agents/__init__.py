@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from gridworld.config.agents import MISSING
 from gridworld.errors import InputError
+from gridworld.world.markov_chain import one_hot_policy
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -45,6 +46,10 @@ class PolicySnapshot:
     sampled: FloatArray
     values: FloatArray
     q: FloatArray | None = None
+
+    def greedy_policy(self) -> FloatArray:
+        """The greedy policy's action probabilities, (S, A)."""
+        return one_hot_policy(self.greedy, self.sampled.shape[1])
 
 
 @dataclass(frozen=True, eq=False)

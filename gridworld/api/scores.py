@@ -12,7 +12,7 @@ from gridworld.envs.inspection import task_of
 from gridworld.errors import InputError
 from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.markov_chain import one_hot_policy
-from gridworld.world.mdp import NUM_ACTIONS, FloatArray, Mdp
+from gridworld.world.mdp import FloatArray, Mdp
 
 
 def evaluate(
@@ -72,14 +72,13 @@ def evaluate(
 def _policy(mdp: Mdp, table: Any) -> FloatArray:
     numbers = _array("the table", table)
     if numbers.shape == (mdp.num_states,):
-        wrong = ~np.isin(numbers, np.arange(NUM_ACTIONS))
+        wrong = ~np.isin(numbers, np.arange(mdp.num_actions))
         if wrong.any():
             state = int(np.argmax(wrong))
             raise InputError(
-                f"the table: state {state} has the action {numbers[state]:g}; must be 0 (up), 1 (right), "
-                "2 (down) or 3 (left)"
+                f"the table: state {state} has the action {numbers[state]:g}; must be {mdp.action_choices()}"
             )
-        return one_hot_policy(numbers.astype(np.int64))
+        return one_hot_policy(numbers.astype(np.int64), mdp.num_actions)
     _check_shape("the table", mdp, numbers)
     if (numbers < 0).any() or (np.abs(numbers.sum(axis=1) - 1) > 1e-4).any():
         raise InputError(
@@ -91,9 +90,9 @@ def _policy(mdp: Mdp, table: Any) -> FloatArray:
 def _greedy(mdp: Mdp, q: ArrayLike) -> FloatArray:
     values = _array("q", q)
     if values.ndim != 2:
-        raise InputError(f"q: has shape {values.shape}, must be ({mdp.num_states}, {NUM_ACTIONS})")
+        raise InputError(f"q: has shape {values.shape}, must be ({mdp.num_states}, {mdp.num_actions})")
     _check_shape("q", mdp, values)
-    return one_hot_policy(values.argmax(axis=1))
+    return one_hot_policy(values.argmax(axis=1), mdp.num_actions)
 
 
 def _array(name: str, table: Any) -> FloatArray:
@@ -110,9 +109,9 @@ def _array(name: str, table: Any) -> FloatArray:
 
 def _check_shape(name: str, mdp: Mdp, table: FloatArray) -> None:
     size = mdp.num_states
-    if table.shape != (size, NUM_ACTIONS):
+    if table.shape != (size, mdp.num_actions):
         either = "" if name == "q" else f"({size},) actions or "
         raise InputError(
-            f"{name}: has shape {table.shape}; this world has {size} states and {NUM_ACTIONS} actions, so it "
-            f"must be {either}({size}, {NUM_ACTIONS})"
+            f"{name}: has shape {table.shape}; this world has {size} states and "
+            f"{mdp.num_actions} actions, so it must be {either}({size}, {mdp.num_actions})"
         )

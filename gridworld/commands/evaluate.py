@@ -52,7 +52,7 @@ def main(arguments: Sequence[str]) -> None:
         sampled = sample_episodes(evaluator, policy, options.episodes, options.seed)
         table, verdict = _table(evaluator, policy, score, sampled), _verdict(evaluator, policy, score)
     of = f"{options.run} at its best, step {saved.steps():,}," if options.best else options.run
-    print(printable(f"{options.policy} policy of {of} on {evaluator.mdp.layout.name}"))
+    print(printable(f"{options.policy} policy of {of} on {evaluator.mdp.name}"))
     print(table)
     print(verdict)
 

@@ -78,7 +78,7 @@ class Player:
         where = "goal" if mdp.goal[self.state] else "trap" if mdp.trap[self.state] else "no end"
         result = f"{where} after {_count(self.steps, 'step')}: "
         missing = self.optimum - self.value
-        if mdp.slip > 0:
+        if mdp.next_state.shape[2] > 1:
             luck = "more" if missing < 0 else "less"
             return result + f"{abs(missing):.4g} {luck} than the best policy gets on average"
         if missing <= _SAME * max(1.0, abs(self.optimum)):

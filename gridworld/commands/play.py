@@ -20,7 +20,6 @@ from gridworld.process.terminal import printable
 from gridworld.restore.saved_run import SavedRun
 from gridworld.training.setup import make_mdp
 from gridworld.world.evaluation import Evaluator
-from gridworld.world.markov_chain import one_hot_policy
 
 _WIDEST_BOARD = 800  # pixels; two boards share twice 640
 _FPS = 30
@@ -73,7 +72,7 @@ def play(game: Game, cell_size: int) -> None:
             size = (frame.shape[1], frame.shape[0])
             if window is None:
                 window = pygame.display.set_mode(size)
-                pygame.display.set_caption(printable(f"GridWorld: {game.person.evaluator.mdp.layout.name}"))
+                pygame.display.set_caption(printable(f"GridWorld: {game.person.evaluator.mdp.name}"))
             window.blit(pygame.image.frombuffer(frame, size, "RGB"), (0, 0))
             pygame.display.flip()
             clock.tick(_FPS)
@@ -137,6 +136,6 @@ def _game(options: argparse.Namespace) -> Game:
     config = saved.config
     mdp = make_mdp(dataclasses.replace(config.env, **given), layout)
     gamma = config.evaluation.gamma if options.gamma is None else options.gamma
-    policy = one_hot_policy(saved.snapshot().greedy)
+    policy = saved.snapshot().greedy_policy()
     evaluator = Evaluator(mdp, gamma, config.env.max_episode_steps)
     return Game(evaluator, options.seed, policy, config.agent.name, config.env.max_episode_steps)

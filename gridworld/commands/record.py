@@ -61,7 +61,7 @@ class _SavedSubject:
 
     @cached_property
     def visits(self) -> NDArray[np.int64]:
-        return read_visits(self._saved.run, self._saved.mdp.neighbour.shape)
+        return read_visits(self._saved.run, self._saved.mdp.probability.shape[:2])
 
 
 def _record(options: argparse.Namespace) -> None:

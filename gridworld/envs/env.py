@@ -20,8 +20,9 @@ from gymnasium import spaces
 from gridworld.envs import rendering as drawing
 from gridworld.envs.rendering import CELL_SIZE, MARGIN, Colour, Frame, Point
 from gridworld.errors import InputError
+from gridworld.world.grid import ACTION_NAMES, NUM_ACTIONS, GridMdp, mdp_or_compiled
 from gridworld.world.layout import CLASSIC, NUM_COLS, NUM_ROWS, Cell, Layout, positive_int
-from gridworld.world.mdp import ACTION_NAMES, NUM_ACTIONS, Mdp, mdp_or_compiled
+from gridworld.world.mdp import Mdp
 
 
 class GridWorldEnv(gym.Env[int, int]):
@@ -83,9 +84,10 @@ class GridWorldEnv(gym.Env[int, int]):
             raise InputError(f"render_mode={render_mode!r}: must be human, rgb_array, ansi or None")
         if isinstance(delay, bool) or not isinstance(delay, Real) or not 0 <= delay < math.inf:
             raise InputError(f"delay={delay!r}: must be a number of seconds, at least 0")
-        self.mdp: Mdp = mdp_or_compiled(
-            mdp, layout, num_rows, num_cols, slip, step_reward, goal_reward, trap_reward
-        )
+        world = mdp_or_compiled(mdp, layout, num_rows, num_cols, slip, step_reward, goal_reward, trap_reward)
+        if not isinstance(world, GridMdp):
+            raise InputError(f"mdp={world.name}: has no map; a batch of it is GridWorldVectorEnv(mdp=...)")
+        self.mdp: GridMdp = world
         self.render_mode = render_mode
         self.delay: float = delay
         self.cell_size: int = positive_int("cell_size", cell_size)

@@ -20,8 +20,9 @@ from gridworld.envs.observations import KINDS, ObservationTable, TableObservatio
 from gridworld.envs.registration import STEP_LIMIT
 from gridworld.envs.rendering import frame_size
 from gridworld.errors import InputError
+from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import Layout, load, positive_int
-from gridworld.world.mdp import Mdp, compile_mdp
+from gridworld.world.mdp import Mdp
 
 _MOST_STEPS = 100_000
 _LIMITS = ("_max_episode_steps", "max_episode_steps")  # of TimeLimit, of a native batch

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from gridworld.envs.vector_env import Advance, GridWorldVectorEnv
 from gridworld.storage.serialization import State, fill
-from gridworld.world.mdp import NUM_ACTIONS
 
 
 class Returns(NamedTuple):
@@ -49,13 +48,13 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
 
     def __init__(self, num_envs: int, **settings: Any) -> None:
         super().__init__(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
-        self.visits = np.zeros((self.mdp.num_states, NUM_ACTIONS), dtype=np.int64)
+        self.visits = np.zeros((self.mdp.num_states, self.mdp.num_actions), dtype=np.int64)
         self._flat_visits = self.visits.reshape(-1)
         self._ended = NO_EPISODES  # since they were last taken
 
     def advance(self, actions: NDArray[Any]) -> Advance:
         """See `GridWorldVectorEnv.advance`."""
-        taken = self._state * NUM_ACTIONS
+        taken = self._state * self.mdp.num_actions
         step = super().advance(actions)
         np.add(taken, actions, out=taken, casting="unsafe")  # unsigned ones too
         np.add.at(self._flat_visits, taken, 1)

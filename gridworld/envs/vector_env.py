@@ -1,4 +1,4 @@
-"""Many GridWorlds at once: a batch of steps is a handful of array look-ups, whatever its size.
+"""Many copies of a world at once: a batch of steps is a handful of array look-ups, whatever its size.
 
 With (state, action, outcome) flattened to one index, the next states, rewards and ends of a whole batch are
 three look-ups in the same frozen tables that the single environment uses. No environment has a Python
@@ -22,8 +22,9 @@ from gridworld.envs.rendering import CELL_SIZE, Frame
 from gridworld.errors import InputError
 from gridworld.storage.rng_state import generator_state, set_generator_state
 from gridworld.storage.serialization import State, StateError, fill
+from gridworld.world.grid import mdp_or_compiled
 from gridworld.world.layout import CLASSIC, NUM_COLS, NUM_ROWS, Layout, positive_int
-from gridworld.world.mdp import NUM_ACTIONS, BoolArray, FloatArray, Mdp, mdp_or_compiled
+from gridworld.world.mdp import BoolArray, FloatArray, Mdp
 
 StateArray = NDArray[np.int64]
 Step = tuple[StateArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]
@@ -44,6 +45,8 @@ Advance = tuple[StateArray, FloatArray, BoolArray, BoolArray, Ended | None]
 
 class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
     """`num_envs` GridWorlds that step together; `gym.make_vec("GridWorld-v0", num_envs=64)` makes one.
+
+    With `mdp`, any compiled world: a map's, or one of `gridworld.world.sources`.
 
     All draws come from the one `np_random`, a number for each environment that needs it, in their order: a
     batch of one and the single environment take the same walk for the same seed and actions. `seed` is
@@ -104,13 +107,15 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         self.cell_size = positive_int("cell_size", cell_size)
         self.metadata = {**self.metadata, "autoreset_mode": self._autoreset}
         self.single_observation_space = spaces.Discrete(self.mdp.num_states)
-        self.single_action_space = spaces.Discrete(NUM_ACTIONS)
+        self.single_action_space = spaces.Discrete(self.mdp.num_actions)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
         # Flat tables, indexed by (state * A + action) * K + outcome. States are in numpy's own index type:
         # smaller ones save nothing that counts and are converted at every look-up.
+        self._num_actions = self.mdp.num_actions
         self._num_outcomes = self.mdp.next_state.shape[2]
+        self._thresholds = _of_pairs(self.mdp.thresholds)
         self._next_state = self.mdp.next_state.ravel().astype(np.int64)
         self._reward = self.mdp.reward.ravel()
         self._terminated = self.mdp.terminal[self._next_state]
@@ -190,12 +195,13 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         Raises:
             InputError: other actions.
         """
-        index = self._state * NUM_ACTIONS
+        index = self._state * self._num_actions
         index += self._check_actions(actions)
         starting = np.flatnonzero(self._over) if self._any_over else None
         if self._num_outcomes > 1:
+            outcomes = self._draw_outcomes(index, starting)
             index *= self._num_outcomes
-            index += self._slips(starting)
+            index += outcomes
         state = self._next_state.take(index)
         rewards = self._reward.take(index)
         terminated = self._terminated.take(index)
@@ -262,19 +268,26 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         if len(starts) == 1:
             self._state[which] = starts[0]
         else:
-            self._state[which] = starts[(self.np_random.random(len(which)) * len(starts)).astype(np.intp)]
+            self._state[which] = starts[self.mdp.start_index(self.np_random.random(len(which)))]
         self._elapsed[which] = 0
 
-    def _slips(self, starting: NDArray[np.intp] | None) -> NDArray[np.int64]:
-        """(num_envs,) outcomes 0 to 2; an environment that ended or starts anew draws nothing."""
+    def _draw_outcomes(
+        self, pairs: NDArray[np.int64], starting: NDArray[np.intp] | None
+    ) -> NDArray[np.int64]:
+        """(num_envs,) outcomes of states and actions; who ended or starts anew draws nothing."""
         still = self.mdp.terminal[self._state]
         if starting is not None:
             still[starting] = True
         moving = np.flatnonzero(~still)
         draws = self.np_random.random(len(moving))
         outcomes = np.zeros(self.num_envs, dtype=np.int64)
-        slip = self.mdp.slip
-        outcomes[moving] = (draws >= 1 - slip).astype(np.int64) + (draws >= 1 - slip / 2)
+        thresholds = self._thresholds
+        if thresholds.ndim == 2:
+            thresholds = thresholds.take(pairs[moving], axis=1)
+        drawn = (draws >= thresholds[0]).astype(np.int64)
+        for each in thresholds[1:]:
+            drawn += draws >= each
+        outcomes[moving] = drawn
         return outcomes
 
     def _check_actions(self, actions: Any) -> NDArray[np.int64]:
@@ -282,12 +295,17 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         if given.shape == (self.num_envs,) and given.dtype.kind in "iu":
             moves = given.astype(np.int64, copy=False)
             # Seen as unsigned, a negative number is huge: one comparison covers both ends.
-            if moves.view(np.uint64).max() < NUM_ACTIONS:
+            if moves.view(np.uint64).max() < self._num_actions:
                 return moves
         raise InputError(
-            f"actions={actions!r}: must be {self.num_envs} whole numbers, "
-            "each 0 (up), 1 (right), 2 (down) or 3 (left)"
+            f"actions={actions!r}: must be {self.num_envs} whole numbers, each {self.mdp.action_choices()}"
         )
+
+
+def _of_pairs(thresholds: FloatArray) -> FloatArray:
+    """(K - 1,) thresholds where all states and actions have the same, else (K - 1, S * A)."""
+    by_pair = thresholds.reshape(-1 if thresholds.size else 1, thresholds.shape[2])
+    return by_pair[0] if (by_pair == by_pair[:1]).all() else np.ascontiguousarray(by_pair.T)
 
 
 def _final_infos(states: StateArray, over: BoolArray) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from gridworld.run.reader import LARGEST_RESULT, RunReader
 from gridworld.storage.event_file import read_scalars
 from gridworld.storage.safe_read import LARGEST_CSV, as_table
 from gridworld.training.summary import CLOCK
-from gridworld.world.mdp import ACTION_NAMES, Mdp
+from gridworld.world.mdp import Mdp
 
 CLOCK_TAGS = "time/"  # prefix of the TensorBoard tags of SB3's speed
 _SPARE_BYTES = 2**20
@@ -140,12 +140,11 @@ def _first_difference(old: NDArray[Any], new: NDArray[Any]) -> tuple[Any, ...] |
 
 
 def _visits(then: RunReader, now: RunReader, mdp: Mdp) -> Finding:
-    before, after = (read_visits(run, mdp.neighbour.shape) for run in (then, now))
+    before, after = (read_visits(run, mdp.probability.shape[:2]) for run in (then, now))
     place = _first_difference(before, after)
     if place is None:
         return Finding("visits", f"{before.sum():,} steps")
-    row, column = divmod(int(place[0]), mdp.layout.num_cols)
-    where = f"row {row + 1}, column {column + 1}, {ACTION_NAMES[int(place[1])]}"
+    where = f"{mdp.state_name(int(place[0]))}, {mdp.action_names[int(place[1])]}"
     return Finding("visits", f"first at {where}: {before[place]} then, {after[place]} now", False)
 
 

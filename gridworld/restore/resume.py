@@ -90,7 +90,7 @@ def unfinished_of(folder: Path, config: TrainConfig) -> Unfinished:
     unfinished = open_unfinished(folder, trust=True)  # its classes are those of `config`, or it is refused
     if unfinished.run.is_finished:
         raise InputError(f"{folder}: holds a run already; give every run a folder of its own")
-    unfinished.check_same(config, check_settings(config).layout.text())
+    unfinished.check_same(config, check_settings(config).text())
     return dataclasses.replace(unfinished, config=config)
 
 
@@ -171,7 +171,7 @@ class Unfinished:
         mdp = check_settings(config, lambda env: make_mdp(env, self.layout))
         self._tell_if_map_changed()
         with telling_if_slow(f"reading the checkpoints of {run.folder}"):
-            state = _newest_state(run, identity(config, mdp.layout.text()))
+            state = _newest_state(run, identity(config, mdp.text()))
         if state is None:
             self._check_restart(config)
             return carry_out(config, run.folder, mdp, lambda: self._restart(config), log, on_built=on_built)

@@ -25,7 +25,6 @@ from gridworld.run.reader import RunReader, open_run
 from gridworld.training.setup import make_context, make_mdp
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.layout import CLASSIC, Layout, load, parse
-from gridworld.world.markov_chain import one_hot_policy
 from gridworld.world.mdp import FloatArray, Mdp
 
 _LARGEST_HEADER = 2**12  # bytes before the numbers in NumPy's format
@@ -181,7 +180,7 @@ def read_visits(run: RunReader, shape: tuple[int, ...]) -> NDArray[np.int64]:
 
 def choose_policy(snapshot: PolicySnapshot, kind: str) -> FloatArray:
     """The probabilities (S, A) of a snapshot's policy of a `kind`, "greedy" or "sampled"."""
-    return one_hot_policy(snapshot.greedy) if kind == "greedy" else snapshot.sampled
+    return snapshot.greedy_policy() if kind == "greedy" else snapshot.sampled
 
 
 def _size(layout: Layout) -> tuple[int, int]:

@@ -160,7 +160,7 @@ def plan(
         config = configure(overrides)
         mistake, layout = None, ""
         try:
-            layout = check_settings(config, world).layout.text()
+            layout = check_settings(config, world).text()
         except InputError as error:
             mistake = str(error)
         digest = settings_hash(dataclasses.asdict(config), layout)

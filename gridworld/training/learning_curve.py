@@ -24,7 +24,6 @@ from gridworld.storage.serialization import State
 from gridworld.training.best_model import BestModel
 from gridworld.training.certificate import Certificate
 from gridworld.world.evaluation import Evaluator, Score
-from gridworld.world.markov_chain import one_hot_policy
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +220,7 @@ class LearningCurve:
         newest = self.newest
         if newest is not None and np.array_equal(newest.snapshot.greedy, snapshot.greedy):
             return newest.greedy
-        return self.evaluator.score(one_hot_policy(snapshot.greedy))
+        return self.evaluator.score(snapshot.greedy_policy())
 
 
 def _snapshot(state: State) -> PolicySnapshot:

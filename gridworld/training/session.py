@@ -126,14 +126,14 @@ class Session:
         self.checkpoints = Checkpoints(run.folder)
         self.checkpoints.newest = None if state is None else self._steps
         self._origin = {
-            "identity": identity(config, evaluator.mdp.layout.text()),
+            "identity": identity(config, evaluator.mdp.text()),
             "environment": environment(config.agent),
         }
         self._pace = Pace(config.checkpoint.every, self._steps)
         self._stop = StopRequest()
         self._started = time.perf_counter() - (0.0 if state is None else float(state["seconds"]))
         self._curve_log = AppendLog(run.curve_file, None if state is None else state["marks"]["curve"])
-        label = f"{config.agent.name} on {evaluator.mdp.layout.name}"
+        label = f"{config.agent.name} on {evaluator.mdp.name}"
         self._progress = Progress(config.total_timesteps, label, config.logging.progress)
         pictures = Pictures(config, run, evaluator, self._visits, events)
         scalars = [] if events is None else [CurveScalars(events, evaluator)]

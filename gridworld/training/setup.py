@@ -10,8 +10,9 @@ from gridworld.envs.observations import ObservationTable
 from gridworld.envs.rendering import frame_size
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.visualization.video import require_video
+from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import Layout, load
-from gridworld.world.mdp import Mdp, compile_mdp
+from gridworld.world.mdp import Mdp
 
 
 def make_mdp(env: EnvConfig, layout: Layout | None = None) -> Mdp:

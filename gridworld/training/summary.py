@@ -9,7 +9,6 @@ from gridworld.config.train import TrainConfig
 from gridworld.run.summary import Summary
 from gridworld.training.learning_curve import Evaluation, LearningCurve
 from gridworld.world.evaluation import Score
-from gridworld.world.markov_chain import one_hot_policy
 from gridworld.world.metrics import numbers, optimal_numbers
 
 CLOCK = {"train_seconds", "evaluation_seconds"}  # the summary's times
@@ -30,7 +29,7 @@ def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, secon
     evaluator, certificate = curve.evaluator, curve.certificate
     return {
         "agent": config.agent.name,
-        "env": evaluator.mdp.layout.name,
+        "env": evaluator.mdp.name,
         "observation": config.observation.kind,
         "seed": config.seed,
         "total_timesteps": config.total_timesteps,
@@ -44,7 +43,7 @@ def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, secon
         "best_regret": curve.best.regret,
         **optimal_numbers(evaluator),
         **_scores(last.greedy),
-        "endless_cells": evaluator.endless_cells(one_hot_policy(last.snapshot.greedy)),
+        "endless_cells": evaluator.endless_cells(last.snapshot.greedy_policy()),
         "sampled": _scores(last.sampled),
         "train_seconds": round(seconds, 3),
         "evaluation_seconds": round(curve.seconds, 3),

@@ -65,7 +65,7 @@ def train(
         mdp = check_settings(config, world)
 
         def begin() -> RunWriter:
-            return RunWriter.start(folder, dataclasses.asdict(config), mdp.layout.text(), overrides, replace)
+            return RunWriter.start(folder, dataclasses.asdict(config), mdp.text(), overrides, replace)
 
         return carry_out(config, folder, mdp, begin, log, on_built=on_built)
 

@@ -86,7 +86,7 @@ def _about(spec: StudySpec) -> dict[str, Any]:
     del settings["seed"]
     return {
         "search space": spec.space.plain(),
-        "configuration": settings | {"map": make_mdp(spec.base.env).layout.text()},
+        "configuration": settings | {"map": make_mdp(spec.base.env).text()},
         "objective": {
             "seeds": list(spec.seeds),
             "stop_after": spec.settings.stop_after,

@@ -7,7 +7,6 @@ import functools
 from gridworld.envs.rollout import play_episode
 from gridworld.visualization.animation import Animation, animation_of_states
 from gridworld.visualization.picture import TIME_SERIES_CARD, Draw, Subject
-from gridworld.world.markov_chain import one_hot_policy
 
 TENSORBOARD_SIDE: int | None = TIME_SERIES_CARD
 
@@ -17,7 +16,7 @@ _MOST_FRAMES = 500  # of an episode that finds no end; by then a greedy one goes
 def draw(subject: Subject) -> Draw:
     """Play one episode on the run's seed; its own cell size is `recording.cell_size`."""
     config, mdp = subject.config, subject.evaluator.mdp
-    policy, limit = one_hot_policy(subject.snapshot.greedy), config.env.max_episode_steps
+    policy, limit = subject.snapshot.greedy_policy(), config.env.max_episode_steps
     states = play_episode(mdp, policy, limit, config.seed)[:_MOST_FRAMES]
 
     @functools.cache  # several files show the same

@@ -15,8 +15,9 @@ from gridworld.envs.rendering import Colour, Frame
 from gridworld.visualization.canvas import INK, PAPER, Canvas, Swatch, short, shown
 from gridworld.visualization.colormaps import ORANGES, is_dark, linear
 from gridworld.visualization.picture import IMAGES_TAB, Draw, Subject, agents_gamma
+from gridworld.world.grid import NUM_ACTIONS
 from gridworld.world.layout import MOVES
-from gridworld.world.mdp import NUM_ACTIONS, FloatArray, Mdp
+from gridworld.world.mdp import FloatArray, Mdp
 from gridworld.world.solver import Solution, value_iteration
 
 TENSORBOARD_SIDE: int | None = IMAGES_TAB

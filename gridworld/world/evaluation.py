@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridworld.process.progress import telling_if_slow
-from gridworld.world.layout import Cell
 from gridworld.world.markov_chain import Chain, Outcome, one_hot_policy
 from gridworld.world.mdp import FloatArray, Mdp
 from gridworld.world.solver import Solution, value_iteration
@@ -67,7 +66,7 @@ class Evaluator:
 
     def optimal_policy(self) -> FloatArray:
         """The policy (S, A) that takes the first of the optimal actions."""
-        return one_hot_policy(np.argmax(self.solution.optimal, axis=1))
+        return one_hot_policy(np.argmax(self.solution.optimal, axis=1), self.mdp.num_actions)
 
     def score(self, policy: FloatArray) -> Score:
         """Score a policy exactly.
@@ -95,20 +94,19 @@ class Evaluator:
         """
         return Chain(self.mdp, policy).discounted_return(self.max_episode_steps, self.solution.gamma)
 
-    def endless_cells(self, policy: FloatArray) -> list[Cell]:
-        """The cells in which a policy may walk for ever.
+    def endless_cells(self, policy: FloatArray) -> list[tuple[int, ...]]:
+        """The states in which a policy may walk for ever.
 
         Args:
             policy: (S, A), action probabilities.
 
         Returns:
-            (row, column) of each, by state number; empty for a policy that always ends.
+            Of each, by state, (row, column) on a map, else (number,); empty for a policy that always ends.
 
         Raises:
             InputError: it is no policy of this world.
         """
-        cols = self.mdp.layout.num_cols
-        return [divmod(int(state), cols) for state in Chain(self.mdp, policy).endless_states()]
+        return [self.mdp.coordinates(int(state)) for state in Chain(self.mdp, policy).endless_states()]
 
     def _at_start(self, values: FloatArray) -> float:
         starts = self.mdp.start_states

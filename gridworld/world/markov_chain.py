@@ -25,7 +25,7 @@ from gridworld.bounds import discount
 from gridworld.errors import InputError
 from gridworld.world.absorption import Absorption, factor
 from gridworld.world.layout import positive_int
-from gridworld.world.mdp import NUM_ACTIONS, BoolArray, FloatArray, IntArray, Mdp
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 ORDINARY_GAMMA = 0.9999  # up to here a plain solution of the linear system is accurate
 DENSE_STATES = 512  # up to here a dense matrix is both faster and small
@@ -208,7 +208,7 @@ class Chain:
 
     @cached_property
     def _in_play(self) -> BoolArray:
-        return ~(self.mdp.terminal | self.mdp.wall)
+        return ~self.mdp.absorbing
 
     def _sums(self, right: FloatArray, gamma: float) -> FloatArray:
         """x = right + γ P_π x for each column, x = 0 where nothing moves any more.
@@ -270,9 +270,9 @@ def check_gamma(gamma: float) -> float:
     return float(gamma)
 
 
-def one_hot_policy(actions: IntArray) -> FloatArray:
+def one_hot_policy(actions: IntArray, num_actions: int) -> FloatArray:
     """The policy (S, A), float64, that takes one action (S,) in every state."""
-    policy = np.zeros((len(actions), NUM_ACTIONS))
+    policy = np.zeros((len(actions), num_actions))
     policy[np.arange(len(actions)), actions] = 1.0
     return policy
 
@@ -294,9 +294,9 @@ def check_policy(mdp: Mdp, policy: ArrayLike) -> FloatArray:
         table: FloatArray = np.asarray(policy, dtype=np.float64)
     except (TypeError, ValueError):
         raise InputError(f"policy={policy!r}: must be a table of action probabilities") from None
-    if table.shape != (mdp.num_states, NUM_ACTIONS):
+    if table.shape != (mdp.num_states, mdp.num_actions):
         raise InputError(
-            f"policy of shape {table.shape}: this world needs ({mdp.num_states}, {NUM_ACTIONS}), "
+            f"policy of shape {table.shape}: this world needs ({mdp.num_states}, {mdp.num_actions}), "
             "a row of action probabilities per state"
         )
     total = table.sum(axis=1, keepdims=True)

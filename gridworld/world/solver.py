@@ -79,7 +79,7 @@ def _solve_discounted(mdp: Mdp, gamma: float, greedy: IntArray) -> Solution:
     seen = set()
     precision = min(1.0, _PATIENT * (1 - gamma))
     while True:
-        found = Chain(mdp, one_hot_policy(greedy)).evaluation(gamma)
+        found = Chain(mdp, one_hot_policy(greedy, mdp.num_actions)).evaluation(gamma)
         v, scale = found.value, found.scale
         q = backup(mdp, v, gamma)
         q_scale = backup(mdp, scale, gamma, magnitude=True)
@@ -101,7 +101,7 @@ def _sweep(mdp: Mdp, gamma: float) -> FloatArray:
     comes to rest; sweeping stops when the waves from all ends have long passed.
     """
     v = np.zeros(mdp.num_states)
-    playing = ~(mdp.terminal | mdp.wall)
+    playing = ~mdp.absorbing
     active = np.flatnonzero(playing)
     for _ in range(100 + 2 * max(_farthest(mdp, ends) for ends in (mdp.goal, mdp.trap))):
         if not active.size:

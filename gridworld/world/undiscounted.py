@@ -23,7 +23,7 @@ import numpy as np
 from gridworld.errors import InputError
 from gridworld.world.bellman import pick
 from gridworld.world.markov_chain import DENSE_STATES, Chain, Evaluation, one_hot_policy, steps_to
-from gridworld.world.mdp import NUM_ACTIONS, BoolArray, FloatArray, IntArray, Mdp
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 # Relative; less than that is rounding: of elimination without subtractions, of sparse factors, of slopes.
 _VISIBLE, _VISIBLE_IN_LARGE, _SAME_SLOPE = 8e-15, 1e-13, 1e-11
@@ -44,15 +44,15 @@ def solve_by_value_and_slope(mdp: Mdp, gamma: float, greedy: IntArray) -> tuple[
     Returns:
         The evaluation of an optimal policy; (S, A), True for every optimal action.
     """
-    worse = np.zeros((mdp.num_states, NUM_ACTIONS), dtype=np.bool_)
+    worse = np.zeros((mdp.num_states, mdp.num_actions), dtype=np.bool_)
     seen: set[bytes] = set()
-    found = Chain(mdp, one_hot_policy(greedy)).evaluation(gamma, with_slope=True)
+    found = Chain(mdp, one_hot_policy(greedy, mdp.num_actions)).evaluation(gamma, with_slope=True)
     while True:
         seen.add(greedy.tobytes())
         optimal, improved = _best_actions(mdp, found, gamma, greedy, worse)
         if improved.tobytes() in seen:  # no better action anywhere; by rounding, perhaps one met before
             return found, optimal
-        then = Chain(mdp, one_hot_policy(improved)).evaluation(gamma, with_slope=True)
+        then = Chain(mdp, one_hot_policy(improved, mdp.num_actions)).evaluation(gamma, with_slope=True)
         with np.errstate(invalid="ignore"):
             is_kept = then.value >= found.value - _KEPT * found.scale
         if (is_kept | np.isneginf(found.value)).all():
@@ -115,7 +115,7 @@ def _advantage(
         sums = (np.where(mdp.probability > 0, mdp.probability * part, 0.0) for part in (change, size))
         gained, rounding = (part.sum(axis=2) for part in sums)
     unknown = ~np.isfinite(rounding)
-    over = mdp.terminal | mdp.wall
+    over = mdp.absorbing
     gained[unknown], rounding[unknown] = -np.inf, 0.0
     gained[over] = rounding[over] = 0.0
     return gained, rounding
@@ -136,7 +136,9 @@ def better_or_resting(mdp: Mdp, one: IntArray) -> IntArray:
         InputError: a policy can go on for ever and earn on its way.
     """
     other = _resting_policy(mdp)
-    first, second = (Chain(mdp, one_hot_policy(each)).evaluation(1.0) for each in (one, other))
+    first, second = (
+        Chain(mdp, one_hot_policy(each, mdp.num_actions)).evaluation(1.0) for each in (one, other)
+    )
     with np.errstate(invalid="ignore"):
         better = first.value > second.value + _VISIBLE_IN_LARGE * (first.scale + second.scale)
     better |= np.isneginf(second.value) & np.isfinite(first.value)
@@ -147,12 +149,12 @@ def better_or_resting(mdp: Mdp, one: IntArray) -> IntArray:
 def _resting_policy(mdp: Mdp) -> IntArray:
     """A policy (S,) that surely comes to an end or to rest, wherever one can."""
     possible = mdp.probability > 0
-    playing = ~(mdp.terminal | mdp.wall)
+    playing = ~mdp.absorbing
     going_on = _staying(mdp, possible, playing, np.ones(possible.shape[:2], dtype=np.bool_))
     if (going_on & (possible & (mdp.reward > 0)).any(axis=2)).any():
         raise InputError(
-            f"gamma=1 with step_reward={mdp.step_reward}: who goes on for ever is paid on the way, so "
-            "that the return may grow without end; take a gamma below 1 or a step_reward of at most 0"
+            f"gamma=1 with {mdp.rewards_text()}: who goes on for ever is paid on the way, so that the return may "
+            "grow without end; take a gamma below 1 or a step_reward of at most 0"
         )
     free = ~np.asarray((possible & (mdp.reward != 0)).any(axis=2))
     resting = _staying(mdp, possible, playing, free)

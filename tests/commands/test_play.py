@@ -15,8 +15,8 @@ from gridworld.commands import play as command
 from gridworld.commands.game import Game, Key, draw
 from gridworld.envs.rendering import AGENT, draw_frame
 from gridworld.world.evaluation import Evaluator
+from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
-from gridworld.world.mdp import compile_mdp
 
 CLASSIC = Evaluator(compile_mdp(load("classic")), 0.99, 100)
 UP, RIGHT, DOWN, LEFT = Key.UP, Key.RIGHT, Key.DOWN, Key.LEFT

@@ -10,8 +10,8 @@ from gymnasium.wrappers.vector import TransformObservation
 import gridworld
 from gridworld import GridWorldEnv, InputError
 from gridworld.envs.observations import KINDS, TableObservation, VectorTableObservation, make_observation
+from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import classic, parse
-from gridworld.world.mdp import compile_mdp
 
 LAYOUTS = gridworld.shipped_layouts()
 WRAPPERS = {  # kind: (wrapper of one environment, wrapper of a batch)

@@ -34,8 +34,8 @@ from gridworld.storage.sealed_json import sealed
 from gridworld.training.setup import check_settings, make_context
 from gridworld.tune.study_folder import is_claimed
 from gridworld.world.evaluation import Evaluator
+from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load
-from gridworld.world.mdp import compile_mdp
 
 OURS = (InputError, OmegaConfBaseException)  # both end as one sentence with exit code 2
 Target = Callable[[random.Random, Path], None]

@@ -16,8 +16,8 @@ from gridworld.process.columns import aligned
 from gridworld.run.summary import summary_text
 from gridworld.sweep.job_table import JobRow, JobTable
 from gridworld.world.evaluation import Evaluator
+from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import classic
-from gridworld.world.mdp import compile_mdp
 
 NUMBERS = st.floats() | st.sampled_from([-0.0001381, 1e-300, -1e-300, -1.234e300, float("-inf"), 0.0])
 WORDS = st.text("ab-.0", min_size=1, max_size=30)

@@ -29,8 +29,8 @@ from gridworld.sweep.job_table import JobTable
 from gridworld.training.pictures import Pictures
 from gridworld.visualization.animation import animation_of_states
 from gridworld.visualization.video import save_pngs
+from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load
-from gridworld.world.mdp import compile_mdp
 
 LESS = ["recording.frames=false", "recording.gif=false", "logging.progress=false"]
 WORDS = [*SHORT["q_learning"], *LESS, "checkpoint.every=600"]

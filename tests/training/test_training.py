@@ -134,7 +134,7 @@ class Scripted:
     def snapshot(self) -> PolicySnapshot:
         greedy = self.optimal if next(self.pattern) else np.zeros_like(self.optimal)
         self.calls += 1
-        return PolicySnapshot(greedy, one_hot_policy(greedy), np.full(len(greedy), float(self.calls)))
+        return PolicySnapshot(greedy, one_hot_policy(greedy, 4), np.full(len(greedy), float(self.calls)))
 
     def model_file(self) -> bytes:
         return f"after snapshot {self.calls}".encode()
@@ -184,7 +184,7 @@ def test_a_policy_that_walks_in_circles_is_reported_not_waited_for() -> None:
     curve, _ = follow([False])
     assert curve.newest is not None
     assert curve.newest.greedy.outcome.timeout == 1
-    assert curve.evaluator.endless_cells(one_hot_policy(curve.newest.snapshot.greedy)) == [(0, 0)]
+    assert curve.evaluator.endless_cells(one_hot_policy(curve.newest.snapshot.greedy, 4)) == [(0, 0)]
 
 
 def test_one_policy_earns_one_certificate_however_often_it_is_met(tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ from gridworld.storage.atomic_write import replacing, replacing_folder, write_ar
 from gridworld.visualization import video as record
 from gridworld.visualization.animation import animation_of_frames, animation_of_states, automatic_cell_size
 from gridworld.visualization.png import encode_png
+from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
-from gridworld.world.mdp import compile_mdp
 
 CLASSIC = compile_mdp(load("classic"))
 WALK = np.array([0, 1, 1, 2, 3, 4, 5, 11, 17, 16])

@@ -7,9 +7,9 @@ from helpers.support import configure
 
 from gridworld.training.setup import make_mdp
 from gridworld.world.evaluation import Evaluator
+from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import parse
 from gridworld.world.markov_chain import Chain, one_hot_policy
-from gridworld.world.mdp import compile_mdp
 
 REWARDS = {"step_reward": -1.0, "goal_reward": 0.0, "trap_reward": -99.0}
 START, GOAL = 36, 47
@@ -24,7 +24,7 @@ def safe_way():
     """Up to the first row, along it, and down in the last column."""
     actions = np.full(48, UP)
     actions[:11], actions[11::12] = RIGHT, DOWN
-    return one_hot_policy(actions)
+    return one_hot_policy(actions, 4)
 
 
 @pytest.mark.parametrize("slippery", [False, True])
@@ -83,7 +83,7 @@ def test_its_known_returns():
     safe = evaluator.score(safe_way())
     assert (safe.value, safe.outcome.goal, safe.regret) == (-17, 1, 4)
     assert not safe.certified
-    falling = one_hot_policy(np.full(48, RIGHT))
+    falling = one_hot_policy(np.full(48, RIGHT), 4)
     outcome = evaluator.score(falling).outcome
     assert (outcome.timeout, outcome.trap, outcome.expected_return) == (1, 0, -100_000)
     assert evaluator.endless_cells(falling) == [(3, 0)]
@@ -94,8 +94,8 @@ def test_a_fall_may_be_the_way_to_an_end():
     assert mdp.layout.starts == ((2, 0),)
     actions = np.full(12, RIGHT)
     actions[3] = LEFT  # off the island, which is far from the start
-    chain = Chain(mdp, one_hot_policy(actions))
+    chain = Chain(mdp, one_hot_policy(actions, 4))
     assert chain.value(1)[[3, 8]].tolist() == [-1, 1]
     assert chain.endless_states().size == 0
     actions[8] = UP  # to the edge, off it, and again
-    assert Chain(mdp, one_hot_policy(actions)).endless_states().tolist() == [4, 5, 8]
+    assert Chain(mdp, one_hot_policy(actions, 4)).endless_states().tolist() == [4, 5, 8]

@@ -18,9 +18,10 @@ from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.training.setup import make_context, make_mdp
 from gridworld.world.evaluation import Evaluator
+from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse, shipped_layouts
 from gridworld.world.markov_chain import one_hot_policy
-from gridworld.world.mdp import Mdp, compile_mdp
+from gridworld.world.mdp import Mdp
 
 CLASSIC = Evaluator(compile_mdp(load("classic")), 0.99, 100)
 
@@ -186,7 +187,7 @@ def test_only_shortest_safe_ways_are_certified() -> None:
     assert best.regret == pytest.approx(0, abs=1e-12)
     detour = np.argmax(CLASSIC.optimal_policy(), axis=1)
     detour[[0, 6, 7]] = 2, 1, 0  # down, right and up again: two steps more
-    score = CLASSIC.score(one_hot_policy(detour))
+    score = CLASSIC.score(one_hot_policy(detour, 4))
     assert score.outcome.goal == 1
     assert score.outcome.expected_length == 10
     assert not score.certified
@@ -195,10 +196,10 @@ def test_only_shortest_safe_ways_are_certified() -> None:
 
 def test_a_certificate_is_relative_on_far_goals() -> None:
     evaluator = Evaluator(compile_mdp(parse("S" + "." * 2000 + "G", "corridor")), 0.99, 5000)
-    right = one_hot_policy(np.full(2002, 1))
+    right = one_hot_policy(np.full(2002, 1), 4)
     assert evaluator.optimal_value == pytest.approx(0.99**2000, rel=1e-9)
     assert evaluator.score(right).certified
-    still = one_hot_policy(np.zeros(2002, dtype=int))
+    still = one_hot_policy(np.zeros(2002, dtype=int), 4)
     assert evaluator.score(still).regret < 1e-6  # a tiny value, yet
     assert not evaluator.score(still).certified
 
@@ -206,7 +207,7 @@ def test_a_certificate_is_relative_on_far_goals() -> None:
 def test_circles_are_found_without_being_walked() -> None:
     actions = np.zeros(30, dtype=int)
     actions[0], actions[1], actions[7], actions[6] = 1, 2, 3, 0  # round the first square
-    policy = one_hot_policy(actions)
+    policy = one_hot_policy(actions, 4)
     assert CLASSIC.endless_cells(policy) == [(0, 0), (0, 1), (1, 0), (1, 1)]
     assert CLASSIC.score(policy).outcome.timeout == 1
     assert len(play_episode(CLASSIC.mdp, policy, 100, seed=0)) == 101

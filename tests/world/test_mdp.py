@@ -9,8 +9,8 @@ from helpers.oracle import MOVES, worlds
 from hypothesis import given
 
 from gridworld import InputError
+from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
-from gridworld.world.mdp import compile_mdp
 
 
 def compiled(world):

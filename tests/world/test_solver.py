@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from gridworld import InputError
 from gridworld.world import markov_chain as chain
 from gridworld.world import solver as solve
+from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
 from gridworld.world.markov_chain import Chain, one_hot_policy
-from gridworld.world.mdp import compile_mdp
 
 GAMMAS = st.sampled_from([0, 0.9, 0.99])
 UNIFORM = np.full((30, 4), 0.25)
@@ -131,7 +131,7 @@ def test_without_discount_and_without_costs_the_optimum_equals_brute_force(rows,
 def test_without_discount_and_with_costs_the_optimum_is_that_of_a_long_horizon(world):
     mdp = compiled(world)
     solution = solve.value_iteration(mdp, 1)
-    greedy = one_hot_policy(np.argmax(solution.q, axis=1))
+    greedy = one_hot_policy(np.argmax(solution.q, axis=1), 4)
     walked = Chain(mdp, greedy).value(1)
     assert walked == pytest.approx(solution.v, abs=1e-9)
     ends = np.isfinite(solution.v)
@@ -149,7 +149,7 @@ def test_without_discount_a_positive_step_reward_has_no_optimum():
 @pytest.mark.parametrize(("step_reward", "worth"), [(0.0, 0.0), (-0.1, -np.inf), (0.1, np.inf)])
 def test_without_discount_a_policy_that_never_ends(step_reward, worth):
     mdp = made("S.G", step_reward=step_reward)
-    back_and_forth = one_hot_policy(np.array([1, 3, 0]))
+    back_and_forth = one_hot_policy(np.array([1, 3, 0]), 4)
     assert Chain(mdp, back_and_forth).value(1).tolist() == [worth, worth, 0]
     half = back_and_forth.copy()
     half[1] = [0, 0.5, 0, 0.5]  # ends surely, after a while: four steps in the mean from the start
@@ -158,7 +158,7 @@ def test_without_discount_a_policy_that_never_ends(step_reward, worth):
 
 def test_without_discount_a_chance_of_never_ending_counts():
     ways = "..S#G\n....."  # left for ever, or down, to the right and up
-    policy = one_hot_policy(np.array([0, 0, 0, 0, 0, 1, 1, 1, 1, 0]))
+    policy = one_hot_policy(np.array([0, 0, 0, 0, 0, 1, 1, 1, 1, 0]), 4)
     policy[2] = [0.5, 0, 0.5, 0]  # waits a while, then goes down
     assert Chain(made(ways), policy).value(1)[2] == pytest.approx(1)
     policy[2] = [0, 0, 0.5, 0.5]  # goes down or left
@@ -186,7 +186,7 @@ def test_without_discount_a_cell_that_cannot_end_is_lost():
 )
 def test_where_nothing_can_be_won_there_still_is_a_best_action(text, slip, gamma):
     code = (  # in a process of its own, which can be stopped
-        "from gridworld.world.layout import parse; from gridworld.world.mdp import compile_mdp;"
+        "from gridworld.world.layout import parse; from gridworld.world.grid import compile_mdp;"
         "from gridworld.world import solver;"
         f"solution = solver.value_iteration(compile_mdp(parse({text!r}, 'map'), slip={slip}), {gamma});"
         "print(solution.optimal.any(axis=1).all(), *solution.v)"
@@ -203,22 +203,22 @@ def test_endless_states_of_a_cycle():
     mdp = made("S..\n...\n..G")
     cycle = {0: 1, 1: 1, 2: 2, 5: 3, 4: 0}  # right twice, down, left, up and round again
     actions = np.array([cycle.get(state, 1) for state in range(9)])
-    assert Chain(mdp, one_hot_policy(actions)).endless_states().tolist() == [1, 2, 4, 5]
+    assert Chain(mdp, one_hot_policy(actions, 4)).endless_states().tolist() == [1, 2, 4, 5]
     actions[5] = 2
-    assert Chain(mdp, one_hot_policy(actions)).endless_states().size == 0
-    assert Chain(mdp, one_hot_policy(np.zeros(9, dtype=int))).endless_states().tolist() == [0]
+    assert Chain(mdp, one_hot_policy(actions, 4)).endless_states().size == 0
+    assert Chain(mdp, one_hot_policy(np.zeros(9, dtype=int), 4)).endless_states().tolist() == [0]
     assert Chain(mdp, np.full((9, 4), 0.25)).endless_states().size == 0
     slippery = made(
         "S..\n...\n..G", slip=0.1
     )  # "up" never leaves the first row, "right" slips down in the end
-    assert Chain(slippery, one_hot_policy(np.full(9, 0))).endless_states().tolist() == [0, 1, 2]
-    assert Chain(slippery, one_hot_policy(np.full(9, 1))).endless_states().size == 0
+    assert Chain(slippery, one_hot_policy(np.full(9, 0), 4)).endless_states().tolist() == [0, 1, 2]
+    assert Chain(slippery, one_hot_policy(np.full(9, 1), 4)).endless_states().size == 0
 
 
 def test_a_world_of_200_by_200_cells_fits_into_a_gigabyte():
     code = (
         "import resource; from gridworld.world.layout import Layout;"
-        "from gridworld.world.mdp import compile_mdp;"
+        "from gridworld.world.grid import compile_mdp;"
         "from gridworld.world.solver import value_iteration;"
         "world = compile_mdp(Layout('open', 200, 200, starts=((0, 0),), goals=((199, 199),)));"
         "print(value_iteration(world, 0.99).v[0].item(), value_iteration(world, 0.5).v[0].item(),"

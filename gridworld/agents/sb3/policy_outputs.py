@@ -113,7 +113,8 @@ def _joined(parts: tuple[Tensor | None, ...]) -> FloatArray | None:
 
 def epsilon_greedy(q: FloatArray, epsilon: float) -> FloatArray:
     """(S, A), the action probabilities of SB3's exploration with Q values (S, A)."""
-    mixed: FloatArray = (1 - epsilon) * one_hot_policy(np.argmax(q, axis=1)) + epsilon / q.shape[1]
+    actions = q.shape[1]
+    mixed: FloatArray = (1 - epsilon) * one_hot_policy(np.argmax(q, axis=1), actions) + epsilon / actions
     return mixed
 
 

@@ -18,7 +18,7 @@ from gridworld.envs.vector_env import GridWorldVectorEnv, StateArray
 from gridworld.errors import InputError
 from gridworld.storage.rng_state import independent_generator
 from gridworld.storage.serialization import State
-from gridworld.world.mdp import NUM_ACTIONS, BoolArray, FloatArray
+from gridworld.world.mdp import BoolArray, FloatArray
 
 _MASKS = "action_masks"  # asked for by agents that respect them; here nothing is ever forbidden
 
@@ -164,7 +164,8 @@ class GridWorldVecEnv(VecEnv):
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
         if method_name == _MASKS:
-            return [np.ones(NUM_ACTIONS, dtype=np.bool_)] * len(list(self._get_indices(indices)))
+            allowed = np.ones(self.envs.mdp.num_actions, dtype=np.bool_)
+            return [allowed] * len(list(self._get_indices(indices)))
         raise InputError(f"{method_name}: the environments of a native batch have no methods of their own")
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:

@@ -34,7 +34,7 @@ from gridworld.config.effects import Effect, affects
 from gridworld.errors import InputError
 from gridworld.storage.rng_state import generator_state, independent_generator, set_generator_state
 from gridworld.storage.serialization import State, fill, fitting
-from gridworld.world.mdp import LEAST_REWARD, MOST_REWARD, NUM_ACTIONS, FloatArray, IntArray
+from gridworld.world.mdp import LEAST_REWARD, MOST_REWARD, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from gridworld.envs.vector_env import Ended
@@ -85,7 +85,7 @@ class TabularControl(ABC):
     def __init__(self, config: TabularControlConfig, context: TrainingContext) -> None:
         mdp = context.envs.mdp
         self.config = config
-        self.q: FloatArray = np.full((mdp.num_states, NUM_ACTIONS), config.initial_value)
+        self.q: FloatArray = np.full((mdp.num_states, mdp.num_actions), config.initial_value)
         self.q[mdp.terminal] = 0.0
         self.visits: IntArray = np.zeros(self.q.shape, dtype=np.int64)
         self.exploration_rate = config.exploration_initial_eps
@@ -140,7 +140,7 @@ class TabularControl(ABC):
         goes_on = True
         while goes_on and self._steps < total_timesteps:
             step_size = self._step_size(self._steps / total_timesteps)
-            pairs = states * NUM_ACTIONS + self._actions
+            pairs = states * self.q.shape[1] + self._actions
             states, rewards, _, _, ended = envs.advance(self._actions)
             self._steps = steps = self._steps + envs.num_envs
             self.exploration_rate = self._epsilon(steps / total_timesteps)

@@ -13,7 +13,6 @@ from gridworld.report.evidence.run_reader import Evidence
 from gridworld.training.setup import make_mdp
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.layout import parse
-from gridworld.world.mdp import NUM_ACTIONS
 
 _MOST_CELLS = 100_000  # beyond, solving the world again would take longer than the report
 _TOLERANCE = 1e-6  # relative
@@ -39,7 +38,7 @@ def reference(run: Evidence) -> Reference:
     """
     try:
         evaluator = _evaluator(run)
-        random = evaluator.score(np.full(evaluator.mdp.neighbour.shape, 1 / NUM_ACTIONS))
+        random = evaluator.score(np.full(evaluator.mdp.probability.shape[:2], 1 / evaluator.mdp.num_actions))
     except (ValueError, TypeError, ArithmeticError, np.linalg.LinAlgError) as error:
         # Whatever is wrong with another version's world, the runs' own scores are as good as before.
         nan = math.nan

@@ -32,7 +32,7 @@ from gridworld.envs.inspection import is_discrete, observation_like, observation
 from gridworld.envs.observations import ObservationTable
 from gridworld.errors import InputError
 from gridworld.world.markov_chain import one_hot_policy
-from gridworld.world.mdp import NUM_ACTIONS, FloatArray, Mdp
+from gridworld.world.mdp import FloatArray, Mdp
 
 
 class Tables(NamedTuple):
@@ -67,9 +67,9 @@ def seen_by(policy: BasePolicy, mdp: Mdp, env: Any = None) -> ObservationTable:
     Raises:
         InputError: it sees or does something else.
     """
-    if not is_discrete(policy.action_space, NUM_ACTIONS):
+    if not is_discrete(policy.action_space, mdp.num_actions):
         raise InputError(
-            f"the model acts in {policy.action_space}; a GridWorld has Discrete({NUM_ACTIONS}), its moves"
+            f"the model acts in {policy.action_space}; {mdp.name} has Discrete({mdp.num_actions})"
         )
     observation = _observation(env)
     if observation is not None and observation.space == policy.observation_space:
@@ -99,7 +99,7 @@ def read_tables(policy: BasePolicy, observation: ObservationTable, epsilon: floa
     if not np.isfinite(table).all():
         raise InputError("the model's outputs are no finite numbers; its training has diverged")
     sampled = table if q is None else epsilon_greedy(q, epsilon)
-    return Tables(one_hot_policy(table.argmax(axis=1)), sampled, table)
+    return Tables(one_hot_policy(table.argmax(axis=1), table.shape[1]), sampled, table)
 
 
 def _policy_of(model: Any) -> BasePolicy:

@@ -31,7 +31,7 @@ from torch import Tensor
 from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer
 from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of, smallest_integer
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv, StateStep
-from gridworld.world.mdp import NUM_ACTIONS, IntArray
+from gridworld.world.mdp import IntArray
 
 Float32Array = NDArray[np.float32]
 
@@ -152,7 +152,7 @@ class TabulatedDQN(DQN):
     def _act(self, states: IntArray, learning_starts: int) -> IntArray:
         """Uniformly random at first; then one coin decides for the whole batch, as in SB3."""
         if self.num_timesteps < learning_starts or np.random.rand() < self.exploration_rate:
-            return self.action_space.np_random.integers(NUM_ACTIONS, size=len(states))
+            return self.action_space.np_random.integers(self.env.envs.mdp.num_actions, size=len(states))
         which, index = self.inputs.distinct(states)
         with torch.set_grad_enabled(which is None):
             q = self._all_q() if which is None else self.q_values(self.q_net, which)
@@ -195,7 +195,7 @@ class TabulatedDQN(DQN):
         """
         which, index = self.inputs.distinct(states)
         q = self._all_q() if which is None else self.q_values(self.q_net, which)
-        pair = index * NUM_ACTIONS + actions
+        pair = index * q.shape[1] + actions
         error = q.detach().cpu().numpy().ravel()[pair] - targets
         slope = np.maximum(np.minimum(error, 1), -1)
         gradient = np.bincount(pair, slope, q.numel()) / len(pair)

@@ -148,10 +148,9 @@ class TabulatedPPO(PPO):
             for batch in _minibatches(len(states), self.batch_size):
                 which, index = self.inputs.distinct(states[batch])
                 weighed = self._normalized(advantages[batch])
-                num_states = self.inputs.num_states if which is None else len(which)
-                sums = sum_up(index, actions[batch], weighed, returns[batch], num_states)
-                outputs = self.outputs(which)
                 old = self._old if which is None else Outputs(*(table[which] for table in self._old))
+                sums = sum_up(index, actions[batch], weighed, returns[batch], old.log_prob.shape)
+                outputs = self.outputs(which)
                 losses, *slopes = losses_and_slopes(_tables(*outputs), old, sums, weights)
                 logged.append(losses)
                 goes_on = self.target_kl is None or losses.approx_kl <= 1.5 * self.target_kl

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.world.mdp import NUM_ACTIONS, FloatArray, IntArray
+from gridworld.world.mdp import FloatArray, IntArray
 
 
 class Outputs(NamedTuple):
@@ -88,7 +88,11 @@ def log_softmax(logits: NDArray[Any]) -> NDArray[Any]:
 
 
 def sum_up(
-    index: IntArray, actions: IntArray, advantages: NDArray[Any], returns: NDArray[Any], num_states: int
+    index: IntArray,
+    actions: IntArray,
+    advantages: NDArray[Any],
+    returns: NDArray[Any],
+    shape: tuple[int, ...],
 ) -> Sums:
     """Sum up a minibatch of B samples.
 
@@ -97,16 +101,16 @@ def sum_up(
         actions: (B,), integers.
         advantages: (B,), float32.
         returns: (B,), float32.
-        num_states: U, how many states occur.
+        shape: (U, A), how many states occur and how many actions there are.
     """
-    count, size = len(index), num_states * NUM_ACTIONS
-    pair = index * NUM_ACTIONS
+    count, size = len(index), shape[0] * shape[1]
+    pair = index * shape[1]
     pair += actions
-    positive = np.bincount(pair, np.maximum(advantages, 0), size).reshape(num_states, NUM_ACTIONS) / count
-    negative = np.bincount(pair, np.minimum(advantages, 0), size).reshape(num_states, NUM_ACTIONS) / count
-    pairs = np.bincount(pair, None, size).reshape(num_states, NUM_ACTIONS) / count
+    positive = np.bincount(pair, np.maximum(advantages, 0), size).reshape(shape) / count
+    negative = np.bincount(pair, np.minimum(advantages, 0), size).reshape(shape) / count
+    pairs = np.bincount(pair, None, size).reshape(shape) / count
     states = pairs.sum(axis=1)
-    mean_return = np.bincount(index, returns, num_states) / np.maximum(states * count, 1)
+    mean_return = np.bincount(index, returns, shape[0]) / np.maximum(states * count, 1)
     apart = returns - mean_return[index]
     return Sums(positive, negative, pairs, states, mean_return, float(apart @ apart) / count)
 

@@ -44,9 +44,9 @@ class ValueIteration:
         mdp = context.envs.mdp
         solution = value_iteration(mdp, config.gamma)
         if not np.isfinite(solution.q).all():
-            row, col = divmod(int(np.argmin(solution.v)), mdp.layout.num_cols)
+            worst = mdp.state_name(int(np.argmin(solution.v)))
             raise InputError(
-                f"agent.gamma={config.gamma}: from row {row + 1}, column {col + 1} no end can be reached, "
+                f"agent.gamma={config.gamma}: from {worst} no end can be reached, "
                 "which costs without end; take a gamma below 1"
             )
         self._algorithm = config.algorithm

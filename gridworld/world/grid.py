@@ -1,0 +1,196 @@
+"""The worlds of maps: a layout and its rewards, compiled into tables.
+
+A move succeeds with probability 1 - slip; otherwise one of the two perpendicular moves happens instead, with
+probability slip / 2 each. A move off the grid or into a wall leaves the agent where it is. The reward of a
+step is `step_reward` plus the reward of the cell entered (goal, trap, or nothing). A move into a cliff pays
+as one into a trap and leads to the start, so that no agent is ever on a cliff cell; as a state it is floor
+that no move leads to. Walls absorb as terminal cells do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from os import PathLike
+
+import numpy as np
+
+from gridworld.errors import InputError
+from gridworld.world.layout import CLASSIC, MOVES, NUM_COLS, NUM_ROWS, Cell, Layout, load_by_default_size
+from gridworld.world.mdp import BoolArray, IntArray, Mdp, checked_reward, finite, frozen
+
+ACTION_NAMES = ("up", "right", "down", "left")
+NUM_ACTIONS = len(MOVES)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GridMdp(Mdp):
+    """The tables of a map: a state is a cell, A = 4 actions, K outcomes (1 without slip, 3 with).
+
+    Attributes:
+        layout: the map.
+        slip: the probability that a move goes elsewhere.
+        step_reward: of every step.
+        goal_reward: of entering a goal.
+        trap_reward: of entering a trap or a cliff.
+        neighbour: (S, A), int32, where a move leads, geometry alone: borders and walls, no slip, fall or end.
+        wall: (S,), bool.
+        cliff: (S,), bool.
+    """
+
+    layout: Layout
+    slip: float
+    step_reward: float
+    goal_reward: float
+    trap_reward: float
+    neighbour: IntArray
+    wall: BoolArray
+    cliff: BoolArray
+
+    def text(self) -> str:
+        """The map."""
+        return self.layout.text()
+
+    def rewards_text(self) -> str:
+        """See `Mdp.rewards_text`."""
+        return f"step_reward={self.step_reward}"
+
+    def coordinates(self, state: int) -> tuple[int, ...]:
+        """Row and column."""
+        return divmod(state, self.layout.num_cols)
+
+    def state_name(self, state: int) -> str:
+        """See `Mdp.state_name`."""
+        row, col = self.coordinates(state)
+        return f"row {row + 1}, column {col + 1}"
+
+
+def compile_mdp(
+    layout: Layout,
+    slip: float = 0.0,
+    step_reward: float = 0.0,
+    goal_reward: float = 1.0,
+    trap_reward: float = -1.0,
+) -> GridMdp:
+    """Compile a layout and its rewards into tables.
+
+    Args:
+        layout: the map.
+        slip: a probability.
+        step_reward: see `GridMdp`, as for the others.
+        goal_reward: see there.
+        trap_reward: see there.
+
+    Raises:
+        InputError: a setting that makes no world.
+    """
+    slip = finite("slip", slip)
+    if not 0 <= slip <= 1:
+        raise InputError(f"slip={slip}: must be a probability, from 0 to 1")
+    step_reward = checked_reward("step_reward", step_reward)
+    goal_reward = checked_reward("goal_reward", goal_reward)
+    trap_reward = checked_reward("trap_reward", trap_reward)
+
+    if layout.cliffs and trap_reward > 0:
+        raise InputError(
+            f"trap_reward={trap_reward}: must be at most 0 where the map has a cliff, "
+            "from which the agent may fall again and again"
+        )
+    goal, trap, wall, cliff = (
+        _mask(layout, cells) for cells in (layout.goals, layout.traps, layout.walls, layout.cliffs)
+    )
+    terminal = goal | trap
+    absorbing = terminal | wall
+    neighbour = _neighbours(layout, wall)
+
+    # Outcome 0 is the move itself; with slip, 1 and 2 are the moves at right angles to it.
+    outcomes = [neighbour] if slip == 0 else [neighbour, np.roll(neighbour, -1, 1), np.roll(neighbour, 1, 1)]
+    chances = [1.0] if slip == 0 else [1 - slip, slip / 2, slip / 2]
+    thresholds = [] if slip == 0 else [1 - slip, 1 - slip / 2]
+    next_state = np.stack(outcomes, axis=-1)
+    reward = (step_reward + goal_reward * goal + trap_reward * (trap | cliff))[next_state]
+    next_state[cliff[next_state]] = layout.state(layout.starts[0])  # the only one where there is a cliff
+    next_state[absorbing] = np.flatnonzero(absorbing).reshape(-1, 1, 1)
+    reward[absorbing] = 0.0
+
+    start = _mask(layout, layout.starts) / len(layout.starts)
+    return GridMdp(
+        name=layout.name,
+        action_names=ACTION_NAMES,
+        layout=layout,
+        slip=slip,
+        step_reward=step_reward,
+        goal_reward=goal_reward,
+        trap_reward=trap_reward,
+        neighbour=frozen(neighbour),
+        next_state=frozen(next_state),
+        probability=np.broadcast_to(np.array(chances), next_state.shape),
+        thresholds=np.broadcast_to(np.array(thresholds), (*neighbour.shape, len(thresholds))),
+        reward=frozen(reward),
+        terminal=frozen(terminal),
+        goal=frozen(goal),
+        absorbing=frozen(absorbing),
+        wall=frozen(wall),
+        cliff=frozen(cliff),
+        start=frozen(start),
+        number=frozen(np.arange(goal.size)),
+        places=frozen(np.array([(0, *cell) for cell in layout.cells()], dtype=np.int64)),
+    )
+
+
+def mdp_or_compiled(
+    mdp: Mdp | None,
+    layout: str | PathLike[str] | Layout,
+    num_rows: int,
+    num_cols: int,
+    slip: float,
+    step_reward: float,
+    goal_reward: float,
+    trap_reward: float,
+) -> Mdp:
+    """The world of an environment, from the arguments of its constructor.
+
+    Args:
+        mdp: a compiled world, or None: the world that the others describe is compiled.
+        layout: see `load`.
+        num_rows: the size of the layout `classic`; the default also means that none is given.
+        num_cols: the same.
+        slip: see `compile_mdp`, as for the rewards.
+        step_reward: see there.
+        goal_reward: see there.
+        trap_reward: see there.
+
+    Returns:
+        `mdp`, or the compiled world.
+
+    Raises:
+        InputError: no world; or a compiled one and arguments that describe another.
+    """
+    described = (layout, num_rows, num_cols, slip, step_reward, goal_reward, trap_reward)
+    if mdp is None:
+        world = load_by_default_size(layout, num_rows, num_cols)
+        return compile_mdp(world, slip, step_reward, goal_reward, trap_reward)
+    if not isinstance(mdp, Mdp):
+        raise InputError(f"mdp={str(mdp)[:50]}: must be a compiled world, as `compile_mdp` makes one")
+    if described != (CLASSIC, NUM_ROWS, NUM_COLS, 0.0, 0.0, 1.0, -1.0):
+        raise InputError(
+            f"mdp={mdp.name}: is compiled with its layout, slip and rewards; leave these arguments out"
+        )
+    return mdp
+
+
+def _mask(layout: Layout, cells: tuple[Cell, ...] | frozenset[Cell]) -> BoolArray:
+    mask = np.zeros(layout.num_rows * layout.num_cols, dtype=np.bool_)
+    mask[[layout.state(cell) for cell in cells]] = True
+    return mask
+
+
+def _neighbours(layout: Layout, wall: BoolArray) -> IntArray:
+    states = np.arange(wall.size, dtype=np.int32)
+    rows, cols = np.divmod(states, layout.num_cols)
+    table = np.empty((wall.size, NUM_ACTIONS), dtype=np.int32)
+    for action, (down, right) in enumerate(MOVES):
+        row = np.clip(rows + down, 0, layout.num_rows - 1)
+        col = np.clip(cols + right, 0, layout.num_cols - 1)
+        target = row * layout.num_cols + col
+        table[:, action] = np.where(wall[target], states, target)
+    return table
