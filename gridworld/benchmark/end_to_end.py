@@ -97,14 +97,14 @@ def _certified(agent: str, seeds: range) -> Callable[[], float]:
         from gridworld.config.composition.conf_folder import conf_folder
         from gridworld.envs.observations import make_observation
         from gridworld.training.learning_curve import LearningCurve
-        from gridworld.training.setup import make_context, make_mdp
+        from gridworld.training.setup import make_context
         from gridworld.world.evaluation import Evaluator
 
         seconds = []
         for seed in seeds:
             config = compose(conf_folder(), [f"agent={agent}", f"seed={seed}"])
-            mdp = make_mdp(config.env)
-            evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.max_episode_steps)
+            mdp = config.env.compile()
+            evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
             made = family(config.agent).build(
                 config.agent, make_context(config, mdp, make_observation(mdp, config.observation.kind))
             )

@@ -10,7 +10,8 @@ from typing import Any
 
 from gridworld.commands import add_best
 from gridworld.commands.game import Game, Key, draw
-from gridworld.config.train import EnvConfig, EvaluationConfig
+from gridworld.config.train import EvaluationConfig
+from gridworld.config.worlds import MapConfig
 from gridworld.envs import rendering as drawing
 from gridworld.errors import InputError
 from gridworld.process.command_line import program
@@ -18,8 +19,8 @@ from gridworld.process.memory_budget import limited
 from gridworld.process.progress import telling_if_slow
 from gridworld.process.terminal import printable
 from gridworld.restore.saved_run import SavedRun
-from gridworld.training.setup import make_mdp
 from gridworld.world.evaluation import Evaluator
+from gridworld.world.grid import GridMdp
 
 _WIDEST_BOARD = 800  # pixels; two boards share twice 640
 _FPS = 30
@@ -127,15 +128,20 @@ def _game(options: argparse.Namespace) -> Game:
         if options.layout is not None:
             given["layout"] = options.layout
         gamma = EvaluationConfig().gamma if options.gamma is None else options.gamma
-        env = EnvConfig(**given)
-        return Game(Evaluator(make_mdp(env), gamma, env.max_episode_steps), options.seed)
+        env = MapConfig(**given)
+        mdp = env.compile()
+        return Game(Evaluator(mdp, gamma, env.step_limit(mdp)), options.seed)
     if "num_rows" in given or "num_cols" in given:
         raise InputError("--num-rows, --num-cols: with --agent, the world has the size it was trained on")
     saved = SavedRun(options.agent, best=options.best)
-    layout = saved.evaluator(options.layout).mdp.layout
-    config = saved.config
-    mdp = make_mdp(dataclasses.replace(config.env, **given), layout)
+    config, world = saved.config, saved.evaluator(options.layout).mdp
+    if not isinstance(config.env, MapConfig) or not isinstance(world, GridMdp):
+        raise InputError(
+            f"--agent {options.agent}: was trained on {config.env.name}; only maps can be played"
+        )
+    env = dataclasses.replace(config.env, **given)
+    mdp = env.compile_on(world.layout)
     gamma = config.evaluation.gamma if options.gamma is None else options.gamma
     policy = saved.snapshot().greedy_policy()
-    evaluator = Evaluator(mdp, gamma, config.env.max_episode_steps)
-    return Game(evaluator, options.seed, policy, config.agent.name, config.env.max_episode_steps)
+    evaluator = Evaluator(mdp, gamma, env.step_limit(mdp))
+    return Game(evaluator, options.seed, policy, config.agent.name, evaluator.max_episode_steps)

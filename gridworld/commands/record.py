@@ -127,6 +127,6 @@ def _check(options: argparse.Namespace) -> None:
 
 def _film(mdp: Mdp, subject: Subject, options: argparse.Namespace) -> Animation:
     policy = choose_policy(subject.snapshot, options.policy)
-    limit = subject.config.env.max_episode_steps
+    limit = subject.evaluator.max_episode_steps
     episodes = [play_episode(mdp, policy, limit, options.seed + index) for index in range(options.episodes)]
     return animation_of_states(mdp, np.concatenate(episodes), options.cell_size)

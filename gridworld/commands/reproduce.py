@@ -27,13 +27,13 @@ from gridworld.process.signals import Interrupted
 from gridworld.process.terminal import printable
 from gridworld.restore.comparison import Finding, check_whole, compare
 from gridworld.restore.repeat import lengths, repeat
-from gridworld.restore.saved_run import layout_of, settings_of
+from gridworld.restore.saved_run import settings_of
 from gridworld.run.claim import check_free, check_inside
 from gridworld.run.folder import MANIFEST
 from gridworld.run.provenance import describe, differences, source_differences
 from gridworld.run.reader import RunReader, open_run, read_run
-from gridworld.training.setup import make_mdp
-from gridworld.world.layout import Layout
+from gridworld.run.stored_world import stored_world
+from gridworld.world.mdp import Mdp
 
 DIFFERENT = 1  # exit code
 
@@ -48,14 +48,14 @@ def main(arguments: Sequence[str]) -> None:
     options = _parser().parse_args(arguments)
     then = open_run(options.run)
     config = settings_of(then, options.trust)
-    layout = layout_of(then, config)
+    mdp = stored_world(then, config.env)
     with telling_if_slow(f"reading {options.run}"):
         check_whole(then, config)  # training may take hours
     *shorter, _ = lengths(then, config)
     if options.keep is not None:
         check_inside(options.keep, "--keep")
         check_free(options.keep, "--keep")
-    print(printable(f"{options.run}: {config.agent.name} on {config.env.layout}, seed {config.seed}"))
+    print(printable(f"{options.run}: {config.agent.name} on {config.env.name}, seed {config.seed}"))
     _tell_environment(list(differences(then.manifest, _here(then.manifest))))
     _tell_resumed(then)
     if shorter:
@@ -64,11 +64,11 @@ def main(arguments: Sequence[str]) -> None:
     try:
         if options.keep is not None:
             options.keep.mkdir(parents=True, exist_ok=True)
-            same = _again(then, options.keep, config, layout, options.trust)
+            same = _again(then, options.keep, config, mdp, options.trust)
         else:
             with tempfile.TemporaryDirectory(prefix="gridworld-") as folder:
                 plain = _without_pictures(config)
-                same = _again(then, Path(folder), plain, layout, options.trust)
+                same = _again(then, Path(folder), plain, mdp, options.trust)
     except Interrupted as interruption:
         print(str(interruption), file=sys.stderr)
         sys.exit(interruption.exit_code)
@@ -96,11 +96,10 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _again(then: RunReader, folder: Path, config: TrainConfig, layout: Layout, trust: bool) -> bool | None:
+def _again(then: RunReader, folder: Path, config: TrainConfig, mdp: Mdp, trust: bool) -> bool | None:
     """Train again and compare: whether all is identical; None: all that can be compared is."""
-    mdp = make_mdp(config.env, layout)
     try:
-        repeat(then, folder, config, layout, trust)
+        repeat(then, folder, config, mdp, trust)
     except InputError as error:
         if not (folder / MANIFEST).exists():  # these settings cannot be run here at all
             raise

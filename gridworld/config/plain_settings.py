@@ -14,6 +14,7 @@ from gridworld.config.agents import MISSING, AgentConfig, agent_schemas
 from gridworld.config.effects import Effect
 from gridworld.config.settings_by_effect import effect_of, is_newer
 from gridworld.config.train import TrainConfig
+from gridworld.config.worlds import EnvConfig, schema_of
 from gridworld.errors import InputError
 
 _LIBRARIES = ("torch.nn.", "torch.optim.", "stable_baselines3.", "sb3_contrib.")
@@ -99,7 +100,8 @@ def read_config(content: Any, where: str) -> TrainConfig:
         own = [schema for schema in schemas if schema.algorithm == MISSING]
     if not own:
         raise InputError(f"{where}: config.agent.algorithm={shown(algorithm)} is not known here")
-    config = _read(TrainConfig, content, f"{where}: config", {AgentConfig: own[0]})
+    stand_in = {AgentConfig: own[0], EnvConfig: schema_of(content.get("env"))}
+    config = _read(TrainConfig, content, f"{where}: config", stand_in)
     assert isinstance(config, TrainConfig)
     return config
 

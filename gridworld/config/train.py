@@ -14,28 +14,14 @@ from gridworld.bounds import at_least, at_most, discount, within
 from gridworld.config.agents import AgentConfig
 from gridworld.config.effects import Effect, affects
 from gridworld.config.pictures import RecordingConfig
+from gridworld.config.worlds import EnvConfig, MapConfig
 from gridworld.errors import InputError
 
 # OmegaConf reads the annotations at run time and knows no `X | None`.
 
 MOST_ENVS = 2**17  # eight times the largest batch that any measurement here is faster with
 MOST_THREADS = 1024
-MOST_STEPS = 100_000  # of an episode; an evaluation goes through all of them
 AUTO = "auto"  # checkpoints as often as they cost next to nothing
-
-
-@dataclass
-class EnvConfig:
-    """The world; the arguments of `GridWorldEnv`."""
-
-    layout: str = "classic"  # the name of a shipped map, or a file
-    num_rows: Optional[int] = None  # noqa: UP045  # of the layout `classic`; null: 5
-    num_cols: Optional[int] = None  # noqa: UP045  # the same; null: 6
-    slip: float = 0.0  # probability of moving at a right angle instead
-    step_reward: float = 0.0  # paid for every step, beside the reward of the cell entered
-    goal_reward: float = 1.0  # paid for entering a goal, which ends the episode
-    trap_reward: float = -1.0  # for entering a trap, which ends it too, or a cliff, which does not
-    max_episode_steps: int = 100  # the step limit: then the episode is cut
 
 
 @dataclass
@@ -84,7 +70,8 @@ class TrainConfig:
     # of SB3: each a mapping of `_target_`, the import path of a class, and its arguments
     callbacks: list[Any] = field(default_factory=list)
     agent: AgentConfig = field(default_factory=AgentConfig)  # the chosen agent's own schema in its place
-    env: EnvConfig = field(default_factory=EnvConfig, metadata=affects(Effect.TASK))
+    # of the chosen source (`gridworld.config.worlds`)
+    env: EnvConfig = field(default_factory=MapConfig, metadata=affects(Effect.TASK))
     observation: ObservationConfig = field(default_factory=ObservationConfig)
     evaluation: EvaluationConfig = field(
         default_factory=EvaluationConfig, metadata=affects(Effect.EVALUATION)
@@ -108,7 +95,7 @@ def check(config: TrainConfig) -> None:
     at_most("n_envs", config.n_envs, MOST_ENVS)
     at_least("threads", config.threads, 1)
     at_most("threads", config.threads, MOST_THREADS)
-    check_step_limit(config.env)
+    config.env.check()
     at_least("observation.cell_size", config.observation.cell_size, 1)
     at_least("evaluation.every", config.evaluation.every, 1)
     discount("evaluation.gamma", config.evaluation.gamma)
@@ -123,13 +110,3 @@ def check(config: TrainConfig) -> None:
             f"checkpoint.every={every}: must be a number of steps, {AUTO}, or null for no checkpoints"
         )
     within("recording.fps", config.recording.fps, 1, 100)
-
-
-def check_step_limit(env: EnvConfig) -> None:
-    """Check the step limit of an episode.
-
-    Raises:
-        InputError: one that cannot be, or that an exact evaluation would not come to the end of.
-    """
-    at_least("env.max_episode_steps", env.max_episode_steps, 1)
-    at_most("env.max_episode_steps", env.max_episode_steps, MOST_STEPS)

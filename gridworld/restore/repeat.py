@@ -14,9 +14,8 @@ from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.restore.resume import open_unfinished
 from gridworld.run.reader import RunReader
-from gridworld.training.setup import make_mdp
 from gridworld.training.train import train
-from gridworld.world.layout import Layout
+from gridworld.world.mdp import Mdp
 
 
 def lengths(then: RunReader, config: TrainConfig) -> list[int]:
@@ -54,14 +53,14 @@ def _old_length(then: RunReader, again: dict[str, Any]) -> int:
     return old
 
 
-def repeat(then: RunReader, folder: Path, config: TrainConfig, layout: Layout, trust: bool = False) -> None:
+def repeat(then: RunReader, folder: Path, config: TrainConfig, mdp: Mdp, trust: bool = False) -> None:
     """Train a run again.
 
     Args:
         then: The run.
         folder: Where the new run is written; it exists.
         config: The settings to train with.
-        layout: The map.
+        mdp: The world.
         trust: Import the classes that the settings name, wherever they are from.
 
     Raises:
@@ -69,7 +68,6 @@ def repeat(then: RunReader, folder: Path, config: TrainConfig, layout: Layout, t
         Interrupted: Training was asked to stop.
     """
     first, *longer = lengths(then, config)
-    mdp = make_mdp(config.env, layout)
     overrides = then.manifest.get("overrides") or []
     train(dataclasses.replace(config, total_timesteps=first), folder, overrides, lambda env: mdp)
     for length in longer:

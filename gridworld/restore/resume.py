@@ -18,16 +18,18 @@ from typing import Any
 from gridworld.config.agents import LINEAR, AgentConfig, parse_schedule
 from gridworld.config.flatten import flat
 from gridworld.config.train import TrainConfig
+from gridworld.config.worlds import BuiltConfig, EnvConfig, GymnasiumConfig, MapConfig
 from gridworld.errors import InputError
 from gridworld.process.progress import telling_if_slow
 from gridworld.process.terminal import printable, tell
-from gridworld.restore.saved_run import layout_of, settings_of
+from gridworld.restore.saved_run import settings_of
 from gridworld.run.checkpoints import MOST_STEPS, Checkpoints, steps_of
 from gridworld.run.fingerprint import environment, identity, settings
 from gridworld.run.folder import CHECKPOINTS, CURVE, MANIFEST
 from gridworld.run.provenance import git, source_differences
 from gridworld.run.reader import RunReader
 from gridworld.run.recovery import is_started, run_to_resume
+from gridworld.run.stored_world import stored_world
 from gridworld.run.summary import Summary
 from gridworld.run.train_log import TrainLog
 from gridworld.run.writer import RunWriter
@@ -35,10 +37,10 @@ from gridworld.storage.append_log import holds
 from gridworld.storage.safe_read import open_ordinary
 from gridworld.storage.serialization import State, StateError
 from gridworld.training.session import CONTENT, FORMAT, LOGS
-from gridworld.training.setup import check_settings, make_mdp
+from gridworld.training.setup import check_settings
 from gridworld.training.sinks import CURVE_COLUMNS
 from gridworld.training.train import OnBuilt, carry_out, ignore, train
-from gridworld.world.layout import Layout
+from gridworld.world.mdp import Mdp
 
 _LONGEST_HEADER = 2**12  # bytes
 
@@ -78,7 +80,7 @@ def open_unfinished(folder: Path, trust: bool = False) -> Unfinished:
     """
     run = run_to_resume(folder)
     config = settings_of(run, trust, allow="trust=true")
-    return Unfinished(run, config, layout_of(run, config))
+    return Unfinished(run, config, stored_world(run, config.env))
 
 
 def unfinished_of(folder: Path, config: TrainConfig) -> Unfinished:
@@ -96,14 +98,14 @@ def unfinished_of(folder: Path, config: TrainConfig) -> Unfinished:
 
 @dataclass(frozen=True, eq=False)
 class Unfinished:
-    """A run to resume: its folder, its settings and its map."""
+    """A run to resume: its folder, its settings and its world."""
 
     run: RunReader
     config: TrainConfig
-    layout: Layout
+    mdp: Mdp
 
-    def check_same(self, config: TrainConfig, layout: str) -> None:
-        """Check that settings and a map's text are the run's own.
+    def check_same(self, config: TrainConfig, world: str) -> None:
+        """Check that settings and a world's text are the run's own.
 
         Raises:
             InputError: They are not.
@@ -117,8 +119,8 @@ class Unfinished:
             for key in dict.fromkeys([*own, *other])
             if own.get(key) != other.get(key)
         ]
-        if not differing and layout != self.layout.text():
-            differing = [f"the map {config.env.layout} has changed since"]
+        if not differing and world != self.mdp.text():
+            differing = [f"the {_kind(config.env)} {config.env.name} has changed since"]
         if differing:
             more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
             raise InputError(
@@ -168,7 +170,7 @@ class Unfinished:
                 self.config.logging, progress=self.config.logging.progress and progress
             ),
         )
-        mdp = check_settings(config, lambda env: make_mdp(env, self.layout))
+        mdp = check_settings(config, lambda env: self.mdp)
         self._tell_if_map_changed()
         with telling_if_slow(f"reading the checkpoints of {run.folder}"):
             state = _newest_state(run, identity(config, mdp.text()))
@@ -187,14 +189,16 @@ class Unfinished:
         return carry_out(config, run.folder, mdp, begin, log, state, on_built)
 
     def _tell_if_map_changed(self) -> None:
+        if isinstance(self.config.env, BuiltConfig | GymnasiumConfig):  # which would run their code
+            return
         try:
-            changed = make_mdp(self.config.env).layout.text() != self.layout.text()
+            changed = self.config.env.compile().text() != self.mdp.text()
         except InputError:
             changed = True
         if changed:
             tell(
-                f"{self.run.folder}: its map {self.config.env.layout} has changed since; it goes on with the "
-                "one that it began with"
+                f"{self.run.folder}: its {_kind(self.config.env)} {self.config.env.name} has changed since; "
+                "it goes on with the one that it began with"
             )
 
     def _check_restart(self, config: TrainConfig) -> None:
@@ -210,7 +214,7 @@ class Unfinished:
     def _restart(self, config: TrainConfig) -> RunWriter:
         overrides = self.run.manifest.get("overrides", [])
         content = dataclasses.asdict(config)
-        return RunWriter.start(self.run.folder, content, self.layout.text(), overrides, replace=True)
+        return RunWriter.start(self.run.folder, content, self.mdp, overrides, replace=True)
 
     def _check_length(self, config: TrainConfig, steps: int) -> None:
         total, old_total = config.total_timesteps, self.config.total_timesteps
@@ -228,6 +232,10 @@ class Unfinished:
             tell(f"{folder}: the source tree is another, which is noted: {printable('; '.join(changes))}")
         if config.total_timesteps != old_total:
             tell(_what_changes(config, steps, old_total))
+
+
+def _kind(env: EnvConfig) -> str:
+    return "map" if isinstance(env, MapConfig) else "world"
 
 
 def _newest_state(run: RunReader, own: str) -> State | None:

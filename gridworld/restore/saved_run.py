@@ -19,12 +19,15 @@ from numpy.typing import NDArray
 from gridworld.agents import Agent, PolicySnapshot, family
 from gridworld.config.plain_settings import check_imports, read_config
 from gridworld.config.train import TrainConfig, check
+from gridworld.config.worlds import MapConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.run.reader import RunReader, open_run
-from gridworld.training.setup import make_context, make_mdp
+from gridworld.run.stored_world import stored_world
+from gridworld.training.setup import make_context
 from gridworld.world.evaluation import Evaluator
-from gridworld.world.layout import CLASSIC, Layout, load, parse
+from gridworld.world.grid import GridMdp
+from gridworld.world.layout import CLASSIC, Layout, load
 from gridworld.world.mdp import FloatArray, Mdp
 
 _LARGEST_HEADER = 2**12  # bytes before the numbers in NumPy's format
@@ -50,7 +53,7 @@ class SavedRun:
         self._steps = "best_step" if best else "timesteps"
         # The device that it was trained on need not exist here.
         self.config = dataclasses.replace(settings_of(self.run, trust, trains=False), device="cpu")
-        self.mdp: Mdp = make_mdp(self.config.env, layout_of(self.run, self.config))
+        self.mdp: Mdp = stored_world(self.run, self.config.env)
 
     def evaluator(self, layout: str | None = None) -> Evaluator:
         """An evaluator of the run's world.
@@ -63,6 +66,11 @@ class SavedRun:
         """
         mdp = self.mdp
         if layout is not None:
+            env = self.config.env
+            if not isinstance(env, MapConfig) or not isinstance(mdp, GridMdp):
+                raise InputError(
+                    f"layout {layout!r}: {self.run.folder} was trained on {env.name}, which is no map"
+                )
             trained = mdp.layout
             world = load(layout, *_size(trained)) if layout == CLASSIC else load(layout)
             if _size(world) != _size(trained):
@@ -70,8 +78,8 @@ class SavedRun:
                     f"layout {world.name}: is {world.num_rows}x{world.num_cols}, the agent was trained on "
                     f"{trained.num_rows}x{trained.num_cols}; take a map of that size"
                 )
-            mdp = make_mdp(self.config.env, world)
-        return Evaluator(mdp, self.config.evaluation.gamma, self.config.env.max_episode_steps)
+            mdp = env.compile_on(world)
+        return Evaluator(mdp, self.config.evaluation.gamma, self.config.env.step_limit(mdp))
 
     def snapshot(self) -> PolicySnapshot:
         """The trained agent's values and policy in every state.
@@ -127,7 +135,7 @@ def settings_of(
         InputError: A setting is not valid, or names a class that is not trusted.
     """
     config = read_config(run.manifest["config"], str(run.manifest_file))
-    for key, name in (("agent.name", config.agent.name), ("env.layout", config.env.layout)):
+    for key, name in (("agent.name", config.agent.name), ("env", config.env.name)):
         if len(name) > _LONGEST_NAME or not all(sign.isprintable() or sign in _UNDECODED for sign in name):
             raise InputError(f"{run.manifest_file}: config.{key}={name[:80]!r}: must be a plain name")
     try:
@@ -139,16 +147,6 @@ def settings_of(
     except RecursionError:
         raise InputError(f"{run.manifest_file}: config is nested too deeply") from None
     return config
-
-
-def layout_of(run: RunReader, config: TrainConfig) -> Layout:
-    """The map in a run's manifest, under the name that its settings have for it.
-
-    Raises:
-        InputError: It is no valid map.
-    """
-    text = "\n".join(run.manifest["layout"])
-    return dataclasses.replace(parse(text, f"{run.manifest_file}: layout"), name=config.env.layout)
 
 
 def read_visits(run: RunReader, shape: tuple[int, ...]) -> NDArray[np.int64]:

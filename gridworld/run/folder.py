@@ -7,6 +7,7 @@
     summary.json    the result
     model.zip       the trained model; best_model.zip: that of the lowest exact regret, the first of equals
     evaluations.npz the learning curve's exact returns and lengths, as SB3's EvalCallback writes sampled ones
+    world.npz       the world's tables, where it is no map (`gridworld.world.sources.arrays`)
     visits.npy      how often training took each action in each state, (S, A)
     policy.png, q_error.png, visits.png, learning.gif   what was learnt, how well, where, and how
     frames/, episode.gif, ...   the final policy's episode
@@ -16,9 +17,10 @@
     .hydra/         the configuration as Hydra composed it
     events.out...   TensorBoard's event file
 
-The manifest alone is enough to build the world and the agent again: it holds the resolved settings and
-the map's text. Of a finished run it also has the checksums of the files that hold its result and its
-pictures. It is sealed. `run.writer` writes these files, `run.reader` reads and verifies them.
+The manifest is enough to build the world and the agent again: it holds the resolved settings and the map's
+text, or of another world the digest of the tables beside it. Of a finished run it also has the checksums of
+the files that hold its result and its pictures. It is sealed. `run.writer` writes these files, `run.reader`
+reads and verifies them.
 """
 
 from __future__ import annotations
@@ -36,6 +38,7 @@ CURVE = "curve.csv"
 SUMMARY = "summary.json"
 MODEL = "model.zip"
 VISITS = "visits.npy"
+WORLD = "world.npz"
 BEST_MODEL = "best_model.zip"  # these two as SB3's EvalCallback names them
 EVALUATIONS = "evaluations.npz"
 RESULTS = (CURVE, SUMMARY, MODEL, BEST_MODEL, VISITS, EVALUATIONS)
@@ -50,7 +53,15 @@ SWEEP_JSON = "sweep.json"  # a sweep's folder has this instead of a manifest
 
 # Patterns of all that training writes, except the manifest.
 OUTPUTS = (
-    *(*RESULTS, *(each.file for each in pictures.PICTURES), CHECKPOINTS, TRAIN_LOG, ERROR_FILE, EVENTS),
+    *(
+        *RESULTS,
+        WORLD,
+        *(each.file for each in pictures.PICTURES),
+        CHECKPOINTS,
+        TRAIN_LOG,
+        ERROR_FILE,
+        EVENTS,
+    ),
     "source*.diff",
 )
 
@@ -73,6 +84,7 @@ class RunFolder:
         self.error_file = folder / ERROR_FILE
         self.visits_file = folder / VISITS
         self.evaluations_file = folder / EVALUATIONS
+        self.world_file = folder / WORLD
 
     def results(self) -> tuple[Path, ...]:
         """The paths of the files that hold the result."""

@@ -10,13 +10,16 @@ from typing import Any, Self
 from gridworld.errors import InputError
 from gridworld.process.command_line import recorded_command_line
 from gridworld.run import provenance
-from gridworld.run.folder import CHECKPOINTS, OUTPUTS, PICTURES, RunFolder
+from gridworld.run.folder import CHECKPOINTS, OUTPUTS, PICTURES, WORLD, RunFolder
 from gridworld.run.provenance import describe, source_differences
 from gridworld.run.reader import LARGEST_RESULT, RunReader
 from gridworld.storage.atomic_write import json_text, sync, sync_folder, tidy, write_bytes, write_json
 from gridworld.storage.safe_read import check_no_link, file_sha256
 from gridworld.storage.sealed_json import sealed
 from gridworld.storage.symlinks import remove_path
+from gridworld.world.grid import GridMdp
+from gridworld.world.mdp import Mdp
+from gridworld.world.sources.arrays import world_bytes
 
 
 class RunWriter(RunFolder):
@@ -37,7 +40,7 @@ class RunWriter(RunFolder):
         cls,
         folder: Path,
         config: dict[str, Any],
-        layout_text: str,
+        world: Mdp,
         overrides: list[str],
         replace: bool = False,
     ) -> Self:
@@ -49,7 +52,7 @@ class RunWriter(RunFolder):
         Args:
             folder: The run's folder, which exists.
             config: The resolved settings.
-            layout_text: The map.
+            world: The compiled world, which the manifest or the folder keeps.
             overrides: The settings given on the command line.
             replace: Remove what the folder has of an earlier run.
 
@@ -65,13 +68,15 @@ class RunWriter(RunFolder):
             "seed": config["seed"],
             "threads": config["threads"],
             **describe(),
-            "layout": layout_text.split("\n"),
+            "layout": world.text().split("\n"),
             "config": config,
         }
         run = cls(folder, content)
         if not replace and run.manifest_file.exists():
             raise InputError(f"{folder}: holds a run already; give every run a folder of its own")
         (clear if replace else _remove_partial_files)(folder)
+        if not isinstance(world, GridMdp):
+            write_bytes(run.world_file, world_bytes(world), durable=replace)
         run._write(durable=replace)
         run._keep_diff(content["git"])
         return run
@@ -111,11 +116,14 @@ class RunWriter(RunFolder):
         """Make the manifest, then these files, and all names in the folder survive a power cut."""
         if self._is_settled and not files:
             return
-        own = [] if self._is_settled else [self.manifest_file, *self.folder.glob("source*.diff")]
+        own = [] if self._is_settled else [self.manifest_file, *self._beside_the_manifest()]
         sync([*own, *files], self.folder)
         if not self._is_settled:
             sync_folder(self.folder.parent)
         self._is_settled = True
+
+    def _beside_the_manifest(self) -> list[Path]:
+        return [path for pattern in ("source*.diff", WORLD) for path in self.folder.glob(pattern)]
 
     @property
     def manifest(self) -> Mapping[str, Any]:

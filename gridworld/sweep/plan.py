@@ -22,10 +22,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
 from gridworld.config.settings_by_effect import ON_RESULT, with_effects
-from gridworld.config.train import EnvConfig, TrainConfig
+from gridworld.config.train import TrainConfig
+from gridworld.config.worlds import EnvConfig
 from gridworld.errors import InputError
 from gridworld.storage.safe_read import sha256
-from gridworld.training.setup import check_settings, make_mdp
+from gridworld.training.setup import check_settings
 from gridworld.world.mdp import Mdp
 
 _LONGEST_NAME = 100  # characters of a job's folder
@@ -147,12 +148,12 @@ def plan(
     Raises:
         Exception: what `configure` raises.
     """
-    worlds: dict[tuple[Any, ...], Mdp] = {}
+    worlds: dict[str, Mdp] = {}
 
     def world(env: EnvConfig) -> Mdp:
-        key = dataclasses.astuple(env)
+        key = repr(env)
         if key not in worlds:
-            worlds[key] = make_mdp(env)
+            worlds[key] = env.compile()
         return worlds[key]
 
     planned: dict[str, Job] = {}

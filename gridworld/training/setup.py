@@ -5,32 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from gridworld.agents import TrainingContext, WriteScalars, family
-from gridworld.config.train import EnvConfig, TrainConfig, check
+from gridworld.config.train import TrainConfig, check
+from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.rendering import frame_size
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.visualization.video import require_video
-from gridworld.world.grid import compile_mdp
-from gridworld.world.layout import Layout, load
 from gridworld.world.mdp import Mdp
-
-
-def make_mdp(env: EnvConfig, layout: Layout | None = None) -> Mdp:
-    """Compile the world of these settings.
-
-    Args:
-        env: the settings of the world.
-        layout: a map that stands in for the configured one.
-
-    Returns:
-        The compiled world.
-
-    Raises:
-        InputError: for a map, a size or a reward that cannot be.
-    """
-    if layout is None:
-        layout = load(env.layout, env.num_rows, env.num_cols)
-    return compile_mdp(layout, env.slip, env.step_reward, env.goal_reward, env.trap_reward)
 
 
 def make_context(
@@ -50,13 +31,13 @@ def make_context(
     Returns:
         `config.n_envs` fresh environments and what else the agent's family builds it from.
     """
-    envs = StatisticsVectorEnv(config.n_envs, max_episode_steps=config.env.max_episode_steps, mdp=mdp)
+    envs = StatisticsVectorEnv(config.n_envs, max_episode_steps=config.env.step_limit(mdp), mdp=mdp)
     return TrainingContext(
         envs, observation, config.seed, config.device, config.threads, write_scalars, config.callbacks
     )
 
 
-def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = make_mdp) -> Mdp:
+def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = compiled) -> Mdp:
     """Check everything that can be checked without the agent's library.
 
     Args:

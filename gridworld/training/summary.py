@@ -35,7 +35,7 @@ def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, secon
         "total_timesteps": config.total_timesteps,
         "timesteps": last.step,
         "gamma": config.evaluation.gamma,
-        "max_episode_steps": config.env.max_episode_steps,
+        "max_episode_steps": evaluator.max_episode_steps,
         "certified": last.greedy.certified,
         "first_certified_step": certificate.first_certified_step,
         "certified_since_step": certificate.certified_since_step,

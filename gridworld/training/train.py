@@ -10,7 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from gridworld.agents import Agent, TrainingContext, family
-from gridworld.config.train import EnvConfig, TrainConfig
+from gridworld.config.train import TrainConfig
+from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import ObservationTable, make_observation
 from gridworld.errors import InputError, MachineError, reason
 from gridworld.process.command_line import recorded_command_line
@@ -23,7 +24,7 @@ from gridworld.run.writer import RunWriter
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.serialization import State, StateError
 from gridworld.training.session import Session
-from gridworld.training.setup import check_settings, make_context, make_mdp
+from gridworld.training.setup import check_settings, make_context
 from gridworld.training.tensorboard import EventWriter
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
@@ -39,7 +40,7 @@ def train(
     config: TrainConfig,
     folder: Path,
     overrides: list[str],
-    world: Callable[[EnvConfig], Mdp] = make_mdp,
+    world: Callable[[EnvConfig], Mdp] = compiled,
     replace: bool = False,
     on_built: OnBuilt = ignore,
 ) -> Summary:
@@ -65,7 +66,7 @@ def train(
         mdp = check_settings(config, world)
 
         def begin() -> RunWriter:
-            return RunWriter.start(folder, dataclasses.asdict(config), mdp.text(), overrides, replace)
+            return RunWriter.start(folder, dataclasses.asdict(config), mdp, overrides, replace)
 
         return carry_out(config, folder, mdp, begin, log, on_built=on_built)
 
@@ -97,7 +98,7 @@ def carry_out(
         InputError, MachineError, Interrupted: as `train` does.
     """
     observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
-    evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.max_episode_steps)
+    evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
     if state is None:
         _rehearse(config, mdp, observation)
     steps, before = (0, None) if state is None else (state["steps"], FilesBefore(folder, state["marks"]))

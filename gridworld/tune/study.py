@@ -19,7 +19,6 @@ from gridworld.errors import InputError
 from gridworld.process.command_line import command
 from gridworld.process.terminal import printable
 from gridworld.sweep.console import shell_path
-from gridworld.training.setup import make_mdp
 from gridworld.training.tensorboard import hparams
 from gridworld.tune.confirmation import (
     HeldOutRun,
@@ -86,7 +85,7 @@ def _about(spec: StudySpec) -> dict[str, Any]:
     del settings["seed"]
     return {
         "search space": spec.space.plain(),
-        "configuration": settings | {"map": make_mdp(spec.base.env).text()},
+        "configuration": settings | {"map": spec.base.env.compile().text()},
         "objective": {
             "seeds": list(spec.seeds),
             "stop_after": spec.settings.stop_after,

@@ -168,7 +168,7 @@ def write_study(spec: StudySpec, study: optuna.Study, outcome: dict[str, Any]) -
     content = {
         "study": spec.name,
         "agent": spec.base.agent.name,
-        "env": spec.base.env.layout,
+        "env": spec.base.env.name,
         "command": recorded_command_line(),
         "versions": versions() | {"optuna": optuna.__version__},
         "total_timesteps": spec.base.total_timesteps,

@@ -194,7 +194,7 @@ def _core_count() -> int:
 
 
 def _completed(settings: TuneConfig, agent: str, base: TrainConfig) -> TuneConfig:
-    study = settings.study or f"tune_{slug(agent)}_{slug(base.env.layout)}"
+    study = settings.study or f"tune_{slug(agent)}_{slug(base.env.name)}"
     if slug(study) != study:
         raise InputError(f"tune.study={study}: must be of letters, digits and _.,=+-, e.g. {slug(study)}")
     workers = _core_count() if settings.workers == -1 else settings.workers

@@ -16,7 +16,7 @@ _MOST_FRAMES = 500  # of an episode that finds no end; by then a greedy one goes
 def draw(subject: Subject) -> Draw:
     """Play one episode on the run's seed; its own cell size is `recording.cell_size`."""
     config, mdp = subject.config, subject.evaluator.mdp
-    policy, limit = subject.snapshot.greedy_policy(), config.env.max_episode_steps
+    policy, limit = subject.snapshot.greedy_policy(), subject.evaluator.max_episode_steps
     states = play_episode(mdp, policy, limit, config.seed)[:_MOST_FRAMES]
 
     @functools.cache  # several files show the same

@@ -14,7 +14,6 @@ from gridworld.config.plain_settings import read_config
 from gridworld.config.train import TrainConfig, check
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
-from gridworld.training.setup import make_mdp
 from gridworld.training.tensorboard import hparams
 from gridworld.world.layout import shipped_layouts
 
@@ -30,7 +29,7 @@ def test_every_choice_composes_and_could_train(group: str, choice: str) -> None:
     config = configure(f"{group}={choice}", *policy)
     check(config)
     family(config.agent).check(config)
-    mdp = make_mdp(config.env)
+    mdp = config.env.compile()
     assert make_observation(mdp, config.observation.kind).num_states == mdp.num_states
     for part in dataclasses.fields(TrainConfig):
         assert not isinstance(getattr(config, part.name), dict)

@@ -20,7 +20,6 @@ from gridworld.storage.sealed_json import sealed
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.job_table import FAILED, JobTable
 from gridworld.sweep.plan import Job, settings_hash
-from gridworld.training.setup import make_mdp
 from gridworld.tune.study_folder import SEARCH_JSON
 from gridworld.world.evaluation import Evaluator
 
@@ -34,7 +33,7 @@ class Maker:
     def __init__(self, *overrides: str) -> None:
         config = configure(*overrides)
         self.config = dataclasses.asdict(config)
-        mdp = make_mdp(config.env)
+        mdp = config.env.compile()
         self.evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.max_episode_steps)
         self.layout = mdp.layout
 

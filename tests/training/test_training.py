@@ -18,7 +18,6 @@ from gridworld.errors import InputError
 from gridworld.restore.saved_run import SavedRun
 from gridworld.storage.sealed_json import sealed
 from gridworld.training.learning_curve import LearningCurve
-from gridworld.training.setup import make_mdp
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.markov_chain import one_hot_policy
 
@@ -93,7 +92,7 @@ def test_the_curve_has_a_row_per_evaluation(tmp_path: Path) -> None:
     with (tmp_path / "curve.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [int(row["step"]) for row in rows] == [0, 500, 1000, 1500, 2000]
-    evaluator = Evaluator(make_mdp(configure().env), 0.99, 100)
+    evaluator = Evaluator(configure().env.compile(), 0.99, 100)
     for row in rows:
         total = sum(float(row[f"{name}_probability"]) for name in ("goal", "trap", "timeout"))
         assert total == pytest.approx(1)
@@ -142,7 +141,7 @@ class Scripted:
 
 def follow(pattern: list[bool], *overrides: str) -> tuple[LearningCurve, list[bool]]:
     config = configure("evaluation.every=10", "logging.progress=false", *overrides)
-    evaluator = Evaluator(make_mdp(config.env), 0.99, 100)
+    evaluator = Evaluator(config.env.compile(), 0.99, 100)
     agent = Scripted(np.argmax(evaluator.optimal_policy(), axis=1), pattern)
     curve = LearningCurve(evaluator, agent, config)  # type: ignore[arg-type]
     goes_on = [curve.on_step(10 * (index + 1)) for index in range(len(pattern))]
@@ -199,7 +198,7 @@ def test_dqn_is_scored_as_random_as_it_acts_before_learning(tmp_path: Path) -> N
     train_in(tmp_path, *SHORT["dqn"])
     with (tmp_path / "curve.csv").open(newline="") as file:
         first = next(csv.DictReader(file))
-    evaluator = Evaluator(make_mdp(configure().env), 0.99, 100)
+    evaluator = Evaluator(configure().env.compile(), 0.99, 100)
     assert float(first["sampled_value"]) == pytest.approx(evaluator.score(np.full((30, 4), 0.25)).value)
 
 

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from helpers.support import configure
 
-from gridworld.training.setup import make_mdp
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import parse
@@ -17,7 +16,7 @@ UP, RIGHT, DOWN, LEFT = range(4)
 
 
 def cliff(slip=0.0):
-    return make_mdp(configure("env=cliff_walking", f"env.slip={slip}").env)
+    return configure("env=cliff_walking", f"env.slip={slip}").env.compile()
 
 
 def safe_way():

@@ -16,7 +16,7 @@ from gridworld.envs.observations import make_observation
 from gridworld.envs.rollout import play_episode, sample_episodes
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.vector_env import GridWorldVectorEnv
-from gridworld.training.setup import make_context, make_mdp
+from gridworld.training.setup import make_context
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse, shipped_layouts
@@ -158,7 +158,7 @@ def test_slips_do_not_depend_on_the_actions_of_training(monkeypatch, agent: str)
         config.agent.learning_starts = 19_000
     elif agent == "qrdqn":
         config.agent.arguments["learning_starts"] = 19_000
-    mdp = make_mdp(config.env)
+    mdp = config.env.compile()
     context = make_context(config, mdp, make_observation(mdp, "one_hot"))
     family(config.agent).build(config.agent, context).learn(config.total_timesteps, lambda steps: True)
     assert_independent(slip_table(mdp, walked))

@@ -23,6 +23,7 @@ from gridworld.config.composition.loader import composing_from
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.config.tune import SearchConfig
+from gridworld.config.worlds import SOURCES, EnvConfig
 
 _LONGEST_NAME = 100  # characters of a job's folder
 _ONE_AT_A_TIME = threading.RLock()  # Hydra composes with variables of the process
@@ -84,6 +85,7 @@ def register_schemas() -> None:
     """Register the schemas with Hydra, and with OmegaConf the functions by which `conf/` names folders."""
     _store_schemas()
     OmegaConf.register_new_resolver("slug", slug, replace=True)
+    OmegaConf.register_new_resolver("world", _world_name, replace=True)
     OmegaConf.register_new_resolver("token", lambda: secrets.token_hex(3), use_cache=True, replace=True)
 
 
@@ -91,13 +93,29 @@ def register_schemas() -> None:
 def _store_schemas() -> None:
     """Register the schemas with Hydra."""
     store = ConfigStore.instance()
-    store.store(name="train_schema", node=TrainConfig)
+    store.store(name="train_schema", node=TrainConfig(env=EnvConfig()))
     store.store(name="tune_schema", node=SearchConfig)
     store.store(group="hydra/sweeper", name="gridworld", node=SweepConfig)
     for name, launcher in LAUNCHER_SCHEMAS.items():
         store.store(group="hydra/launcher/schema", name=name, node=launcher)
     for name, schema in agent_schemas().items():
         store.store(group="agent/schema", name=name, node=schema)
+    for name, source in SOURCES.items():
+        store.store(group="env/schema", name=name, node=_open(source))
+
+
+def _world_name(env: DictConfig) -> str:
+    """What folders call the world of the section `env`."""
+    chosen = OmegaConf.to_object(env)
+    return chosen.name if isinstance(chosen, EnvConfig) else "world"
+
+
+def _open(source: type[EnvConfig]) -> DictConfig:
+    """A source's schema whose `kwargs`, if it has them, take any name without a plus."""
+    node = cast(DictConfig, OmegaConf.structured(source))
+    if "kwargs" in node:
+        OmegaConf.set_struct(node.kwargs, False)
+    return node
 
 
 def slug(text: Any) -> str:

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridworld.config.train import EnvConfig, check_step_limit
+from gridworld.config.worlds import schema_of
 from gridworld.report.evidence.run_reader import Evidence
-from gridworld.training.setup import make_mdp
+from gridworld.run.reader import read_run
+from gridworld.run.stored_world import stored_world
 from gridworld.world.evaluation import Evaluator
-from gridworld.world.layout import parse
 
 _MOST_CELLS = 100_000  # beyond, solving the world again would take longer than the report
 _TOLERANCE = 1e-6  # relative
@@ -59,13 +59,14 @@ def reference(run: Evidence) -> Reference:
 
 
 def _evaluator(run: Evidence) -> Evaluator:
-    known = {field.name for field in dataclasses.fields(EnvConfig)}
+    schema = schema_of(run.world)
+    known = {field.name for field in dataclasses.fields(schema)}
     if unknown := sorted(run.world.keys() - known):
         raise ValueError(f"env.{unknown[0]} is not known to this version")
     lines = run.layout.split("\n")
     if len(lines) * max(map(len, lines)) > _MOST_CELLS:
         raise ValueError(f"it has more than {_MOST_CELLS:,} cells")
-    env = EnvConfig(**run.world)
-    check_step_limit(env)
-    layout = parse(run.layout, f"{run.folder}: layout")
-    return Evaluator(make_mdp(env, layout), run.gamma, env.max_episode_steps)
+    env = schema(**run.world)
+    env.check()
+    mdp = stored_world(read_run(run.folder), env)
+    return Evaluator(mdp, run.gamma, env.step_limit(mdp))

@@ -174,7 +174,7 @@ def _learn(config: TrainConfig, on_evaluation: OnEvaluation, is_stopped: IsStopp
     """Train and evaluate as a run would, and keep nothing but the end."""
     mdp = check_settings(config)
     observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
-    evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.max_episode_steps)
+    evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
     context = make_context(config, mdp, observation)
     agent = family(config.agent).build(config.agent, context)
     curve = LearningCurve(evaluator, agent, config, envs=context.envs)

@@ -1,0 +1,180 @@
+"""Where a world comes from: a schema for each source, which compiles its world.
+
+A schema is the section `env` of a run's settings. `SOURCES` has them by the names that the files in
+`conf/env` choose them by. To add a source, add a schema here, a yaml, and a module in
+`gridworld.world.sources`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Optional
+
+from gridworld.bounds import at_least, at_most
+from gridworld.config.agents import MISSING
+from gridworld.world.grid import GridMdp, compile_mdp
+from gridworld.world.layout import Layout, load
+from gridworld.world.mdp import Mdp
+
+# OmegaConf reads the annotations at run time and knows no `X | None`.
+
+MOST_STEPS = 100_000  # of an episode; an evaluation goes through all of them
+WITHOUT_LIMIT = 1000  # steps of an episode, where neither the settings nor the world have a limit
+
+
+@dataclass
+class EnvConfig:
+    """A world of any source."""
+
+    max_episode_steps: Optional[int] = None  # noqa: UP045  # the step limit; null: the world's own, or 1000
+
+    @property
+    def name(self) -> str:
+        """What folders and messages call the world."""
+        raise NotImplementedError
+
+    def compile(self) -> Mdp:
+        """Compile the world.
+
+        Raises:
+            InputError: settings that make no world.
+        """
+        raise NotImplementedError
+
+    def step_limit(self, mdp: Mdp) -> int:
+        """The step limit of an episode in the compiled world."""
+        return self.max_episode_steps or mdp.max_episode_steps or WITHOUT_LIMIT
+
+    def check(self) -> None:
+        """Check the step limit: one that can be, and that an exact evaluation comes to the end of.
+
+        Raises:
+            InputError: it is another one.
+        """
+        if self.max_episode_steps is not None:
+            at_least("env.max_episode_steps", self.max_episode_steps, 1)
+            at_most("env.max_episode_steps", self.max_episode_steps, MOST_STEPS)
+
+
+@dataclass
+class MapConfig(EnvConfig):
+    """A map and its rewards; the arguments of `GridWorldEnv`."""
+
+    layout: str = "classic"  # the name of a shipped map, or a file
+    num_rows: Optional[int] = None  # noqa: UP045  # of the layout `classic`; null: 5
+    num_cols: Optional[int] = None  # noqa: UP045  # the same; null: 6
+    slip: float = 0.0  # probability of moving at a right angle instead
+    step_reward: float = 0.0  # paid for every step, beside the reward of the cell entered
+    goal_reward: float = 1.0  # paid for entering a goal, which ends the episode
+    trap_reward: float = -1.0  # for entering a trap, which ends it too, or a cliff, which does not
+    max_episode_steps: Optional[int] = 100  # noqa: UP045  # the step limit: then the episode is cut
+
+    @property
+    def name(self) -> str:
+        """See `EnvConfig.name`."""
+        return self.layout
+
+    def compile(self) -> GridMdp:
+        """See `EnvConfig.compile`."""
+        return self.compile_on(load(self.layout, self.num_rows, self.num_cols))
+
+    def compile_on(self, layout: Layout) -> GridMdp:
+        """Compile the world with another map in place of the configured one.
+
+        Raises:
+            InputError: a reward that cannot be.
+        """
+        return compile_mdp(layout, self.slip, self.step_reward, self.goal_reward, self.trap_reward)
+
+
+@dataclass
+class GymnasiumConfig(EnvConfig):
+    """An environment of Gymnasium that has a transition table; its step limit is that of its id."""
+
+    source: str = "gymnasium"
+    id: str = MISSING  # that it is registered under, e.g. FrozenLake-v1
+    kwargs: dict[str, Any] = field(default_factory=dict)  # of gymnasium.make
+
+    @property
+    def name(self) -> str:
+        """See `EnvConfig.name`."""
+        return self.id
+
+    def compile(self) -> Mdp:
+        """See `EnvConfig.compile`."""
+        from gridworld.world.sources.gymnasium_table import compile_gymnasium
+
+        return compile_gymnasium(self.id, self.kwargs)
+
+
+@dataclass
+class EnumeratedConfig(GymnasiumConfig):
+    """A deterministic environment of Gymnasium whose states are found by trying all actions."""
+
+    source: str = "enumerated"
+
+    def compile(self) -> Mdp:
+        """See `EnvConfig.compile`."""
+        from gridworld.world.sources.enumerated import enumerate_env
+
+        return enumerate_env(self.id, self.kwargs)
+
+
+@dataclass
+class ArraysConfig(EnvConfig):
+    """Tables in a file."""
+
+    source: str = "arrays"
+    path: str = MISSING  # of an .npz
+
+    @property
+    def name(self) -> str:
+        """See `EnvConfig.name`."""
+        return Path(self.path).stem
+
+    def compile(self) -> Mdp:
+        """See `EnvConfig.compile`."""
+        from gridworld.world.sources.arrays import load_arrays
+
+        return load_arrays(self.path)
+
+
+@dataclass
+class BuiltConfig(EnvConfig):
+    """What a function returns: an `Mdp`, or the tables of one."""
+
+    source: str = "built"
+    builder: str = MISSING  # the function's import path
+    kwargs: dict[str, Any] = field(default_factory=dict)  # of the function
+
+    @property
+    def name(self) -> str:
+        """See `EnvConfig.name`."""
+        return self.builder.rpartition(".")[2]
+
+    def compile(self) -> Mdp:
+        """See `EnvConfig.compile`."""
+        from gridworld.world.sources.built import build
+
+        return build(self.builder, self.kwargs)
+
+
+def compiled(env: EnvConfig) -> Mdp:
+    """The world of these settings; see `EnvConfig.compile`."""
+    return env.compile()
+
+
+def schema_of(content: Any) -> type[EnvConfig]:
+    """The schema of a world's settings, which may be anything: that of maps, unless they name a source."""
+    source = content.get("source") if isinstance(content, dict) else None
+    return SOURCES.get(source, MapConfig) if isinstance(source, str) else MapConfig
+
+
+SOURCES: dict[str, type[EnvConfig]] = {
+    "map": MapConfig,
+    "gymnasium": GymnasiumConfig,
+    "enumerated": EnumeratedConfig,
+    "arrays": ArraysConfig,
+    "built": BuiltConfig,
+}
