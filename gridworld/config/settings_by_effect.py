@@ -10,7 +10,7 @@ import functools
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, get_type_hints
 
-from gridworld.config.agents import agent_schemas
+from gridworld.config.alternatives import alternatives
 from gridworld.config.effects import EFFECTS, Effect
 from gridworld.config.train import TrainConfig
 
@@ -68,10 +68,7 @@ def with_effects(
 @functools.cache
 def _declared() -> dict[str, Effect]:
     """Every effect that is declared, by the dotted name of its field, entry or section."""
-    found = dict(_declarations(TrainConfig))
-    for schema in agent_schemas().values():
-        found |= _declarations(schema, "agent.")
-    return found
+    return dict(_declarations(TrainConfig))
 
 
 @functools.cache
@@ -89,4 +86,5 @@ def _declarations(schema: type, section: str = "") -> Iterator[tuple[str, Effect
     for name, kind in get_type_hints(schema).items():
         if dataclasses.is_dataclass(kind):
             assert isinstance(kind, type)
-            yield from _declarations(kind, f"{section}{name}.")
+            for each in alternatives(kind):
+                yield from _declarations(each, f"{section}{name}.")

@@ -17,7 +17,8 @@ import yaml
 from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import OmegaConf
 
-from gridworld.config.agents import MISSING, AgentConfig, agent_schemas
+from gridworld.config.agents import MISSING
+from gridworld.config.alternatives import alternatives
 from gridworld.config.composition.words import as_whole
 from gridworld.config.plain_settings import check_imports, fits, shown
 from gridworld.config.train import TrainConfig
@@ -162,8 +163,7 @@ def _values(schemas: Sequence[type], content: dict[Any, Any], path: Path, sectio
         if not hints:
             raise InputError(f"{path}: has an unknown key {name!r}; a recipe has the settings of a run only")
         kinds = [kind for kind in hints if isinstance(kind, type) and dataclasses.is_dataclass(kind)]
-        if AgentConfig in kinds:
-            kinds = [AgentConfig, *agent_schemas().values()]
+        kinds = [schema for kind in kinds for schema in alternatives(kind)]
         if kinds and isinstance(value, dict):
             yield from _values(kinds, value, path, f"{name}.")
         elif any(fits(value, hint) or fits(as_whole(value), hint) for hint in hints if hint not in kinds):

@@ -8,7 +8,7 @@ import types
 from collections.abc import Iterator
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from gridworld.config.agents import agent_schemas
+from gridworld.config.alternatives import alternatives
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.config.tune import TuneConfig
@@ -16,15 +16,14 @@ from gridworld.config.tune import TuneConfig
 
 @functools.cache
 def settings_of_a_run() -> dict[str, tuple[Any, ...]]:
-    """Every setting of a run, those of all agents included.
+    """Every setting of a run, those of all agents and of all sources of worlds included.
 
     Returns:
-        The type hints by dotted names. A name that several agents have may have several.
+        The type hints by dotted names. A name that several of them have may have several.
     """
-    found = dict(_settings(TrainConfig, ""))
-    for schema in agent_schemas().values():
-        for name, hints in _settings(schema, "agent."):
-            found[name] = tuple({*found.get(name, ()), *hints})
+    found: dict[str, tuple[Any, ...]] = {}
+    for name, hints in _settings(TrainConfig, ""):
+        found[name] = tuple(dict.fromkeys([*found.get(name, ()), *hints]))
     return found
 
 
@@ -42,7 +41,8 @@ def _settings(schema: type, section: str) -> Iterator[tuple[str, tuple[Any, ...]
     for name, hint in get_type_hints(schema).items():
         if dataclasses.is_dataclass(hint):
             assert isinstance(hint, type)
-            yield from _settings(hint, f"{section}{name}.")
+            for each in alternatives(hint):
+                yield from _settings(each, f"{section}{name}.")
         else:
             yield f"{section}{name}", (hint,)
 
