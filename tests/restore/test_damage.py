@@ -74,7 +74,7 @@ def recorded(folder: Path) -> str:
 
 def gone_on(folder: Path) -> str:
     unfinished = open_unfinished(folder / "run")
-    return f"{unfinished.run.manifest} {unfinished.config} {unfinished.layout}"
+    return f"{unfinished.run.manifest} {unfinished.config} {unfinished.mdp.text()}"
 
 
 def reproduced(folder: Path) -> str:

@@ -1,6 +1,0 @@
-def load_arrays(p): ...
-def world_bytes(m):
-    return b""
-
-
-def world_from_bytes(c, w): ...
