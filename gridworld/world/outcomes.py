@@ -86,7 +86,7 @@ def mdp_from_outcomes(
     Raises:
         InputError: shapes that do not fit, no probabilities, numbers of no state, or too many of them.
     """
-    _check(name, outcomes)
+    check_outcomes(name, outcomes)
     _check_extras(name, outcomes, action_names, places, max_episode_steps, own_observation)
     ends = _Ends(outcomes)
     extra = ends.number[len(outcomes.start) :]
@@ -115,7 +115,7 @@ def mdp_from_outcomes(
         terminal=frozen(terminal),
         goal=frozen(goal),
         start=frozen(np.concatenate([outcomes.start, np.zeros(len(extra))])),
-        thresholds=frozen(_thresholds(probability)),
+        thresholds=frozen(thresholds_of(probability)),
         absorbing=frozen(terminal),
         number=frozen(ends.number),
         places=None if places is None else frozen(places[ends.number].astype(np.int64)),
@@ -176,8 +176,8 @@ def _best_paid(reward: FloatArray, ending: BoolArray) -> BoolArray:
     return np.asarray(reward == best)
 
 
-def _thresholds(probability: FloatArray) -> FloatArray:
-    """(S, A, K - 1): running sums; no draw reaches those behind the last possible outcome."""
+def thresholds_of(probability: FloatArray) -> FloatArray:
+    """`Mdp.thresholds`: running sums; no draw reaches those behind the last possible outcome."""
     sums: FloatArray = np.cumsum(probability, axis=2)[:, :, :-1]
     behind = np.cumsum(probability[:, :, ::-1], axis=2)[:, :, ::-1][:, :, 1:]
     sums[behind == 0] = np.inf
@@ -214,7 +214,12 @@ _KINDS = {  # of arrays, as numpy's `dtype.kind` names them
 }
 
 
-def _check(name: str, outcomes: Outcomes) -> None:
+def check_outcomes(name: str, outcomes: Outcomes) -> None:
+    """Check the tables of outcomes.
+
+    Raises:
+        InputError: see `mdp_from_outcomes`.
+    """
     for what, (kinds, words) in _KINDS.items():
         table = getattr(outcomes, what)
         if what == "success" and table is None:
