@@ -18,11 +18,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, checked_reward, frozen
+from gridworld.process.memory_budget import check_memory
+from gridworld.world.layout import positive_int
+from gridworld.world.mdp import (
+    LEAST_REWARD,
+    MOST_REWARD,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Mdp,
+    checked_reward,
+    frozen,
+)
 
 MOST_ACTIONS = 256
 MOST_STATES = 512 * 512
 _SUM = 1e-9  # how far probabilities may be from 1 in sum
+_BYTES = 64  # of an outcome in all tables, and while they are made
+_MOST_BYTES = 4 * 2**30
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -73,7 +86,8 @@ def mdp_from_outcomes(
     Raises:
         InputError: shapes that do not fit, no probabilities, numbers of no state, or too many of them.
     """
-    _check(name, outcomes)
+    check_outcomes(name, outcomes)
+    _check_extras(name, outcomes, action_names, places, max_episode_steps, own_observation)
     ends = _Ends(outcomes)
     extra = ends.number[len(outcomes.start) :]
     size, actions, count = len(ends.number), *outcomes.next_state.shape[1:]
@@ -101,11 +115,11 @@ def mdp_from_outcomes(
         terminal=frozen(terminal),
         goal=frozen(goal),
         start=frozen(np.concatenate([outcomes.start, np.zeros(len(extra))])),
-        thresholds=frozen(_thresholds(probability)),
+        thresholds=frozen(thresholds_of(probability)),
         absorbing=frozen(terminal),
         number=frozen(ends.number),
-        places=None if places is None else frozen(places[ends.number]),
-        max_episode_steps=max_episode_steps,
+        places=None if places is None else frozen(places[ends.number].astype(np.int64)),
+        max_episode_steps=None if max_episode_steps is None else int(max_episode_steps),
         own_observation=None if own_observation is None else frozen(own_observation[ends.number]),
         truth=truth,
     )
@@ -117,38 +131,32 @@ class _Ends:
     Attributes:
         states: (E,), integers, the terminal states.
         success: (E,), bool, which of them are goals.
-        number: (S,), integers, the number of every state.
+        number: (S,), integers, the number of every state: of the N numbered ones, then of further ends.
         leads_to: (N, A, K), integers, the state that each outcome leads to.
     """
 
     def __init__(self, outcomes: Outcomes) -> None:
-        possible = outcomes.probability > 0
+        size, possible = len(outcomes.start), outcomes.probability > 0
         playing = _playing(outcomes, possible)
         ending = possible & outcomes.terminated
         first = ending & playing[:, None, None]
         success = outcomes.success if outcomes.success is not None else _best_paid(outcomes.reward, first)
-        self.number: IntArray = np.arange(len(playing), dtype=np.int64)
+        # An end is told from others by its number and whether it is a success: the last bit of its key.
+        every = 2 * outcomes.next_state.astype(np.int64) + success
+        keys = np.unique(every[first])
+        others = np.unique(every[ending & ~first])  # what nobody reaches needs no end of its own
+        others = others[~np.isin(others // 2, keys // 2)]
+        others = others[~(np.isin(others ^ 1, others) & (others % 2 == 1))]
+        keys = np.sort(np.concatenate([keys, others]))
+        number, self.success = keys // 2, keys % 2 == 1
+        taken = playing[number]
+        taken[1:] |= number[1:] == number[:-1]
+        self.states: IntArray = np.where(taken, size - 1 + np.cumsum(taken), number)
+        self.number: IntArray = np.concatenate([np.arange(size, dtype=np.int64), number[taken]])
         self.leads_to: IntArray = outcomes.next_state.astype(np.int64)
-        found: dict[tuple[int, bool], int] = {}
-        taken = set(np.flatnonzero(playing).tolist())
-        for mask in (first, ending & ~first):
-            for where in np.argwhere(mask):
-                key = int(outcomes.next_state[tuple(where)]), bool(success[tuple(where)])
-                if mask is not first and (key[0], not key[1]) in found:
-                    key = key[0], not key[1]  # what nobody reaches needs no end of its own
-                if key not in found:
-                    found[key] = self._state_for(key[0], taken)
-                self.leads_to[tuple(where)] = found[key]
-        self.states: IntArray = np.array(list(found.values()), dtype=np.int64)
-        self.success: BoolArray = np.array([success for _, success in found], dtype=np.bool_)
-
-    def _state_for(self, number: int, taken: set[int]) -> int:
-        """The numbered state itself, where it is free; else a further one."""
-        if number not in taken:
-            taken.add(number)
-            return number
-        self.number = np.append(self.number, number)
-        return len(self.number) - 1
+        key = every[ending]
+        key = np.where(np.isin(key, keys), key, key ^ 1)
+        self.leads_to[ending] = self.states[np.searchsorted(keys, key)]
 
 
 def _playing(outcomes: Outcomes, possible: BoolArray) -> BoolArray:
@@ -168,31 +176,69 @@ def _best_paid(reward: FloatArray, ending: BoolArray) -> BoolArray:
     return np.asarray(reward == best)
 
 
-def _thresholds(probability: FloatArray) -> FloatArray:
-    """(S, A, K - 1): running sums; no draw reaches those behind the last possible outcome."""
+def thresholds_of(probability: FloatArray) -> FloatArray:
+    """`Mdp.thresholds`: running sums; no draw reaches those behind the last possible outcome."""
     sums: FloatArray = np.cumsum(probability, axis=2)[:, :, :-1]
     behind = np.cumsum(probability[:, :, ::-1], axis=2)[:, :, ::-1][:, :, 1:]
     sums[behind == 0] = np.inf
     return sums
 
 
-def _check(name: str, outcomes: Outcomes) -> None:
+def check_size(name: str, states: int, actions: int, outcomes: int) -> None:
+    """Refuse tables that are too large. Call it before allocating them.
+
+    Raises:
+        InputError: too many states, actions or outcomes; or tables that are above the memory budget.
+    """
+    if states > MOST_STATES or actions > MOST_ACTIONS:
+        raise InputError(
+            f"{name}: {states:,} states and {actions:,} actions are too many; at most {MOST_STATES:,} "
+            f"states and {MOST_ACTIONS} actions can be solved for"
+        )
+    size = states * actions * outcomes * _BYTES
+    if size > _MOST_BYTES:
+        raise InputError(
+            f"{name}: {states:,} states, {actions:,} actions and {outcomes:,} outcomes of each would take "
+            f"{size / 2**30:,.1f} GiB of memory; at most {_MOST_BYTES / 2**30:.0f} GiB can be solved for"
+        )
+    check_memory(name, size)
+
+
+_KINDS = {  # of arrays, as numpy's `dtype.kind` names them
+    "next_state": ("iu", "whole numbers"),
+    "probability": ("fiu", "numbers"),
+    "reward": ("fiu", "numbers"),
+    "terminated": ("b", "booleans"),
+    "success": ("b", "booleans"),
+    "start": ("fiu", "numbers"),
+}
+
+
+def check_outcomes(name: str, outcomes: Outcomes) -> None:
+    """Check the tables of outcomes.
+
+    Raises:
+        InputError: see `mdp_from_outcomes`.
+    """
+    for what, (kinds, words) in _KINDS.items():
+        table = getattr(outcomes, what)
+        if what == "success" and table is None:
+            continue
+        if not isinstance(table, np.ndarray) or table.dtype.kind not in kinds:
+            found = table.dtype if isinstance(table, np.ndarray) else type(table).__name__
+            raise InputError(f"{name}: {what} is {found}, must be an array of {words}")
     shape = outcomes.next_state.shape
+    if len(shape) != 3 or 0 in shape:
+        raise InputError(f"{name}: next_state has shape {shape}, must be (states, actions, outcomes)")
     for what in ("probability", "reward", "terminated", "success"):
         table = getattr(outcomes, what)
         if table is not None and table.shape != shape:
             raise InputError(
                 f"{name}: {what} has shape {table.shape}, next_state has {shape}; give one shape"
             )
-    if len(shape) != 3 or 0 in shape:
-        raise InputError(f"{name}: next_state has shape {shape}, must be (states, actions, outcomes)")
     if outcomes.start.shape != shape[:1]:
         raise InputError(f"{name}: start has shape {outcomes.start.shape}, must be ({shape[0]},)")
-    if shape[0] > MOST_STATES or shape[1] > MOST_ACTIONS:
-        raise InputError(
-            f"{name}: {shape[0]:,} states and {shape[1]:,} actions are too many; at most {MOST_STATES:,} "
-            f"states and {MOST_ACTIONS} actions can be solved for"
-        )
+    check_size(name, *shape)
     _check_distribution(name, "start", outcomes.start[None])
     _check_distribution(name, "probability", outcomes.probability)
     wrong = (outcomes.next_state < 0) | (outcomes.next_state >= shape[0])
@@ -202,11 +248,37 @@ def _check(name: str, outcomes: Outcomes) -> None:
             f"{name}: next_state of state {state}, action {action} is "
             f"{outcomes.next_state[state, action, outcome]}, must be from 0 to {shape[0] - 1}"
         )
-    for reward in np.unique(outcomes.reward[outcomes.probability > 0]):
-        checked_reward(f"{name}: a reward", float(reward))
+    _check_rewards(name, outcomes.reward, outcomes.probability > 0)
+
+
+def _check_rewards(name: str, reward: FloatArray, possible: BoolArray) -> None:
+    size = np.abs(reward)
+    for state, action, outcome in np.argwhere(
+        possible & (reward != 0) & ~((size >= LEAST_REWARD) & (size <= MOST_REWARD))
+    )[:1]:
+        where = f"{name}: reward of state {state}, action {action}"
+        checked_reward(where, float(reward[state, action, outcome]))
+
+
+def _check_extras(
+    name: str, outcomes: Outcomes, names: Sequence[str] | None, places: Any, limit: Any, shown: Any
+) -> None:
+    size, actions = outcomes.next_state.shape[:2]
+    if names is not None and len(names) != actions:
+        raise InputError(f"{name}: {len(names)} action_names for {actions} actions; give one for each")
+    if places is not None and (places.shape != (size, 3) or places.dtype.kind not in "iu"):
+        raise InputError(
+            f"{name}: places is {places.dtype} {places.shape}, must be whole numbers ({size}, 3): panel, "
+            "row and column of each state"
+        )
+    if shown is not None and shown.shape[:1] != (size,):
+        raise InputError(f"{name}: own_observation has shape {shown.shape}, must begin with {size} states")
+    if limit is not None:
+        positive_int(f"{name}: max_episode_steps", limit)
 
 
 def _check_distribution(name: str, what: str, table: FloatArray) -> None:
+    table = table.astype(np.float64)
     wrong = ~((table >= 0).all(axis=-1) & (np.abs(table.sum(axis=-1) - 1) <= _SUM))
     if wrong.any():
         where = np.argwhere(wrong)[0]

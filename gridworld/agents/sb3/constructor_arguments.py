@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import inspect
 from collections.abc import Sequence
 from typing import Any
@@ -24,7 +23,8 @@ from gridworld.agents.sb3.tabulated.state_inputs import why_not
 from gridworld.agents.sb3.validation import SCHEDULES
 from gridworld.config.agents import parse_schedule
 from gridworld.config.plain_settings import foreign_imports
-from gridworld.errors import InputError, install_command
+from gridworld.errors import InputError
+from gridworld.process.import_path import imported
 from gridworld.process.terminal import tell
 
 Arguments = dict[str, Any]
@@ -179,23 +179,7 @@ def import_class(where: str, path: Any, kind: type) -> Any:
     Raises:
         InputError: there is no such class, or its module cannot be imported.
     """
-    module, _, name = str(path).rpartition(".")
-    try:
-        found = getattr(importlib.import_module(module), name, None)
-    except ModuleNotFoundError as error:
-        found = None
-        if error.name == "sb3_contrib":
-            raise InputError(f"{where}={path}: needs sb3-contrib; {install_command('contrib')}") from None
-        if error.name and f"{module}.".startswith(f"{error.name}."):
-            raise InputError(
-                f"{where}={path}: there is no module {error.name}; is the folder that it is in on PYTHONPATH?"
-            ) from None
-        raise InputError(f"{where}={path}: {module} needs {error.name}, which is not installed") from None
-    except (ValueError, TypeError):  # no path at all
-        found = None
-    except Exception as error:  # a module of the user's own may raise anything
-        told = f"{module} cannot be imported ({type(error).__name__}: {error})"
-        raise InputError(f"{where}={path}: {told}") from error
+    found = imported(where, path)
     if not (inspect.isclass(found) and issubclass(found, kind)):
         what = "class" if kind is object else f"{kind.__name__} class"
         example = _EXAMPLES.get(kind, "torch.nn.ReLU")

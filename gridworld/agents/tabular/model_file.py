@@ -5,9 +5,6 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,22 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError
+from gridworld.process.npz import npz_arrays, npz_bytes
 from gridworld.storage.safe_read import read_bytes
 
 _ALGORITHM = "algorithm"
 _SPARE_BYTES = 2**20  # for the frames around the arrays
-_DAMAGED = (
-    *(OSError, ValueError, TypeError, KeyError, IndexError, EOFError, SyntaxError, MemoryError),
-    *(RuntimeError, zipfile.BadZipFile, zlib.error),
-)
 
 
 def model_bytes(algorithm: str, arrays: Mapping[str, NDArray[Any]]) -> bytes:
     """The content of a model file: the arrays and the algorithm's name."""
-    content = io.BytesIO()
-    named: dict[str, Any] = {_ALGORITHM: np.array(algorithm), **arrays}
-    np.savez(content, **named)
-    return content.getvalue()
+    return npz_bytes({_ALGORITHM: np.array(algorithm), **arrays})
 
 
 def read_model(path: Path, algorithm: str, like: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -79,14 +70,4 @@ def read_arrays(path: Path, most: int, algorithm: str = "a table") -> dict[str, 
         InputError: the file cannot be read.
     """
     content = read_bytes(path, most, copies=3)  # beside it a member and the array in it
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            infos = archive.infolist()
-            # `numpy.savez` compresses nothing; what is compressed, or there twice, could grow in reading.
-            if sum(info.file_size for info in infos) > len(content) or any(i.compress_type for i in infos):
-                raise ValueError("its members are larger than itself")
-        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except _DAMAGED as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: not a model of {algorithm} that can be read ({reason})") from None
+    return npz_arrays(path, content, f"a model of {algorithm}")

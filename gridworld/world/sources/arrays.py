@@ -1,0 +1,228 @@
+"""Worlds as arrays: a file of one's own (.npz), and the file that a run keeps of its world.
+
+A world of one's own, with N states, A actions and at most K outcomes of each:
+
+    next_state         (N, A, K)  whole numbers from 0 to N - 1: the state that follows
+    probability        (N, A, K)  of each outcome; 0 where there is none
+    reward             (N, A, K)
+    terminated         (N, A, K)  booleans: whether the outcome ends the episode
+    start              (N,)       the probabilities of starting in each state
+    success            (N, A, K)  optional, booleans: which ends are goals; without it, those that pay best
+    action_names       (A,)       optional, strings
+    places             (N, 3)     optional, panel, row and column of each state in pictures; -1: it has none.
+                                  (N, 2): row and column
+    max_episode_steps  ()         optional, the step limit
+    name               ()         optional, a string
+
+In a deterministic world, the tables may be (N, A), and `probability` may be left out. An example:
+
+    numpy.savez("two_rooms.npz", next_state=[[0, 1], [0, 1]], reward=[[0.0, 0.0], [0.0, 1.0]],
+                terminated=[[False, False], [False, True]], start=[1.0, 0.0])
+
+A run's world holds the fields of an `Mdp` as they are.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import os
+import stat
+from collections.abc import Mapping
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gridworld.errors import InputError
+from gridworld.process.command_line import users_folder
+from gridworld.process.memory_budget import check_memory
+from gridworld.process.npz import npz_arrays, npz_bytes
+from gridworld.world.mdp import Mdp, frozen
+from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
+from gridworld.world.sources.verification import checked_text, verified
+
+_TABLES = ("next_state", "probability", "reward", "terminated", "success")
+_NEEDED = ("next_state", "reward", "terminated", "start")
+_OPTIONAL = ("probability", "success", "action_names", "places", "max_episode_steps", "name")
+_MOST_BYTES = 4 * 2**30
+_FORMAT = np.array("gridworld world 1")
+
+
+def load_arrays(path: str | PathLike[str]) -> Mdp:
+    """Read a world of one's own; the module says what is in the file.
+
+    Args:
+        path: an .npz file, relative to the folder that the program was started in.
+
+    Returns:
+        The world; without a `name`, its name is that of the file.
+
+    Raises:
+        InputError: no such file, another one, or arrays that make no world.
+    """
+    content = _read(path)
+    arrays = npz_arrays(path, content, "an .npz file of arrays", _MOST_BYTES)
+    return mdp_from_arrays(Path(path).stem, arrays, str(path))
+
+
+def mdp_from_arrays(name: str, arrays: Mapping[str, Any], where: str) -> Mdp:
+    """Compile the arrays of a world of one's own; the module says which.
+
+    Args:
+        name: of the world, where `arrays` has none.
+        arrays: arrays, or what numpy makes arrays of, by name.
+        where: where they come from, for messages.
+
+    Raises:
+        InputError: arrays that make no world.
+    """
+    _check_names(where, arrays)
+    given = {key: _array(where, key, value) for key, value in arrays.items()}
+    if given["next_state"].ndim == 2:
+        for key in set(_TABLES) & given.keys():
+            if given[key].ndim != 2:
+                raise InputError(
+                    f"{where}: {key} has shape {given[key].shape}, next_state has "
+                    f"{given['next_state'].shape}; give one shape"
+                )
+            given[key] = given[key][:, :, None]
+        given.setdefault("probability", np.ones(given["next_state"].shape))
+    elif "probability" not in given:
+        raise InputError(f"{where}: has no probability; without it, next_state must be (states, actions)")
+    tables = Outcomes(**{key: given[key] for key in (*_TABLES, "start") if key in given})
+    mdp = mdp_from_outcomes(
+        where,
+        tables,
+        action_names=_action_names(where, given.get("action_names")),
+        places=_places(where, given.get("places")),
+        max_episode_steps=_whole(where, "max_episode_steps", given.get("max_episode_steps")),
+    )
+    called = checked_text(where, "name", given["name"]) if "name" in given else name
+    return verified(dataclasses.replace(mdp, name=called), where)
+
+
+def _check_names(where: str, arrays: Mapping[str, Any]) -> None:
+    for key in _NEEDED:
+        if key not in arrays:
+            raise InputError(f"{where}: has no {key}, must hold {', '.join(_NEEDED)}")
+    for key in arrays:
+        if key not in _NEEDED + _OPTIONAL:
+            near = difflib.get_close_matches(str(key), _OPTIONAL, n=1)
+            told = f"did you mean {near[0]}?" if near else f"beside what is needed it may hold {_listed()}"
+            raise InputError(f"{where}: {str(key)[:50]} is no array of a world; {told}")
+
+
+def _listed() -> str:
+    *others, last = _OPTIONAL
+    return f"{', '.join(others)} and {last}"
+
+
+def _array(where: str, key: str, value: Any) -> NDArray[Any]:
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError):
+        array = np.array(None)
+    if array.dtype.kind == "O":
+        raise InputError(f"{where}: {key} is {type(value).__name__}, which is no array of numbers or text")
+    return array
+
+
+def _action_names(where: str, given: NDArray[Any] | None) -> list[str] | None:
+    if given is None:
+        return None
+    if given.ndim != 1 or given.dtype.kind != "U":
+        raise InputError(f"{where}: action_names is {given.dtype} {given.shape}, must be one string each")
+    return [checked_text(where, "action_names", name) for name in given]
+
+
+def _places(where: str, given: NDArray[Any] | None) -> NDArray[Any] | None:
+    if given is not None and given.ndim == 2 and given.shape[1] == 2 and given.dtype.kind in "iu":
+        return np.concatenate([np.where(given[:, :1] < 0, -1, 0), given], axis=1)
+    return given
+
+
+def _whole(where: str, key: str, given: NDArray[Any] | None) -> int | None:
+    if given is None:
+        return None
+    if given.ndim != 0 or given.dtype.kind not in "iu":
+        raise InputError(f"{where}: {key} is {given.dtype} {given.shape}, must be one whole number")
+    return int(given)
+
+
+def _read(path: str | PathLike[str]) -> bytes:
+    try:
+        given = fspath(path)
+    except TypeError:
+        given = None
+    if not isinstance(given, str) or not given:
+        raise InputError(f"env.path={path!r}: must be the path of an .npz file")
+    try:
+        with open(users_folder() / given, "rb", opener=_without_waiting) as file:
+            found = os.fstat(file.fileno())
+            if not stat.S_ISREG(found.st_mode):  # a pipe or a device, which need not end
+                raise InputError(f"env.path={given}: is no ordinary file; give an .npz file")
+            if found.st_size > _MOST_BYTES:
+                raise InputError(
+                    f"env.path={given}: is larger than {_MOST_BYTES / 2**30:.0f} GiB; give a smaller world"
+                )
+            check_memory(given, 2 * found.st_size)
+            return file.read(_MOST_BYTES)
+    except IsADirectoryError:
+        raise InputError(f"env.path={given}: is a folder; give an .npz file") from None
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        told = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"env.path={given}: cannot be read ({told}); give an .npz file") from None
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    """Open a file; a pipe too is opened at once, whether somebody writes into it or not."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def world_bytes(mdp: Mdp) -> bytes:
+    """A world as the content of a file, all its tables bit for bit.
+
+    Args:
+        mdp: any world. Of a map, what only `GridMdp` has is left out.
+
+    Returns:
+        The same bytes for the same world.
+    """
+    arrays = {"format": _FORMAT}
+    for field in dataclasses.fields(Mdp):
+        value = getattr(mdp, field.name)
+        if value is not None:
+            arrays[field.name] = np.ascontiguousarray(value) if np.ndim(value) else np.array(value)
+    return npz_bytes(arrays)
+
+
+def world_from_bytes(content: bytes, where: str) -> Mdp:
+    """Mirrors `world_bytes`.
+
+    Args:
+        content: of the file.
+        where: the file, for messages.
+
+    Raises:
+        InputError: it is no such file, or the tables in it are no world.
+    """
+    found = npz_arrays(where, content, "a world")
+    fields = {field.name: field for field in dataclasses.fields(Mdp)}
+    if not np.array_equal(found.pop("format", np.array("")), _FORMAT):
+        raise InputError(f"{where}: not a world of this version, must hold format={_FORMAT}")
+    needed = {name for name, field in fields.items() if field.default is dataclasses.MISSING}
+    if not needed <= found.keys() <= fields.keys():
+        raise InputError(f"{where}: not a world, must hold {sorted(needed)}, holds {sorted(found)[:20]}")
+    values: dict[str, Any] = dict(found)
+    for key in ("name", "truth"):
+        if key in found:
+            values[key] = checked_text(where, key, found[key])
+    values["action_names"] = tuple(_action_names(where, found["action_names"]) or ())
+    values["max_episode_steps"] = _whole(where, "max_episode_steps", found.get("max_episode_steps"))
+    tables = {key: frozen(value) for key, value in values.items() if isinstance(value, np.ndarray)}
+    return verified(Mdp(**{**values, **tables}), where)

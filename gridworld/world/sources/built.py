@@ -1,0 +1,61 @@
+"""Worlds that a function of the user's own makes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from gridworld.errors import InputError
+from gridworld.process.import_path import imported
+from gridworld.world.mdp import Mdp
+from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
+from gridworld.world.sources.arrays import mdp_from_arrays
+from gridworld.world.sources.verification import verified
+
+
+def build(builder: str | Callable[..., Any], kwargs: Mapping[str, Any] | None = None) -> Mdp:
+    """Call a function that makes a world.
+
+    Args:
+        builder: the function, or its import path, `package.module.function`. It returns an `Mdp`, `Outcomes`,
+            or arrays by their names, as `gridworld.world.sources.arrays` has them.
+        kwargs: its arguments.
+
+    Returns:
+        The world, named after the function unless what that returns has a name. A map's is an `Mdp` as any
+        other.
+
+    Raises:
+        InputError: there is no such function, it raises something, or what it returns is no world.
+    """
+    where = f"env.builder={_name_of(builder) if callable(builder) else str(builder)[:200]}"
+    function = imported("env.builder", builder) if isinstance(builder, str) else builder
+    if not callable(function):
+        raise InputError(f"{where}: must be the import path of a function, e.g. my_package.worlds.make")
+    try:
+        found = function(**dict(kwargs or {}))
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    except Exception as error:  # a function of the user's own may raise anything
+        text = str(error).strip().splitlines()
+        told = f"{type(error).__name__}: {text[0][:200]}" if text else type(error).__name__
+        raise InputError(f"{where}: raised {told}") from error
+    return _world(where, _name_of(function), found)
+
+
+def _name_of(function: Any) -> str:
+    return str(getattr(function, "__name__", type(function).__name__))
+
+
+def _world(where: str, name: str, found: Any) -> Mdp:
+    if isinstance(found, Mdp):
+        plain = {field.name: getattr(found, field.name) for field in dataclasses.fields(Mdp)}
+        return verified(Mdp(**plain), where)
+    if isinstance(found, Outcomes):
+        return verified(dataclasses.replace(mdp_from_outcomes(where, found), name=name), where)
+    if isinstance(found, Mapping):
+        return mdp_from_arrays(name, found, where)
+    raise InputError(
+        f"{where}: returned {type(found).__name__}, must return an Mdp, Outcomes, or a mapping of arrays"
+    )
