@@ -151,7 +151,7 @@ def draw_grid(surface: Any, board: Board, cell_size: int) -> None:
 
 
 def _name_panel(surface: Any, panel: Panel, cell_size: int) -> None:
-    size = text_size(panel.name, min(round(0.7 * cell_size), 20), panel.cols * cell_size)
+    size = text_size(panel.name, min(round(0.6 * cell_size), 16), panel.cols * cell_size)
     if panel.name and size is not None:
         write(surface, panel.name, (panel.left + 1) * cell_size, round((panel.top + 0.5) * cell_size), size)
 

@@ -105,11 +105,16 @@ class Canvas(Sheet):
             rect(self._world, colour, (left + 1, top + 1, cell - 1, cell - 1), thick)
 
     def line(self, segments: Sequence[tuple[Point, Point]], colour: Colour) -> None:
-        """Draw upright and level lines between points of `world`, edged in white; thin on small cells."""
+        """Draw lines between points of `world`, edged in white; thin on small cells."""
         thick = max(1, self.cell // 10)
         edge = 2 if self.cell >= 5 * _NO_GRID else 1 if self.cell >= 2 * _NO_GRID else 0
         for half, ink in ((thick / 2 + edge, PAPER), (thick / 2, colour)) if edge else ((0.5, colour),):
             for (x, y), (to_x, to_y) in segments:
+                if x != to_x and y != to_y:
+                    drawing.import_pygame().draw.line(
+                        self._world, ink, (x, y), (to_x, to_y), round(2.8 * half)
+                    )
+                    continue
                 left, top = round(min(x, to_x) - half), round(min(y, to_y) - half)
                 size = round(abs(x - to_x) + 2 * half), round(abs(y - to_y) + 2 * half)
                 self._world.fill(ink, (left, top, *size))

@@ -94,14 +94,16 @@ def draw_policy_map(
     canvas.paint(colours[:, None])
     canvas.draw_world()
     texts = {value: short(value, own.high) for value in set(values[known].tolist())} if not scale else {}
+    if len(canvas.board.panels) > 1:
+        texts = {}  # small cells, where an arrow is worth more
     size = canvas.number_size(0.8, texts.values())
     inks = [PAPER if dark else INK for dark in is_dark(colours).tolist()]
     middle = 0.5 if size is None else 0.4  # of the arrows, above the numbers
     paths = greedy_paths(mdp, greedy)
-    _draw_paths(canvas, paths, middle)
+    ways = directions(mdp)[np.arange(mdp.num_states), greedy]
+    _draw_paths(canvas, paths, ways, middle)
     if canvas.cell >= _SMALLEST_ARROW_CELL:
         length = canvas.cell if size is None else 0.85 * canvas.cell
-        ways = directions(mdp)[np.arange(mdp.num_states), greedy]
         for state in states.tolist():
             ink = inks[state] if known[state] else _UNKNOWN_INK
             point = canvas.point(state, 0.5, middle)
@@ -136,20 +138,27 @@ def _swatches(cell: int, has_path: bool, all_known: bool) -> list[Swatch]:
     return [*([path] if has_path else []), wrong, *([] if all_known else [never])]
 
 
-def _draw_paths(canvas: Canvas, paths: list[list[int]], middle: float) -> None:
-    """A ring around each start, and lines through the states where one is beside the next."""
+def _draw_paths(canvas: Canvas, paths: list[list[int]], ways: IntArray, middle: float) -> None:
+    """A ring around each start, and lines through the states where one is beside the next.
+
+    Args:
+        canvas: is drawn on.
+        paths: the states of each path.
+        ways: (S, 2), where each state's arrow points.
+        middle: how far below a cell's upper edge, in cells.
+    """
+    cell = canvas.board.cell
     for path in paths:
-        points = [canvas.point(state, 0.5, middle) for state in path]
-        lines = [each for each in pairwise(points) if _length(each) < 1.5 * canvas.cell]
-        if canvas.mdp.terminal[path[-1]] and canvas.has_grid and lines[-1:] == [tuple(points[-2:])]:
-            (x, y), (to_x, to_y) = lines[-1]  # what is drawn there stays whole
-            lines[-1] = (x, y), ((x + to_x) / 2, (y + to_y) / 2)
+        lines = []
+        for state, following in pairwise(path):
+            step = cell[following] - cell[state]
+            if np.abs(step).sum() <= 1 or (step == ways[state]).all():  # an arrow may point along a diagonal
+                lines.append((canvas.point(state, 0.5, middle), canvas.point(following, 0.5, middle)))
+                if canvas.mdp.terminal[following] and canvas.has_grid:  # what is drawn there stays whole
+                    (x, y), (to_x, to_y) = lines[-1]
+                    lines[-1] = (x, y), ((x + to_x) / 2, (y + to_y) / 2)
         canvas.line(lines, AGENT)
-        canvas.ring(points[0], AGENT)
-
-
-def _length(line: tuple[Point, Point]) -> float:
-    return abs(line[0][0] - line[1][0]) + abs(line[0][1] - line[1][1])
+        canvas.ring(canvas.point(path[0], 0.5, middle), AGENT)
 
 
 def _draw_arrow(canvas: Canvas, middle: Point, way: IntArray, size: float, ink: Colour) -> None:
