@@ -7,7 +7,8 @@ A schema is the section `env` of a run's settings. `SOURCES` has them by the nam
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Optional
 
@@ -160,6 +161,62 @@ class BuiltConfig(EnvConfig):
         return build(self.builder, self.kwargs)
 
 
+@dataclass
+class ClassicConfig(EnvConfig):
+    """A world of the literature (`gridworld.world.sources.classics`), whose sizes are the other settings."""
+
+    source: str = MISSING
+
+    @property
+    def name(self) -> str:
+        """See `EnvConfig.name`."""
+        return self.source
+
+    def compile(self) -> Mdp:
+        """See `EnvConfig.compile`."""
+        from gridworld.world.sources import classics
+
+        sizes = asdict(self)
+        del sizes["source"], sizes["max_episode_steps"]
+        make: Callable[..., Mdp] = getattr(classics, self.source)
+        return make(**sizes)
+
+
+@dataclass
+class RiverSwimConfig(ClassicConfig):
+    """Against the current to a large reward, or with it to a small one."""
+
+    source: str = "river_swim"
+    length: int = 6
+
+
+@dataclass
+class DeepSeaConfig(ClassicConfig):
+    """One way of 2 ** size leads to the treasure."""
+
+    source: str = "deep_sea"
+    size: int = 10
+    seed: Optional[int] = None  # noqa: UP045  # of what the actions mean in each cell; null: left and right
+
+
+@dataclass
+class CombinationLockConfig(ClassicConfig):
+    """A wrong action leads back to the start."""
+
+    source: str = "combination_lock"
+    length: int = 10
+    num_actions: int = 2
+    seed: Optional[int] = None  # noqa: UP045  # of the combination; null: the first action everywhere
+
+
+@dataclass
+class RandomWalkConfig(ClassicConfig):
+    """A chain whose right end pays 1."""
+
+    source: str = "random_walk"
+    length: int = 5
+
+
 def compiled(env: EnvConfig) -> Mdp:
     """The world of these settings; see `EnvConfig.compile`."""
     return env.compile()
@@ -177,4 +234,8 @@ SOURCES: dict[str, type[EnvConfig]] = {
     "enumerated": EnumeratedConfig,
     "arrays": ArraysConfig,
     "built": BuiltConfig,
+    "river_swim": RiverSwimConfig,
+    "deep_sea": DeepSeaConfig,
+    "combination_lock": CombinationLockConfig,
+    "random_walk": RandomWalkConfig,
 }

@@ -1,5 +1,8 @@
 """Pictures of the world: a frame from (mdp, state), and the window of human mode.
 
+A frame shows the world's board (`gridworld.envs.board`); that of a world without places is a card with the
+state's name.
+
 pygame is imported when the first picture is drawn. Drawing goes to a plain surface, which needs no display;
 only `Window` opens one.
 """
@@ -10,20 +13,23 @@ import logging
 import os
 import sys
 import time
-from types import ModuleType
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gridworld.envs.board import Board, Kind, Panel, board_of
+from gridworld.envs.text_drawing import Colour as Colour
+from gridworld.envs.text_drawing import import_pygame as import_pygame
+from gridworld.envs.text_drawing import text_size, write
 from gridworld.errors import InputError
-from gridworld.world.layout import Cell
+from gridworld.world.grid import GridMdp
 from gridworld.world.mdp import Mdp
 
 CELL_SIZE = 100  # pixels
 MARGIN = 10  # pixels
 
-Colour = tuple[int, int, int]
 Point = tuple[float, float]
 Frame = NDArray[np.uint8]  # (height, width, 3), RGB
 
@@ -41,32 +47,25 @@ MAX_SIDE = 65_535  # pixels; GIF counts no further, and hardly a viewer does
 _log = logging.getLogger("gridworld")
 
 
-def import_pygame() -> ModuleType:
-    """pygame, without its greeting."""
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    import pygame
-
-    return pygame
-
-
 def frame_size(mdp: Mdp, cell_size: int = CELL_SIZE) -> tuple[int, int]:
     """Width and height of a frame in pixels: the grid and one empty cell of border all round.
 
     Raises:
         InputError: the frame is too large to draw.
     """
-    width, height = (mdp.layout.num_cols + 2) * cell_size, (mdp.layout.num_rows + 2) * cell_size
+    board = board_of(mdp)
+    width, height = (board.cols + 2) * cell_size, (board.rows + 2) * cell_size
     if width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
         remedy = f"; take a cell_size below {cell_size}" if cell_size > 1 else ""
-        raise InputError(
-            f"layout {mdp.layout.name}: a frame of {width} x {height} pixels is too large to draw{remedy}"
-        )
+        world = f"layout {mdp.name}" if isinstance(mdp, GridMdp) else mdp.name
+        raise InputError(f"{world}: a frame of {width} x {height} pixels is too large to draw{remedy}")
     return width, height
 
 
 def fitting_cell_size(mdp: Mdp, longest_side: int, largest: int = CELL_SIZE) -> int:
     """The cell size with which a frame's longest side is about `longest_side`, at most `largest`; pixels."""
-    cells = max(mdp.layout.num_rows, mdp.layout.num_cols) + 2
+    board = board_of(mdp)
+    cells = max(board.rows, board.cols) + 2
     return max(2 if 2 * cells <= MAX_SIDE else 1, min(largest, longest_side // cells))
 
 
@@ -100,43 +99,69 @@ def surface_to_frame(surface: Any) -> Frame:
 def draw_world(surface: Any, mdp: Mdp, state: int | None, cell_size: int = CELL_SIZE) -> None:
     """Draw background, walls, cliffs, grid, traps, goals and the agent, in this order; see `draw_frame`."""
     surface.fill(BACKGROUND)
-    for colour, cells in ((WALL, mdp.layout.walls), (CLIFF, mdp.layout.cliffs)):
-        for cell in cells:
-            fill_cell(surface, cell, colour, cell_size)
-    draw_grid(surface, mdp, cell_size)
-    draw_terminals(surface, mdp, cell_size)
+    board = board_of(mdp)
+    if not board.panels:
+        draw_card(surface, [] if state is None else [mdp.state_name(state)])
+        return
+    for colour, kind in ((WALL, Kind.WALL), (CLIFF, Kind.CLIFF)):
+        for row, col in board.cells(kind):
+            surface.fill(colour, ((col + 1) * cell_size, (row + 1) * cell_size, cell_size, cell_size))
+    draw_grid(surface, board, cell_size)
+    draw_terminals(surface, board, cell_size)
     if state is not None:
         surface.fill(AGENT, agent_box(mdp, state, cell_size))
 
 
+def draw_card(surface: Any, lines: Sequence[str]) -> None:
+    """Write lines of text, the first one larger, as large as they fit; none where they cannot be read."""
+    width, height = surface.get_size()
+    sizes = [height // (3 * len(lines) + 1) * share for share in (2, *[1.5] * (len(lines) - 1))]
+    top = (height - 1.4 * sum(sizes)) / 2
+    for line, size in zip(lines, sizes, strict=True):
+        fitting = text_size(line, round(size), 0.94 * width)
+        if fitting is not None:
+            write(surface, line, round(0.03 * width), round(top + 0.7 * size), fitting)
+        top += 1.4 * size
+
+
 def agent_box(mdp: Mdp, state: int, cell_size: int = CELL_SIZE) -> tuple[int, int, int, int]:
-    """Left, top, width and height of the agent's square in a frame, in pixels."""
-    row, col = divmod(state, mdp.layout.num_cols)
-    inset, side = round(0.2 * cell_size), round(0.6 * cell_size)
+    """Left, top, width and height of the agent's square in a frame, in pixels; nothing without a place."""
+    row, col = board_of(mdp).cell[state].tolist()
+    inset, side = round(0.2 * cell_size), round(0.6 * cell_size) if row >= 0 else 0
     return (col + 1) * cell_size + inset, (row + 1) * cell_size + inset, side, side
 
 
-def fill_cell(surface: Any, cell: Cell, colour: Colour, cell_size: int) -> None:
-    """Fill a whole cell (row, column) of a frame."""
-    surface.fill(colour, ((cell[1] + 1) * cell_size, (cell[0] + 1) * cell_size, cell_size, cell_size))
+def draw_grid(surface: Any, board: Board, cell_size: int) -> None:
+    """Lines of one pixel at the edges of the cells that show a state; the names of panels above them."""
+    draw = import_pygame().draw
+    for panel in board.panels:
+        rows, cols = slice(panel.top, panel.top + panel.rows), slice(panel.left, panel.left + panel.cols)
+        left, top = (panel.left + 1) * cell_size, (panel.top + 1) * cell_size
+        right, bottom = left + panel.cols * cell_size, top + panel.rows * cell_size
+        if (board.state[rows, cols] >= 0).all():
+            for x in range(left, right + 1, cell_size):
+                draw.line(surface, GRID_LINE, (x, top), (x, bottom))
+            for y in range(top, bottom + 1, cell_size):
+                draw.line(surface, GRID_LINE, (left, y), (right, y))
+        else:
+            for row, col in np.argwhere(board.state[rows, cols] >= 0).tolist():
+                box = left + col * cell_size, top + row * cell_size, cell_size + 1, cell_size + 1
+                draw.rect(surface, GRID_LINE, box, 1)
+        _name_panel(surface, panel, cell_size)
 
 
-def draw_grid(surface: Any, mdp: Mdp, cell_size: int) -> None:
-    """Lines of one pixel at every cell's edge."""
-    line = import_pygame().draw.line
-    right, bottom = (mdp.layout.num_cols + 1) * cell_size, (mdp.layout.num_rows + 1) * cell_size
-    for x in range(cell_size, right + 1, cell_size):
-        line(surface, GRID_LINE, (x, cell_size), (x, bottom))
-    for y in range(cell_size, bottom + 1, cell_size):
-        line(surface, GRID_LINE, (cell_size, y), (right, y))
+def _name_panel(surface: Any, panel: Panel, cell_size: int) -> None:
+    size = text_size(panel.name, min(round(0.6 * cell_size), 16), panel.cols * cell_size)
+    if panel.name and size is not None:
+        write(surface, panel.name, (panel.left + 1) * cell_size, round((panel.top + 0.5) * cell_size), size)
 
 
-def draw_terminals(surface: Any, mdp: Mdp, cell_size: int) -> None:
+def draw_terminals(surface: Any, board: Board, cell_size: int) -> None:
     """Traps as discs, goals as triangles."""
     draw = import_pygame().draw
-    for row, col in mdp.layout.traps:
+    for row, col in board.cells(Kind.TRAP):
         draw.circle(surface, TRAP, cell_centre(row, col, cell_size), cell_size // 3)
-    for row, col in mdp.layout.goals:
+    for row, col in board.cells(Kind.GOAL):
         x, y = (col + 1) * cell_size, (row + 1) * cell_size
         corners = [(0.5, 0.2), (0.8, 0.8), (0.2, 0.8)]
         points = [(x + round(right * cell_size), y + round(down * cell_size)) for right, down in corners]
@@ -149,11 +174,16 @@ def cell_centre(row: int, col: int, cell_size: int = CELL_SIZE) -> Point:
 
 
 def ansi(mdp: Mdp, state: int) -> str:
-    """The map as text, with the agent as 'A', and a newline at the end."""
-    rows = [list(line) for line in mdp.layout.text().split("\n")]
-    row, col = divmod(state, mdp.layout.num_cols)
-    rows[row][col] = "A"
-    return "\n".join(map("".join, rows)) + "\n"
+    """The board as text, in the signs of maps, with the agent as 'A', and a newline at the end."""
+    board = board_of(mdp)
+    if not board.panels:
+        return f"{mdp.state_name(state)}\n"
+    signs = np.array(list(" ..#CGT"))[board.kind]
+    for each, sign in [*((start, "S") for start in mdp.start_states.tolist()), (state, "A")]:
+        row, col = board.cell[each].tolist()
+        if row >= 0:
+            signs[row, col] = sign
+    return "\n".join(map("".join, signs.tolist())) + "\n"
 
 
 def has_display() -> bool:

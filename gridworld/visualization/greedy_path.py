@@ -48,15 +48,4 @@ def explored(mdp: Mdp, visits: NDArray[np.int64] | None) -> BoolArray:
     """
     if visits is not None and visits.any():
         return np.asarray(visits.any(axis=1))
-    themselves = np.arange(mdp.num_states)[:, None, None]
-    possible = np.where(mdp.probability > 0, mdp.next_state, themselves)
-    following = possible.reshape(mdp.num_states, -1).tolist()
-    waiting = mdp.start_states.tolist()
-    known = np.zeros(mdp.num_states, dtype=bool)
-    known[waiting] = True
-    while waiting:
-        for state in following[waiting.pop()]:
-            if not known[state]:
-                known[state] = True
-                waiting.append(state)
-    return known
+    return mdp.reachable

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
+from gridworld.envs.board import board_of
 from gridworld.envs.rendering import fitting_cell_size
 from gridworld.storage.serialization import State
 from gridworld.visualization.animation import Animation, animation_of_frames
@@ -24,6 +25,7 @@ TENSORBOARD_SIDE: int | None = None
 _MOST = 48  # moments
 _MOST_NUMBERS = 5_000_000  # of all moments together: some 25 MB
 _SIDE = 320  # pixels of the animation
+_MOSAIC_SIDE = 640  # pixels, where there are several panels
 
 
 def draw(subject: Subject) -> Draw:
@@ -101,7 +103,7 @@ class PolicyHistory:
         """
         mdp, moments = evaluator.mdp, self.moments()
         scale = linear(VIRIDIS, np.stack([moment.values[shown(mdp) & known] for moment in moments]))
-        cell_size = fitting_cell_size(mdp, _SIDE)
+        cell_size = fitting_cell_size(mdp, _SIDE if len(board_of(mdp).panels) <= 1 else _MOSAIC_SIDE)
         return animation_of_frames(
             [
                 draw_policy_map(

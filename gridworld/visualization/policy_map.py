@@ -6,23 +6,25 @@ a red frame. What training never acted in is grey: its values are guesses, and n
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import numpy as np
 
 from gridworld.envs import rendering as drawing
 from gridworld.envs.rendering import AGENT, Colour, Frame, Point
+from gridworld.envs.text_drawing import SMALLEST_TEXT
 from gridworld.errors import InputError
-from gridworld.visualization.canvas import INK, PAPER, Canvas, Swatch, short, shown
+from gridworld.visualization.canvas import UNKNOWN, Canvas, shown
 from gridworld.visualization.colormaps import VIRIDIS, Scale, is_dark, linear
+from gridworld.visualization.directions import directions
 from gridworld.visualization.greedy_path import explored, greedy_paths
 from gridworld.visualization.picture import IMAGES_TAB, Draw, Subject, agents_gamma
-from gridworld.world.layout import MOVES
+from gridworld.visualization.sheet import INK, PAPER, Swatch, short
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 TENSORBOARD_SIDE: int | None = IMAGES_TAB
 DISAGREES: Colour = (213, 60, 50)
-UNKNOWN: Colour = (222, 222, 222)  # the colour of a cell that training never acted in
 _UNKNOWN_INK: Colour = (170, 170, 170)
 _UNKNOWN_DISAGREES: Colour = (226, 178, 174)
 
@@ -92,16 +94,24 @@ def draw_policy_map(
     canvas.paint(colours[:, None])
     canvas.draw_world()
     texts = {value: short(value, own.high) for value in set(values[known].tolist())} if not scale else {}
+    if len(canvas.board.panels) > 1:
+        texts = {}  # small cells, where an arrow is worth more
     size = canvas.number_size(0.8, texts.values())
     inks = [PAPER if dark else INK for dark in is_dark(colours).tolist()]
     middle = 0.5 if size is None else 0.4  # of the arrows, above the numbers
     paths = greedy_paths(mdp, greedy)
-    _draw_paths(canvas, paths, middle)
+    ways = directions(mdp)[np.arange(mdp.num_states), greedy]
+    _draw_paths(canvas, paths, ways, middle)
     if canvas.cell >= _SMALLEST_ARROW_CELL:
         length = canvas.cell if size is None else 0.85 * canvas.cell
         for state in states.tolist():
             ink = inks[state] if known[state] else _UNKNOWN_INK
-            _draw_arrow(canvas, canvas.point(state, 0.5, middle), int(greedy[state]), length, ink)
+            point = canvas.point(state, 0.5, middle)
+            if ways[state].any():
+                _draw_arrow(canvas, point, ways[state], length, ink)
+            else:
+                paper = colours[state].tolist()
+                _draw_dot(canvas, point, mdp.action_names[greedy[state]], length, ink, paper)
     on_path = set().union(*paths)
     for state in np.flatnonzero(known).tolist():
         if size is None:
@@ -116,7 +126,7 @@ def draw_policy_map(
         ends,
         f"value {short(ends.low, ends.high)}",
         short(ends.high),
-        _swatches(canvas.cell, bool(paths), bool(known[states].all())),
+        _swatches(canvas.cell, bool(paths), bool(known[states].all()) and not canvas.hidden),
     )
     return canvas.frame()
 
@@ -128,23 +138,31 @@ def _swatches(cell: int, has_path: bool, all_known: bool) -> list[Swatch]:
     return [*([path] if has_path else []), wrong, *([] if all_known else [never])]
 
 
-def _draw_paths(canvas: Canvas, paths: list[list[int]], middle: float) -> None:
-    """A ring around each start, and lines through the states where one is beside the next."""
+def _draw_paths(canvas: Canvas, paths: list[list[int]], ways: IntArray, middle: float) -> None:
+    """A ring around each start, and lines through the states where one is beside the next.
+
+    Args:
+        canvas: is drawn on.
+        paths: the states of each path.
+        ways: (S, 2), where each state's arrow points.
+        middle: how far below a cell's upper edge, in cells.
+    """
+    cell = canvas.board.cell
     for path in paths:
-        points = [canvas.point(state, 0.5, middle) for state in path]
-        if canvas.mdp.terminal[path[-1]] and canvas.has_grid:  # what is drawn there stays whole
-            (x, y), (to_x, to_y) = points[-2:]
-            points[-1] = (x + to_x) / 2, (y + to_y) / 2
-        canvas.line([each for each in pairwise(points) if _length(each) < 1.5 * canvas.cell], AGENT)
-        canvas.ring(points[0], AGENT)
+        lines = []
+        for state, following in pairwise(path):
+            step = cell[following] - cell[state]
+            if np.abs(step).sum() <= 1 or (step == ways[state]).all():  # an arrow may point along a diagonal
+                lines.append((canvas.point(state, 0.5, middle), canvas.point(following, 0.5, middle)))
+                if canvas.mdp.terminal[following] and canvas.has_grid:  # what is drawn there stays whole
+                    (x, y), (to_x, to_y) = lines[-1]
+                    lines[-1] = (x, y), ((x + to_x) / 2, (y + to_y) / 2)
+        canvas.line(lines, AGENT)
+        canvas.ring(canvas.point(path[0], 0.5, middle), AGENT)
 
 
-def _length(line: tuple[Point, Point]) -> float:
-    return abs(line[0][0] - line[1][0]) + abs(line[0][1] - line[1][1])
-
-
-def _draw_arrow(canvas: Canvas, middle: Point, action: int, size: float, ink: Colour) -> None:
-    down, right = MOVES[action]
+def _draw_arrow(canvas: Canvas, middle: Point, way: IntArray, size: float, ink: Colour) -> None:
+    down, right = (way / math.hypot(*way)).tolist()
     shape = [
         (-0.28, 0.05),
         (0.04, 0.05),
@@ -162,3 +180,11 @@ def _draw_arrow(canvas: Canvas, middle: Point, action: int, size: float, ink: Co
         for along, across in shape
     ]
     drawing.import_pygame().draw.polygon(canvas.world, ink, points)
+
+
+def _draw_dot(canvas: Canvas, middle: Point, name: str, size: float, ink: Colour, paper: Colour) -> None:
+    """A disc for an action that does not move, with its first letter where there is room for it."""
+    drawing.import_pygame().draw.circle(canvas.world, ink, middle, round(0.2 * size))
+    letter = min(round(0.32 * size), 20)
+    if letter >= SMALLEST_TEXT:
+        canvas.number(name[:1].upper(), middle, letter, paper)

@@ -1,8 +1,9 @@
 """The error map: how far an agent's values are from the true ones, per cell and action.
 
-A cell is cut into four triangles, one for each action, coloured by |Q - Q*|. An agent that has no Q shows
-|V - V*|, a colour per cell. Both sides must mean the same thing: Q* has to be the optimum under the discount
-that the agent learns with, which need not be the one it is evaluated with.
+A cell is cut into four triangles, one for each action, coloured by |Q - Q*|; where the actions are not the
+four moves, it shows the largest error of them. An agent that has no Q shows |V - V*|, a colour per cell. Both
+sides must mean the same thing: Q* has to be the optimum under the discount that the agent learns with, which
+need not be the one it is evaluated with.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
 from gridworld.envs.rendering import Colour, Frame
-from gridworld.visualization.canvas import INK, PAPER, Canvas, Swatch, short, shown
+from gridworld.visualization.canvas import UNREACHABLE, Canvas, shown
 from gridworld.visualization.colormaps import ORANGES, is_dark, linear
+from gridworld.visualization.directions import moving_actions
 from gridworld.visualization.picture import IMAGES_TAB, Draw, Subject, agents_gamma
-from gridworld.world.grid import NUM_ACTIONS
+from gridworld.visualization.sheet import INK, PAPER, Swatch, short
 from gridworld.world.layout import MOVES
 from gridworld.world.mdp import FloatArray, Mdp
 from gridworld.world.solver import Solution, value_iteration
@@ -73,8 +75,9 @@ def draw_error_map(mdp: Mdp, error: FloatArray, caption: str = "", cell_size: in
         InputError: where the picture would be too large to draw.
     """
     canvas = Canvas(mdp, cell_size)
-    if not canvas.has_grid:
-        error = error.max(axis=1, keepdims=True)
+    sides = moving_actions(mdp) if error.shape[1] == len(MOVES) and canvas.has_grid else None
+    error = error.max(axis=1, keepdims=True) if sides is None else error[:, sides]
+    per_action = sides is not None
     playable = shown(mdp)
     states = np.flatnonzero(playable)
     scale = linear(ORANGES, error[states], low=0.0)
@@ -83,7 +86,6 @@ def draw_error_map(mdp: Mdp, error: FloatArray, caption: str = "", cell_size: in
     colours = colours.astype(np.uint8)
     separated = np.empty((mdp.num_states, 1, 3), dtype=np.uint8)
     separated[:] = _SEPARATOR
-    per_action = error.shape[1] == NUM_ACTIONS
     canvas.paint(
         np.concatenate([colours, separated], axis=1), _triangles(canvas.cell) if per_action else None
     )
@@ -99,16 +101,17 @@ def draw_error_map(mdp: Mdp, error: FloatArray, caption: str = "", cell_size: in
                 ink = PAPER if dark[state, part] else INK
                 canvas.number(texts[float(error[state, part])], middle, size, ink)
     canvas.caption(caption)
-    swatches = [] if known[states].all() else [Swatch("no finite optimum", fill=PAPER)]
+    unknown = [] if known[states].all() else [Swatch("no finite optimum", fill=PAPER)]
+    swatches = [*unknown, *([UNREACHABLE] if canvas.hidden else [])]
     canvas.legend(scale, "error 0", short(scale.high), swatches)
     return canvas.frame()
 
 
 def _triangles(cell: int) -> NDArray[np.intp]:
-    """(cell, cell), the action whose triangle a pixel is in; 4 on the lines between them."""
+    """(cell, cell), the number in `MOVES` of the triangle a pixel is in; 4 on the lines between them."""
     down, right = np.mgrid[:cell, :cell]
     upper, other = down - right, down + right - cell  # signs tell the side of the two diagonals
     parts = np.where(upper < 0, np.where(other < 0, 0, 1), np.where(other < 0, 3, 2))
     if cell >= _SMALLEST_SEPARATED_CELL:
-        parts[(upper == 0) | (other == 0)] = NUM_ACTIONS
+        parts[(upper == 0) | (other == 0)] = len(MOVES)
     return parts.astype(np.intp)

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.envs.rendering import Frame
-from gridworld.visualization.canvas import INK, PAPER, Canvas, Swatch, short, shown
+from gridworld.visualization.canvas import UNREACHABLE, Canvas, shown
 from gridworld.visualization.colormaps import BLUES, counting, is_dark
 from gridworld.visualization.picture import IMAGES_TAB, Draw, Subject
+from gridworld.visualization.sheet import INK, PAPER, Swatch, short
 from gridworld.world.mdp import Mdp
 
 TENSORBOARD_SIDE: int | None = IMAGES_TAB
@@ -56,5 +57,6 @@ def draw_visit_map(
     canvas.caption(caption)
     kind = ", log scale" if scale.logarithmic else ""
     never = [Swatch("never", fill=PAPER)] if (counts[states] == 0).any() else []
-    canvas.legend(scale, f"visits {short(scale.low)}", f"{short(scale.high)}{kind}", never)
+    hidden = [UNREACHABLE] if canvas.hidden else []
+    canvas.legend(scale, f"visits {short(scale.low)}", f"{short(scale.high)}{kind}", [*never, *hidden])
     return canvas.frame()

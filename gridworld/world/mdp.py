@@ -52,6 +52,7 @@ class Mdp:
         number: (S,), int64, what the environment calls each state, its observation. Two states share a number
             where a transition into it ends the episode and another one does not.
         places: (S, 3), int64, or None: panel, row and column of each state in pictures, -1 where it has none.
+        panel_names: what pictures call each panel; none: they do not name them.
         max_episode_steps: the step limit that belongs to the world; None: it has none of its own.
         own_observation: (S, *shape), or None: what the environment itself shows of each state.
         truth: where the tables come from, as tables and pictures say it.
@@ -69,6 +70,7 @@ class Mdp:
     absorbing: BoolArray
     number: IntArray
     places: IntArray | None = None
+    panel_names: tuple[str, ...] = ()
     max_episode_steps: int | None = None
     own_observation: NDArray[Any] | None = field(default=None, repr=False)
     truth: str = "exact"
@@ -109,6 +111,22 @@ class Mdp:
     def trap(self) -> BoolArray:
         """(S,), bool, terminal and no goal."""
         return frozen(self.terminal & ~self.goal)
+
+    @cached_property
+    def reachable(self) -> BoolArray:
+        """(S,), the states that an episode can come to."""
+        themselves = np.arange(self.num_states)[:, None, None]
+        possible = np.where(self.probability > 0, self.next_state, themselves)
+        following = possible.reshape(self.num_states, -1).tolist()
+        waiting = self.start_states.tolist()
+        known = np.zeros(self.num_states, dtype=np.bool_)
+        known[waiting] = True
+        while waiting:
+            for state in following[waiting.pop()]:
+                if not known[state]:
+                    known[state] = True
+                    waiting.append(state)
+        return frozen(known)
 
     def text(self) -> str:
         """A text that tells this world from others, for a run's manifest."""

@@ -65,6 +65,7 @@ def mdp_from_outcomes(
     *,
     action_names: Sequence[str] | None = None,
     places: IntArray | None = None,
+    panel_names: Sequence[str] = (),
     max_episode_steps: int | None = None,
     own_observation: NDArray[Any] | None = None,
     truth: str = "exact",
@@ -76,6 +77,7 @@ def mdp_from_outcomes(
         outcomes: its transitions and starts.
         action_names: A names; None: their numbers.
         places: (N, 3), see `Mdp`; None: pictures have no place for states.
+        panel_names: see `Mdp`.
         max_episode_steps: see `Mdp`.
         own_observation: (N, *shape), see `Mdp`.
         truth: see `Mdp`.
@@ -119,6 +121,7 @@ def mdp_from_outcomes(
         absorbing=frozen(terminal),
         number=frozen(ends.number),
         places=None if places is None else frozen(places[ends.number].astype(np.int64)),
+        panel_names=tuple(panel_names),
         max_episode_steps=None if max_episode_steps is None else int(max_episode_steps),
         own_observation=None if own_observation is None else frozen(own_observation[ends.number]),
         truth=truth,
