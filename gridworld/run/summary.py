@@ -120,14 +120,15 @@ def circles_text(cells: Sequence[Sequence[int]], timeout_probability: float) -> 
     """Half a sentence on a policy that never ends; "" where it does.
 
     Args:
-        cells: (row, column) of the cells in which it walks for ever.
+        cells: the states in which it walks for ever: (row, column) on a map, else (number,).
         timeout_probability: How probable it is that an episode is cut off by the step limit.
     """
     if not cells:
         return ""
-    shown = ", ".join(f"({row},{col})" for row, col in cells[:8])
+    are_of_a_map = len(cells[0]) == 2
+    shown = ", ".join(f"({each[0]},{each[1]})" if are_of_a_map else str(each[0]) for each in cells[:8])
     more = f" and {len(cells) - 8} more" if len(cells) > 8 else ""
     return (
         f"; it walks in circles until the time is out (probability {timeout_probability:.3g}), "
-        f"in cells (row,column) {shown}{more}"
+        f"in {'cells (row,column)' if are_of_a_map else 'states'} {shown}{more}"
     )
