@@ -16,11 +16,8 @@ from gridworld.envs import rendering as drawing
 from gridworld.envs.board import Kind, board_of
 from gridworld.envs.rendering import Colour, Point
 from gridworld.visualization.colormaps import ColourArray
-from gridworld.visualization.sheet import INK, PAPER, Sheet, Swatch
+from gridworld.visualization.sheet import INK, PAPER, UNKNOWN, Sheet
 from gridworld.world.mdp import BoolArray, IntArray, Mdp
-
-UNKNOWN: Colour = (222, 222, 222)  # the colour of a cell that training never acted in
-UNREACHABLE = Swatch("cannot be reached", UNKNOWN, (170, 170, 170))
 
 _LONGEST_SIDE = 640  # pixels, of the grid with its border
 _LONGEST_MOSAIC = 1000  # pixels, of several panels

@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
 from gridworld.envs.board import board_of
-from gridworld.envs.rendering import fitting_cell_size
+from gridworld.envs.rendering import Frame, fitting_cell_size
 from gridworld.storage.serialization import State
 from gridworld.visualization.animation import Animation, animation_of_frames
 from gridworld.visualization.canvas import shown
 from gridworld.visualization.colormaps import VIRIDIS, linear
 from gridworld.visualization.picture import Draw, Subject
 from gridworld.visualization.policy_map import caption_at, draw_policy_map, explored_by
+from gridworld.visualization.state_table import draw_policy_table, table_states
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import BoolArray
 
@@ -32,7 +33,7 @@ def draw(subject: Subject) -> Draw:
     """The animation of the subject's history, of one size."""
     assert subject.history is not None
     animation = subject.history.animation(
-        subject.evaluator, explored_by(subject), lambda step: caption_at(subject, step)
+        subject.evaluator, explored_by(subject), lambda step: caption_at(subject, step), subject.visits
     )
     return lambda cell_size: animation
 
@@ -93,29 +94,34 @@ class PolicyHistory:
         self._kept = moments[: state["kept"]]
         self._last = moments[-1] if moments else None
 
-    def animation(self, evaluator: Evaluator, known: BoolArray, caption: Callable[[int], str]) -> Animation:
-        """The policy map over training; one scale of colours for all of it.
+    def animation(
+        self,
+        evaluator: Evaluator,
+        known: BoolArray,
+        caption: Callable[[int], str],
+        visits: NDArray[np.int64] | None = None,
+    ) -> Animation:
+        """The policy map, or table, over training; one scale of colours for all of it.
 
         Args:
             evaluator: of the run's world.
             known: (S,), the states that training acted in at any time.
             caption: of a map after so many steps.
+            visits: (S, A), how often training took each action, by which a table's states are chosen.
         """
-        mdp, moments = evaluator.mdp, self.moments()
-        scale = linear(VIRIDIS, np.stack([moment.values[shown(mdp) & known] for moment in moments]))
-        cell_size = fitting_cell_size(mdp, _SIDE if len(board_of(mdp).panels) <= 1 else _MOSAIC_SIDE)
-        return animation_of_frames(
-            [
-                draw_policy_map(
-                    mdp,
-                    moment.values.astype(np.float64),
-                    moment.greedy,
-                    evaluator.solution.optimal,
-                    caption(moment.step),
-                    cell_size,
-                    scale,
-                    known,
-                )
-                for moment in moments
-            ]
-        )
+        mdp, optimal, moments = evaluator.mdp, evaluator.solution.optimal, self.moments()
+        board = board_of(mdp)
+        states = np.flatnonzero(shown(mdp)) if board.panels else table_states(mdp, visits)
+        drawn = states[known[states]]
+        scale = linear(VIRIDIS, np.stack([moment.values[drawn] for moment in moments]))
+        cell_size = fitting_cell_size(mdp, _SIDE if len(board.panels) <= 1 else _MOSAIC_SIDE)
+
+        def frame(moment: Moment) -> Frame:
+            values, greedy, words = moment.values.astype(np.float64), moment.greedy, caption(moment.step)
+            if board.panels:
+                return draw_policy_map(mdp, values, greedy, optimal, words, cell_size, scale, known)
+            numbers = np.full(optimal.shape, np.nan)
+            np.put_along_axis(numbers, greedy[:, None].astype(np.intp), values[:, None], axis=1)
+            return draw_policy_table(mdp, states, numbers, greedy, optimal, known, words, "value", scale)
+
+        return animation_of_frames([frame(moment) for moment in moments])

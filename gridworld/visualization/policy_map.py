@@ -10,22 +10,32 @@ import math
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gridworld.envs import rendering as drawing
+from gridworld.envs.board import board_of
 from gridworld.envs.rendering import AGENT, Colour, Frame, Point
 from gridworld.envs.text_drawing import SMALLEST_TEXT
 from gridworld.errors import InputError
-from gridworld.visualization.canvas import UNKNOWN, Canvas, shown
+from gridworld.visualization.canvas import Canvas, shown
 from gridworld.visualization.colormaps import VIRIDIS, Scale, is_dark, linear
 from gridworld.visualization.directions import directions
 from gridworld.visualization.greedy_path import explored, greedy_paths
 from gridworld.visualization.picture import IMAGES_TAB, Draw, Subject, agents_gamma
-from gridworld.visualization.sheet import INK, PAPER, Swatch, short
+from gridworld.visualization.sheet import (
+    DISAGREES,
+    INK,
+    NEVER_VISITED,
+    PAPER,
+    UNKNOWN,
+    UNKNOWN_INK,
+    Swatch,
+    short,
+)
+from gridworld.visualization.state_table import draw_policy_table, table_states
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 TENSORBOARD_SIDE: int | None = IMAGES_TAB
-DISAGREES: Colour = (213, 60, 50)
-_UNKNOWN_INK: Colour = (170, 170, 170)
 _UNKNOWN_DISAGREES: Colour = (226, 178, 174)
 
 _SMALLEST_ARROW_CELL = 12  # pixels; below it an arrow is a blot
@@ -37,6 +47,11 @@ def draw(subject: Subject) -> Draw:
     optimal = subject.evaluator.solution.optimal
     caption = caption_at(subject, subject.steps)
     known = explored_by(subject)
+    if not board_of(mdp).panels:
+        numbers, name = (snapshot.sampled, "probability") if snapshot.q is None else (snapshot.q, "Q")
+        states = table_states(mdp, visits_of(subject))
+        picture = draw_policy_table(mdp, states, numbers, snapshot.greedy, optimal, known, caption, name)
+        return lambda cell_size: picture
     return lambda cell_size: draw_policy_map(
         mdp, snapshot.values, snapshot.greedy, optimal, caption, cell_size, known=known
     )
@@ -49,10 +64,15 @@ def caption_at(subject: Subject, steps: int) -> str:
 
 def explored_by(subject: Subject) -> BoolArray:
     """Which states the subject's training acted in, (S,)."""
+    return explored(subject.evaluator.mdp, visits_of(subject))
+
+
+def visits_of(subject: Subject) -> NDArray[np.int64] | None:
+    """The subject's visits; None where the run has none, as its policy can be drawn without."""
     try:
-        return explored(subject.evaluator.mdp, subject.visits)
-    except InputError:  # the run's counts are missing; the policy can be drawn without
-        return explored(subject.evaluator.mdp, None)
+        return subject.visits
+    except InputError:
+        return None
 
 
 def draw_policy_map(
@@ -105,7 +125,7 @@ def draw_policy_map(
     if canvas.cell >= _SMALLEST_ARROW_CELL:
         length = canvas.cell if size is None else 0.85 * canvas.cell
         for state in states.tolist():
-            ink = inks[state] if known[state] else _UNKNOWN_INK
+            ink = inks[state] if known[state] else UNKNOWN_INK
             point = canvas.point(state, 0.5, middle)
             if ways[state].any():
                 _draw_arrow(canvas, point, ways[state], length, ink)
@@ -134,8 +154,7 @@ def draw_policy_map(
 def _swatches(cell: int, has_path: bool, all_known: bool) -> list[Swatch]:
     path = Swatch("greedy path from the start" if cell >= 24 else "greedy path", AGENT, PAPER)
     wrong = Swatch("not optimal in this cell", frame=DISAGREES, thick=2)
-    never = Swatch("never visited", UNKNOWN, _UNKNOWN_INK)
-    return [*([path] if has_path else []), wrong, *([] if all_known else [never])]
+    return [*([path] if has_path else []), wrong, *([] if all_known else [NEVER_VISITED])]
 
 
 def _draw_paths(canvas: Canvas, paths: list[list[int]], ways: IntArray, middle: float) -> None:

@@ -12,12 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
+from gridworld.envs.board import board_of
 from gridworld.envs.rendering import Colour, Frame
-from gridworld.visualization.canvas import UNREACHABLE, Canvas, shown
+from gridworld.visualization.canvas import Canvas, shown
 from gridworld.visualization.colormaps import ORANGES, is_dark, linear
 from gridworld.visualization.directions import moving_actions
 from gridworld.visualization.picture import IMAGES_TAB, Draw, Subject, agents_gamma
-from gridworld.visualization.sheet import INK, PAPER, Swatch, short
+from gridworld.visualization.policy_map import visits_of
+from gridworld.visualization.sheet import INK, PAPER, UNREACHABLE, Swatch, short
+from gridworld.visualization.state_table import draw_error_table, table_states
 from gridworld.world.layout import MOVES
 from gridworld.world.mdp import FloatArray, Mdp
 from gridworld.world.solver import Solution, value_iteration
@@ -42,6 +45,10 @@ def draw(subject: Subject) -> Draw:
     error = value_error(snapshot, best)
     name = "|V - V*|" if snapshot.q is None else "|Q - Q*|"
     caption = f"{name} after {subject.steps:,} steps, at the agent's gamma {gamma:g}"
+    if not board_of(evaluator.mdp).panels:
+        states = table_states(evaluator.mdp, visits_of(subject))
+        picture = draw_error_table(evaluator.mdp, states, error, caption)
+        return lambda cell_size: picture
     return lambda cell_size: draw_error_map(evaluator.mdp, error, caption, cell_size)
 
 

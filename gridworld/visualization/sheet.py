@@ -14,6 +14,9 @@ from gridworld.envs.text_drawing import SMALLEST_TEXT, Colour, font, import_pyga
 from gridworld.visualization.colormaps import ColourArray, Scale
 
 PAPER: Colour = BACKGROUND
+DISAGREES: Colour = (213, 60, 50)  # the colour of a greedy action that is not optimal
+UNKNOWN: Colour = (222, 222, 222)  # the colour of a cell that training never acted in
+UNKNOWN_INK: Colour = (170, 170, 170)
 
 Box = tuple[int, int, int, int]  # left, top, width, height
 
@@ -26,6 +29,10 @@ class Swatch:
     fill: Colour = PAPER
     frame: Colour = INK
     thick: int = 1
+
+
+NEVER_VISITED = Swatch("never visited", UNKNOWN, UNKNOWN_INK)
+UNREACHABLE = Swatch("cannot be reached", UNKNOWN, UNKNOWN_INK)
 
 
 class Sheet:

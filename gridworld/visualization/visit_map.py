@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gridworld.envs.board import board_of
 from gridworld.envs.rendering import Frame
-from gridworld.visualization.canvas import UNREACHABLE, Canvas, shown
+from gridworld.visualization.canvas import Canvas, shown
 from gridworld.visualization.colormaps import BLUES, counting, is_dark
 from gridworld.visualization.picture import IMAGES_TAB, Draw, Subject
-from gridworld.visualization.sheet import INK, PAPER, Swatch, short
+from gridworld.visualization.sheet import INK, PAPER, UNREACHABLE, Swatch, short
+from gridworld.visualization.state_table import draw_visit_table, table_states
 from gridworld.world.mdp import Mdp
 
 TENSORBOARD_SIDE: int | None = IMAGES_TAB
@@ -19,6 +21,9 @@ def draw(subject: Subject) -> Draw:
     """The map of the subject's visits."""
     mdp, visits = subject.evaluator.mdp, subject.visits
     caption = f"where {visits.sum():,} training steps were taken"
+    if not board_of(mdp).panels:
+        picture = draw_visit_table(mdp, table_states(mdp, visits), visits, caption)
+        return lambda cell_size: picture
     return lambda cell_size: draw_visit_map(mdp, visits, caption, cell_size)
 
 

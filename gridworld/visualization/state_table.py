@@ -1,0 +1,194 @@
+"""Pictures of a world without places: a table with a row for each state and a column for each action.
+
+The rows are in the order in which an agent comes to the states: by the fewest steps from a start. Where there
+are too many states, those remain that training visited most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gridworld.envs.rendering import AGENT, Colour, Frame
+from gridworld.envs.text_drawing import SMALLEST_TEXT, import_pygame, text_size, text_width, write
+from gridworld.visualization.colormaps import BLUES, ORANGES, VIRIDIS, Scale, counting, is_dark, linear
+from gridworld.visualization.sheet import DISAGREES, INK, NEVER_VISITED, PAPER, UNKNOWN, Sheet, Swatch, short
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+
+_MOST_ROWS = 24
+_ROW = 24  # pixels
+_TEXT = 14  # pixels
+_WIDTH = 640  # pixels, of all columns
+_NARROWEST, _WIDEST = 8, 80  # pixels, of a column
+
+_GREEDY = Swatch("greedy action", frame=AGENT, thick=2)
+_WRONG = Swatch("greedy, not optimal", frame=DISAGREES, thick=2)
+
+
+def table_states(mdp: Mdp, visits: NDArray[np.int64] | None = None) -> IntArray:
+    """Choose the states of a table.
+
+    Args:
+        mdp: the world.
+        visits: (S, A), how often training took each action in each state.
+
+    Returns:
+        (rows,), in the order of the table; states that are over or cannot be reached are none of them.
+    """
+    away = _steps_away(mdp)
+    states = np.flatnonzero((away >= 0) & ~mdp.terminal)
+    states = states[np.argsort(away[states], kind="stable")]
+    counts = np.zeros(len(states)) if visits is None else visits[states].sum(axis=1)
+    most_visited = np.argsort(-counts, kind="stable")[:_MOST_ROWS]
+    return states[np.sort(most_visited)]
+
+
+def _steps_away(mdp: Mdp) -> IntArray:
+    """(S,), the fewest steps from a start; -1 for states that cannot be reached."""
+    away = np.full(mdp.num_states, -1)
+    frontier, steps = mdp.start_states, 0
+    while frontier.size:
+        away[frontier] = steps
+        following = np.unique(mdp.next_state[frontier][mdp.probability[frontier] > 0])
+        frontier, steps = following[away[following] < 0], steps + 1
+    return away
+
+
+class StateTable(Sheet):
+    """A table under construction.
+
+    Args:
+        mdp: the world.
+        states: (rows,), see `table_states`.
+        columns: their names.
+        legend_rows: 1 or 2.
+    """
+
+    def __init__(self, mdp: Mdp, states: IntArray, columns: Sequence[str], legend_rows: int = 1) -> None:
+        names = [mdp.state_name(state) for state in states.tolist()]
+        hidden = int((mdp.reachable & ~mdp.terminal).sum()) - len(states)
+        self._label = max((text_width(name, _TEXT) for name in names), default=0) + _ROW // 2
+        self._column = max(_NARROWEST, min(_WIDEST, _WIDTH // len(columns)))
+        self._states = states
+        width = self._label + len(columns) * self._column
+        rows = 1 + len(states) + (hidden > 0)
+        super().__init__(width + 2 * _ROW, (rows + 2) * _ROW, _ROW, legend_rows)
+        for row, name in enumerate(names):
+            write(self.world, name, _ROW, self._middle(row), _TEXT)
+        room = self._column - 4
+        sizes = [text_size(name, _TEXT, room) for name in columns]
+        for column, (name, size) in enumerate(zip(columns, sizes, strict=True)):
+            if size is not None and None not in sizes:
+                left = self._left(column) + (self._column - text_width(name, size)) // 2
+                write(self.world, name, left, self._middle(-1), size)
+        if hidden:
+            line = f"and {hidden:,} more states, visited less or further from the start"
+            size = text_size(line, _TEXT, width) or SMALLEST_TEXT
+            write(self.world, line, _ROW, self._middle(len(states)) + 3, size)
+
+    def _left(self, column: int) -> int:
+        return _ROW + self._label + column * self._column
+
+    def _middle(self, row: int) -> int:
+        return (2 + row) * _ROW + _ROW // 2
+
+    def paint(self, numbers: FloatArray, scale: Scale, known: BoolArray, with_numbers: bool = True) -> None:
+        """Fill the cells.
+
+        Args:
+            numbers: (S, columns); NaN is left white.
+            scale: their colours.
+            known: (S,), the states whose numbers mean anything; the rows of others are grey.
+            with_numbers: whether to write them.
+        """
+        there = np.isfinite(numbers) & known[:, None]
+        colours = np.where(there[..., None], scale.colours(np.where(there, numbers, scale.low)), PAPER)
+        colours[~known] = UNKNOWN
+        texts = {value: short(value, scale.high) for value in set(numbers[self._states][there[self._states]])}
+        size = min((text_size(text, _TEXT, 0.8 * self._column) or 0 for text in texts.values()), default=0)
+        dark = is_dark(colours)
+        for row, state in enumerate(self._states.tolist()):
+            for column in range(numbers.shape[1]):
+                self.world.fill(colours[state, column].tolist(), self._box(row, column))
+                import_pygame().draw.rect(self.world, INK, self._box(row, column), 1)
+                if with_numbers and size and there[state, column]:
+                    middle = self._left(column) + self._column / 2, self._middle(row)
+                    ink = PAPER if dark[state, column] else INK
+                    self.number(texts[numbers[state, column]], middle, size, ink)
+
+    def mark(self, row: int, column: int, colour: Colour) -> None:
+        """A frame inside a cell, edged in white."""
+        left, top, width, height = self._box(row, column)
+        rect = import_pygame().draw.rect
+        rect(self.world, PAPER, (left + 1, top + 1, width - 2, height - 2), 3)
+        rect(self.world, colour, (left + 1, top + 1, width - 2, height - 2), 2)
+
+    def _box(self, row: int, column: int) -> tuple[int, int, int, int]:
+        return self._left(column), (2 + row) * _ROW, self._column + 1, _ROW + 1
+
+
+def draw_policy_table(
+    mdp: Mdp,
+    states: IntArray,
+    numbers: FloatArray,
+    greedy: IntArray,
+    optimal: BoolArray,
+    known: BoolArray,
+    caption: str = "",
+    name: str = "Q",
+    scale: Scale | None = None,
+) -> Frame:
+    """Draw what an agent holds of its actions as colours, with a frame around the greedy one.
+
+    Args:
+        mdp: the world.
+        states: (rows,), see `table_states`.
+        numbers: (S, A); NaN is left white.
+        greedy: (S,), the action that it would take.
+        optimal: (S, A), whether an action is optimal.
+        known: (S,), the states that training acted in; the others are grey.
+        caption: a line above the table.
+        name: of the numbers.
+        scale: their colours, for pictures that are to be compared; without numbers then.
+
+    Returns:
+        (height, width, 3), RGB.
+    """
+    table = StateTable(mdp, states, mdp.action_names, legend_rows=2)
+    ends = scale or linear(VIRIDIS, numbers[states][known[states]])
+    table.paint(numbers, ends, known, with_numbers=scale is None)
+    for row, state in enumerate(states.tolist()):
+        action = int(greedy[state])
+        table.mark(row, action, AGENT if optimal[state, action] else DISAGREES)
+    table.caption(caption)
+    never = [] if known[states].all() else [NEVER_VISITED]
+    low, high = short(ends.low, ends.high), short(ends.high)
+    table.legend(ends, f"{name} {low}", high, [_GREEDY, _WRONG, *never])
+    return table.frame()
+
+
+def draw_error_table(mdp: Mdp, states: IntArray, error: FloatArray, caption: str = "") -> Frame:
+    """Draw errors (S, A), or (S, 1) of values, as colours; NaN is left white."""
+    table = StateTable(mdp, states, mdp.action_names if error.shape[1] == mdp.num_actions else ["V"])
+    scale = linear(ORANGES, error[states], low=0.0)
+    table.paint(error, scale, np.ones(mdp.num_states, dtype=np.bool_))
+    table.caption(caption)
+    swatches = [] if np.isfinite(error[states]).all() else [Swatch("no finite optimum")]
+    table.legend(scale, "error 0", short(scale.high), swatches)
+    return table.frame()
+
+
+def draw_visit_table(mdp: Mdp, states: IntArray, visits: NDArray[np.int64], caption: str = "") -> Frame:
+    """Draw counts (S, A) as colours, on a logarithmic scale where they span decades."""
+    table = StateTable(mdp, states, mdp.action_names)
+    scale = counting(BLUES, visits[states])
+    counts: NDArray[Any] = np.where(visits > 0, visits.astype(np.float64), np.nan)
+    table.paint(counts, scale, np.ones(mdp.num_states, dtype=np.bool_))
+    table.caption(caption)
+    kind = ", log scale" if scale.logarithmic else ""
+    never = [Swatch("never")] if (visits[states] == 0).any() else []
+    table.legend(scale, f"visits {short(scale.low)}", f"{short(scale.high)}{kind}", never)
+    return table.frame()
