@@ -2,7 +2,7 @@
 
 Where the reward depends on the step count, as in MiniGrid, the time is part of a state: a world is then one
 copy of its states for every step of an episode. Which steps pay by the time is found out by trying each at
-four times, among them the first and the last possible one; over all steps, every time is tried. Those that
+three times, among them the first and the last possible one; over all steps, every time is tried. Those that
 pay by the time are tried at all times. That nothing was missed is checked by replays (`replays`).
 
 At the step limit an episode is truncated. A state of that time is not terminal, since the environment does
@@ -23,7 +23,6 @@ from gridworld.world.sources.exploring import Clocks, Graph, Subject, TimeMatter
 
 _LONGEST = 10_000  # steps; who truncates later is taken to have no limit
 _WALK = 40  # steps that an attribute must count to be a clock
-_EVERY = 2  # further times at which a step is tried
 
 Rewards = dict[tuple[int, int], FloatArray]  # (L,) by (state, action), NaN where it cannot be reached
 
@@ -69,23 +68,40 @@ class Trials:
     clocks: Clocks
     own_limit: int | None
 
-    def rewards_by_time(self, limit: int) -> Rewards:
-        """The rewards that depend on the time, within `limit` steps.
+    def rewards_by_time(self, limit: int, most_states: int) -> Rewards:
+        """The rewards that depend on the time, within `limit` steps; empty where none does.
+
+        Args:
+            limit: L, the last step of an episode.
+            most_states: of states with their time, more are refused.
 
         Raises:
             TimeMatters: something else depends on the time too.
+            InputError: a reward does, and with the time there are too many states.
         """
         others = itertools.cycle(np.random.default_rng(0).permutation(limit).tolist())
         varying: Rewards = {}
-        for state in np.flatnonzero(self.graph.tried & (self.graph.depth < limit)).tolist():
+        states = np.flatnonzero(self.graph.tried & (self.graph.depth < limit))
+        pays = np.abs(self.graph.reward[states]).max(axis=1)
+        for state in states[np.argsort(-pays, kind="stable")].tolist():  # likely ones first
             first = int(self.graph.depth[state])
             for action in range(self.subject.num_actions):
-                times = {first, limit - 1, *(max(first, next(others)) for _ in range(_EVERY))}
+                times = {first, limit - 1, max(first, next(others))}
                 found = {self._reward(state, action, time) for time in times}
                 if found != {self.graph.reward[state, action]}:
+                    if not varying:
+                        self._check_size(limit, most_states)
                     by_time = [self._reward(state, action, time) for time in range(first, limit)]
                     varying[state, action] = np.concatenate([np.full(first, np.nan), by_time])
         return varying
+
+    def _check_size(self, limit: int, most_states: int) -> None:
+        size = _Layers(self.graph, limit).size
+        if size > most_states:
+            raise self.subject.refusal(
+                f"its reward depends on the elapsed time, and with it there are {size:,} states, "
+                f"{len(self.graph.keys):,} without it; at most {most_states:,} can be solved for"
+            )
 
     def _reward(self, state: int, action: int, time: int) -> float:
         graph = self.graph
@@ -139,25 +155,15 @@ class _Layers:
         return int(self.first[-1])
 
 
-def with_time(subject: Subject, graph: Graph, rewards: Rewards, limit: int, most_states: int) -> Timed:
+def with_time(graph: Graph, rewards: Rewards, limit: int) -> Timed:
     """Make states of (state, time).
 
     Args:
-        subject: the environment, for messages.
-        graph: its states without time.
+        graph: the states without time.
         rewards: those that depend on the time.
         limit: the time of the last states, in which nothing is possible any more.
-        most_states: more are refused.
-
-    Raises:
-        InputError: too many states.
     """
     layers = _Layers(graph, limit)
-    if layers.size > most_states:
-        raise subject.refusal(
-            f"its reward depends on the elapsed time, and with it there are {layers.size:,} states, "
-            f"{len(graph.keys):,} without it; at most {most_states:,} can be solved for"
-        )
     actions = graph.next_state.shape[1]
     next_state = np.repeat(np.arange(layers.size)[:, None], actions, axis=1)
     reward, terminated = np.zeros(next_state.shape), np.zeros(next_state.shape, dtype=np.bool_)

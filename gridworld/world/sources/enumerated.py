@@ -31,6 +31,8 @@ from gridworld.world.sources.exploring import Clocks, Graph, Subject, TimeMatter
 from gridworld.world.sources.making import make_env
 from gridworld.world.sources.replays import Replays
 
+_UNLIMITED = 1_000  # steps within which rewards must not depend on the time where episodes have no limit
+
 
 def enumerate_env(
     env_id: str, kwargs: Mapping[str, Any] | None = None, *, most_states: int = MOST_STATES
@@ -92,7 +94,7 @@ def _without_time(subject: Subject, clocks: Clocks, limit_of_id: int | None, mos
     graph = explore(subject, clocks, most_states)
     own = own_limit(subject, graph, clocks, limit_of_id)
     limit = _least(own, limit_of_id)
-    rewards = Trials(subject, graph, clocks, own).rewards_by_time(limit or 1000)
+    rewards = Trials(subject, graph, clocks, own).rewards_by_time(limit or _UNLIMITED, most_states)
     if not rewards:
         return _Table(graph, clocks, _plain(graph), np.arange(len(graph.keys)), limit)
     if limit is None:
@@ -100,7 +102,7 @@ def _without_time(subject: Subject, clocks: Clocks, limit_of_id: int | None, mos
             "its rewards depend on the elapsed time, and episodes have no limit, so that its states have no "
             "number; set env.kwargs.max_episode_steps"
         )
-    timed = with_time(subject, graph, rewards, limit, most_states)
+    timed = with_time(graph, rewards, limit)
     return _Table(graph, clocks, timed.outcomes, timed.state, limit)
 
 
