@@ -28,7 +28,7 @@ AUTO = "auto"  # checkpoints as often as they cost next to nothing
 class ObservationConfig:
     """What the agent sees of a state."""
 
-    kind: str = "one_hot"  # or coordinates, image, none (the state's number)
+    kind: str = "one_hot"  # or coordinates, image, own, none (the state's number)
     cell_size: int = 8  # pixels, for images
 
 

@@ -20,6 +20,7 @@ from gridworld.world.layout import positive_int
 from gridworld.world.mdp import IntArray, Mdp
 
 _MOST_COLOURS = 256
+_SAMPLED = 16  # frames that a palette is chosen from
 _LONGEST_SIDE = 1000  # pixels, where no cell size is asked for
 
 Palette = NDArray[np.uint8]  # (colours, 3), RGB
@@ -86,6 +87,25 @@ def animation_of_frames(frames: Sequence[Frame]) -> Animation:
     """
     pictures, palette = _indexed(frames)
     return Animation(range(len(pictures)), lambda index: _image(pictures[index], palette))
+
+
+def animation_of_photos(frames: Sequence[Frame]) -> Animation:
+    """Show frames of any colours one after the other, in the palette that is nearest to them all.
+
+    Args:
+        frames: (height, width, 3) each, RGB.
+
+    Returns:
+        A picture for each frame.
+    """
+    spread = np.linspace(0, len(frames) - 1, min(len(frames), _SAMPLED)).round().astype(int)
+    sample = Image.fromarray(np.concatenate([frames[index] for index in spread]))
+    palette = sample.quantize(_MOST_COLOURS)
+
+    def draw(index: int) -> Image.Image:
+        return Image.fromarray(frames[index]).quantize(palette=palette, dither=Image.Dither.NONE)
+
+    return Animation(range(len(frames)), draw)
 
 
 def _image(picture: NDArray[np.uint8], palette: Palette) -> Image.Image:

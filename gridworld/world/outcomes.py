@@ -107,6 +107,7 @@ def mdp_from_outcomes(
     probability[terminal] = np.eye(count)[0]
     reward[terminal] = 0.0
     reward[probability == 0] = 0.0
+    stays = (next_state == np.arange(size)[:, None, None]) & (reward == 0)
     names = tuple(action_names) if action_names is not None else tuple(map(str, range(actions)))
     return Mdp(
         name=name,
@@ -118,7 +119,7 @@ def mdp_from_outcomes(
         goal=frozen(goal),
         start=frozen(np.concatenate([outcomes.start, np.zeros(len(extra))])),
         thresholds=frozen(thresholds_of(probability)),
-        absorbing=frozen(terminal),
+        absorbing=frozen(terminal | (stays | (probability == 0)).all(axis=(1, 2))),
         number=frozen(ends.number),
         places=None if places is None else frozen(places[ends.number].astype(np.int64)),
         panel_names=tuple(panel_names),
