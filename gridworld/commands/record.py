@@ -23,8 +23,8 @@ from gridworld.restore.saved_run import SavedRun, choose_policy, read_visits
 from gridworld.run.claim import check_inside, check_writable
 from gridworld.storage.safe_read import check_no_link
 from gridworld.storage.symlinks import make_inside
-from gridworld.visualization import video
-from gridworld.visualization.animation import Animation, animation_of_states
+from gridworld.visualization import episode, video
+from gridworld.visualization.animation import Animation
 from gridworld.visualization.picture import Subject, drawer, save
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
@@ -129,4 +129,6 @@ def _film(mdp: Mdp, subject: Subject, options: argparse.Namespace) -> Animation:
     policy = choose_policy(subject.snapshot, options.policy)
     limit = subject.evaluator.max_episode_steps
     episodes = [play_episode(mdp, policy, limit, options.seed + index) for index in range(options.episodes)]
-    return animation_of_states(mdp, np.concatenate(episodes), options.cell_size)
+    drawn = episode.film(subject, episodes)(options.cell_size)
+    assert isinstance(drawn, Animation)
+    return drawn

@@ -166,7 +166,7 @@ def make_observation(mdp: Mdp, kind: str, cell_size: int = IMAGE_CELL_SIZE) -> O
         cell_size: pixels a cell, for images.
 
     Raises:
-        InputError: no such kind; the world has nothing of that kind; or images that would not fit into memory.
+        InputError: no such kind; the world has nothing of it; or images that would not fit into memory.
     """
     if kind not in KINDS:
         *others, last = KINDS

@@ -14,9 +14,11 @@ from typing import Any
 
 import yaml
 
+from gridworld.config.worlds import EnvConfig, MapConfig
 from gridworld.errors import InputError
 from gridworld.export.exported_run import ExportedRun
 from gridworld.report.table import Table, to_markdown
+from gridworld.run.folder import WORLD
 from gridworld.storage.atomic_write import replacing_folder, write_json, write_text
 from gridworld.storage.safe_read import read_object
 from gridworld.world.metrics import METRICS
@@ -47,8 +49,7 @@ from huggingface_hub import snapshot_download
 {the_import}
 
 folder = Path(snapshot_download("USER/{group}"))
-world = dict({world})
-env = gym.make("gridworld:GridWorld-v0", layout=str(folder / "map.txt"), **world)
+{world}
 {load}
 print(gridworld.evaluate({policy}, env=env, gamma={gamma}))
 ```
@@ -84,7 +85,10 @@ def to_hub(run: ExportedRun, out: Path, project: str) -> str:
         for path in run.pictures:
             shutil.copyfile(path, new / _shown_as(path))
         write_text(new / "README.md", card)
-        write_text(new / "map.txt", run.evidence.layout + "\n")
+        if isinstance(run.config.env, MapConfig):
+            write_text(new / "map.txt", run.evidence.layout + "\n")
+        else:
+            shutil.copyfile(run.evidence.folder / WORLD, new / WORLD)
         write_json(new / "config.json", dataclasses.asdict(run.config))
         exact = {"is_deterministic": True, "is_exact": True, "run": run.identity}
         write_json(new / _RESULTS, {**run.summary, **_sb3_scores(run), **exact})
@@ -125,12 +129,21 @@ def _card(run: ExportedRun) -> str:
             f"![{each.stem}]({_shown_as(each)})\n" for each in run.pictures if each.suffix != ".mp4"
         ),
         the_import=f"from {module or 'stable_baselines3'} import {name}" if is_sb3 else "import numpy as np",
-        world=", ".join(f"{key}={getattr(run.config.env, key)!r}" for key in _WORLD),
+        world=_world(run.config.env),
         load=f"model = {name}.load{file}" if is_sb3 else f"table = np.load{file}",
         policy="model" if is_sb3 else 'q=table["q"]',
         gamma=run.evidence.gamma,
     )
     return f"---\n{yaml.safe_dump(_metadata(run, is_sb3), sort_keys=False, width=10_000)}---\n\n{text}"
+
+
+def _world(env: EnvConfig) -> str:
+    """The lines of Python that make the world."""
+    if not isinstance(env, MapConfig):
+        return f'env = gridworld.load_world(folder / "{WORLD}")'
+    settings = ", ".join(f"{key}={getattr(env, key)!r}" for key in _WORLD)
+    made = 'gym.make("gridworld:GridWorld-v0", layout=str(folder / "map.txt"), **world)'
+    return f"world = dict({settings})\nenv = {made}"
 
 
 def _metadata(run: ExportedRun, is_sb3: bool) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import gridworld
 from gridworld.config.flatten import flat
 from gridworld.config.train import TrainConfig
+from gridworld.config.worlds import SOURCES
 from gridworld.errors import InputError
 from gridworld.report.analysis.analyse import Overall, TaskAnalysis, analyse
 from gridworld.report.embedded_images import changed_pictures
@@ -70,6 +71,9 @@ def gather(paths: Sequence[Path], seed: int = 0, log_steps: bool = False) -> Rep
     return Report(study, tasks, overall, unusable, tuple(problems), notes, seed, tuple(tunings))
 
 
+_OPEN = ("agent.", "env.kwargs.")  # sections with settings that no schema names
+
+
 def _foreign(runs: Sequence[Evidence]) -> tuple[str, ...]:
     """What was written by another version, and what it says that this one does not know."""
     notes = []
@@ -80,9 +84,10 @@ def _foreign(runs: Sequence[Evidence]) -> tuple[str, ...]:
                 f"{count} {'runs were' if count > 1 else 'run was'} written by gridworld {version}, this is "
                 f"{gridworld.__version__}: {first.folder}{' and others' if count > 1 else ''}."
             )
-    known = {name for name, _ in flat(asdict(TrainConfig()))}
+    worlds = [asdict(TrainConfig(env=source())) for source in SOURCES.values()]
+    known = {name for settings in worlds for name, _ in flat(settings)}
     unknown = Counter(
-        name for run in runs for name in run.settings if name not in known and not name.startswith("agent.")
+        name for run in runs for name in run.settings if name not in known and not name.startswith(_OPEN)
     )
     for name, count in sorted(unknown.items()):
         first = next(run for run in runs if name in run.settings)

@@ -96,7 +96,7 @@ def mdp_from_arrays(name: str, arrays: Mapping[str, Any], where: str) -> Mdp:
     mdp = mdp_from_outcomes(
         where,
         tables,
-        action_names=_action_names(where, given.get("action_names")),
+        action_names=_names(where, "action_names", given.get("action_names")),
         places=_places(where, given.get("places")),
         max_episode_steps=_whole(where, "max_episode_steps", given.get("max_episode_steps")),
     )
@@ -130,12 +130,12 @@ def _array(where: str, key: str, value: Any) -> NDArray[Any]:
     return array
 
 
-def _action_names(where: str, given: NDArray[Any] | None) -> list[str] | None:
+def _names(where: str, key: str, given: NDArray[Any] | None) -> list[str] | None:
     if given is None:
         return None
     if given.ndim != 1 or given.dtype.kind != "U":
-        raise InputError(f"{where}: action_names is {given.dtype} {given.shape}, must be one string each")
-    return [checked_text(where, "action_names", name) for name in given]
+        raise InputError(f"{where}: {key} is {given.dtype} {given.shape}, must be one string each")
+    return [checked_text(where, key, name) for name in given]
 
 
 def _places(where: str, given: NDArray[Any] | None) -> NDArray[Any] | None:
@@ -198,6 +198,8 @@ def world_bytes(mdp: Mdp) -> bytes:
         value = getattr(mdp, field.name)
         if value is not None:
             arrays[field.name] = np.ascontiguousarray(value) if np.ndim(value) else np.array(value)
+    if not mdp.panel_names:
+        del arrays["panel_names"]
     return npz_bytes(arrays)
 
 
@@ -222,7 +224,8 @@ def world_from_bytes(content: bytes, where: str) -> Mdp:
     for key in ("name", "truth"):
         if key in found:
             values[key] = checked_text(where, key, found[key])
-    values["action_names"] = tuple(_action_names(where, found["action_names"]) or ())
+    for key in ("action_names", "panel_names"):
+        values[key] = tuple(_names(where, key, found.get(key)) or ())
     values["max_episode_steps"] = _whole(where, "max_episode_steps", found.get("max_episode_steps"))
     tables = {key: frozen(value) for key, value in values.items() if isinstance(value, np.ndarray)}
     return verified(Mdp(**{**values, **tables}), where)
