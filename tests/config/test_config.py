@@ -3,7 +3,9 @@
 import dataclasses
 import inspect
 import json
+from pathlib import Path
 
+import numpy as np
 import pytest
 import stable_baselines3
 from helpers.support import CONF, DEEP, configure
@@ -12,6 +14,7 @@ from gridworld.agents import family
 from gridworld.config.agents import agent_schemas
 from gridworld.config.plain_settings import read_config
 from gridworld.config.train import TrainConfig, check
+from gridworld.config.worlds import SOURCES
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.training.tensorboard import hparams
@@ -20,13 +23,30 @@ from gridworld.world.layout import shipped_layouts
 GROUPS = sorted(folder.name for folder in CONF.iterdir() if folder.is_dir() and folder.name != "tune")
 CHOICES = [(group, file.stem) for group in GROUPS for file in sorted((CONF / group).glob("*.yaml"))]
 AGENTS = {choice for group, choice in CHOICES if group == "agent"}
+COMPLETED = {  # choices that leave something to say
+    "gymnasium": ["env.id=FrozenLake-v1"],
+    "enumerated": ["env.id=MiniGrid-Empty-5x5-v0"],
+    "arrays": ["env.path=two_rooms.npz"],
+    "built": ["env.builder=gridworld.world.sources.classics.river_swim"],
+    "image": ["agent.policy=CnnPolicy"],
+    "own": ["env=enumerated", "env.id=MiniGrid-Empty-5x5-v0"],
+}
 FROM_ELSEWHERE = {"self", "env", "seed", "device", "tensorboard_log", "verbose", "_init_setup_model"}
 
 
 @pytest.mark.parametrize(("group", "choice"), CHOICES)
-def test_every_choice_composes_and_could_train(group: str, choice: str) -> None:
-    policy = ["agent.policy=CnnPolicy"] if choice == "image" else []
-    config = configure(f"{group}={choice}", *policy)
+def test_every_choice_composes_and_could_train(
+    group: str, choice: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.savez(
+        "two_rooms.npz",
+        next_state=[[0, 1]] * 2,
+        reward=[[0, 0], [0, 1.0]],
+        terminated=np.zeros(1) < [[0, 0], [0, 1]],
+        start=[1.0, 0],
+    )
+    config = configure(f"{group}={choice}", *COMPLETED.get(choice, []))
     check(config)
     family(config.agent).check(config)
     mdp = config.env.compile()
@@ -36,7 +56,9 @@ def test_every_choice_composes_and_could_train(group: str, choice: str) -> None:
 
 
 def test_there_is_a_yaml_for_every_layout_and_every_agent() -> None:
-    assert {choice for group, choice in CHOICES if group == "env"} == set(shipped_layouts())
+    worlds = {choice for group, choice in CHOICES if group == "env"}
+    assert set(shipped_layouts()) <= worlds
+    assert set(SOURCES) - {"map"} <= worlds
     assert set(agent_schemas()) - {"sb3"} <= AGENTS
 
 
@@ -64,6 +86,9 @@ def test_policy_kwargs_has_every_parameter_of_the_policies(name: str) -> None:
 @pytest.mark.parametrize(
     "overrides",
     [
+        ["env=frozen_lake_v1", "env.kwargs.is_slippery=false"],
+        ["env=built", "env.builder=a.b", "env.kwargs.size=3"],
+        ["env=deep_sea", "env.size=5"],
         ["agent=ppo", "env=cliff", "agent.policy_kwargs.net_arch=[8,8]", "agent.clip_range=lin_0.3"],
         *([f"agent={name}"] for name in sorted(AGENTS)),
     ],

@@ -92,8 +92,7 @@ def test_a_manifest_has_the_settings_of_its_job(agent: str, tmp_path: Path) -> N
     """By which a sweep knows a run that is no longer the job's."""
     words = SHORT[agent]
     config = configure(*words)
-    layout = check_settings(config).layout.text()
-    RunWriter.start(tmp_path, dataclasses.asdict(config), layout, words)
+    RunWriter.start(tmp_path, dataclasses.asdict(config), check_settings(config), words)
     manifest = read_run(tmp_path).manifest
     assert [settings_hash(manifest["config"], "\n".join(manifest["layout"]))] == hashes(words)
 

@@ -24,7 +24,7 @@ from gridworld.config.composition.setting_names import settings_of_a_run
 from gridworld.config.composition.words import OF_THE_COMMAND
 from gridworld.errors import InputError, failure
 
-_LISTED = 16  # choices of a group that are listed at most; of more, those with a similar name
+_LISTED = 24  # choices of a group that are listed at most; of more, those with a similar name
 
 
 def sentence(error: BaseException) -> str:
