@@ -115,7 +115,7 @@ def _image(mdp: Mdp, cell_size: int) -> Rows:
 
 
 def _none(mdp: Mdp, cell_size: int) -> Rows:
-    return spaces.Discrete(mdp.num_states), np.arange(mdp.num_states)
+    return spaces.Discrete(mdp.num_numbers), mdp.number
 
 
 KINDS: dict[str, Callable[[Mdp, int], Rows]] = {  # takes the world and `cell_size`

@@ -166,9 +166,7 @@ def _step_limit(env: gym.Env[Any, Any]) -> int | None:
     try:
         limit = env.get_wrapper_attr("_max_episode_steps")  # of the wrapper TimeLimit
     except AttributeError:
-        limit = None
-    if limit is None and env.unwrapped.spec is not None:
-        limit = env.unwrapped.spec.max_episode_steps
+        return None
     return None if limit is None else int(limit)
 
 
