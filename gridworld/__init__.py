@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from gridworld.api.runs import RunResult, open_run, train
     from gridworld.api.scores import evaluate
     from gridworld.api.settings import compose
+    from gridworld.api.worlds import compile_env, make_vec
     from gridworld.envs.env import GridWorldEnv
     from gridworld.envs.observations import (
         CoordinateObservation,
@@ -52,10 +53,12 @@ _HOME = {
     "VectorCoordinateObservation": "envs.observations",
     "VectorImageObservation": "envs.observations",
     "VectorOneHotObservation": "envs.observations",
+    "compile_env": "api.worlds",
     "compile_mdp": "world.grid",
     "compose": "api.settings",
     "evaluate": "api.scores",
     "load": "world.layout",
+    "make_vec": "api.worlds",
     "make_vec_env": "agents.sb3.interop.make_vec_env",
     "open_run": "api.runs",
     "shipped_layouts": "world.layout",
@@ -79,10 +82,12 @@ __all__ = [
     "VectorCoordinateObservation",
     "VectorImageObservation",
     "VectorOneHotObservation",
+    "compile_env",
     "compile_mdp",
     "compose",
     "evaluate",
     "load",
+    "make_vec",
     "make_vec_env",
     "open_run",
     "register_envs",

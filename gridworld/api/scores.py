@@ -28,11 +28,12 @@ def evaluate(
 
     Args:
         model_or_table: a model of SB3 or of any library with its interface (DQN, PPO, A2C, QRDQN, TRPO, ...),
-            or its policy; or a table: actions (S,), whole numbers from 0 to 3, or their probabilities (S, A).
-        env: an environment or a batch of Gymnasium or SB3, wrapped or not; a compiled world (`compile_mdp`);
-            or the name of a map. A model sees states as this environment shows them, if it has the model's
-            observation space, and else by the world's own observation with that space. None: the environment
-            that the model was trained on.
+            or its policy; or a table: actions (S,), whole numbers from 0, or their probabilities (S, A).
+        env: an environment or a batch of Gymnasium or SB3, wrapped or not: a GridWorld, or one of Gymnasium's
+            own with a transition table; a compiled world (`compile_mdp`, `compile_env`); or the name of a
+            map. A model sees states as this environment shows them, if it has the model's observation space,
+            and else by the world's own observation with that space. None: the environment that the model was
+            trained on.
         gamma: discount of value and regret.
         q: in place of `model_or_table`: Q values (S, A), of which the first of the best actions is taken.
         deterministic: whether to score a model's best action in every state, or the distribution that it
@@ -44,12 +45,15 @@ def evaluate(
         probabilities of `goal`, `trap` and `timeout`, `expected_return` and `expected_length`.
 
     Raises:
-        InputError: no GridWorld; a table that does not fit it; a model that keeps a memory, or sees or does
-            something else.
+        InputError: no world that is known exactly; a table that does not fit it; a model that keeps a memory,
+            or sees or does something else.
 
     Example:
         >>> evaluate([1] * 30, "classic").regret > 0.9  # always to the right
         True
+        >>> import gymnasium
+        >>> round(evaluate([1] * 16, gymnasium.make("FrozenLake-v1")).outcome.goal, 3)  # always down
+        0.049
     """
     discount("gamma", gamma)
     if (model_or_table is None) == (q is None):

@@ -7,6 +7,7 @@ the libraries need be imported for it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from os import PathLike
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from gridworld.errors import InputError
 from gridworld.world.grid import GridMdp, compile_mdp
 from gridworld.world.layout import Layout, load, positive_int
 from gridworld.world.mdp import Mdp
+from gridworld.world.sources.gymnasium_table import compile_table
 
 _MOST_STEPS = 100_000
 _LIMITS = ("_max_episode_steps", "max_episode_steps")  # of TimeLimit, of a native batch
@@ -40,12 +42,13 @@ def task_of(env: Any, max_episode_steps: int | None = None) -> Task:
     """Find the world and the step limit of an environment.
 
     Args:
-        env: an environment or a batch of Gymnasium or SB3, wrapped or not; a compiled world; or what `load`
-            takes: the name of a map, its file, or a `Layout`.
+        env: an environment or a batch of Gymnasium or SB3, wrapped or not: a GridWorld, or one with a
+            transition table; a compiled world; or what `load` takes: the name of a map, its file, or a
+            `Layout`.
         max_episode_steps: the step limit; None: the environment's own, or 100 where it has none.
 
     Raises:
-        InputError: there is no GridWorld in it.
+        InputError: there is no world in it.
     """
     limit = max_episode_steps
     if isinstance(env, Mdp):
@@ -53,18 +56,38 @@ def task_of(env: Any, max_episode_steps: int | None = None) -> Task:
     elif isinstance(env, str | PathLike | Layout):
         mdp = compile_mdp(load(env))
     else:
-        mdp = _attribute(env, "mdp")
-        if not isinstance(mdp, Mdp):
-            raise InputError(
-                f"env: {type(env).__name__} has no GridWorld in it; must be a GridWorld environment, a "
-                "compiled world (`compile_mdp`), or the name of a map"
-            )
-        if limit is None:
-            found = (_attribute(env, name) for name in _LIMITS)
-            limit = next((each for each in found if each is not None), None)
+        mdp = world_of(env)
+        limit = _step_limit(env) if limit is None else limit
+    limit = mdp.max_episode_steps if limit is None else limit
     limit = STEP_LIMIT if limit is None else positive_int("max_episode_steps", limit)
     at_most("max_episode_steps", limit, _MOST_STEPS)
     return Task(mdp, limit)
+
+
+def world_of(env: Any) -> Mdp:
+    """Find the world of an environment, or compile its transition table.
+
+    Args:
+        env: an environment or a batch of Gymnasium or SB3, wrapped or not.
+
+    Raises:
+        InputError: it is neither a GridWorld nor an environment with a table that is true.
+    """
+    mdp = _attribute(env, "mdp")
+    if isinstance(mdp, Mdp):
+        return mdp
+    if _attribute(env, "P") is not None:
+        mdp = compile_table(env if isinstance(env, gym.Env) else _of_first(env, "unwrapped"))
+        return replace(mdp, max_episode_steps=_step_limit(env))
+    raise InputError(
+        f"env: {type(env).__name__} has no GridWorld in it and no transition table; must be a GridWorld "
+        "environment, one of Gymnasium with a table P, a compiled world, or the name of a map"
+    )
+
+
+def _step_limit(env: Any) -> int | None:
+    found = (_attribute(env, name) for name in _LIMITS)
+    return next((each for each in found if each is not None), None)
 
 
 def _attribute(env: Any, name: str) -> Any:
@@ -72,7 +95,7 @@ def _attribute(env: Any, name: str) -> Any:
     ways: tuple[Callable[[], Any], ...] = (
         lambda: env.get_wrapper_attr(name),
         lambda: getattr(env.unwrapped, name),
-        lambda: env.get_attr(name)[0],
+        lambda: _of_first(env, name),
     )
     for ask in ways:
         try:
@@ -80,6 +103,14 @@ def _attribute(env: Any, name: str) -> Any:
         except (AttributeError, TypeError):
             continue
     return None
+
+
+def _of_first(batch: Any, name: str) -> Any:
+    """An attribute of a batch's first environment. Other processes would die of one that is not there."""
+    has = batch.has_attr(name) if hasattr(batch, "has_attr") else all(batch.call("has_wrapper_attr", name))
+    if not has:
+        raise AttributeError(name)
+    return batch.get_attr(name)[0]
 
 
 def observation_like(mdp: Mdp, space: gym.Space[Any]) -> ObservationTable:
@@ -114,8 +145,12 @@ def _cell_size(mdp: Mdp, space: gym.Space[Any]) -> int:
     return max(1, (width - border) // per_cell + 1)
 
 
-def observation_of(env: gym.Env[Any, Any]) -> ObservationTable:
+def observation_of(env: gym.Env[Any, Any], mdp: Mdp) -> ObservationTable:
     """What an agent in a scalar environment sees of each state, through all of its wrappers.
+
+    Args:
+        env: the environment.
+        mdp: its world.
 
     Raises:
         InputError: what it sees or does is not a function of the state alone.
@@ -124,10 +159,10 @@ def observation_of(env: gym.Env[Any, Any]) -> ObservationTable:
     seeing = [each for each in wrappers if _sees(each)]
     first = seeing[0] if seeing else None
     if first is None:
-        return make_observation(env.unwrapped.mdp, "none")  # type: ignore[attr-defined]
+        return make_observation(mdp, "none")
     if len(seeing) == 1 and isinstance(first, TableObservation):
         return first.table
-    rows: list[Any] = list(range(env.unwrapped.mdp.num_states))  # type: ignore[attr-defined]
+    rows: list[Any] = mdp.number.tolist()
     for wrapper in seeing:
         rows = [wrapper.observation(row) for row in rows]
     if not all(isinstance(row, np.ndarray | int | np.integer) for row in rows):
@@ -155,7 +190,7 @@ def _sees(wrapper: Any) -> bool:
             "evaluated exactly; leave it out"
         )
     if isinstance(wrapper, gym.ActionWrapper):
-        raise InputError(f"env: {name} changes actions; an exact score is of the world's own four")
+        raise InputError(f"env: {name} changes actions; an exact score is of the world's own")
     if isinstance(wrapper, gym.ObservationWrapper):
         return True
     if wrapper.observation_space != wrapper.env.observation_space:

@@ -129,7 +129,7 @@ def _image(mdp: Mdp, cell_size: int) -> Rows:
 
 
 def _none(mdp: Mdp, cell_size: int) -> Rows:
-    return spaces.Discrete(mdp.num_states), np.arange(mdp.num_states)
+    return spaces.Discrete(mdp.num_numbers), mdp.number
 
 
 def _own(mdp: Mdp, cell_size: int) -> Rows:

@@ -22,7 +22,7 @@ ACTION_NAMES = ("up", "right", "down", "left")
 NUM_ACTIONS = len(MOVES)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class GridMdp(Mdp):
     """The tables of a map: a state is a cell, A = 4 actions, K outcomes (1 without slip, 3 with).
 

@@ -34,7 +34,7 @@ Table = TypeVar("Table", bound=NDArray[Any])
 LEAST_REWARD, MOST_REWARD = 1e-100, 1e100
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Mdp:
     """Read-only tables of one world.
 
@@ -74,6 +74,10 @@ class Mdp:
     max_episode_steps: int | None = None
     own_observation: NDArray[Any] | None = field(default=None, repr=False)
     truth: str = "exact"
+
+    def __repr__(self) -> str:
+        sizes = f"{self.num_states} states, {self.num_actions} actions"
+        return f"<{type(self).__name__} {self.name}: {sizes}>"
 
     @property
     def num_states(self) -> int:

@@ -166,9 +166,7 @@ def _step_limit(env: gym.Env[Any, Any]) -> int | None:
     try:
         limit = env.get_wrapper_attr("_max_episode_steps")  # of the wrapper TimeLimit
     except AttributeError:
-        limit = None
-    if limit is None and env.unwrapped.spec is not None:
-        limit = env.unwrapped.spec.max_episode_steps
+        return None
     return None if limit is None else int(limit)
 
 
@@ -296,10 +294,11 @@ def _copied(real: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
 
 
 def _check_steps(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> None:
+    mistake = None
     try:
         _walk(mdp, table, real)
-    except InputError:
-        raise
+    except InputError as error:
+        mistake = error
     except Exception as error:  # an environment of the user's own may raise anything
         raise InputError(f"{mdp.name}: cannot be stepped ({_told(error)})") from error
     if _differ(table, _table(mdp.name, real)):
@@ -307,6 +306,8 @@ def _check_steps(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> None:
             f"{mdp.name}: its table P changes when it is reset or stepped, so no exact truth is known; must "
             "stay what it is from when the environment was made"
         )
+    if mistake is not None:
+        raise mistake
 
 
 def _walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> None:

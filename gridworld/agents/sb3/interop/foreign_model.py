@@ -71,7 +71,7 @@ def seen_by(policy: BasePolicy, mdp: Mdp, env: Any = None) -> ObservationTable:
         raise InputError(
             f"the model acts in {policy.action_space}; {mdp.name} has Discrete({mdp.num_actions})"
         )
-    observation = _observation(env)
+    observation = _observation(env, mdp)
     if observation is not None and observation.space == policy.observation_space:
         return observation
     return observation_like(mdp, policy.observation_space)
@@ -123,20 +123,21 @@ def _check_is_a_table(policy: BasePolicy, observation: ObservationTable) -> None
         raise InputError(f"the model {reason}")
 
 
-def _observation(env: Any) -> ObservationTable | None:
+def _observation(env: Any, mdp: Mdp) -> ObservationTable | None:
     """What an environment shows of each state; None where that cannot be seen from here."""
     if isinstance(env, VecEnvWrapper):
-        return _through(env, _observation(env.venv))
+        return _through(env, _observation(env.venv, mdp))
     if isinstance(env, GridWorldVecEnv):
         return env.observation
     if isinstance(env, DummyVecEnv):
-        return observation_of(env.envs[0])
+        return observation_of(env.envs[0], mdp)
     if isinstance(env, VecEnv) or env is None:
         return None  # in other processes, say
     table = getattr(env, "table", None)  # of a batch's wrapper
     if isinstance(table, ObservationTable):
         return table
-    return observation_of(env) if hasattr(env, "get_wrapper_attr") and not hasattr(env, "num_envs") else None
+    is_single = hasattr(env, "get_wrapper_attr") and not hasattr(env, "num_envs")
+    return observation_of(env, mdp) if is_single else None
 
 
 def _through(wrapper: VecEnvWrapper, observation: ObservationTable | None) -> ObservationTable | None:

@@ -1,0 +1,237 @@
+"""Worlds in files: what one writes oneself, and what a run keeps of its world."""
+
+import contextlib
+import dataclasses
+import io
+import os
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gridworld import InputError, compile_mdp, load
+from gridworld.process.npz import npz_bytes
+from gridworld.world.mdp import Mdp
+from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
+from gridworld.world.solver import value_iteration
+from gridworld.world.sources.arrays import load_arrays, world_bytes, world_from_bytes
+from gridworld.world.sources.classics import river_swim
+
+TWO_ROOMS = {
+    "next_state": [[0, 1], [0, 1]],
+    "reward": [[0.0, 0.0], [0.0, 1.0]],
+    "terminated": [[False, False], [False, True]],
+    "start": [1.0, 0.0],
+}
+
+
+def written(folder, save=np.savez, **changed):
+    arrays = {key: value for key, value in {**TWO_ROOMS, **changed}.items() if value is not None}
+    save(folder / "rooms.npz", **arrays)
+    return folder / "rooms.npz"
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_a_deterministic_world_needs_five_lines(tmp_path, save):
+    mdp = load_arrays(written(tmp_path, save))
+    assert (mdp.name, mdp.action_names, mdp.places, mdp.max_episode_steps) == (
+        "rooms",
+        ("0", "1"),
+        None,
+        None,
+    )
+    assert mdp.goal.tolist() == [False, False, True]
+    assert value_iteration(mdp, 0.9).v.tolist() == pytest.approx([0.9, 1.0, 0.0])
+
+
+def test_everything_optional(tmp_path):
+    table = {
+        key: np.array(value)[:, :, None].repeat(2, 2) for key, value in TWO_ROOMS.items() if key != "start"
+    }
+    path = written(
+        tmp_path,
+        **table,
+        probability=np.broadcast_to([0.25, 0.75], (2, 2, 2)),
+        success=np.arange(8).reshape(2, 2, 2) == 7,
+        action_names=["back", "on"],
+        places=[[0, 0], [0, 1]],
+        max_episode_steps=9,
+        name="two rooms",
+    )
+    mdp = load_arrays(str(path))
+    assert (mdp.name, mdp.action_names, mdp.max_episode_steps) == ("two rooms", ("back", "on"), 9)
+    assert mdp.places.tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 1], [0, 0, 1]]
+    assert mdp.goal.sum() == mdp.trap.sum() == 1
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"start": None}, "has no start, must hold next_state, reward, terminated, start"),
+        ({"probabilty": [1.0]}, "probabilty is no array of a world; did you mean probability"),
+        ({"nonsense": [1.0]}, "nonsense is no array of a world; beside what is needed it may hold"),
+        ({"reward": [0.0, 1.0]}, r"reward has shape \(2,\), next_state has \(2, 2\)"),
+        ({"reward": [["a", "b"], ["a", "b"]]}, "reward is <U1, must be an array of numbers"),
+        ({"terminated": [[0, 0], [0, 1]]}, "terminated is int64, must be an array of booleans"),
+        ({"next_state": [[0, 2], [0, 1]]}, "next_state of state 0, action 1 is 2"),
+        ({"next_state": [[0.0, 1.0], [0.0, 1.0]]}, "next_state is float64"),
+        ({"next_state": [[[0], [1]], [[0], [1]]]}, "has no probability; without it"),
+        ({"start": [0.4, 0.4]}, "start is .* must be probabilities with sum 1"),
+        ({"action_names": ["a"]}, "1 action_names for 2 actions"),
+        ({"action_names": [1, 2]}, "action_names is int64"),
+        ({"places": [["a", "b"], ["a", "b"]]}, "places is <U1"),
+        ({"places": [[0, -2, 0], [0, 0, 0]]}, "has a place below -1"),
+        ({"places": [[0, 0, 0], [0, 10**9, 10**9]]}, "places are 1 panels of 1,000,000,001 rows"),
+        ({"max_episode_steps": 0}, "max_episode_steps=0: must be a whole number of at least 1"),
+        ({"max_episode_steps": 1.5}, "max_episode_steps is float64"),
+        ({"name": "two\nlines"}, "name is .* must be 1 to 200 letters"),
+    ],
+)
+def test_arrays_that_make_no_world_are_refused(tmp_path, changed, told):
+    path = written(tmp_path, **changed)
+    with pytest.raises(InputError, match=f"^{path}: .*{told}") as refused:
+        load_arrays(path)
+    assert "\n" not in str(refused.value)
+
+
+def test_no_file_of_arrays(tmp_path, monkeypatch):
+    def refused(path, told):
+        with pytest.raises(InputError, match=told):
+            load_arrays(path)
+
+    refused(tmp_path / "none.npz", "env.path=.*none.npz: cannot be read .No such file")
+    refused(tmp_path, "env.path=.*: is a folder; give an .npz file")
+    refused(3, "env.path=3: must be the path")
+    (tmp_path / "text.npz").write_text("no zip")
+    refused(tmp_path / "text.npz", "text.npz: not an .npz file of arrays that can be read")
+    np.save(tmp_path / "one.npy", np.zeros(3))
+    refused(tmp_path / "one.npy", "not an .npz file of arrays")
+    os.mkfifo(tmp_path / "pipe.npz")
+    refused(tmp_path / "pipe.npz", "is no ordinary file")
+    refused(written(tmp_path, name=np.array([{}], dtype=object)), "cannot be loaded when allow_pickle=False")
+    monkeypatch.setattr("gridworld.world.sources.arrays._MOST_BYTES", 2**20)
+    np.savez_compressed(tmp_path / "bomb.npz", **{**TWO_ROOMS, "reward": np.zeros(2**20)})
+    refused(tmp_path / "bomb.npz", "its arrays have 8 MiB, more than 1")
+
+
+@st.composite
+def worlds(draw):
+    n, a, k = draw(st.integers(1, 5)), draw(st.integers(1, 3)), draw(st.integers(1, 3))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    shape = (n, a, k)
+    table = Outcomes(
+        next_state=rng.integers(n, size=shape),
+        probability=rng.dirichlet(np.ones(k), (n, a)),
+        reward=rng.normal(size=shape),
+        terminated=rng.random(shape) < 0.3,
+        start=rng.dirichlet(np.ones(n)),
+    )
+    return mdp_from_outcomes(
+        draw(st.text("abc é-", min_size=1, max_size=9)),
+        table,
+        places=rng.integers(-1, 4, (n, 3)) if draw(st.booleans()) else None,
+        max_episode_steps=draw(st.none() | st.integers(1, 1000)),
+        own_observation=rng.normal(size=(n, 2)) if draw(st.booleans()) else None,
+        truth=draw(st.sampled_from(["exact", "enumerated"])),
+    )
+
+
+def assert_same(one, other):
+    for field in dataclasses.fields(Mdp):
+        mine, theirs = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(mine, np.ndarray):
+            assert (mine.dtype, mine.shape, mine.tobytes()) == (theirs.dtype, theirs.shape, theirs.tobytes())
+            assert not theirs.flags.writeable
+        else:
+            assert (type(mine), mine) == (type(theirs), theirs)
+
+
+@given(worlds())
+def test_a_world_comes_back_bit_for_bit(mdp):
+    content = world_bytes(mdp)
+    again = world_from_bytes(content, "world.npz")
+    assert_same(mdp, again)
+    assert world_bytes(again) == content == world_bytes(mdp)
+    assert again.text() == mdp.text()
+
+
+def test_the_tables_of_a_map_come_back_too():
+    mdp = compile_mdp(load("four_rooms"), slip=0.3)
+    assert_same(mdp, world_from_bytes(world_bytes(mdp), "world.npz"))
+
+
+BASE = river_swim(3)
+
+
+def changed_world(**changed):
+    """A file in which fields of a world are others; a function gets a copy of the table to write to."""
+    with np.load(io.BytesIO(world_bytes(BASE))) as file:
+        arrays = dict(file)
+    for name, value in changed.items():
+        if callable(value):
+            arrays[name] = arrays[name].copy()
+            value(arrays[name])
+        elif value is None:
+            del arrays[name]
+        else:
+            arrays[name] = value
+    return npz_bytes(arrays)
+
+
+def at(where, value):
+    return lambda table: table.__setitem__(where, value)
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"format": np.array("another")}, "not a world of this version"),
+        ({"start": None}, "not a world, must hold"),
+        ({"more": np.zeros(2)}, "not a world, must hold"),
+        ({"next_state": at((0, 0, 0), 99)}, "next_state of state 0, action 0 is 99"),
+        ({"next_state": at((0, 0, 0), -1)}, "next_state of state 0"),
+        ({"next_state": np.zeros((3, 2), np.int32)}, "next_state is int32"),
+        ({"next_state": np.zeros((3, 2, 3))}, "next_state is float64"),
+        ({"probability": at((0, 0, 0), 0.5)}, "probability of state 0, action 0"),
+        ({"probability": np.zeros((3, 2, 2))}, "probability is float64"),
+        ({"reward": at((0, 0, 0), np.nan)}, "reward of state 0, action 0=nan"),
+        ({"start": at(0, 0.5)}, "start is"),
+        ({"thresholds": at((1, 1, 0), 0.9)}, "state 1 has thresholds"),
+        ({"thresholds": at((0, 0, 0), np.nan)}, "state 0 has thresholds"),
+        ({"thresholds": np.zeros((3, 2, 1))}, "thresholds is"),
+        ({"number": at(0, 99)}, "state 0 has a number"),
+        ({"number": np.zeros(2, np.int64)}, "number is"),
+        ({"places": at((0, 0), -5)}, "state 0 has a place below"),
+        ({"places": at((0, 1), 10**8)}, "pictures have room"),
+        ({"goal": at(0, True)}, "state 0 is a goal and not terminal"),
+        ({"absorbing": at(0, True)}, "state 0 is absorbing and goes on"),
+        ({"terminal": at(0, True)}, "state 0 is terminal and not absorbing"),
+        ({"action_names": np.array(["a", "b", "c"])}, "next_state is"),
+        ({"action_names": np.array(["a", "\x1b[1m"])}, "action_names is"),
+        ({"name": np.array(3)}, "name is '3'"),
+        ({"truth": np.array("x" * 1000)}, "truth is"),
+        ({"max_episode_steps": np.array(-1)}, "max_episode_steps=-1"),
+        ({"own_observation": np.zeros((7, 2))}, "own_observation must be"),
+    ],
+)
+def test_a_damaged_world_is_one_sentence(changed, told):
+    with pytest.raises(InputError, match=f"^world.npz: .*{told}"):
+        world_from_bytes(changed_world(**changed), "world.npz")
+
+
+@given(st.integers(0, 10**6), st.integers(0, 255))
+def test_a_byte_that_changed_is_found_or_harmless(position, value):
+    content = bytearray(world_bytes(BASE))
+    content[position % len(content)] = value
+    with contextlib.suppress(InputError):
+        assert isinstance(world_from_bytes(bytes(content), "world.npz"), Mdp)
+
+
+def test_a_world_that_would_grow_is_refused():
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("start.npy", b"0" * 10**6)
+    with pytest.raises(InputError, match="its members are larger than itself"):
+        world_from_bytes(content.getvalue(), "world.npz")

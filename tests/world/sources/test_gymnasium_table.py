@@ -1,0 +1,361 @@
+"""Gymnasium's own environments and the worlds compiled from their tables are the same."""
+
+import re
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from scipy.stats import chi2
+
+from gridworld import GridWorldVectorEnv, InputError
+from gridworld.world.solver import value_iteration
+from gridworld.world.sources import gymnasium_table
+from gridworld.world.sources.gymnasium_table import compile_gymnasium, compile_table
+
+DETERMINISTIC = {
+    "frozen_lake": ("FrozenLake-v1", {"is_slippery": False}, 100),
+    "cliff_walking": ("CliffWalking-v1", {}, None),
+    "taxi": ("Taxi-v4", {}, 200),
+}
+RANDOM = {
+    "slippery_lake": ("FrozenLake-v1", {}, 100),
+    "large_lake": ("FrozenLake8x8-v1", {}, 200),
+    "slippery_cliff": ("CliffWalkingSlippery-v1", {}, None),
+    "rainy_taxi": ("Taxi-v4", {"is_rainy": True}, 200),
+}
+EVERY = {**DETERMINISTIC, **RANDOM}
+
+
+@pytest.fixture(scope="module")
+def world():
+    """{name: (its world, the real environment)}, made once."""
+    made = {}
+
+    def of(name):
+        if name not in made:
+            env_id, kwargs, _ = EVERY[name]
+            real = gym.make(env_id, disable_env_checker=True, **kwargs)
+            made[name] = compile_gymnasium(env_id, kwargs), real
+        return made[name]
+
+    return of
+
+
+def reached_states(mdp):
+    found, frontier = set(), mdp.start_states.tolist()
+    while frontier:
+        state = frontier.pop()
+        if state not in found:
+            found.add(state)
+            frontier += mdp.next_state[state][mdp.probability[state] > 0].tolist()
+    return found
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_every_row_is_that_of_the_table(world, name):
+    mdp, env = world(name)
+    real = env.unwrapped
+    assert mdp.num_numbers == env.observation_space.n
+    assert mdp.num_actions == env.action_space.n
+    assert np.array_equal(mdp.start[: mdp.num_numbers], real.initial_state_distrib)
+    reached = reached_states(mdp)
+    for state in np.flatnonzero(~mdp.terminal).tolist():
+        for action in range(mdp.num_actions):
+            targets = mdp.next_state[state, action].tolist()
+            ours = zip(
+                mdp.probability[state, action].tolist(),
+                mdp.number[targets].tolist(),
+                mdp.reward[state, action].tolist(),
+                mdp.terminal[targets].tolist(),
+                strict=True,
+            )
+            ours = [row for row in ours if row[0] > 0]
+            theirs = [(p, n, r, t) for p, n, r, t in real.P[state][action] if p > 0]
+            if state not in reached:  # a step that nobody takes needs no end of its own
+                ours, theirs = ([row[:3] for row in rows] for rows in (ours, theirs))
+            assert ours == theirs
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_the_step_limit_is_that_of_the_id(world, name):
+    env_id, _, limit = EVERY[name]
+    mdp, env = world(name)
+    assert mdp.max_episode_steps == limit == gym.spec(env_id).max_episode_steps
+    assert mdp.name == env_id == compile_table(env).name
+    assert compile_table(env).max_episode_steps == limit
+    assert compile_gymnasium(env_id, {"max_episode_steps": 7}).max_episode_steps == 7
+
+
+WALKS, LENGTH = 500, 200  # 100,000 steps
+
+
+def real_walks(env, actions):
+    """(walks, steps) of state, next state, reward, terminated, truncated, and whether an episode began."""
+    found = np.zeros((*actions.shape, 6))
+    env.reset(seed=0)
+    for walk, chosen in enumerate(actions.tolist()):
+        state, begins = env.reset()[0], True
+        for step, action in enumerate(chosen):
+            following, reward, terminated, truncated, _ = env.step(action)
+            found[walk, step] = state, following, reward, terminated, truncated, begins
+            begins = terminated or truncated
+            state = env.reset()[0] if begins else following
+    return found
+
+
+@pytest.mark.parametrize("name", DETERMINISTIC)
+def test_100_000_random_steps_are_identical(world, name):
+    mdp, env = world(name)
+    actions = np.random.default_rng(1).integers(mdp.num_actions, size=(WALKS, LENGTH))
+    real = real_walks(env, actions)
+    ours = GridWorldVectorEnv(
+        WALKS, mdp=mdp, max_episode_steps=mdp.max_episode_steps, autoreset_mode="Disabled"
+    )
+    ours.reset(seed=0)
+    for step in range(LENGTH):
+        state, following, reward, terminated, truncated, begins = real[:, step].T
+        if begins.any():
+            ours.reset(options={"reset_mask": begins == 1})
+            there = ours.get_state()
+            there["states"] = np.where(begins == 1, state, there["states"]).astype(np.int64)
+            ours.set_state(there)
+        found, *others, _ = ours.step(actions[:, step])
+        for mine, theirs in zip(
+            [mdp.number[found], *others], [following, reward, terminated, truncated], strict=True
+        ):
+            assert np.array_equal(mine, theirs)
+    assert real[..., 3].sum() > 0 or name != "frozen_lake"
+
+
+def statistic(mdp, pair, found):
+    """Chi-square of (next number, reward) counts of a state and an action, and its degrees of freedom."""
+    rows = zip(mdp.number[mdp.next_state[pair]].tolist(), mdp.reward[pair].tolist(), strict=True)
+    expected = {}
+    for key, p in zip(rows, mdp.probability[pair].tolist(), strict=True):
+        expected[key] = expected.get(key, 0) + p
+    counts = dict.fromkeys(expected, 0)
+    for key in found:
+        counts[key] += 1  # what the table does not have is a KeyError
+    size = len(found)
+    parts = [(counts[key] - size * p) ** 2 / (size * p) for key, p in expected.items() if p > 0]
+    return sum(parts), len(parts) - 1
+
+
+@pytest.mark.parametrize("name", RANDOM)
+def test_random_steps_have_the_same_frequencies(world, name):
+    mdp, env = world(name)
+    real, rng = env.unwrapped, np.random.default_rng(2)
+    real.reset(seed=3)
+    states = rng.choice(np.flatnonzero(~mdp.terminal), 10)
+    pairs = [(int(state), int(rng.integers(min(mdp.num_actions, 4)))) for state in states]
+    of_theirs, of_ours = np.zeros(2), np.zeros(2)
+    ours = GridWorldVectorEnv(2000, mdp=mdp, max_episode_steps=None)
+    ours.reset(seed=4)
+    for state, action in pairs:
+        seen = []
+        for _ in range(200):
+            real.s = state
+            following, reward, *_ = real.step(action)
+            seen.append((following, reward))
+        of_theirs += statistic(mdp, (state, action), seen)
+        ours.reset()
+        ours.set_state({**ours.get_state(), "states": np.full(2000, state)})
+        found, rewards, *_ = ours.step(np.full(2000, action))
+        numbers = mdp.number[found].tolist()
+        of_ours += statistic(mdp, (state, action), list(zip(numbers, rewards.tolist(), strict=True)))
+    assert chi2.sf(*of_theirs) > 1e-3
+    assert chi2.sf(*of_ours) > 1e-3
+
+
+def naive_value(real, gamma, sweeps):
+    values = [0.0] * len(real.P)
+    for _ in range(sweeps):
+        values = [
+            max(
+                sum(p * (r + gamma * (0.0 if ended else values[n])) for p, n, r, ended in row)
+                for row in real.P[state].values()
+            )
+            for state in range(len(values))
+        ]
+    return float(real.initial_state_distrib @ values)
+
+
+@pytest.mark.parametrize(
+    ("name", "gamma", "sweeps", "known"),
+    [
+        ("frozen_lake", 0.99, 20, 0.99**5),
+        ("slippery_lake", 0.99, 1000, 0.5420),
+        ("cliff_walking", 1.0, 30, -13.0),
+        ("taxi", 1.0, 30, 7.93),
+        ("rainy_taxi", 0.8, 60, None),
+    ],
+)
+def test_the_optimum_is_that_of_a_naive_solver(world, name, gamma, sweeps, known):
+    mdp, env = world(name)
+    value = float(mdp.start @ np.where(mdp.start > 0, value_iteration(mdp, gamma).v, 0.0))
+    assert value == pytest.approx(naive_value(env.unwrapped, gamma, sweeps), abs=1e-3)
+    assert known is None or value == pytest.approx(known, abs=0.005)
+
+
+def test_names_and_places(world):
+    assert world("slippery_lake")[0].action_names == ("left", "down", "right", "up")
+    assert world("cliff_walking")[0].action_names == ("up", "right", "down", "left")
+    assert world("taxi")[0].action_names == ("south", "north", "east", "west", "pickup", "dropoff")
+    assert world("cliff_walking")[0].places[25].tolist() == [0, 2, 1]
+    assert world("large_lake")[0].places[-1].tolist() == [0, 7, 7]
+    taxi, env = world("taxi")
+    for state in (0, 123, 499):
+        row, col, passenger, destination = env.unwrapped.decode(state)
+        assert taxi.places[state].tolist() == [passenger * 4 + destination, row, col]
+
+
+class TableEnv(gym.Env):
+    """Two states: action 1 in the second one ends with 1; a subclass does it otherwise."""
+
+    def __init__(self):
+        self.observation_space, self.action_space = spaces.Discrete(2), spaces.Discrete(2)
+        self.initial_state_distrib = [1.0, 0.0]
+        self.P = {s: {0: [(1.0, 0, 0.0, False)], 1: [(1.0, 1, float(s), s == 1)]} for s in (0, 1)}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.s = 0
+        return self.s, {}
+
+    def step(self, action):
+        _, self.s, reward, terminated = self.P[self.s][action][0]
+        return self.s, reward, terminated, False, {}
+
+
+class StepCounting(TableEnv):
+    def reset(self, **kwargs):
+        self.steps = 0
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        self.steps += 1
+        state, reward, *others = super().step(action)
+        return state, reward - 0.01 * (self.steps > 3), *others
+
+
+class Redrawn(TableEnv):
+    def reset(self, **kwargs):
+        self.P = {**self.P, 1: {**self.P[1], 0: [(1.0, 0, self.P[1][0][0][2] + 1.0, False)]}}
+        return super().reset(**kwargs)
+
+
+class Cutting(TableEnv):
+    def step(self, action):
+        state, reward, terminated, _, info = super().step(action)
+        return state, reward, terminated, True, info
+
+
+class Elsewhere(TableEnv):
+    def reset(self, **kwargs):
+        super().reset(**kwargs)
+        self.s = 1
+        return 1, {}
+
+
+class Raising(TableEnv):
+    def step(self, action):
+        raise RuntimeError("no power")
+
+
+def test_an_environment_of_ones_own_will_do():
+    mdp = compile_table(TableEnv())
+    assert (mdp.name, mdp.action_names, mdp.places, mdp.max_episode_steps) == (
+        "TableEnv",
+        ("0", "1"),
+        None,
+        None,
+    )
+    assert mdp.number.tolist() == [0, 1, 1]
+    assert value_iteration(mdp, 0.9).v.tolist() == pytest.approx([0.9, 1.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [
+        (StepCounting, "leaves its own table: in state .* with reward .*, which P"),
+        (Redrawn, "its table P changes when it is reset"),
+        (Cutting, "cuts its episodes by itself"),
+        (Elsewhere, "started in state 1, which has no probability"),
+        (Raising, "cannot be stepped .RuntimeError: no power"),
+    ],
+)
+def test_an_environment_that_is_not_its_table_is_refused(kind, told):
+    with pytest.raises(InputError, match=f"^{kind.__name__}: {told}"):
+        compile_table(kind())
+
+
+ROW = [(1.0, 0, 0.0, False)]
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"P": None}, "has no transition table P, .*env=enumerated may fit"),
+        ({"P": {0: {0: ROW, 1: ROW}}}, "P has no state 1 with action 0"),
+        ({"P": [[ROW, ROW], [ROW]]}, "P has no state 1 with action 1"),
+        ({"P": [[ROW, ROW], [ROW, []]]}, r"P\[1\]\[1\] is \[\], must be a list of"),
+        ({"P": [[ROW, ROW], [ROW, [(1.0, 0, 0.0)]]]}, r"P\[1\]\[1\] is"),
+        ({"P": [[ROW, ROW], [ROW, 3]]}, r"P\[1\]\[1\] is 3"),
+        ({"P": [[ROW, ROW], [ROW, [(1.0, 2, 0.0, False)]]]}, "next state from 0 to 1"),
+        ({"P": [[ROW, ROW], [ROW, [(1.0, 0, 0.0, None)]]]}, r"P\[1\]\[1\] is"),
+        ({"P": [[ROW, ROW], [ROW, [(0.5, 0, 0.0, False)]]]}, "probability of state 1, action 1"),
+        ({"P": [[ROW, ROW], [ROW, [(1.0, 0, float("nan"), False)]]]}, "reward of state 1, action 1"),
+        ({"initial_state_distrib": None}, "initial_state_distrib must be the 2 probabilities"),
+        ({"observation_space": spaces.Box(0, 1)}, "its observation space is Box"),
+        ({"action_space": spaces.Discrete(2, start=1)}, "its action space is Discrete"),
+        ({"observation_space": spaces.Discrete(10**6)}, "1,000,000 states and 2 actions are too many"),
+    ],
+)
+def test_a_table_that_is_none_is_refused(changed, told):
+    env = TableEnv()
+    vars(env).update(changed)
+    with pytest.raises(InputError, match=f"^TableEnv: .*{told}"):
+        compile_table(env)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kwargs", "told"),
+    [
+        ("FrozenLak-v1", {}, "env.id=FrozenLak-v1: is no environment .*Did you mean: `FrozenLake`"),
+        ("FrozenLake-v9", {}, "env.id=FrozenLake-v9: .*`v1`"),
+        ("no such id", {}, "env.id=no such id: "),
+        (3, {}, "env.id=3: "),
+        ("CartPole-v1", {}, "CartPole-v1: has no transition table P.*env=enumerated"),
+        (
+            "FrozenLake-v1",
+            {"is_slipery": True},
+            "env.kwargs={is_slipery: True}: .*it takes desc, map_name, is_sl",
+        ),
+        ("FrozenLake-v1", {"map_name": "9x9"}, "env.kwargs={map_name: 9x9}: FrozenLake-v1 cannot be made"),
+        ("FrozenLake-v1", {"map_name": None}, "another table each time that it is made"),
+        ("FrozenLake-v1", {"desc": ["FF", "FG"]}, "start is .*must be probabilities"),
+        ("Taxi-v4", {"fickle_passenger": True}, "Taxi-v4: fickle_passenger=True changes the destination"),
+        ("Taxi-v4", {"render_mode": "human"}, "env.kwargs: render_mode=human is no part"),
+    ],
+)
+def test_an_id_that_makes_no_world_is_refused(env_id, kwargs, told):
+    with pytest.raises(InputError, match=told.replace("{", r"\{").replace("}", r"\}")) as refused:
+        compile_gymnasium(env_id, kwargs)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_walk_alone_finds_a_fickle_passenger(seed, monkeypatch):
+    monkeypatch.setattr(gymnasium_table, "_SEED", seed)
+    monkeypatch.setattr(gymnasium_table, "_known", lambda env: None)
+    with pytest.raises(InputError, match=re.escape("Taxi-v4: leaves its own table: in state")):
+        compile_gymnasium("Taxi-v4", {"fickle_passenger": True})
+
+
+def test_the_environment_is_left_as_it_is():
+    env = gym.make("Taxi-v4", render_mode="ansi")
+    env.reset(seed=5)
+    before = env.unwrapped.s, env.unwrapped.np_random.bit_generator.state, env.render()
+    compile_table(env)
+    assert before == (env.unwrapped.s, env.unwrapped.np_random.bit_generator.state, env.render())
