@@ -8,13 +8,19 @@ setting affects (`gridworld.config.effects`). Nothing heavy is imported here.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Optional, Union
+from typing import TYPE_CHECKING, Any, Optional, Union
 
 from gridworld.bounds import at_least, at_most, discount, within
 from gridworld.config.agents import AgentConfig
 from gridworld.config.effects import Effect, affects
 from gridworld.config.pictures import RecordingConfig
 from gridworld.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from gridworld.world.mdp import IntArray, Mdp
 
 # OmegaConf reads the annotations at run time and knows no `X | None`.
 
@@ -36,6 +42,19 @@ class EnvConfig:
     goal_reward: float = 1.0  # paid for entering a goal, which ends the episode
     trap_reward: float = -1.0  # for entering a trap, which ends it too, or a cliff, which does not
     max_episode_steps: int = 100  # the step limit: then the episode is cut
+
+    def frames(self, mdp: Mdp, states: IntArray) -> list[NDArray[np.uint8]] | None:
+        """Draw states by the world's own environment.
+
+        Args:
+            mdp: the world that these settings describe.
+            states: (n,), state numbers.
+
+        Returns:
+            n frames (height, width, 3), RGB, all of one size; None where there is no such environment, or
+            it draws nothing.
+        """
+        return None
 
 
 @dataclass

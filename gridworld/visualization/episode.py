@@ -1,12 +1,24 @@
-"""The final greedy policy's episode as an animation."""
+"""Episodes as animations: of the real environment's frames, on the world's board, or in text."""
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable, Sequence
 
-from gridworld.envs.rollout import play_episode
-from gridworld.visualization.animation import Animation, animation_of_states
+import numpy as np
+
+from gridworld.config.train import EnvConfig
+from gridworld.envs.board import board_of
+from gridworld.envs.rendering import frame_size
+from gridworld.envs.rollout import Episode, play
+from gridworld.visualization.animation import (
+    Animation,
+    animation_of_cards,
+    animation_of_rendered,
+    animation_of_states,
+)
 from gridworld.visualization.picture import TIME_SERIES_CARD, Draw, Subject
+from gridworld.world.mdp import Mdp
 
 TENSORBOARD_SIDE: int | None = TIME_SERIES_CARD
 
@@ -14,13 +26,36 @@ _MOST_FRAMES = 500  # of an episode that finds no end; by then a greedy one goes
 
 
 def draw(subject: Subject) -> Draw:
-    """Play one episode on the run's seed; its own cell size is `recording.cell_size`."""
+    """Play one greedy episode on the run's seed; its own cell size is `recording.cell_size`."""
     config, mdp = subject.config, subject.evaluator.mdp
     policy, limit = subject.snapshot.greedy_policy(), config.env.max_episode_steps
-    states = play_episode(mdp, policy, limit, config.seed)[:_MOST_FRAMES]
+    drawn = film(config.env, mdp, [play(mdp, policy, limit, config.seed).beginning(_MOST_FRAMES)])
+    return functools.cache(  # several files show the same
+        lambda cell_size: drawn(cell_size or config.recording.cell_size)
+    )
 
-    @functools.cache  # several files show the same
-    def animation(cell_size: int | None) -> Animation:
-        return animation_of_states(mdp, states, cell_size or config.recording.cell_size)
 
-    return animation
+def film(env: EnvConfig, mdp: Mdp, episodes: Sequence[Episode]) -> Callable[[int | None], Animation]:
+    """Prepare an animation of episodes, one after the other.
+
+    Args:
+        env: the settings of the world; they know whether its own environment draws frames.
+        mdp: the world.
+        episodes: at least one.
+
+    Returns:
+        A function of a cell size in pixels, None for its own. An environment's own frames are scaled down
+        where they are larger than the board would be with cells of that size.
+    """
+    states, place = np.unique(np.concatenate([each.states for each in episodes]), return_inverse=True)
+    frames = env.frames(mdp, states)
+    if frames is not None:
+
+        def rendered(cell_size: int | None) -> Animation:
+            longest = None if cell_size is None else max(frame_size(mdp, cell_size))
+            return animation_of_rendered(frames, place.tolist(), longest)
+
+        return rendered
+    if board_of(mdp).panels:
+        return lambda cell_size: animation_of_states(mdp, states[place], cell_size)
+    return lambda cell_size: animation_of_cards(mdp, episodes, cell_size)

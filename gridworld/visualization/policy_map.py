@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gridworld.envs import rendering as drawing
 from gridworld.envs.board import board_of
-from gridworld.envs.rendering import AGENT, Colour, Frame, Point
+from gridworld.envs.rendering import AGENT, UNKNOWN, Colour, Frame, Point
 from gridworld.envs.text_drawing import SMALLEST_TEXT
 from gridworld.errors import InputError
 from gridworld.visualization.canvas import Canvas, shown
@@ -27,12 +27,11 @@ from gridworld.visualization.sheet import (
     INK,
     NEVER_VISITED,
     PAPER,
-    UNKNOWN,
     UNKNOWN_INK,
     Swatch,
     short,
 )
-from gridworld.visualization.state_table import draw_policy_table, table_states
+from gridworld.visualization.state_table import draw_policy_table, held, table_states
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 TENSORBOARD_SIDE: int | None = IMAGES_TAB
@@ -48,9 +47,9 @@ def draw(subject: Subject) -> Draw:
     caption = caption_at(subject, subject.steps)
     known = explored_by(subject)
     if not board_of(mdp).panels:
-        numbers, name = (snapshot.sampled, "probability") if snapshot.q is None else (snapshot.q, "Q")
         states = table_states(mdp, visits_of(subject))
-        picture = draw_policy_table(mdp, states, numbers, snapshot.greedy, optimal, known, caption, name)
+        numbers = held(snapshot, states[known[states]])
+        picture = draw_policy_table(mdp, states, numbers, snapshot.greedy, optimal, known, caption)
         return lambda cell_size: picture
     return lambda cell_size: draw_policy_map(
         mdp, snapshot.values, snapshot.greedy, optimal, caption, cell_size, known=known
