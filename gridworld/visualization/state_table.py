@@ -39,23 +39,11 @@ def table_states(mdp: Mdp, visits: NDArray[np.int64] | None = None) -> IntArray:
     Returns:
         (rows,), in the order of the table; states that are over or cannot be reached are none of them.
     """
-    away = _steps_away(mdp)
-    states = np.flatnonzero((away >= 0) & ~mdp.terminal)
-    states = states[np.argsort(away[states], kind="stable")]
+    states = np.flatnonzero(mdp.reachable & ~mdp.terminal)
+    states = states[np.argsort(mdp.steps_away[states], kind="stable")]
     counts = np.zeros(len(states)) if visits is None else visits[states].sum(axis=1)
     most_visited = np.argsort(-counts, kind="stable")[:_MOST_ROWS]
     return states[np.sort(most_visited)]
-
-
-def _steps_away(mdp: Mdp) -> IntArray:
-    """(S,), the fewest steps from a start; -1 for states that cannot be reached."""
-    away = np.full(mdp.num_states, -1)
-    frontier, steps = mdp.start_states, 0
-    while frontier.size:
-        away[frontier] = steps
-        following = np.unique(mdp.next_state[frontier][mdp.probability[frontier] > 0])
-        frontier, steps = following[away[following] < 0], steps + 1
-    return away
 
 
 @dataclass(frozen=True, eq=False)
