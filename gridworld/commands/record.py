@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gridworld.commands import parser_for_a_run
 from gridworld.config.pictures import PICTURES
 from gridworld.envs.rendering import frame_size
-from gridworld.envs.rollout import play_episode
+from gridworld.envs.rollout import play
 from gridworld.errors import InputError
 from gridworld.process.command_line import program
 from gridworld.process.memory_budget import limited
@@ -23,8 +23,9 @@ from gridworld.restore.saved_run import SavedRun, choose_policy, read_visits
 from gridworld.run.claim import check_inside, check_writable
 from gridworld.storage.safe_read import check_no_link
 from gridworld.storage.symlinks import make_inside
-from gridworld.visualization import episode, video
+from gridworld.visualization import video
 from gridworld.visualization.animation import Animation
+from gridworld.visualization.episode import film
 from gridworld.visualization.picture import Subject, drawer, save
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
@@ -74,8 +75,8 @@ def _record(options: argparse.Namespace) -> None:
     formats = list(dict.fromkeys(options.format))
     subject = _SavedSubject(saved)
     drawn = {kind: drawer(MAPS[kind]).draw(subject)(options.cell_size) for kind in formats if kind in MAPS}
-    film = _film(saved.mdp, subject, options)
-    video.check_size(film, formats)
+    episodes = _film(saved.mdp, subject, options)
+    video.check_size(episodes, formats)
     if options.out is None:
         make_inside(options.run, folder.name)
     else:
@@ -86,7 +87,7 @@ def _record(options: argparse.Namespace) -> None:
             check_no_link(path)
         else:
             path = folder / (f"{kind}.png" if kind in MAPS else f"episode.{kind}")
-        save(drawn.get(kind, film), path, options.fps)
+        save(drawn.get(kind, episodes), path, options.fps)
         print(printable(str(path)))
 
 
@@ -128,7 +129,5 @@ def _check(options: argparse.Namespace) -> None:
 def _film(mdp: Mdp, subject: Subject, options: argparse.Namespace) -> Animation:
     policy = choose_policy(subject.snapshot, options.policy)
     limit = subject.evaluator.max_episode_steps
-    episodes = [play_episode(mdp, policy, limit, options.seed + index) for index in range(options.episodes)]
-    drawn = episode.film(subject, episodes)(options.cell_size)
-    assert isinstance(drawn, Animation)
-    return drawn
+    episodes = [play(mdp, policy, limit, options.seed + index) for index in range(options.episodes)]
+    return film(subject.config.env, mdp, episodes)(options.cell_size)

@@ -120,7 +120,7 @@ def _mosaic(mdp: Mdp, places: IntArray) -> tuple[Panel, ...]:
         return max(across * (cols + 1), -(-count // across) * (rows + 1))
 
     across = min(range(1, count + 1), key=longest_side)
-    names = mdp.panel_names or ("",) * count
+    names = (*mdp.panel_names, *[""] * count)
     return tuple(
         Panel(number // across * (rows + 1), number % across * (cols + 1), rows, cols, names[number])
         for number in range(count)

@@ -35,6 +35,7 @@ Frame = NDArray[np.uint8]  # (height, width, 3), RGB
 
 BACKGROUND: Colour = (255, 255, 255)
 GRID_LINE: Colour = (0, 0, 0)
+UNKNOWN: Colour = (222, 222, 222)  # of states that nothing is known of, or that cannot be reached
 WALL: Colour = (150, 150, 150)
 CLIFF: Colour = (110, 85, 65)
 TRAP: Colour = (50, 50, 50)
@@ -97,13 +98,13 @@ def surface_to_frame(surface: Any) -> Frame:
 
 
 def draw_world(surface: Any, mdp: Mdp, state: int | None, cell_size: int = CELL_SIZE) -> None:
-    """Draw background, walls, cliffs, grid, traps, goals and the agent, in this order; see `draw_frame`."""
+    """Draw cells, grid, traps, goals and the agent, in this order; see `draw_frame`."""
     surface.fill(BACKGROUND)
     board = board_of(mdp)
     if not board.panels:
         draw_card(surface, [] if state is None else [mdp.state_name(state)])
         return
-    for colour, kind in ((WALL, Kind.WALL), (CLIFF, Kind.CLIFF)):
+    for colour, kind in ((UNKNOWN, Kind.UNREACHABLE), (WALL, Kind.WALL), (CLIFF, Kind.CLIFF)):
         for row, col in board.cells(kind):
             surface.fill(colour, ((col + 1) * cell_size, (row + 1) * cell_size, cell_size, cell_size))
     draw_grid(surface, board, cell_size)
@@ -113,15 +114,17 @@ def draw_world(surface: Any, mdp: Mdp, state: int | None, cell_size: int = CELL_
 
 
 def draw_card(surface: Any, lines: Sequence[str]) -> None:
-    """Write lines of text, the first one larger, as large as they fit; none where they cannot be read."""
+    """Write lines of text, the first one larger; none where they could not be read."""
+    surface.fill(BACKGROUND)
     width, height = surface.get_size()
-    sizes = [height // (3 * len(lines) + 1) * share for share in (2, *[1.5] * (len(lines) - 1))]
-    top = (height - 1.4 * sum(sizes)) / 2
-    for line, size in zip(lines, sizes, strict=True):
-        fitting = text_size(line, round(size), 0.94 * width)
+    unit = height / (2.5 * len(lines) + 1.5)
+    top = unit
+    for number, line in enumerate(lines):
+        size = 2 * unit if number == 0 else 1.5 * unit
+        fitting = text_size(line, round(size), 0.9 * width)
         if fitting is not None:
-            write(surface, line, round(0.03 * width), round(top + 0.7 * size), fitting)
-        top += 1.4 * size
+            write(surface, line, round(0.05 * width), round(top + 0.7 * size), fitting)
+        top += size + unit
 
 
 def agent_box(mdp: Mdp, state: int, cell_size: int = CELL_SIZE) -> tuple[int, int, int, int]:

@@ -78,7 +78,31 @@ def sample_episodes(evaluator: Evaluator, policy: FloatArray, episodes: int, see
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """One episode of n steps.
+
+    Attributes:
+        states: (n + 1,) the states in order, from the start to the end or the step limit.
+        actions: (n,) the action taken in each but the last of them.
+        rewards: (n,) what each action paid.
+    """
+
+    states: IntArray
+    actions: IntArray
+    rewards: FloatArray
+
+    def beginning(self, states: int) -> Episode:
+        """The episode up to its first so many states."""
+        return Episode(self.states[:states], self.actions[: states - 1], self.rewards[: states - 1])
+
+
 def play_episode(mdp: Mdp, policy: FloatArray, max_episode_steps: int, seed: int) -> IntArray:
+    """The states of an episode, (steps + 1,); see `play`."""
+    return play(mdp, policy, max_episode_steps, seed).states
+
+
+def play(mdp: Mdp, policy: FloatArray, max_episode_steps: int, seed: int) -> Episode:
     """Play one episode.
 
     Args:
@@ -87,20 +111,19 @@ def play_episode(mdp: Mdp, policy: FloatArray, max_episode_steps: int, seed: int
         max_episode_steps: the step limit.
         seed: of the environment; what the policy draws is independent of it.
 
-    Returns:
-        (steps + 1,) the states in order, from the start to the end or the step limit.
-
     Raises:
         InputError: `policy` is none for this world.
     """
     policy = check_policy(mdp, policy)
     env = GridWorldVectorEnv(1, max_episode_steps=max_episode_steps, autoreset_mode="Disabled", mdp=mdp)
-    actions = independent_generator(seed)  # the environment takes the seed's own
-    states, _ = env.reset(seed=seed)
-    visited, over = [int(states[0])], False
+    chance = independent_generator(seed)  # the environment takes the seed's own
+    first, _ = env.reset(seed=seed)
+    states, actions, rewards, over = [int(first[0])], list[int](), list[float](), False
     while not over:
-        row = policy[visited[-1]]
-        states, _, terminated, truncated, _ = env.step(np.array([actions.choice(len(row), p=row)]))
-        visited.append(int(states[0]))
+        row = policy[states[-1]]
+        actions.append(int(chance.choice(len(row), p=row)))
+        following, reward, terminated, truncated, _ = env.step(np.array(actions[-1:]))
+        states.append(int(following[0]))
+        rewards.append(float(reward[0]))
         over = bool(terminated[0] or truncated[0])
-    return np.array(visited)
+    return Episode(np.array(states), np.array(actions), np.array(rewards))

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from gridworld.envs import rendering as drawing
 from gridworld.envs.board import Kind, board_of
-from gridworld.envs.rendering import Colour, Point
+from gridworld.envs.rendering import UNKNOWN, Colour, Point
 from gridworld.visualization.colormaps import ColourArray
-from gridworld.visualization.sheet import INK, PAPER, UNKNOWN, Sheet
+from gridworld.visualization.sheet import INK, PAPER, Sheet
 from gridworld.world.mdp import BoolArray, IntArray, Mdp
 
 _LONGEST_SIDE = 640  # pixels, of the grid with its border

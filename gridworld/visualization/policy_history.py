@@ -17,7 +17,7 @@ from gridworld.visualization.canvas import shown
 from gridworld.visualization.colormaps import VIRIDIS, linear
 from gridworld.visualization.picture import Draw, Subject
 from gridworld.visualization.policy_map import caption_at, draw_policy_map, explored_by
-from gridworld.visualization.state_table import draw_policy_table, table_states
+from gridworld.visualization.state_table import Numbers, draw_policy_table, table_states
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import BoolArray
 
@@ -112,8 +112,8 @@ class PolicyHistory:
         mdp, optimal, moments = evaluator.mdp, evaluator.solution.optimal, self.moments()
         board = board_of(mdp)
         states = np.flatnonzero(shown(mdp)) if board.panels else table_states(mdp, visits)
-        drawn = states[known[states]]
-        scale = linear(VIRIDIS, np.stack([moment.values[drawn] for moment in moments]))
+        visited = states[known[states]]
+        scale = linear(VIRIDIS, np.stack([moment.values[visited] for moment in moments]))
         cell_size = fitting_cell_size(mdp, _SIDE if len(board.panels) <= 1 else _MOSAIC_SIDE)
 
         def frame(moment: Moment) -> Frame:
@@ -122,6 +122,7 @@ class PolicyHistory:
                 return draw_policy_map(mdp, values, greedy, optimal, words, cell_size, scale, known)
             numbers = np.full(optimal.shape, np.nan)
             np.put_along_axis(numbers, greedy[:, None].astype(np.intp), values[:, None], axis=1)
-            return draw_policy_table(mdp, states, numbers, greedy, optimal, known, words, "value", scale)
+            drawn = Numbers("value", numbers, scale, written=False)
+            return draw_policy_table(mdp, states, drawn, greedy, optimal, known, words)
 
         return animation_of_frames([frame(moment) for moment in moments])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gridworld.envs import rendering as drawing
 from gridworld.envs.board import board_of
-from gridworld.envs.rendering import AGENT, Colour, Frame, Point
+from gridworld.envs.rendering import AGENT, UNKNOWN, Colour, Frame, Point
 from gridworld.envs.text_drawing import SMALLEST_TEXT
 from gridworld.errors import InputError
 from gridworld.visualization.canvas import Canvas, shown
@@ -27,12 +27,11 @@ from gridworld.visualization.sheet import (
     INK,
     NEVER_VISITED,
     PAPER,
-    UNKNOWN,
     UNKNOWN_INK,
     Swatch,
     short,
 )
-from gridworld.visualization.state_table import draw_policy_table, table_states
+from gridworld.visualization.state_table import draw_policy_table, held, table_states
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 TENSORBOARD_SIDE: int | None = IMAGES_TAB
@@ -48,9 +47,9 @@ def draw(subject: Subject) -> Draw:
     caption = caption_at(subject, subject.steps)
     known = explored_by(subject)
     if not board_of(mdp).panels:
-        numbers, name = (snapshot.sampled, "probability") if snapshot.q is None else (snapshot.q, "Q")
         states = table_states(mdp, visits_of(subject))
-        picture = draw_policy_table(mdp, states, numbers, snapshot.greedy, optimal, known, caption, name)
+        numbers = held(snapshot, states[known[states]])
+        picture = draw_policy_table(mdp, states, numbers, snapshot.greedy, optimal, known, caption)
         return lambda cell_size: picture
     return lambda cell_size: draw_policy_map(
         mdp, snapshot.values, snapshot.greedy, optimal, caption, cell_size, known=known
@@ -113,31 +112,27 @@ def draw_policy_map(
     colours[~known] = UNKNOWN
     canvas.paint(colours[:, None])
     canvas.draw_world()
-    texts = {value: short(value, own.high) for value in set(values[known].tolist())} if not scale else {}
-    if len(canvas.board.panels) > 1:
-        texts = {}  # small cells, where an arrow is worth more
+    with_numbers = scale is None and len(canvas.board.panels) <= 1  # of several panels the cells are small
+    texts = {value: short(value, own.high) for value in set(values[known].tolist()) if with_numbers}
     size = canvas.number_size(0.8, texts.values())
     inks = [PAPER if dark else INK for dark in is_dark(colours).tolist()]
     middle = 0.5 if size is None else 0.4  # of the arrows, above the numbers
     paths = greedy_paths(mdp, greedy)
     ways = directions(mdp)[np.arange(mdp.num_states), greedy]
     _draw_paths(canvas, paths, ways, middle)
+    length = canvas.cell if size is None else 0.85 * canvas.cell
     if canvas.cell >= _SMALLEST_ARROW_CELL:
-        length = canvas.cell if size is None else 0.85 * canvas.cell
         for state in states.tolist():
             ink = inks[state] if known[state] else UNKNOWN_INK
             point = canvas.point(state, 0.5, middle)
-            if ways[state].any():
-                _draw_arrow(canvas, point, ways[state], length, ink)
-            else:
-                paper = colours[state].tolist()
-                _draw_dot(canvas, point, mdp.action_names[greedy[state]], length, ink, paper)
+            name, paper = mdp.action_names[greedy[state]], colours[state].tolist()
+            _draw_action(canvas, point, ways[state], name, length, ink, paper)
     on_path = set().union(*paths)
-    for state in np.flatnonzero(known).tolist():
-        if size is None:
-            break
-        plate = colours[state] if state in on_path else None
-        canvas.number(texts[float(values[state])], canvas.point(state, 0.5, 0.83), size, inks[state], plate)
+    if size is not None:
+        for state in np.flatnonzero(known).tolist():
+            plate = colours[state] if state in on_path else None
+            below = canvas.point(state, 0.5, 0.83)
+            canvas.number(texts[float(values[state])], below, size, inks[state], plate)
     wrong = playable & ~optimal[np.arange(mdp.num_states), greedy]
     canvas.mark(np.flatnonzero(wrong & ~known), _UNKNOWN_DISAGREES)
     canvas.mark(np.flatnonzero(wrong & known), DISAGREES)
@@ -168,8 +163,8 @@ def _draw_paths(canvas: Canvas, paths: list[list[int]], ways: IntArray, middle: 
     """
     cell = canvas.board.cell
     for path in paths:
-        lines = []
-        for state, following in pairwise(path):
+        placed, lines = [state for state in path if cell[state, 0] >= 0], []
+        for state, following in pairwise(placed):
             step = cell[following] - cell[state]
             if np.abs(step).sum() <= 1 or (step == ways[state]).all():  # an arrow may point along a diagonal
                 lines.append((canvas.point(state, 0.5, middle), canvas.point(following, 0.5, middle)))
@@ -177,7 +172,21 @@ def _draw_paths(canvas: Canvas, paths: list[list[int]], ways: IntArray, middle: 
                     (x, y), (to_x, to_y) = lines[-1]
                     lines[-1] = (x, y), ((x + to_x) / 2, (y + to_y) / 2)
         canvas.line(lines, AGENT)
-        canvas.ring(canvas.point(path[0], 0.5, middle), AGENT)
+        if placed:
+            canvas.ring(canvas.point(placed[0], 0.5, middle), AGENT)
+
+
+def _draw_action(
+    canvas: Canvas, middle: Point, way: IntArray, name: str, size: float, ink: Colour, paper: Colour
+) -> None:
+    """An arrow; for an action that does not move a disc, with its first letter where there is room for it."""
+    if way.any():
+        _draw_arrow(canvas, middle, way, size, ink)
+        return
+    drawing.import_pygame().draw.circle(canvas.world, ink, middle, round(0.2 * size))
+    letter = min(round(0.32 * size), 20)
+    if letter >= SMALLEST_TEXT:
+        canvas.number(name[:1].upper(), middle, letter, paper)
 
 
 def _draw_arrow(canvas: Canvas, middle: Point, way: IntArray, size: float, ink: Colour) -> None:
@@ -199,11 +208,3 @@ def _draw_arrow(canvas: Canvas, middle: Point, way: IntArray, size: float, ink: 
         for along, across in shape
     ]
     drawing.import_pygame().draw.polygon(canvas.world, ink, points)
-
-
-def _draw_dot(canvas: Canvas, middle: Point, name: str, size: float, ink: Colour, paper: Colour) -> None:
-    """A disc for an action that does not move, with its first letter where there is room for it."""
-    drawing.import_pygame().draw.circle(canvas.world, ink, middle, round(0.2 * size))
-    letter = min(round(0.32 * size), 20)
-    if letter >= SMALLEST_TEXT:
-        canvas.number(name[:1].upper(), middle, letter, paper)

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from gridworld.envs.rendering import BACKGROUND, Frame, Point, surface_to_frame
+from gridworld.envs.rendering import BACKGROUND, UNKNOWN, Frame, Point, surface_to_frame
 from gridworld.envs.text_drawing import INK as INK
 from gridworld.envs.text_drawing import SMALLEST_TEXT, Colour, font, import_pygame, text_width, write
 from gridworld.visualization.colormaps import ColourArray, Scale
 
 PAPER: Colour = BACKGROUND
 DISAGREES: Colour = (213, 60, 50)  # the colour of a greedy action that is not optimal
-UNKNOWN: Colour = (222, 222, 222)  # the colour of a cell that training never acted in
 UNKNOWN_INK: Colour = (170, 170, 170)
 
 Box = tuple[int, int, int, int]  # left, top, width, height

@@ -7,15 +7,16 @@ are too many states, those remain that training visited most.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.envs.rendering import AGENT, Colour, Frame
+from gridworld.agents import PolicySnapshot
+from gridworld.envs.rendering import AGENT, UNKNOWN, Colour, Frame
 from gridworld.envs.text_drawing import SMALLEST_TEXT, import_pygame, text_size, text_width, write
 from gridworld.visualization.colormaps import BLUES, ORANGES, VIRIDIS, Scale, counting, is_dark, linear
-from gridworld.visualization.sheet import DISAGREES, INK, NEVER_VISITED, PAPER, UNKNOWN, Sheet, Swatch, short
+from gridworld.visualization.sheet import DISAGREES, INK, NEVER_VISITED, PAPER, Sheet, Swatch, short
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 _MOST_ROWS = 24
@@ -38,23 +39,35 @@ def table_states(mdp: Mdp, visits: NDArray[np.int64] | None = None) -> IntArray:
     Returns:
         (rows,), in the order of the table; states that are over or cannot be reached are none of them.
     """
-    away = _steps_away(mdp)
-    states = np.flatnonzero((away >= 0) & ~mdp.terminal)
-    states = states[np.argsort(away[states], kind="stable")]
+    states = np.flatnonzero(mdp.reachable & ~mdp.terminal)
+    states = states[np.argsort(mdp.steps_away[states], kind="stable")]
     counts = np.zeros(len(states)) if visits is None else visits[states].sum(axis=1)
     most_visited = np.argsort(-counts, kind="stable")[:_MOST_ROWS]
     return states[np.sort(most_visited)]
 
 
-def _steps_away(mdp: Mdp) -> IntArray:
-    """(S,), the fewest steps from a start; -1 for states that cannot be reached."""
-    away = np.full(mdp.num_states, -1)
-    frontier, steps = mdp.start_states, 0
-    while frontier.size:
-        away[frontier] = steps
-        following = np.unique(mdp.next_state[frontier][mdp.probability[frontier] > 0])
-        frontier, steps = following[away[following] < 0], steps + 1
-    return away
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """What a policy's table shows of each action.
+
+    Attributes:
+        name: of the numbers.
+        table: (S, A); NaN is left white.
+        scale: their colours.
+        written: whether they are written into their cells too.
+    """
+
+    name: str
+    table: FloatArray
+    scale: Scale
+    written: bool = True
+
+
+def held(snapshot: PolicySnapshot, states: IntArray) -> Numbers:
+    """What an agent holds of its actions, scaled by these states: Q, or probabilities where it has no Q."""
+    if snapshot.q is None:
+        return Numbers("probability", snapshot.sampled, Scale(VIRIDIS, 0.0, 1.0))
+    return Numbers("Q", snapshot.q, linear(VIRIDIS, snapshot.q[states]))
 
 
 class StateTable(Sheet):
@@ -95,29 +108,29 @@ class StateTable(Sheet):
     def _middle(self, row: int) -> int:
         return (2 + row) * _ROW + _ROW // 2
 
-    def paint(self, numbers: FloatArray, scale: Scale, known: BoolArray, with_numbers: bool = True) -> None:
+    def paint(self, numbers: Numbers, known: BoolArray | None = None) -> None:
         """Fill the cells.
 
         Args:
-            numbers: (S, columns); NaN is left white.
-            scale: their colours.
-            known: (S,), the states whose numbers mean anything; the rows of others are grey.
-            with_numbers: whether to write them.
+            numbers: a column for each of the table's.
+            known: (S,), the states whose numbers mean anything; the rows of others are grey. None: all.
         """
-        there = np.isfinite(numbers) & known[:, None]
-        colours = np.where(there[..., None], scale.colours(np.where(there, numbers, scale.low)), PAPER)
-        colours[~known] = UNKNOWN
-        texts = {value: short(value, scale.high) for value in set(numbers[self._states][there[self._states]])}
+        values = numbers.table[self._states]
+        rows = np.ones(len(values), dtype=np.bool_) if known is None else known[self._states]
+        there = np.isfinite(values) & rows[:, None]
+        colours = numbers.scale.colours(np.where(there, values, numbers.scale.low))
+        colours[~there] = PAPER
+        colours[~rows] = UNKNOWN
+        for row, column in np.ndindex(*values.shape):
+            self.world.fill(colours[row, column].tolist(), self._box(row, column))
+            import_pygame().draw.rect(self.world, INK, self._box(row, column), 1)
+        texts = {value: short(value, numbers.scale.high) for value in set(values[there].tolist())}
         size = min((text_size(text, _TEXT, 0.8 * self._column) or 0 for text in texts.values()), default=0)
         dark = is_dark(colours)
-        for row, state in enumerate(self._states.tolist()):
-            for column in range(numbers.shape[1]):
-                self.world.fill(colours[state, column].tolist(), self._box(row, column))
-                import_pygame().draw.rect(self.world, INK, self._box(row, column), 1)
-                if with_numbers and size and there[state, column]:
-                    middle = self._left(column) + self._column / 2, self._middle(row)
-                    ink = PAPER if dark[state, column] else INK
-                    self.number(texts[numbers[state, column]], middle, size, ink)
+        for row, column in np.argwhere(there).tolist() if numbers.written and size else []:
+            middle = self._left(column) + self._column / 2, self._middle(row)
+            ink = PAPER if dark[row, column] else INK
+            self.number(texts[float(values[row, column])], middle, size, ink)
 
     def mark(self, row: int, column: int, colour: Colour) -> None:
         """A frame inside a cell, edged in white."""
@@ -133,40 +146,35 @@ class StateTable(Sheet):
 def draw_policy_table(
     mdp: Mdp,
     states: IntArray,
-    numbers: FloatArray,
+    numbers: Numbers,
     greedy: IntArray,
     optimal: BoolArray,
     known: BoolArray,
     caption: str = "",
-    name: str = "Q",
-    scale: Scale | None = None,
 ) -> Frame:
     """Draw what an agent holds of its actions as colours, with a frame around the greedy one.
 
     Args:
         mdp: the world.
         states: (rows,), see `table_states`.
-        numbers: (S, A); NaN is left white.
+        numbers: see there.
         greedy: (S,), the action that it would take.
         optimal: (S, A), whether an action is optimal.
         known: (S,), the states that training acted in; the others are grey.
         caption: a line above the table.
-        name: of the numbers.
-        scale: their colours, for pictures that are to be compared; without numbers then.
 
     Returns:
         (height, width, 3), RGB.
     """
     table = StateTable(mdp, states, mdp.action_names, legend_rows=2)
-    ends = scale or linear(VIRIDIS, numbers[states][known[states]])
-    table.paint(numbers, ends, known, with_numbers=scale is None)
+    table.paint(numbers, known)
     for row, state in enumerate(states.tolist()):
         action = int(greedy[state])
         table.mark(row, action, AGENT if optimal[state, action] else DISAGREES)
     table.caption(caption)
     never = [] if known[states].all() else [NEVER_VISITED]
-    low, high = short(ends.low, ends.high), short(ends.high)
-    table.legend(ends, f"{name} {low}", high, [_GREEDY, _WRONG, *never])
+    low, high = short(numbers.scale.low, numbers.scale.high), short(numbers.scale.high)
+    table.legend(numbers.scale, f"{numbers.name} {low}", high, [_GREEDY, _WRONG, *never])
     return table.frame()
 
 
@@ -174,7 +182,7 @@ def draw_error_table(mdp: Mdp, states: IntArray, error: FloatArray, caption: str
     """Draw errors (S, A), or (S, 1) of values, as colours; NaN is left white."""
     table = StateTable(mdp, states, mdp.action_names if error.shape[1] == mdp.num_actions else ["V"])
     scale = linear(ORANGES, error[states], low=0.0)
-    table.paint(error, scale, np.ones(mdp.num_states, dtype=np.bool_))
+    table.paint(Numbers("error", error, scale))
     table.caption(caption)
     swatches = [] if np.isfinite(error[states]).all() else [Swatch("no finite optimum")]
     table.legend(scale, "error 0", short(scale.high), swatches)
@@ -185,8 +193,7 @@ def draw_visit_table(mdp: Mdp, states: IntArray, visits: NDArray[np.int64], capt
     """Draw counts (S, A) as colours, on a logarithmic scale where they span decades."""
     table = StateTable(mdp, states, mdp.action_names)
     scale = counting(BLUES, visits[states])
-    counts: NDArray[Any] = np.where(visits > 0, visits.astype(np.float64), np.nan)
-    table.paint(counts, scale, np.ones(mdp.num_states, dtype=np.bool_))
+    table.paint(Numbers("visits", np.where(visits > 0, visits, np.nan), scale))
     table.caption(caption)
     kind = ", log scale" if scale.logarithmic else ""
     never = [Swatch("never")] if (visits[states] == 0).any() else []

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections import deque
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
@@ -117,20 +118,27 @@ class Mdp:
         return frozen(self.terminal & ~self.goal)
 
     @cached_property
-    def reachable(self) -> BoolArray:
-        """(S,), the states that an episode can come to."""
+    def steps_away(self) -> IntArray:
+        """(S,), in how few steps an episode can come to each state; -1 where it cannot."""
         themselves = np.arange(self.num_states)[:, None, None]
         possible = np.where(self.probability > 0, self.next_state, themselves)
         following = possible.reshape(self.num_states, -1).tolist()
-        waiting = self.start_states.tolist()
-        known = np.zeros(self.num_states, dtype=np.bool_)
-        known[waiting] = True
+        waiting = deque(self.start_states.tolist())
+        steps = [-1] * self.num_states
+        for start in waiting:
+            steps[start] = 0
         while waiting:
-            for state in following[waiting.pop()]:
-                if not known[state]:
-                    known[state] = True
+            origin = waiting.popleft()
+            for state in following[origin]:
+                if steps[state] < 0:
+                    steps[state] = steps[origin] + 1
                     waiting.append(state)
-        return frozen(known)
+        return frozen(np.array(steps))
+
+    @property
+    def reachable(self) -> BoolArray:
+        """(S,), the states that an episode can come to."""
+        return np.asarray(self.steps_away >= 0)
 
     def text(self) -> str:
         """A text that tells this world from others, for a run's manifest."""

@@ -1,0 +1,340 @@
+"""Pictures of worlds that are no maps: panels, other actions, states without a place, foreign frames."""
+
+import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gridworld.agents import PolicySnapshot
+from gridworld.config.pictures import PICTURES
+from gridworld.config.train import EnvConfig, TrainConfig
+from gridworld.envs.board import Kind, Panel, board_of
+from gridworld.envs.rendering import AGENT, GOAL, TRAP, UNKNOWN, Frame, ansi, draw_frame, fitting_cell_size
+from gridworld.envs.rollout import Episode, play
+from gridworld.visualization.animation import Animation, animation_of_rendered
+from gridworld.visualization.canvas import Canvas, shown
+from gridworld.visualization.colormaps import BLUES, ORANGES, linear
+from gridworld.visualization.directions import directions, moving_actions
+from gridworld.visualization.episode import film
+from gridworld.visualization.picture import Subject, drawer, save
+from gridworld.visualization.policy_history import PolicyHistory
+from gridworld.visualization.policy_map import draw_policy_map
+from gridworld.visualization.q_error_map import draw_error_map
+from gridworld.visualization.sheet import DISAGREES
+from gridworld.visualization.state_table import (
+    StateTable,
+    draw_policy_table,
+    draw_visit_table,
+    held,
+    table_states,
+)
+from gridworld.world.evaluation import Evaluator
+from gridworld.world.grid import compile_mdp
+from gridworld.world.layout import load
+from gridworld.world.mdp import IntArray, Mdp
+from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
+from gridworld.world.solver import value_iteration
+
+DIRECTIONS = {"up": (-1, 0), "right": (0, 1), "down": (1, 0), "left": (0, -1)}
+
+
+def from_gymnasium(name: str, places: IntArray, names: str, panel_names: tuple[str, ...] = ()) -> Mdp:
+    env = gym.make(name).unwrapped
+    table = env.P  # type: ignore[attr-defined]
+    most, none = len(table[0][0]), [(0.0, 0, 0.0, False)]
+    actions = range(len(table[0]))
+    rows = [
+        [(table[state][action] + most * none)[:most] for action in actions] for state in range(len(table))
+    ]
+    probability, next_state, reward, terminated = np.moveaxis(np.array(rows, dtype=float), -1, 0)
+    outcomes = Outcomes(
+        next_state=next_state.astype(int),
+        probability=probability,
+        reward=reward,
+        terminated=terminated.astype(bool),
+        start=np.asarray(env.initial_state_distrib, dtype=float),  # type: ignore[attr-defined]
+    )
+    return mdp_from_outcomes(
+        name, outcomes, action_names=names.split(), places=places, panel_names=panel_names
+    )
+
+
+def one_panel(rows: int, cols: int) -> IntArray:
+    return np.array([(0, *divmod(state, cols)) for state in range(rows * cols)])
+
+
+def taxi_places() -> IntArray:
+    states = np.arange(500)
+    return np.stack([states // 4 % 5 * 4 + states % 4, states // 100, states // 20 % 5], axis=1)
+
+
+FROZEN_LAKE = from_gymnasium("FrozenLake-v1", one_panel(4, 4), "left down right up")
+CLIFF_WALKING = from_gymnasium("CliffWalking-v1", one_panel(4, 12), "up right down left")
+TAXI = from_gymnasium(
+    "Taxi-v4",
+    taxi_places(),
+    "down up right left pickup dropoff",
+    tuple(f"{here} to {there}" for here in ("R", "G", "Y", "B", "taxi") for there in "RGYB"),
+)
+
+
+def chain(length: int) -> Mdp:
+    """Action 0 leads back to the start, action 1 to the next state, the last of which is the end."""
+    next_state = np.stack([np.zeros(length, dtype=int), np.arange(1, length + 1)], axis=1)
+    next_state = np.append(next_state, [[length, length]], axis=0)[..., None]
+    reward = np.where(next_state == length, 1.0, -0.5)
+    start = np.eye(length + 1)[0]
+    outcomes = Outcomes(
+        next_state=next_state,
+        probability=np.ones(next_state.shape),
+        reward=reward,
+        terminated=next_state == length,
+        start=start,
+    )
+    return mdp_from_outcomes("chain", outcomes, action_names=["back", "on"])
+
+
+def deep_sea(size: int, mirrored: bool) -> Mdp:
+    """Each step goes down, and left or right; `mirrored`: actions are swapped in every other row."""
+    cells = size * size
+    rows, cols = np.divmod(np.arange(cells), size)
+    swap = (rows % 2 == 1) & mirrored
+    next_state = np.full((cells + 1, 2, 1), cells)
+    for action in range(2):
+        right = (action == 1) != swap
+        col = np.clip(np.where(right, cols + 1, cols - 1), 0, size - 1)
+        next_state[:-1, action, 0] = np.where(rows == size - 1, cells, (rows + 1) * size + col)
+    outcomes = Outcomes(
+        next_state=next_state,
+        probability=np.ones(next_state.shape),
+        reward=np.zeros(next_state.shape),
+        terminated=next_state == cells,
+        start=np.eye(cells + 1)[0],
+    )
+    places = np.append(one_panel(size, size), [[-1, -1, -1]], axis=0)
+    return mdp_from_outcomes("deep sea", outcomes, places=places)
+
+
+def subject(mdp: Mdp, q: NDArray[np.float64], visits: NDArray[np.int64]) -> Subject:
+    evaluator = Evaluator(mdp, 0.95, 50)
+    snapshot = PolicySnapshot(q.argmax(axis=1), np.full(q.shape, 1 / q.shape[1]), q.max(axis=1), q)
+    history = PolicyHistory(mdp.num_states)
+    for step in range(3):
+        history.add(step, snapshot)
+    return SimpleNamespace(
+        config=TrainConfig(), evaluator=evaluator, snapshot=snapshot, steps=3, visits=visits, history=history
+    )
+
+
+def cell_of(mdp: Mdp, frame: Frame, state: int, legend_rows: int = 1) -> Frame:
+    canvas = Canvas(mdp, legend_rows=legend_rows)
+    left, top = canvas.world.get_offset()
+    x, y = (int(side) for side in canvas.point(state, 0, 0))
+    return frame[top + y : top + y + canvas.cell, left + x : left + x + canvas.cell]
+
+
+def has(picture: Frame, colour: tuple[int, ...]) -> bool:
+    return bool((picture == colour).all(axis=2).any())
+
+
+def test_panels_stand_in_a_mosaic_near_to_square_with_a_blank_line_between_two() -> None:
+    board = board_of(TAXI)
+    assert board is board_of(TAXI)
+    assert (board.rows, board.cols, len(board.panels)) == (29, 23, 20)
+    assert board.panels[5] == Panel(top=6, left=6, rows=5, cols=5, name="G to G")
+    assert (board.kind[5] == Kind.BLANK).all()
+    assert (board.kind[:, 5] == Kind.BLANK).all()
+    assert (board.kind == Kind.GOAL).sum() == 4
+    assert (board.kind == Kind.UNREACHABLE).sum() == 4 * 24  # brought there without having been fetched
+    assert shown(TAXI).sum() == 400
+    assert len(board_of(CLIFF_WALKING).panels) == 1
+
+
+def test_of_two_states_in_a_place_the_first_that_can_be_reached_is_shown() -> None:
+    places = np.array([(0, 0, 0), (0, 0, 1), (0, 0, 1), (0, 0, 2)])
+    next_state = np.array([2, 2, 3, 3]).reshape(4, 1, 1)
+    outcomes = Outcomes(
+        next_state=next_state,
+        probability=np.ones(next_state.shape),
+        reward=np.zeros(next_state.shape),
+        terminated=next_state == 3,
+        start=np.eye(4)[0],
+    )
+    mdp = mdp_from_outcomes("crowd", outcomes, places=places)
+    assert board_of(mdp).state.tolist() == [[0, 2, 3]]
+    assert ansi(mdp, 2) == "SAG\n"
+
+
+def test_a_world_from_outcomes_looks_as_the_same_map_does() -> None:
+    same = compile_mdp(load("frozen_lake_4x4"))
+    assert ansi(FROZEN_LAKE, 5) == ansi(same, 5)
+    assert np.array_equal(draw_frame(FROZEN_LAKE, 1, 20), draw_frame(same, 1, 20))
+    cliff = draw_frame(CLIFF_WALKING, 36, 10)
+    assert tuple(cliff[45, 25]) == UNKNOWN  # nobody ever is on the cliff
+
+
+def test_an_action_that_slips_falls_or_bumps_has_one_arrow_everywhere() -> None:
+    for mdp in (FROZEN_LAKE, CLIFF_WALKING, TAXI):
+        for action, name in enumerate(mdp.action_names):
+            ways = np.unique(directions(mdp)[:, action], axis=0).tolist()
+            assert ways == [list(DIRECTIONS.get(name, (0, 0)))]
+    assert moving_actions(FROZEN_LAKE) == (3, 2, 1, 0)
+    assert moving_actions(CLIFF_WALKING) == (0, 1, 2, 3)
+    assert moving_actions(TAXI) is None
+    assert moving_actions(compile_mdp(load("cliff"), slip=1.0)) == (0, 1, 2, 3)
+
+
+def test_arrows_may_be_diagonal_and_differ_from_state_to_state() -> None:
+    plain, mirrored = (directions(deep_sea(6, swap)) for swap in (False, True))
+    assert plain[8].tolist() == [[1, -1], [1, 1]]
+    assert mirrored[[0, 7, 14], 1].tolist() == [[1, 1], [1, -1], [1, 1]]
+
+
+def test_error_triangles_lie_on_the_side_that_the_action_moves_to() -> None:
+    error = np.zeros((16, 4))
+    error[6] = [1, 2, 3, 4]  # left, down, right, up
+    cell = cell_of(FROZEN_LAKE, draw_error_map(FROZEN_LAKE, error), 6)
+    low, far = 4, len(cell) - 5
+    points = [(9, low), (far, 9), (9, far), (low, 9)]
+    colours = linear(ORANGES, error, low=0).colours(error[6])
+    assert [tuple(cell[point]) for point in points] == [tuple(colour) for colour in colours]
+
+
+def test_with_other_actions_a_cell_has_the_largest_error_and_what_cannot_be_reached_is_grey() -> None:
+    error = np.zeros((TAXI.num_states, 6))
+    error[1, 4], error[2, 0] = 3.0, 6.0
+    frame = draw_error_map(TAXI, error)
+    assert tuple(cell_of(TAXI, frame, 1)[4, 4]) == tuple(ORANGES[64])
+    assert tuple(cell_of(TAXI, frame, 2)[4, 4]) == tuple(ORANGES[127])
+    assert tuple(cell_of(TAXI, frame, 20)[4, 4]) == UNKNOWN
+    assert has(cell_of(TAXI, frame, 0), GOAL)
+
+
+def test_the_policy_of_a_mosaic_has_dots_where_no_action_moves_and_diagonal_paths() -> None:
+    best = value_iteration(TAXI, 0.95)
+    frame = draw_policy_map(TAXI, best.v, best.optimal.argmax(axis=1), best.optimal)
+    cells = [cell_of(TAXI, frame, state, 2) for state in np.flatnonzero(shown(TAXI))]
+    assert not any(has(cell, DISAGREES) for cell in cells)
+    sea = deep_sea(5, mirrored=False)
+    frame = draw_policy_map(sea, np.zeros(26), np.ones(26, dtype=int), np.ones((26, 2), dtype=bool))
+    assert [has(cell_of(sea, frame, 6 * row, 2), AGENT) for row in range(5)] == [True] * 5
+    assert not has(cell_of(sea, frame, 5, 2), AGENT)
+
+
+def test_a_table_has_the_most_visited_states_in_the_order_in_which_they_are_met() -> None:
+    world = chain(40)
+    assert table_states(world).tolist() == list(range(24))
+    visits = np.ones((41, 2), dtype=np.int64)
+    visits[[3, 30]] = 100
+    assert table_states(world, visits).tolist() == [*range(23), 30]
+    assert table_states(chain(5)).tolist() == [0, 1, 2, 3, 4]
+
+
+def table_cell(table: StateTable, frame: Frame, row: int, column: int) -> Frame:
+    left, top, width, height = table._box(row, column)
+    x, y = table.world.get_offset()
+    return frame[y + top : y + top + height, x + left : x + left + width]
+
+
+def test_a_policy_table_frames_the_greedy_action() -> None:
+    world = chain(5)
+    best = value_iteration(world, 0.9)
+    q = best.q.copy()
+    q[2] = q[2, ::-1]
+    snapshot = PolicySnapshot(q.argmax(axis=1), np.full(q.shape, 0.5), q.max(axis=1), q)
+    states, known = table_states(world), np.arange(6) < 4
+    for each in (snapshot, dataclasses.replace(snapshot, q=None)):
+        frame = draw_policy_table(world, states, held(each, states), each.greedy, best.optimal, known)
+        table = StateTable(world, states, world.action_names, legend_rows=2)
+        for row in range(5):
+            cells = [table_cell(table, frame, row, column) for column in range(2)]
+            assert [has(cell, AGENT) for cell in cells] == [False, row != 2]
+            assert [has(cell, DISAGREES) for cell in cells] == [row == 2, False]
+            assert has(cells[0], UNKNOWN) == (row == 4)
+
+
+def test_a_visit_table_leaves_actions_never_taken_white() -> None:
+    world = chain(3)
+    visits = np.array([[1, 50], [0, 25], [0, 0], [0, 0]])
+    frame = draw_visit_table(world, table_states(world), visits)
+    table = StateTable(world, table_states(world), world.action_names)
+    corners = [[tuple(table_cell(table, frame, row, col)[3, 3]) for col in range(2)] for row in range(3)]
+    white = (255, 255, 255)
+    assert corners[0] == [tuple(BLUES[0]), tuple(BLUES[127])]
+    assert corners[1][0] == corners[2][0] == corners[2][1] == white
+    assert corners[1][1] != white
+
+
+@pytest.mark.parametrize(
+    "world",
+    [FROZEN_LAKE, CLIFF_WALKING, TAXI, deep_sea(4, True), chain(40), dataclasses.replace(TAXI, places=None)],
+    ids=["frozen", "cliff", "taxi", "sea", "chain", "taxi without places"],
+)
+def test_every_picture_can_be_drawn_of_any_world(world: Mdp, tmp_path: Path) -> None:
+    shape = (world.num_states, world.num_actions)
+    rng = np.random.default_rng(0)
+    of_it = subject(world, rng.normal(size=shape), rng.integers(0, 9, shape))
+    for picture in PICTURES:
+        if picture.file.endswith((".png", ".gif")):
+            prepared = drawer(picture.drawer).draw(of_it)
+            drawn = prepared(None)
+            if picture.is_map:
+                save(drawn, tmp_path / picture.file, 4)
+            size = drawn.size if isinstance(drawn, Animation) else drawn.shape[1::-1]
+            assert 150 < max(size) <= 1100
+            prepared(fitting_cell_size(world, 240))  # as TensorBoard asks for it
+
+
+def test_an_episode_in_text_tells_state_action_and_reward() -> None:
+    world = chain(3)
+    episode = play(world, np.eye(2)[[1, 1, 1, 1]], 10, seed=0)
+    assert episode.states.tolist() == [0, 1, 2, 3]
+    assert episode.actions.tolist() == [1, 1, 1]
+    assert episode.rewards.tolist() == [-0.5, -0.5, 1.0]
+    assert episode.beginning(2).actions.tolist() == [1]
+    told = film(EnvConfig(), world, [episode, episode])(None)
+    assert len(told) == 8
+    pictures = [np.asarray(told.draw(key).convert("RGB")) for key in told.keys]
+    assert np.array_equal(pictures[0], pictures[4])
+    assert len({picture.tobytes() for picture in pictures}) == 4
+    assert ansi(world, 2) == "state 2\n"
+    assert (draw_frame(world, 2) < 128).any()
+
+
+class _Noisy(EnvConfig):
+    """Draws frames of more colours than a palette has."""
+
+    def frames(self, mdp: Mdp, states: IntArray) -> list[NDArray[np.uint8]]:
+        self.asked = states.tolist()
+        ramp = np.indices((40, 80)).transpose(1, 2, 0)
+        blue = np.zeros((40, 80, 1), dtype=int)
+        return [np.concatenate([3 * ramp, blue + 100 * state], axis=2).astype(np.uint8) for state in states]
+
+
+def test_an_episode_shows_the_frames_of_the_environment_that_has_some() -> None:
+    env = _Noisy()
+    walk = Episode(np.array([2, 0, 2, 1]), np.zeros(3, dtype=int), np.zeros(3))
+    prepared = film(env, FROZEN_LAKE, [walk])
+    assert env.asked == [0, 1, 2]  # each state once
+    shown = prepared(None)
+    assert shown.size == (80, 40)
+    pictures = [np.asarray(shown.draw(key).convert("RGB")).astype(int) for key in shown.keys]
+    for picture, state in zip(pictures, walk.states, strict=True):
+        assert np.abs(picture - env.frames(FROZEN_LAKE, np.array([state]))[0]).mean() < 12
+    assert np.array_equal(pictures[0], pictures[2])
+    assert prepared(5).size == (30, 15)  # a board with such cells has six of them on a side
+    assert prepared(100).size == (80, 40)
+
+
+def test_foreign_frames_of_few_colours_stay_exact() -> None:
+    frames = [np.full((4, 6, 3), colour, dtype=np.uint8) for colour in (AGENT, TRAP)]
+    shown = animation_of_rendered(frames, [1, 0, 1])
+    assert [tuple(np.asarray(shown.draw(key).convert("RGB"))[0, 0]) for key in shown.keys] == [
+        TRAP,
+        AGENT,
+        TRAP,
+    ]
