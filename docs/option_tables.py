@@ -24,13 +24,14 @@ from gridworld.config.composition.conf_folder import conf_folder
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.config.tune import DimensionConfig, TuneConfig
+from gridworld.config.worlds import SOURCES, EnvConfig
 from gridworld.envs.env import GridWorldEnv
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.world.layout import shipped_layouts
 
 Row = tuple[str, ...]
 
-_NOT_SHOWN = {"_target_"}
+_NOT_SHOWN = {"_target_", "source"}
 _NOQA = re.compile(r"\s*noqa: [\w, ]+")
 _ARGUMENT = re.compile(r"^\s*- ((?:`\w+`(?:, )?)+): (.*?)(?=^\s*- `|^\s*$)", re.MULTILINE | re.DOTALL)
 
@@ -63,9 +64,9 @@ def setting_rows(schema: type, prefix: str = "") -> Iterator[Row]:
     hints, told, default = get_type_hints(schema), _comments(schema), schema()
     for each in fields(schema):
         key, value = f"{prefix}{each.name}", getattr(default, each.name)
-        if is_dataclass(value) and not isinstance(value, AgentConfig):
+        if is_dataclass(value) and not isinstance(value, AgentConfig | EnvConfig):
             yield from setting_rows(type(value), f"{key}.")
-        elif each.name != "_target_" and not isinstance(value, AgentConfig):
+        elif each.name not in _NOT_SHOWN and not isinstance(value, AgentConfig | EnvConfig):
             meaning = told.get(each.name) or _yaml_comments().get(key) or _of_sb3(schema)
             yield f"`{key}`", f"`{_type(hints[each.name])}`", _value(value), _cell(meaning)
 
@@ -92,6 +93,13 @@ def _agents() -> str:
     for name, schema in sorted(agent_schemas().items()):
         rows = setting_rows(schema, "agent.")
         parts.append(f"### `{name}`\n\n{inspect.getdoc(schema)}\n\n{_settings(rows)}")
+    return "\n\n".join(parts)
+
+
+def _worlds() -> str:
+    parts = []
+    for name, schema in SOURCES.items():
+        parts.append(f"### `{name}`\n\n{inspect.getdoc(schema)}\n\n{_settings(setting_rows(schema, 'env.'))}")
     return "\n\n".join(parts)
 
 
@@ -187,6 +195,7 @@ TABLES = {
     "environment": lambda: _table(("argument", "default", ""), environment_rows()),
     "maps": lambda: ", ".join(f"`{name}`" for name in shipped_layouts()),
     "train": lambda: _settings(setting_rows(TrainConfig)),
+    "worlds": _worlds,
     "agents": _agents,
     "sweeps": lambda: _settings(setting_rows(SweepConfig, "hydra.sweeper.")),
     "launchers": _launchers,

@@ -6,6 +6,7 @@ import math
 
 from gridworld.errors import InputError
 
+STEP_LIMIT = 100  # steps of an episode, where neither the world nor a setting says another
 NEAREST_GAMMA = 1 - 1e-11  # to 1, but for 1 itself
 
 

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Optional
 
-from gridworld.bounds import at_least, at_most
+from gridworld.bounds import STEP_LIMIT, at_least, at_most
 from gridworld.config.agents import MISSING
 from gridworld.world.grid import GridMdp, compile_mdp
 from gridworld.world.layout import Layout, load
@@ -21,14 +21,13 @@ from gridworld.world.mdp import Mdp
 # OmegaConf reads the annotations at run time and knows no `X | None`.
 
 MOST_STEPS = 100_000  # of an episode; an evaluation goes through all of them
-WITHOUT_LIMIT = 1000  # steps of an episode, where neither the settings nor the world have a limit
 
 
 @dataclass
 class EnvConfig:
     """A world of any source."""
 
-    max_episode_steps: Optional[int] = None  # noqa: UP045  # the step limit; null: the world's own, or 1000
+    max_episode_steps: Optional[int] = None  # noqa: UP045  # the step limit; null: the world's own, or 100
 
     @property
     def name(self) -> str:
@@ -45,7 +44,7 @@ class EnvConfig:
 
     def step_limit(self, mdp: Mdp) -> int:
         """The step limit of an episode in the compiled world."""
-        return self.max_episode_steps or mdp.max_episode_steps or WITHOUT_LIMIT
+        return self.max_episode_steps or mdp.max_episode_steps or STEP_LIMIT
 
     def check(self) -> None:
         """Check the step limit: one that can be, and that an exact evaluation comes to the end of.
@@ -187,7 +186,7 @@ class RiverSwimConfig(ClassicConfig):
     """Against the current to a large reward, or with it to a small one."""
 
     source: str = "river_swim"
-    length: int = 6
+    length: int = 6  # states
 
 
 @dataclass
@@ -195,7 +194,7 @@ class DeepSeaConfig(ClassicConfig):
     """One way of 2 ** size leads to the treasure."""
 
     source: str = "deep_sea"
-    size: int = 10
+    size: int = 10  # rows and columns
     seed: Optional[int] = None  # noqa: UP045  # of what the actions mean in each cell; null: left and right
 
 
@@ -204,9 +203,9 @@ class CombinationLockConfig(ClassicConfig):
     """A wrong action leads back to the start."""
 
     source: str = "combination_lock"
-    length: int = 10
-    num_actions: int = 2
-    seed: Optional[int] = None  # noqa: UP045  # of the combination; null: the first action everywhere
+    length: int = 10  # actions that open it
+    num_actions: int = 2  # of each state
+    seed: Optional[int] = None  # noqa: UP045  # of the combination; null: the last action everywhere
 
 
 @dataclass
@@ -214,7 +213,7 @@ class RandomWalkConfig(ClassicConfig):
     """A chain whose right end pays 1."""
 
     source: str = "random_walk"
-    length: int = 5
+    length: int = 5  # states without the ends, an odd number
 
 
 def compiled(env: EnvConfig) -> Mdp:

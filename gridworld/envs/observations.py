@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 from gridworld.envs import rendering as drawing
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import check_memory
-from gridworld.world.grid import GridMdp
 from gridworld.world.layout import positive_int
 from gridworld.world.mdp import IntArray, Mdp
 
@@ -108,10 +107,10 @@ def _coordinates(mdp: Mdp, cell_size: int) -> Rows:
 
 
 def _image(mdp: Mdp, cell_size: int) -> Rows:
-    """Raises `InputError` where there is no map, or all frames together would not fit into 1 GiB."""
-    if not isinstance(mdp, GridMdp):
+    """Raises `InputError` where states have no places, or all frames would not fit into 1 GiB."""
+    if mdp.places is None:
         raise InputError(
-            f"observation image: {mdp.name} has no map to draw frames of; take another observation"
+            f"observation image: the states of {mdp.name} have no places; take another observation"
         )
     cell_size = positive_int("cell_size", cell_size)
     width, height = drawing.frame_size(mdp, cell_size)

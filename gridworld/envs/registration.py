@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import sys
 
+from gridworld.bounds import STEP_LIMIT
+
 ENV_ID = "GridWorld-v0"
-STEP_LIMIT = 100  # of its episodes
 
 TYPE_CHECKING = False  # what type checkers take for True; `typing` itself would double the import's cost
 if TYPE_CHECKING:

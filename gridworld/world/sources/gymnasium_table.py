@@ -155,6 +155,7 @@ def _compiled(env: gym.Env[Any, Any]) -> tuple[Mdp, Outcomes]:
         table,
         action_names=names,
         places=places if places is not None and len(places) == num_states else None,
+        panel_names=known.panel_names if known is not None else (),
         max_episode_steps=_step_limit(env),
     )
     if known is not None and (reason := known.refused(real)):
@@ -374,6 +375,7 @@ class _Known:
 
     action_names: tuple[str, ...]
     places: Callable[[Any], NDArray[np.int64]]  # (N, 3), see `Mdp`
+    panel_names: tuple[str, ...] = ()  # see `Mdp`
     refused: Callable[[Any], str] = lambda env: ""  # why its table is not true, if that can be seen
 
 
@@ -401,7 +403,10 @@ _KNOWN = {
     "FrozenLakeEnv": _Known(("left", "down", "right", "up"), lambda env: _grid_places(*env.desc.shape)),
     "CliffWalkingEnv": _Known(("up", "right", "down", "left"), lambda env: _grid_places(*env.shape)),
     "TaxiEnv": _Known(
-        ("south", "north", "east", "west", "pickup", "dropoff"), _taxi_places, refused=_is_fickle
+        ("south", "north", "east", "west", "pickup", "dropoff"),
+        _taxi_places,
+        tuple(f"{passenger} to {destination}" for passenger in (*"RGYB", "taxi") for destination in "RGYB"),
+        refused=_is_fickle,
     ),
 }
 
