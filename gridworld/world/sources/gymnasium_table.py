@@ -55,18 +55,17 @@ def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> M
             not what its table says.
     """
     arguments = dict(kwargs or {})
-    env, again = _made(env_id, arguments), _made(env_id, arguments)
-    try:
-        mdp, table = _compiled(env)
-        if _differ(table, _table(mdp.name, again.unwrapped)):
-            raise InputError(
-                f"env.id={env_id}: has another table each time that it is made, so no exact truth is known; "
-                "give what it draws as env.kwargs, e.g. desc of a FrozenLake"
-            )
-        _check_steps(mdp, table, env.unwrapped)
-    finally:
-        env.close()
-        again.close()
+    env = _made(env_id, arguments)
+    mdp, table = _compiled(env)
+    again = _made(env_id, arguments)  # only now: a large environment takes long, and may be refused
+    if _differ(table, _table(mdp.name, again.unwrapped)):
+        raise InputError(
+            f"env.id={env_id}: has another table each time that it is made, so no exact truth is known; "
+            "give what it draws as env.kwargs, e.g. desc of a FrozenLake"
+        )
+    _check_steps(mdp, table, env.unwrapped)
+    env.close()
+    again.close()
     return mdp
 
 
