@@ -91,6 +91,7 @@ def mdp_from_outcomes(
     probability[terminal] = np.eye(count)[0]
     reward[terminal] = 0.0
     reward[probability == 0] = 0.0
+    stays = (next_state == np.arange(size)[:, None, None]) & (reward == 0)
     names = tuple(action_names) if action_names is not None else tuple(map(str, range(actions)))
     return Mdp(
         name=name,
@@ -102,7 +103,7 @@ def mdp_from_outcomes(
         goal=frozen(goal),
         start=frozen(np.concatenate([outcomes.start, np.zeros(len(extra))])),
         thresholds=frozen(_thresholds(probability)),
-        absorbing=frozen(terminal),
+        absorbing=frozen(terminal | (stays | (probability == 0)).all(axis=(1, 2))),
         number=frozen(ends.number),
         places=None if places is None else frozen(places[ends.number]),
         max_episode_steps=max_episode_steps,
