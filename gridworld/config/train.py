@@ -42,7 +42,7 @@ class EnvConfig:
 class ObservationConfig:
     """What the agent sees of a state."""
 
-    kind: str = "one_hot"  # or coordinates, image, none (the state's number)
+    kind: str = "one_hot"  # or coordinates, image, own, none (the state's number)
     cell_size: int = 8  # pixels, for images
 
 

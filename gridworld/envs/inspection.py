@@ -20,7 +20,7 @@ from gridworld.envs.observations import KINDS, ObservationTable, TableObservatio
 from gridworld.envs.registration import STEP_LIMIT
 from gridworld.envs.rendering import frame_size
 from gridworld.errors import InputError
-from gridworld.world.grid import compile_mdp
+from gridworld.world.grid import GridMdp, compile_mdp
 from gridworld.world.layout import Layout, load, positive_int
 from gridworld.world.mdp import Mdp
 
@@ -89,7 +89,7 @@ def observation_like(mdp: Mdp, space: gym.Space[Any]) -> ObservationTable:
         InputError: there is none.
     """
     for kind in KINDS:
-        table = make_observation(mdp, kind, _cell_size(mdp, space)) if _may_be(kind, space) else None
+        table = make_observation(mdp, kind, _cell_size(mdp, space)) if _may_be(mdp, kind, space) else None
         if table is not None and table.space == space:
             return table
     raise InputError(
@@ -98,12 +98,17 @@ def observation_like(mdp: Mdp, space: gym.Space[Any]) -> ObservationTable:
     )
 
 
-def _may_be(kind: str, space: gym.Space[Any]) -> bool:
-    return kind != "image" or (space.dtype == np.uint8 and len(space.shape or ()) == 3)
+def _may_be(mdp: Mdp, kind: str, space: gym.Space[Any]) -> bool:
+    if kind == "image":
+        return isinstance(mdp, GridMdp) and space.dtype == np.uint8 and len(space.shape or ()) == 3
+    needs = {"coordinates": mdp.places, "own": mdp.own_observation}
+    return kind not in needs or needs[kind] is not None
 
 
 def _cell_size(mdp: Mdp, space: gym.Space[Any]) -> int:
     """Of the images that have this space, as their width has it; 1 where there is none."""
+    if not isinstance(mdp, GridMdp):
+        return 1
     width = (space.shape or (1,))[-1]
     per_cell, border = frame_size(mdp, 2)[0] - frame_size(mdp, 1)[0], frame_size(mdp, 1)[0]
     return max(1, (width - border) // per_cell + 1)

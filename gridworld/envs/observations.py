@@ -5,8 +5,9 @@ all there is to it, for one environment, a batch, a replay buffer or the whole s
 
     kind         dtype    shape        row of a state
     one_hot      float32  (S,)         1 at the state's number
-    coordinates  float32  (2,)         row and column, each scaled to [0, 1]
+    coordinates  float32  (2,), (3,)   row and column (and panel, if there are several), scaled to [0, 1]
     image        uint8    (3, H, W)    the pixels of its frame, channels first as SB3's CnnPolicy takes them
+    own          its own  its own      what the environment itself shows, where the world was made from one
     none         int64    ()           the state's number itself
 
 A new kind is a function with its row in `KINDS`, and a yaml in `conf/observation`. The two generic wrappers
@@ -29,6 +30,7 @@ from numpy.typing import NDArray
 from gridworld.envs import rendering as drawing
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import check_memory
+from gridworld.world.grid import GridMdp
 from gridworld.world.layout import positive_int
 from gridworld.world.mdp import IntArray, Mdp
 
@@ -90,15 +92,27 @@ def _one_hot(mdp: Mdp, cell_size: int) -> Rows:
 
 
 def _coordinates(mdp: Mdp, cell_size: int) -> Rows:
-    """Row and column, each from 0 (first) to 1 (last); 0 where there is only one."""
-    layout = mdp.layout
-    cells = np.array(list(layout.cells()), dtype=np.float32)
-    scaled = cells / np.maximum(np.array([layout.num_rows, layout.num_cols], dtype=np.float32) - 1, 1)
-    return spaces.Box(0.0, 1.0, (2,), np.float32), scaled
+    """Each from 0 (first) to 1 (last), 0 where there is only one; -1 of a state that has no place.
+
+    Raises:
+        InputError: no state has a place.
+    """
+    if mdp.places is None:
+        raise InputError(
+            f"observation coordinates: the states of {mdp.name} have no places; take another observation"
+        )
+    panels = mdp.places[:, :1] if mdp.places[:, 0].max() > 0 else mdp.places[:, :0]
+    places = np.concatenate([mdp.places[:, 1:], panels], axis=1).astype(np.float32)
+    scaled = np.where(places < 0, np.float32(-1), places / np.maximum(places.max(axis=0), 1))
+    return spaces.Box(min(0.0, scaled.min()), 1.0, scaled.shape[1:], np.float32), scaled
 
 
 def _image(mdp: Mdp, cell_size: int) -> Rows:
-    """Raises `InputError` where all frames together would not fit into 1 GiB."""
+    """Raises `InputError` where there is no map, or all frames together would not fit into 1 GiB."""
+    if not isinstance(mdp, GridMdp):
+        raise InputError(
+            f"observation image: {mdp.name} has no map to draw frames of; take another observation"
+        )
     cell_size = positive_int("cell_size", cell_size)
     width, height = drawing.frame_size(mdp, cell_size)
     size = mdp.num_states * 3 * width * height
@@ -118,10 +132,30 @@ def _none(mdp: Mdp, cell_size: int) -> Rows:
     return spaces.Discrete(mdp.num_states), np.arange(mdp.num_states)
 
 
+def _own(mdp: Mdp, cell_size: int) -> Rows:
+    """As it is, within the bounds of the table; pixels are flat, for SB3 would take others for CnnPolicy's.
+
+    Raises:
+        InputError: the world has none.
+    """
+    table = mdp.own_observation
+    if table is None:
+        raise InputError(
+            f"observation own: {mdp.name} has no observation of its own as an array; take another observation"
+        )
+    if table.ndim == 1 and table.dtype.kind in "iu":
+        return spaces.Discrete(int(table.max()) + 1), table.astype(np.int64)
+    low, high = table.min(), table.max()
+    if table.ndim == 4 and table.dtype == np.uint8 and (low, high) == (0, 255):
+        table = table.reshape(len(table), -1)
+    return spaces.Box(low, high, table.shape[1:], table.dtype.type), table
+
+
 KINDS: dict[str, Callable[[Mdp, int], Rows]] = {  # takes the world and `cell_size`
     "one_hot": _one_hot,
     "coordinates": _coordinates,
     "image": _image,
+    "own": _own,
     "none": _none,
 }
 
@@ -135,7 +169,7 @@ def make_observation(mdp: Mdp, kind: str, cell_size: int = IMAGE_CELL_SIZE) -> O
         cell_size: pixels a cell, for images.
 
     Raises:
-        InputError: no such kind; or images that would not fit into memory.
+        InputError: no such kind, or the world has nothing of it; or images that would not fit into memory.
     """
     if kind not in KINDS:
         *others, last = KINDS

@@ -31,6 +31,8 @@ def test_every_choice_composes_and_could_train(group: str, choice: str) -> None:
     check(config)
     family(config.agent).check(config)
     mdp = make_mdp(config.env)
+    if choice == "own":  # which a map has not
+        mdp = dataclasses.replace(mdp, own_observation=mdp.number)
     assert make_observation(mdp, config.observation.kind).num_states == mdp.num_states
     for part in dataclasses.fields(TrainConfig):
         assert not isinstance(getattr(config, part.name), dict)

@@ -35,7 +35,7 @@ def make_vec_env(
     Args:
         layout: the name of a map, its file, or a `Layout`.
         n_envs: how many environments step together.
-        observation: `one_hot`, `coordinates`, `image` (for CnnPolicy) or `none` (the state's number).
+        observation: `one_hot`, `coordinates`, `image` (for CnnPolicy), `own` or `none` (the state's number).
         seed: of the starts and slips, unless the model has a seed, which SB3 gives to its environments; None:
             another one at every call.
         cell_size: pixels a cell, of the images.
