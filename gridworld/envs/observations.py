@@ -132,7 +132,7 @@ def _none(mdp: Mdp, cell_size: int) -> Rows:
 
 
 def _own(mdp: Mdp, cell_size: int) -> Rows:
-    """Bounds are those of the rows, number by number: SB3 does not take it for the pixels of an image then.
+    """As it is, within the bounds of the table; pixels are flat, for SB3 would take others for CnnPolicy's.
 
     Raises:
         InputError: the world has none.
@@ -144,7 +144,10 @@ def _own(mdp: Mdp, cell_size: int) -> Rows:
         )
     if table.ndim == 1 and table.dtype.kind in "iu":
         return spaces.Discrete(int(table.max()) + 1), table.astype(np.int64)
-    return spaces.Box(table.min(axis=0), table.max(axis=0), table.shape[1:], table.dtype.type), table
+    low, high = table.min(), table.max()
+    if table.ndim == 4 and table.dtype == np.uint8 and (low, high) == (0, 255):
+        table = table.reshape(len(table), -1)
+    return spaces.Box(low, high, table.shape[1:], table.dtype.type), table
 
 
 KINDS: dict[str, Callable[[Mdp, int], Rows]] = {  # takes the world and `cell_size`

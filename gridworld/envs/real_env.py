@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -82,7 +83,7 @@ def _set_states(env: gym.Env[Any, Any], mdp: Mdp, states: Sequence[int]) -> Iter
 
 def _replayed(env: gym.Env[Any, Any], mdp: Mdp, states: Sequence[int]) -> Iterator[None]:
     yield
-    for state, following in zip(states, states[1:], strict=False):
+    for state, following in itertools.pairwise(states):
         leading = np.flatnonzero(mdp.next_state[state, :, 0] == following)
         if not leading.size:
             raise InputError(

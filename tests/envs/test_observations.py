@@ -1,6 +1,7 @@
 """Every shipped layout under every observation, single or batched, keeps the contract."""
 
 import warnings
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -9,9 +10,12 @@ from gymnasium.wrappers.vector import TransformObservation
 
 import gridworld
 from gridworld import GridWorldEnv, InputError
+from gridworld.envs.inspection import observation_like
 from gridworld.envs.observations import KINDS, TableObservation, VectorTableObservation, make_observation
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import classic, parse
+from gridworld.world.mdp import Mdp
+from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 
 LAYOUTS = gridworld.shipped_layouts()
 WRAPPERS = {  # kind: (wrapper of one environment, wrapper of a batch)
@@ -144,7 +148,7 @@ def test_a_batch_that_resets_in_the_same_step_is_wrapped_no_more_than_gymnasium_
             wrap(envs)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", sorted(set(KINDS) - {"own"}))  # a map has none
 def test_any_kind_is_shown_by_the_generic_wrappers(kind):
     env = TableObservation(gym.make("GridWorld-v0", layout="cliff"), kind)
     envs = VectorTableObservation(gridworld.GridWorldVectorEnv(3, layout="cliff"), kind)
@@ -182,3 +186,88 @@ def test_one_hot_rows_of_a_large_world_are_written_when_asked_for():
     assert rows.sum() == 4
     assert rows[0, 1, 3599] == rows[1, 0, 7] == 1
     assert np.array_equal(table.rows(np.array([5]), out=rows[0, :1]), np.eye(3600, dtype=np.float32)[5:6])
+
+
+def world(**tables: Any) -> Mdp:
+    """Four states in a row, as a source without a map gives them."""
+    steps = np.array([[0, 1], [0, 2], [1, 3], [3, 3]])[:, :, None]
+    ends = np.zeros(steps.shape, dtype=bool)
+    ends[2, 1] = True
+    outcomes = Outcomes(
+        next_state=steps,
+        probability=np.ones(steps.shape),
+        reward=ends.astype(float),
+        terminated=ends,
+        start=np.eye(4)[0],
+    )
+    return mdp_from_outcomes("row", outcomes, **tables)
+
+
+def test_coordinates_are_of_the_places_that_a_world_has():
+    places = np.array([[0, 0, 0], [0, 2, 1], [0, 1, 4], [-1, -1, -1]])
+    table = make_observation(world(places=places), "coordinates")
+    assert table.table().tolist() == [[0, 0], [1, 0.25], [0.5, 1], [-1, -1]]
+    assert table.space == gym.spaces.Box(-1, 1, (2,), np.float32)
+    places = np.array([[0, 0, 0], [1, 2, 1], [2, 1, 4], [0, 0, 1]])
+    table = make_observation(world(places=places), "coordinates")
+    assert table.table().tolist() == [[0, 0, 0], [1, 0.25, 0.5], [0.5, 1, 1], [0, 0.25, 0]]
+    assert table.space == gym.spaces.Box(0, 1, (3,), np.float32)
+
+
+def test_coordinates_of_a_map_are_its_rows_and_columns_to_the_last_bit():
+    for mdp in (compile_mdp(classic(7, 23)), GridWorldEnv(layout="four_rooms").mdp):
+        size = np.array([mdp.layout.num_rows, mdp.layout.num_cols], dtype=np.float32)
+        cells = np.array(list(mdp.layout.cells()), dtype=np.float32)
+        table = make_observation(mdp, "coordinates").table()
+        assert table.dtype == np.float32
+        assert np.array_equal(table, cells / np.maximum(size - 1, 1))
+
+
+def test_the_environments_own_observation():
+    images = np.random.default_rng(0).integers(3, 9, size=(4, 7, 7, 3)).astype(np.uint8)
+    table = make_observation(world(own_observation=images), "own")
+    assert np.array_equal(table.table(), images)
+    assert table.space == gym.spaces.Box(3, 8, (7, 7, 3), np.uint8)
+    assert observation_like(world(own_observation=images), table.space).kind == "own"
+    pixels = np.linspace(0, 255, 4 * 12).astype(np.uint8).reshape(4, 2, 2, 3)
+    table = make_observation(world(own_observation=pixels), "own")
+    assert np.array_equal(table.table(), pixels.reshape(4, 12))  # SB3 would take others for CnnPolicy's
+    table = make_observation(world(own_observation=np.array([5, 0, 2, 1])), "own")
+    assert table.space == gym.spaces.Discrete(6)
+    assert table.table().tolist() == [5, 0, 2, 1]
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [("own", "no observation of its own"), ("coordinates", "no places"), ("image", "no map")],
+)
+def test_a_world_without_what_an_observation_shows(kind, why):
+    with pytest.raises(InputError, match=f"^observation {kind}: .*row ha(s|ve) {why}") as refused:
+        make_observation(world(), kind)
+    assert str(refused.value).count("\n") == 0
+    assert observation_like(world(), gym.spaces.Discrete(4)).kind == "none"
+    with pytest.raises(InputError, match="no observation of this world"):
+        observation_like(world(), gym.spaces.Box(0, 1, (2,), np.float32))
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "DQN"])
+@pytest.mark.parametrize("numbers", [False, True])
+def test_agents_train_on_the_environments_own_observation(algorithm, numbers):
+    import stable_baselines3
+
+    from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
+    from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
+    from gridworld.agents.sb3.vec_env import GridWorldVecEnv
+
+    images = np.repeat(np.arange(4, dtype=np.uint8), 7 * 7 * 3).reshape(4, 7, 7, 3)
+    mdp = world(own_observation=np.arange(4) if numbers else images)
+    small = (
+        {"n_steps": 16, "n_epochs": 1} if algorithm == "PPO" else {"learning_starts": 20, "buffer_size": 100}
+    )
+    fast = {"PPO": TabulatedPPO, "DQN": TabulatedDQN}[algorithm]
+    for each in (getattr(stable_baselines3, algorithm), fast):
+        envs = gridworld.GridWorldVectorEnv(4, mdp=mdp, autoreset_mode="SameStep", max_episode_steps=9)
+        table = make_observation(mdp, "own")
+        model = each("MlpPolicy", GridWorldVecEnv(envs, table), seed=0, device="cpu", **small).learn(128)
+        assert model.num_timesteps >= 128
+        assert model.predict(table.rows(mdp.start_states))[0].shape == (1,)

@@ -19,9 +19,10 @@ import numpy as np
 
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 from gridworld.world.outcomes import Outcomes
-from gridworld.world.sources.exploring import Clocks, Graph, Subject, TimeMatters
+from gridworld.world.sources.exploring import Clocks, Graph, Subject, TimeMattersError
 
 _LONGEST = 10_000  # steps; who truncates later is taken to have no limit
+_UNLIMITED = 1_000  # steps within which rewards must not depend on the time where there is no limit
 _WALK = 40  # steps that an attribute must count to be a clock
 
 Rewards = dict[tuple[int, int], FloatArray]  # (L,) by (state, action), NaN where it cannot be reached
@@ -47,7 +48,7 @@ def own_limit(subject: Subject, graph: Graph, clocks: Clocks, longest: int | Non
     lasting = np.flatnonzero(~graph.terminated[0])
     if lasting.size:
         for time in range(min(longest or _LONGEST, _LONGEST)):
-            if subject.try_action(graph.snapshots[0], clocks, time, int(lasting[0])).truncated:
+            if subject.truncates(graph.snapshots[0], clocks, time, int(lasting[0])):
                 return time + 1
     return None
 
@@ -68,34 +69,40 @@ class Trials:
     clocks: Clocks
     own_limit: int | None
 
-    def rewards_by_time(self, limit: int, most_states: int) -> Rewards:
+    def rewards_by_time(self, limit: int | None, most_states: int) -> Rewards:
         """The rewards that depend on the time, within `limit` steps; empty where none does.
 
         Args:
-            limit: L, the last step of an episode.
+            limit: L, the last step of an episode; None: there is none.
             most_states: of states with their time, more are refused.
 
         Raises:
-            TimeMatters: something else depends on the time too.
+            TimeMattersError: something else depends on the time too.
             InputError: a reward does, and with the time there are too many states.
         """
-        others = itertools.cycle(np.random.default_rng(0).permutation(limit).tolist())
+        last = limit or _UNLIMITED
+        others = itertools.cycle(np.random.default_rng(0).permutation(last).tolist())
         varying: Rewards = {}
-        states = np.flatnonzero(self.graph.tried & (self.graph.depth < limit))
+        states = np.flatnonzero(self.graph.tried & (self.graph.depth < last))
         pays = np.abs(self.graph.reward[states]).max(axis=1)
         for state in states[np.argsort(-pays, kind="stable")].tolist():  # likely ones first
             first = int(self.graph.depth[state])
             for action in range(self.subject.num_actions):
-                times = {first, limit - 1, max(first, next(others))}
+                times = {first, last - 1, max(first, next(others))}
                 found = {self._reward(state, action, time) for time in times}
                 if found != {self.graph.reward[state, action]}:
                     if not varying:
                         self._check_size(limit, most_states)
-                    by_time = [self._reward(state, action, time) for time in range(first, limit)]
+                    by_time = [self._reward(state, action, time) for time in range(first, last)]
                     varying[state, action] = np.concatenate([np.full(first, np.nan), by_time])
         return varying
 
-    def _check_size(self, limit: int, most_states: int) -> None:
+    def _check_size(self, limit: int | None, most_states: int) -> None:
+        if limit is None:
+            raise self.subject.refusal(
+                "its reward depends on the elapsed time, and its episodes have no step limit, so that its "
+                "states have no end; set env.kwargs.max_episode_steps"
+            )
         size = _Layers(self.graph, limit).size
         if size > most_states:
             raise self.subject.refusal(
@@ -113,7 +120,7 @@ class Trials:
             or move.terminated != graph.terminated[state, action]
             or move.truncated != (self.own_limit is not None and time + 1 >= self.own_limit)
         ):
-            raise TimeMatters
+            raise TimeMattersError
         return move.reward
 
 

@@ -15,23 +15,22 @@ An end is a success as in `outcomes`; where the reward depends on the time, if i
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import EnumType
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+from gridworld.errors import InputError
 from gridworld.process.memory_budget import check_memory
 from gridworld.process.progress import telling_if_slow
 from gridworld.world.mdp import IntArray, Mdp
 from gridworld.world.outcomes import MOST_STATES, Outcomes, mdp_from_outcomes
 from gridworld.world.sources.elapsed_time import Trials, find_clocks, outcomes_of, own_limit, with_time
-from gridworld.world.sources.exploring import Clocks, Graph, Subject, TimeMatters, explore
+from gridworld.world.sources.exploring import Clocks, Graph, Subject, TimeMattersError, explore
 from gridworld.world.sources.making import make_env
 from gridworld.world.sources.replays import Replays
-
-_UNLIMITED = 1_000  # steps within which rewards must not depend on the time where episodes have no limit
 
 
 def enumerate_env(
@@ -75,7 +74,8 @@ class _Table:
 
 
 def _limit_of_id(env: gym.Env[Any, Any]) -> int | None:
-    return None if env.spec is None else env.spec.max_episode_steps
+    limit = None if env.spec is None else env.spec.max_episode_steps
+    return limit if limit is not None and limit > 0 else None  # -1 is "none" to `gymnasium.make`
 
 
 def _tabulate(subject: Subject, limit_of_id: int | None, most_states: int) -> _Table:
@@ -83,25 +83,22 @@ def _tabulate(subject: Subject, limit_of_id: int | None, most_states: int) -> _T
     if clocks:
         try:
             return _without_time(subject, clocks, limit_of_id, most_states)
-        except TimeMatters:
+        except TimeMattersError:
             pass
-    graph = explore(subject, {}, most_states)
+    graph = explore(subject, {}, most_states, limit_of_id if clocks else None)
     limit = _least(_common_limit(subject, graph), limit_of_id)
     return _Table(graph, {}, _plain(graph), np.arange(len(graph.keys)), limit)
 
 
 def _without_time(subject: Subject, clocks: Clocks, limit_of_id: int | None, most_states: int) -> _Table:
     graph = explore(subject, clocks, most_states)
+    if len(np.unique(graph.truncated[graph.tried])) > 1:
+        raise _no_common_limit(subject)
     own = own_limit(subject, graph, clocks, limit_of_id)
     limit = _least(own, limit_of_id)
-    rewards = Trials(subject, graph, clocks, own).rewards_by_time(limit or _UNLIMITED, most_states)
-    if not rewards:
+    rewards = Trials(subject, graph, clocks, own).rewards_by_time(limit, most_states)
+    if not rewards or limit is None:  # without a limit no reward varies
         return _Table(graph, clocks, _plain(graph), np.arange(len(graph.keys)), limit)
-    if limit is None:
-        raise subject.refusal(
-            "its rewards depend on the elapsed time, and episodes have no limit, so that its states have no "
-            "number; set env.kwargs.max_episode_steps"
-        )
     timed = with_time(graph, rewards, limit)
     return _Table(graph, clocks, timed.outcomes, timed.state, limit)
 
@@ -125,11 +122,14 @@ def _common_limit(subject: Subject, graph: Graph) -> int | None:
         or not graph.truncated[at_the_end].all()
         or (graph.depth[graph.tried] >= times[0]).any()
     ):
-        raise subject.refusal(
-            "it truncates some episodes earlier than others, by a rule of its own, which a step limit does not "
-            "say"
-        )
+        raise _no_common_limit(subject)
     return int(times[0])
+
+
+def _no_common_limit(subject: Subject) -> InputError:
+    return subject.refusal(
+        "it truncates some episodes earlier than others, which no step limit of the world says"
+    )
 
 
 def _compile(name: str, table: _Table, subject: Subject) -> Mdp:
@@ -138,14 +138,14 @@ def _compile(name: str, table: _Table, subject: Subject) -> Mdp:
         rows = table.graph.observations
         check_memory(f"env.id={name}: its own observations", len(table.state) * rows[0].nbytes)
         observations = np.stack(rows)[table.state]
-    return mdp_from_outcomes(
+    mdp = mdp_from_outcomes(
         name,
         table.outcomes,
         action_names=_action_names(subject),
         max_episode_steps=table.max_episode_steps,
         own_observation=observations,
-        truth=f"enumerated, {len(table.state):,} states",
     )
+    return replace(mdp, truth=f"enumerated, {mdp.num_states:,} states")
 
 
 def _action_names(subject: Subject) -> list[str] | None:
@@ -154,8 +154,5 @@ def _action_names(subject: Subject) -> list[str] | None:
     if not isinstance(actions, EnumType):
         return None
     names = {member.value: member.name for member in actions}  # type: ignore[var-annotated]
-    return (
-        [names[action] for action in range(subject.num_actions)]
-        if set(names) >= set(range(subject.num_actions))
-        else None
-    )
+    numbers = range(subject.num_actions)
+    return [names[number] for number in numbers] if names.keys() >= set(numbers) else None

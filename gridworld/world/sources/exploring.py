@@ -28,7 +28,7 @@ _MOST_BYTES = 2**31  # of all copies and observations together
 _SEEDS = 8  # resets that must lead to the same state
 
 
-class TimeMatters(Exception):
+class TimeMattersError(Exception):
     """A step does something else at another time."""
 
 
@@ -72,8 +72,12 @@ class Subject:
         if len(keys) > 1:
             raise self.refusal(
                 "a reset leads to another state with another seed, so that its states cannot be enumerated "
-                "from one start; take an environment whose layout and start are fixed"
+                f"from one start{self._remedy or '; take an environment whose layout and start are fixed'}"
             )
+
+    @property
+    def _remedy(self) -> str:
+        return "; it has a transition table, so take env=gymnasium" if hasattr(self.env, "P") else ""
 
     def refusal(self, reason: str) -> InputError:
         """An error that says why there is no table of it."""
@@ -83,6 +87,16 @@ class Subject:
         """The key of the state after a reset, and the observation."""
         observation, _ = self.env.reset(seed=seed)
         return self.key(), observation
+
+    def truncates(self, snapshot: bytes, clocks: Clocks, time: int, action: int) -> bool:
+        """Whether an action truncates, as in `try_action`."""
+        self._set(snapshot, clocks, time)
+        return self.step(action)[3]
+
+    def _set(self, snapshot: bytes, clocks: Clocks, time: int) -> None:
+        self.snapshots.put_back(snapshot)
+        for clock, first in clocks.items():
+            setattr(self.env, clock, first + time)
 
     def step(self, action: int) -> tuple[Any, float, bool, bool]:
         """Observation, reward, terminated and truncated of a step.
@@ -116,18 +130,15 @@ class Subject:
         Raises:
             InputError: the step fails, or draws a random number.
         """
-        self.snapshots.put_back(snapshot)
-        for clock, first in clocks.items():
-            setattr(self.env, clock, first + time)
+        self._set(snapshot, clocks, time)
         before = random_states(self.env)
         observation, reward, terminated, truncated = self.step(action)
         if random_states(self.env) != before:
-            remedy = "; it has a transition table, so take env=gymnasium" if hasattr(self.env, "P") else ""
             raise self.refusal(
-                f"a step with action {action} draws a random number, so that it need not be deterministic{remedy}"
+                f"a step with action {action} draws a random number, so it is not deterministic{self._remedy}"
             )
         if any(getattr(self.env, clock, None) != first + time + 1 for clock, first in clocks.items()):
-            raise TimeMatters
+            raise TimeMattersError
         return Move(self.key(clocks), key_of(observation), observation, reward, terminated, truncated)
 
 
@@ -187,16 +198,17 @@ class _Found:
         return len(self.number) - 1
 
 
-def explore(subject: Subject, clocks: Clocks, most_states: int) -> Graph:
+def explore(subject: Subject, clocks: Clocks, most_states: int, deepest: int | None = None) -> Graph:
     """Find all states that can be reached, breadth first, and what every action does there.
 
     Args:
         subject: the environment.
         clocks: attributes that are no part of a state; they are as after a reset before each step.
         most_states: more are refused.
+        deepest: states that are this many steps from the start are not tried.
 
     Raises:
-        TimeMatters: the clocks do not count every step, or observations show them.
+        TimeMattersError: the clocks do not count every step, or observations show them.
         InputError: too many states; or what `Subject.try_action` refuses.
     """
     _, observation = subject.reset(0)
@@ -211,7 +223,8 @@ def explore(subject: Subject, clocks: Clocks, most_states: int) -> Graph:
             move = subject.try_action(found.snapshots[state], clocks, 0, action)
             following = _state_of(subject, found, move, found.depth[state] + 1, clocks, most_states)
             rows[state].append((following, move.reward, move.terminated, move.truncated))
-            if not (move.terminated or (move.truncated and not clocks) or found.goes_on[following]):
+            over = move.terminated or (move.truncated and not clocks) or found.depth[following] == deepest
+            if not (over or found.goes_on[following]):
                 found.goes_on[following] = True
                 pending.append(following)
     return _as_graph(found, rows, subject.num_actions)
@@ -236,7 +249,7 @@ def _state_of(
         check_memory(f"env.id={subject.name}", found.num_bytes)
     elif found.seen[state] != move.seen:
         if clocks:
-            raise TimeMatters
+            raise TimeMattersError
         raise subject.refusal(
             "the same state is shown by different observations, so that what an agent sees is no function of "
             "the state"

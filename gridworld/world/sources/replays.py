@@ -129,6 +129,6 @@ class Replays:
         if found != expected:
             shown = f" ({found}, enumerated as {expected})" if what != "state" else ""
             raise self._subject.refusal(
-                f"after {steps} steps of an episode its {what} is another one than that enumerated{shown}: it is "
-                "random, keeps a state outside of its attributes, or its wrappers change it"
+                f"after {steps} steps of an episode its {what} is not the enumerated one{shown}, so it is "
+                "random, has state outside of its attributes, or a wrapper that changes it"
             )

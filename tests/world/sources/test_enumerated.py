@@ -1,0 +1,224 @@
+"""Deterministic environments become tables; whatever is not deterministic is refused with a reason."""
+
+import random
+from collections import deque
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from gridworld.errors import InputError
+from gridworld.world.evaluation import Evaluator
+from gridworld.world.mdp import Mdp
+from gridworld.world.sources.enumerated import enumerate_env
+
+CELLS = 5
+MINIGRID = "MiniGrid-Empty-5x5-v0"
+_of_the_process = [0]  # state where no copy of an environment has it
+
+
+class Corridor(gym.Env[Any, int]):
+    """Cells 0 to 4; action 1 goes right, 0 left; the last cell ends the episode and pays 1."""
+
+    observation_space: gym.Space[Any] = spaces.Discrete(CELLS)
+
+    def __init__(self, render_mode: str | None = None, variant: str = "plain", limit: int = 0) -> None:
+        self.action_space = spaces.Discrete(2)
+        self.render_mode, self.variant, self.limit = render_mode, variant, limit
+        self.cell = self.steps = 0
+        self.past: deque[int] = deque(maxlen=2)
+        if variant == "pixels":
+            self.observation_space = spaces.Box(0, 255, (2, 2, 3), np.uint8)
+        if variant == "text":
+            self.observation_space = spaces.Text(3)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.cell = int(self.np_random.integers(3)) if self.variant == "layout" else 0
+        self.steps = 0
+        self.past.clear()
+        return self._observation(), {}
+
+    def _observation(self) -> Any:
+        if self.variant == "pixels":
+            return np.full((2, 2, 3), 255 * self.cell // (CELLS - 1), dtype=np.uint8)
+        return str(self.cell) if self.variant == "text" else self.cell
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if self.variant == "fails" and self.cell == 2:
+            raise RuntimeError("no third cell")
+        forward = action == 1
+        if self.variant == "random":
+            forward = forward and self.np_random.random() < 0.999
+        if self.variant == "global":
+            forward = forward and random.random() < 0.999
+        if self.variant == "hidden":
+            _of_the_process[0] += 1
+            forward = forward and _of_the_process[0] % 97 != 0
+        if self.variant == "gate":  # open at even times
+            forward = forward and (self.cell != 2 or self.steps % 2 == 0)
+        if self.variant == "past":
+            self.past.append(action)
+            forward = forward and sum(self.past) == 2
+        if self.variant == "endless":
+            self.past = deque([*self.past, action])
+        self.cell = min(self.cell + 1, CELLS - 1) if forward else max(self.cell - 1, 0)
+        self.steps += 1
+        terminated = self.cell == CELLS - 1
+        reward = float(terminated)
+        if self.variant in ("decay", "gate"):
+            reward *= 0.9**self.steps
+        if self.variant == "once" and self.steps == 37:
+            reward += 1
+        truncated = 0 < self.limit <= self.steps or (self.variant == "cut" and self.cell == 2)
+        return self._observation(), reward, terminated, truncated, {}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _registered() -> Any:
+    gym.register("Corridor-v0", entry_point=Corridor)
+    gym.register("ShortCorridor-v0", entry_point=Corridor, max_episode_steps=12)
+    gym.register(
+        "DoubledCorridor-v0",
+        entry_point=Corridor,
+        additional_wrappers=(
+            gym.envs.registration.WrapperSpec(
+                "TransformReward", "gymnasium.wrappers:TransformReward", {"func": lambda reward: 2 * reward}
+            ),
+        ),
+    )
+    yield
+    for name in ("Corridor-v0", "ShortCorridor-v0", "DoubledCorridor-v0"):
+        del gym.registry[name]
+
+
+@pytest.fixture(scope="module")
+def empty() -> Mdp:
+    return enumerate_env(MINIGRID)
+
+
+def walk_beside(mdp: Mdp, env: gym.Env[Any, Any], steps: int, entry: str | None = None) -> int:
+    """Random episodes in the environment and in its table; returns how many ended with a reward."""
+    numbers, paid = np.random.default_rng(3), 0
+    while steps > 0:
+        observation, _ = env.reset(seed=int(numbers.integers(1000)))
+        state, elapsed, over = int(mdp.start_states[0]), 0, False
+        while not over:
+            assert mdp.own_observation is not None
+            shown = observation[entry] if entry else observation
+            assert np.array_equal(mdp.own_observation[state], shown)
+            action = int(numbers.integers(mdp.num_actions if numbers.random() < 0.3 else 3)) % mdp.num_actions
+            observation, reward, terminated, truncated, _ = env.step(action)
+            assert float(reward) == mdp.reward[state, action, 0]
+            state, elapsed, steps = int(mdp.next_state[state, action, 0]), elapsed + 1, steps - 1
+            assert terminated == mdp.terminal[state]
+            assert truncated == (mdp.max_episode_steps is not None and elapsed >= mdp.max_episode_steps)
+            over = terminated or truncated
+        paid += bool(reward)
+    env.close()
+    return paid
+
+
+def test_minigrid_has_a_state_for_every_position_and_time(empty: Mdp) -> None:
+    assert empty.action_names == ("left", "right", "forward", "pickup", "drop", "toggle", "done")
+    assert empty.truth == f"enumerated, {empty.num_states:,} states"
+    assert empty.max_episode_steps == 100
+    # 8 cells without the goal, 4 directions, at most 101 times; a goal that is entered to the right or down.
+    assert 32 * 90 < empty.num_states < 34 * 101
+    assert empty.own_observation is not None
+    assert empty.own_observation.shape == (empty.num_states, 7, 7, 3)
+    assert empty.own_observation.dtype == np.uint8
+    assert empty.goal.sum() == empty.terminal.sum() > 150
+    last = empty.absorbing & ~empty.terminal  # at the step limit: truncated, not terminated
+    assert last.sum() == 32
+
+
+def test_minigrid_is_the_environment_step_by_step(empty: Mdp) -> None:
+    assert walk_beside(empty, gym.make(MINIGRID), 2000, "image") > 10
+
+
+def test_the_optimum_of_minigrid_is_the_shortest_way_by_its_formula(empty: Mdp) -> None:
+    judge = Evaluator(empty, 1.0, 100)
+    assert judge.optimal_value == pytest.approx(1 - 0.9 * 5 / 100, abs=1e-12)  # two ahead, a turn, two ahead
+    assert judge.optimum.expected_length == 5
+    # Backward over the time, with nothing of the solver: the value at the limit is 0.
+    assert judge.solution.v[empty.start_states[0]] == pytest.approx(best_return(gym.make(MINIGRID), 8))
+    sitting = np.eye(7)[np.full(empty.num_states, 6)]
+    score = judge.score(sitting)
+    assert (score.value, score.outcome.timeout, score.outcome.expected_length) == (0, 1, 100)
+
+
+def best_return(env: gym.Env[Any, Any], depth: int) -> float:
+    """By trying all sequences of left, right and forward in the environment itself, shortest first."""
+    ways: list[list[int]] = [[]]
+    for _ in range(depth):
+        ways = [[*way, action] for way in ways for action in range(3)]
+        for way in ways:
+            env.reset(seed=0)
+            total = sum(float(env.step(action)[1]) for action in way)
+            if total > 0:
+                env.close()
+                return total
+    raise AssertionError("no way to the goal")
+
+
+@pytest.mark.parametrize("variant", ["plain", "past", "gate", "decay", "pixels"])
+@pytest.mark.parametrize("limit", [0, 20])
+def test_any_deterministic_environment(variant: str, limit: int) -> None:
+    kwargs = {"variant": variant, "limit": limit}
+    env_id = "Corridor-v0" if limit else "ShortCorridor-v0"
+    mdp = enumerate_env(env_id, kwargs)
+    assert mdp.max_episode_steps == (limit or 12)
+    walk_beside(mdp, gym.make(env_id, **kwargs), 500)
+    if variant in ("plain", "pixels"):
+        assert mdp.num_states == CELLS  # the steps are counted, but nothing depends on them
+    best = {"plain": 1.0, "pixels": 1.0, "past": 1.0, "gate": 0.9**4, "decay": 0.9**4}[variant]
+    assert Evaluator(mdp, 1.0, limit or 12).optimal_value == pytest.approx(best)
+
+
+def test_a_world_without_a_step_limit() -> None:
+    mdp = enumerate_env("Corridor-v0")
+    assert (mdp.num_states, mdp.max_episode_steps, mdp.action_names) == (CELLS, None, ("0", "1"))
+    assert mdp.goal.tolist() == [False] * 4 + [True]
+    assert mdp.next_state[:, :, 0].tolist() == [[0, 1], [0, 2], [1, 3], [2, 4], [4, 4]]
+
+
+def test_an_observation_that_is_no_array_is_left_out() -> None:
+    assert enumerate_env("Corridor-v0", {"variant": "text"}).own_observation is None
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kwargs", "reason"),
+    [
+        ("Corridor-v0", {"variant": "random"}, "draws a random number"),
+        ("Corridor-v0", {"variant": "global"}, "draws a random number"),
+        ("Corridor-v0", {"variant": "layout"}, "a reset leads to another state with another seed"),
+        ("Corridor-v0", {"variant": "hidden"}, "is random, has state outside of its attributes"),
+        ("Corridor-v0", {"variant": "once", "limit": 50}, "enumerated as"),
+        ("Corridor-v0", {"variant": "endless"}, "more than 300 states"),
+        ("Corridor-v0", {"variant": "decay"}, "episodes have no step limit"),
+        ("Corridor-v0", {"variant": "decay", "limit": 200}, "with it there are .* states, 5 without it"),
+        ("Corridor-v0", {"variant": "cut"}, "truncates some episodes earlier"),
+        ("Corridor-v0", {"variant": "fails"}, "a step with action 0 fails: no third cell"),
+        ("Corridor-v0", {"size": 3}, "unexpected keyword argument 'size'"),
+        ("DoubledCorridor-v0", {}, r"its reward is not the enumerated one \(2.0, enumerated as 1.0\)"),
+        ("MiniGrid-FourRooms-v0", {}, "a reset leads to another state"),
+        ("MiniGrid-Empty-Random-6x6-v0", {}, "a reset leads to another state"),
+        ("FrozenLake-v1", {}, "take env=gymnasium"),
+        ("Taxi-v4", {}, "another seed, .* take env=gymnasium"),
+        ("Pendulum-v1", {}, r"its actions are Box"),
+        ("NoSuchWorld-v0", {}, "doesn't exist"),
+    ],
+)
+def test_what_cannot_be_enumerated_is_refused(env_id: str, kwargs: dict[str, Any], reason: str) -> None:
+    with pytest.raises(InputError, match=f"^env.id={env_id}: .*{reason}") as refused:
+        enumerate_env(env_id, kwargs, most_states=300)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "minigrid", None)
+    with pytest.raises(InputError, match=r"needs the package minigrid; install it with pip install"):
+        enumerate_env(MINIGRID)
