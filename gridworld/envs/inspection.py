@@ -16,9 +16,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from gridworld.bounds import at_most
+from gridworld.bounds import STEP_LIMIT, at_most
 from gridworld.envs.observations import KINDS, ObservationTable, TableObservation, make_observation
-from gridworld.envs.registration import STEP_LIMIT
 from gridworld.envs.rendering import frame_size
 from gridworld.errors import InputError
 from gridworld.world.grid import GridMdp, compile_mdp
