@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from gridworld.config.composition.words import digits
 from gridworld.errors import EXIT_CODE, InputError, failure
 from gridworld.process.early_signals import AtWork
 from gridworld.process.terminal import prepare, printing, tell_error
@@ -61,6 +62,18 @@ def add_best(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="the model with the lowest exact regret on the way, not the last one",
     )
+
+
+def whole_number(text: str) -> int:
+    """The type of an option that takes a whole number, which may be written as 1e5.
+
+    Raises:
+        argparse.ArgumentTypeError: it is none.
+    """
+    try:
+        return int(digits(text))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a whole number, not {text}") from None
 
 
 def run(main: Main) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from gridworld.commands import parser_for_a_run
+from gridworld.commands import parser_for_a_run, whole_number
 from gridworld.envs.env import GridWorldEnv
 from gridworld.envs.rendering import has_display
 from gridworld.envs.rollout import SampledScores, play_episode, sample_episodes
@@ -60,8 +60,10 @@ def main(arguments: Sequence[str]) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = parser_for_a_run(program("evaluate"), __doc__)
     parser.add_argument("--layout", help="score it on another map of the same size: a name or a file")
-    parser.add_argument("--episodes", type=int, default=1000, help="episodes to sample (default 1000)")
-    parser.add_argument("--seed", type=int, default=0, help="of the sampled episodes (default 0)")
+    parser.add_argument(
+        "--episodes", type=whole_number, default=1000, help="episodes to sample (default 1000)"
+    )
+    parser.add_argument("--seed", type=whole_number, default=0, help="of the sampled episodes (default 0)")
     parser.add_argument("--render", choices=("human",), help="first show one episode in a window")
     return parser
 

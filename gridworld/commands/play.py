@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gridworld.commands import add_best
+from gridworld.commands import add_best, whole_number
 from gridworld.commands.game import Game, Key, draw
 from gridworld.config.train import EvaluationConfig
 from gridworld.config.worlds import MapConfig
@@ -96,15 +96,15 @@ def play(game: Game, cell_size: int) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=program("play"), description=__doc__)
     parser.add_argument("--layout", help="a shipped map's name or a map file (default classic)")
-    parser.add_argument("--num-rows", type=int, help="of the layout classic (default 5)")
-    parser.add_argument("--num-cols", type=int, help="of the layout classic (default 6)")
+    parser.add_argument("--num-rows", type=whole_number, help="of the layout classic (default 5)")
+    parser.add_argument("--num-cols", type=whole_number, help="of the layout classic (default 6)")
     parser.add_argument("--slip", type=float, help="probability of slipping aside (default 0)")
     parser.add_argument("--step-reward", type=float, help="paid for every step (default 0)")
     parser.add_argument("--goal-reward", type=float, help="paid for entering a goal (default 1)")
     parser.add_argument("--trap-reward", type=float, help="paid for entering a trap (default -1)")
     parser.add_argument("--gamma", type=float, help="discount of returns, 0 to 1 (default 0.99)")
-    parser.add_argument("--seed", type=int, default=0, help="of starts and slips (default 0)")
-    parser.add_argument("--cell-size", type=int, help="pixels (default 100, less on large maps)")
+    parser.add_argument("--seed", type=whole_number, default=0, help="of starts and slips (default 0)")
+    parser.add_argument("--cell-size", type=whole_number, help="pixels (default 100, less on large maps)")
     parser.add_argument(
         "--agent", type=Path, metavar="RUN", help="a finished run: its agent plays beside you, in its world"
     )

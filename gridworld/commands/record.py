@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.commands import parser_for_a_run
+from gridworld.commands import parser_for_a_run, whole_number
 from gridworld.config.pictures import PICTURES
 from gridworld.envs.rendering import frame_size
 from gridworld.envs.rollout import play
@@ -102,11 +102,11 @@ def _parser() -> argparse.ArgumentParser:
         "(default png gif; mp4 needs the extra `video`)",
     )
     parser.add_argument(
-        "--cell-size", type=int, help="pixels (default 100, 80 in maps, less on large worlds)"
+        "--cell-size", type=whole_number, help="pixels (default 100, 80 in maps, less on large worlds)"
     )
-    parser.add_argument("--fps", type=int, default=4, help="frames a second, 1 to 100 (default 4)")
-    parser.add_argument("--episodes", type=int, default=1, help="one after the other (default 1)")
-    parser.add_argument("--seed", type=int, default=0, help="of the first episode (default 0)")
+    parser.add_argument("--fps", type=whole_number, default=4, help="frames a second, 1 to 100 (default 4)")
+    parser.add_argument("--episodes", type=whole_number, default=1, help="one after the other (default 1)")
+    parser.add_argument("--seed", type=whole_number, default=0, help="of the first episode (default 0)")
     parser.add_argument("--out", type=Path, help="the folder to write to (default RUN/recording)")
     return parser
 

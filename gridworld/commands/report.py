@@ -13,7 +13,7 @@ import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 
-from gridworld.commands import parser_for_runs
+from gridworld.commands import parser_for_runs, whole_number
 from gridworld.errors import InputError
 from gridworld.process.command_line import program
 from gridworld.process.memory_budget import limited
@@ -82,7 +82,7 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="curves against the logarithm of the steps (without it, where an agent is ten times slower)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the bootstrap (default 0)")
+    parser.add_argument("--seed", type=whole_number, default=0, help="of the bootstrap (default 0)")
     return parser
 
 

@@ -6,12 +6,13 @@ classes that the run names wherever they are from, `anyway=true` accepts other v
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from gridworld.config.composition.words import with_whole_numbers
+from gridworld.config.composition.words import digits
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import limited
 from gridworld.process.terminal import result_is_in_files
@@ -76,7 +77,8 @@ def _folder(text: str) -> str:
 
 
 def _step_count(text: str) -> int:
-    text = with_whole_numbers([f"total_timesteps={text}"])[0].partition("=")[2]  # 1e5
+    with contextlib.suppress(ValueError):
+        text = digits(text)  # 1e5
     if not text.isascii() or not text.isdecimal() or len(text) > 18 or int(text) < 1:
         raise ValueError("a number of environment steps")
     return int(text)

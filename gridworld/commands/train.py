@@ -71,7 +71,7 @@ def _sum_up(sweep: Path, kind: object, error: BaseException | None, trace: objec
     from gridworld.report.writer import write_over_seeds
 
     with contextlib.suppress(InputError, OSError, FolderLostError):  # the report says what cannot be used
-        if (folder := write_over_seeds(sweep)) is not None:
+        if (folder := write_over_seeds(sweep, sweep)) is not None:
             print(f"  over seeds: {printable(shown(folder))}, beside the jobs in TensorBoard")
 
 

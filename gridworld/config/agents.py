@@ -12,7 +12,7 @@ import importlib
 import math
 import pkgutil
 from dataclasses import dataclass, field
-from typing import Protocol, Union
+from typing import Annotated, Any, Protocol, Union
 
 from gridworld.bounds import above_zero, within
 from gridworld.config.effects import Effect, affects
@@ -24,6 +24,7 @@ LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
 Schedule = Union[int, float, str]  # noqa: UP007
+WholeNumbers = Annotated[Any, "a whole number, or lists and dicts of them"]  # OmegaConf reads it as Any
 
 
 @dataclass

@@ -20,7 +20,7 @@ from gridworld.storage.atomic_write import replacing_folder, write_text
 
 PAGE = "report.html"
 FIGURES, TABLES, EVENTS = "figures", "tables", "tensorboard"
-OVER_SEEDS = "_over_seeds"  # in a sweep's folder; TensorBoard shows it before the jobs
+OVER_SEEDS = "_over_seeds"  # in a sweep's folder or a study's; TensorBoard shows it before the runs
 _MOST_READ_UNASKED = 500  # runs of a sweep: a second
 _OURS = {PAGE, FIGURES, TABLES, EVENTS}
 _LONGEST_NAME = 120
@@ -82,29 +82,30 @@ def write_report(report: Report, folder: Path, formats: Sequence[str] = FORMATS)
     return folder / PAGE
 
 
-def write_over_seeds(sweep: Path) -> Path | None:
-    """Write a sweep's curves over seeds into its folder, where TensorBoard shows them beside the jobs' own.
+def write_over_seeds(runs: Path, folder: Path) -> Path | None:
+    """Write the curves over seeds of a sweep or a study, for TensorBoard to show beside those of the runs.
 
     Args:
-        sweep: its folder. What was written there before is replaced.
+        runs: the folder that has the runs' folders.
+        folder: of the sweep or the study. What was written there before is replaced.
 
     Returns:
-        The folder; None where no agent has two seeds, there are too many runs to read them all, or none has
-        curves for TensorBoard.
+        What was made; None where no agent has two seeds, there are too many runs to read them all, or
+        none has curves for TensorBoard.
 
     Raises:
         InputError: no run can be used.
         OSError: the folder cannot be written.
     """
-    count = sum(1 for _ in sweep.glob(f"*/{MANIFEST}"))
-    if count > _MOST_READ_UNASKED or not any(sweep.glob(f"*/{EVENT_FILE}")):
+    count = sum(1 for _ in runs.glob(f"*/{MANIFEST}"))
+    if count > _MOST_READ_UNASKED or not any(runs.glob(f"*/{EVENT_FILE}")):
         return None
-    report = gather([sweep])
+    report = gather([runs])
     if all(len(result.group.runs) < 2 for task in report.tasks for result in task.results):
         return None
-    with replacing_folder(sweep / OVER_SEEDS) as new:
+    with replacing_folder(folder / OVER_SEEDS) as new:
         _write_events(report, new)
-    return sweep / OVER_SEEDS
+    return folder / OVER_SEEDS
 
 
 def _write_events(report: Report, folder: Path) -> None:

@@ -186,7 +186,7 @@ class Unfinished:
         def begin() -> RunWriter:
             return RunWriter.resume(run, steps, config.total_timesteps, differs)
 
-        return carry_out(config, run.folder, mdp, begin, log, state, on_built)
+        return carry_out(config, run.folder, mdp, begin, log, (run, state), on_built)
 
     def _tell_if_map_changed(self) -> None:
         if isinstance(self.config.env, BuiltConfig | GymnasiumConfig):  # which would run their code

@@ -41,11 +41,13 @@ class Checkpoints:
 
     Attributes:
         newest: Environment steps at the newest one that this process wrote or resumed from; None: none.
+        held: Environment steps at one that is kept however many are saved; None: none.
     """
 
     def __init__(self, run_folder: Path) -> None:
         self.folder = run_folder / CHECKPOINTS
         self.newest: int | None = None
+        self.held: int | None = None
 
     def save(self, steps: int, state: State, durable: bool = True, small: bool = False) -> None:
         """Write a checkpoint and remove the oldest.
@@ -70,12 +72,13 @@ class Checkpoints:
         if durable and is_new:
             sync_folder(self.folder.parent)
         self.newest = steps
-        self.keep(_KEPT)
+        self.keep(_KEPT, self.held)
 
-    def keep(self, count: int) -> None:
-        """Remove all but the `count` newest."""
+    def keep(self, count: int, held: int | None = None) -> None:
+        """Remove all but the `count` newest, and the one of `held` environment steps."""
         for old in self.files()[count:]:
-            remove_path(old)
+            if steps_of(old) != held:
+                remove_path(old)
 
     def files(self) -> list[Path]:
         """The files, newest first.

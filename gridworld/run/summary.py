@@ -110,10 +110,11 @@ def _rows(summary: Summary, within_limit: bool) -> list[list[str]]:
 
 def verdict(summary: Summary) -> str:
     """Whether the final greedy policy is optimal, in a sentence."""
+    truth = f" (world: {summary['truth']})" if "truth" in summary else ""
     if summary["certified"]:
-        return f"certified optimal since step {summary['certified_since_step']:,}"
+        return f"certified optimal since step {summary['certified_since_step']:,}{truth}"
     circles = circles_text(summary["endless_cells"], summary["timeout_probability"])
-    return f"not optimal: regret {summary['regret']:.3g}{circles}"
+    return f"not optimal: regret {summary['regret']:.3g}{circles}{truth}"
 
 
 def circles_text(cells: Sequence[Sequence[int]], timeout_probability: float) -> str:

@@ -30,7 +30,7 @@ from gridworld.storage.atomic_write import in_background, write_array, write_byt
 from gridworld.storage.serialization import State, fitting
 from gridworld.training.learning_curve import LearningCurve, Sink
 from gridworld.training.pictures import Pictures
-from gridworld.training.sinks import CHARTS, HPARAM_METRICS, CurveFile, CurveScalars, ProgressLine, read_curve
+from gridworld.training.sinks import CHARTS, CurveFile, CurveScalars, ProgressLine, read_curve
 from gridworld.training.summary import CLOCK, as_json, summarise
 from gridworld.training.tensorboard import EventWriter, as_markdown, hparams
 from gridworld.world.evaluation import Evaluator
@@ -179,7 +179,7 @@ class Session:
             self._parts.curve.catch_up()
             return
         if self._events is not None:
-            self._events.hparams(hparams(self._config), HPARAM_METRICS)
+            self._events.hparams(hparams(self._config))
             self._events.charts("greedy and sampled policy beside the optimum", CHARTS)
             self._events.text("run/command", f"    {shlex.join(self._run.manifest['command'])}", 0)
             self._events.text("run/settings", as_markdown(dataclasses.asdict(self._config)), 0)

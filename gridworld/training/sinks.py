@@ -51,11 +51,6 @@ CURVE_COLUMNS = (
     *(f"sampled_{metric.name}" for metric in METRICS),
     *(metric.name for metric in TRAINING_METRICS),
 )
-HPARAM_METRICS = tuple(  # those that have a chart first
-    _greedy_tag(metric)
-    for metric in sorted(METRICS, key=lambda metric: metric.chart is None)
-    if metric.is_headline
-)
 
 
 class CurveFile:

@@ -9,6 +9,7 @@ from gridworld.config.train import TrainConfig
 from gridworld.run.summary import Summary
 from gridworld.training.learning_curve import Evaluation, LearningCurve
 from gridworld.world.evaluation import Score
+from gridworld.world.mdp import EXACT
 from gridworld.world.metrics import numbers, optimal_numbers
 
 CLOCK = {"train_seconds", "evaluation_seconds"}  # the summary's times
@@ -30,6 +31,7 @@ def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, secon
     return {
         "agent": config.agent.name,
         "env": evaluator.mdp.name,
+        **_of_another_truth(evaluator.mdp.truth),
         "observation": config.observation.kind,
         "seed": config.seed,
         "total_timesteps": config.total_timesteps,
@@ -48,6 +50,10 @@ def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, secon
         "train_seconds": round(seconds, 3),
         "evaluation_seconds": round(curve.seconds, 3),
     }
+
+
+def _of_another_truth(truth: str) -> dict[str, str]:
+    return {} if truth == EXACT else {"truth": truth}
 
 
 def as_json(content: Any) -> Any:

@@ -82,29 +82,21 @@ class EventWriter:
         """Write an encoded GIF, `size` pixels wide and high; TensorBoard's Images tab plays it."""
         self._image(tag, gif, size, step)
 
-    def hparams(self, values: Mapping[str, HParamValue], metrics: Sequence[str]) -> None:
-        """Write the run's entry in the HParams table; its metrics are scalar tags of this same run."""
+    def hparams(self, values: Mapping[str, HParamValue]) -> None:
+        """Write the run's entry in the HParams table; its metrics are scalar tags of this same run.
+
+        Nothing is said of the whole experiment: then TensorBoard looks at all runs that it shows, and puts
+        the settings that differ between them first.
+        """
         start = plugin_data_pb2.SessionStartInfo(start_time_secs=time.time())
-        infos = []
         for name, value in values.items():
-            info = api_pb2.HParamInfo(name=name)
             if isinstance(value, bool):
                 start.hparams[name].bool_value = value
-                info.type = api_pb2.DATA_TYPE_BOOL
             elif isinstance(value, int | float):
                 start.hparams[name].number_value = value
-                info.type = api_pb2.DATA_TYPE_FLOAT64
             else:
                 # A name that the locale could not decode has characters that no protocol buffer takes.
                 start.hparams[name].string_value = str(value).encode("utf-8", "backslashreplace").decode()
-                info.type = api_pb2.DATA_TYPE_STRING
-            infos.append(info)
-        experiment = api_pb2.Experiment(
-            hparam_infos=infos,
-            metric_infos=[api_pb2.MetricInfo(name=api_pb2.MetricName(tag=tag)) for tag in metrics],
-            time_created_secs=time.time(),
-        )
-        self._session(metadata.EXPERIMENT_TAG, plugin_data_pb2.HParamsPluginData(experiment=experiment))
         self._session(
             metadata.SESSION_START_INFO_TAG, plugin_data_pb2.HParamsPluginData(session_start_info=start)
         )

@@ -13,10 +13,12 @@ from gridworld.agents import Agent, TrainingContext, family
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import ObservationTable, make_observation
-from gridworld.errors import InputError, MachineError, reason
+from gridworld.errors import FolderLostError, InputError, MachineError, reason
 from gridworld.process.command_line import recorded_command_line
 from gridworld.process.signals import Interrupted
+from gridworld.process.terminal import tell
 from gridworld.run.folder import RunFolder, shown
+from gridworld.run.reader import RunReader
 from gridworld.run.summary import Summary, interruption_text
 from gridworld.run.train_log import TrainLog
 from gridworld.run.undo import FilesBefore
@@ -77,7 +79,7 @@ def carry_out(
     mdp: Mdp,
     begin: Callable[[], RunWriter],
     log: TrainLog,
-    state: State | None = None,
+    earlier: tuple[RunReader, State] | None = None,
     on_built: OnBuilt = ignore,
 ) -> Summary:
     """Train from the start or continue from a state, with settings that were checked.
@@ -88,7 +90,7 @@ def carry_out(
         mdp: the run's world.
         begin: writes the manifest, once the agent is built.
         log: takes what is warned about; its file is opened here.
-        state: the content of a checkpoint; None: from the start.
+        earlier: the run as its folder has it and the content of a checkpoint; None: from the start.
         on_built: as for `train`.
 
     Returns:
@@ -99,9 +101,10 @@ def carry_out(
     """
     observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
     evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
+    before = None if earlier is None else FilesBefore(*earlier)
+    state = None if earlier is None else earlier[1]
     if state is None:
         _rehearse(config, mdp, observation)
-    steps, before = (0, None) if state is None else (state["steps"], FilesBefore(folder, state["marks"]))
     events = None
     if config.logging.tensorboard:
         events = EventWriter(folder, None if state is None else state["marks"]["events"])
@@ -119,6 +122,8 @@ def carry_out(
     session = None
     try:
         session = Session(config, run, evaluator, agent, context, events, state)
+        if before is not None and before.has_result():
+            session.checkpoints.held = before.steps
         summary = session.run()
     except Interrupted as interruption:
         progress = _progress(session)
@@ -127,12 +132,7 @@ def carry_out(
         raise
     except BaseException as error:
         with contextlib.suppress(OSError):  # nothing can be written perhaps
-            is_mistake = isinstance(error, InputError | StateError)
-            has_gone_on = session is not None and session.reached != steps
-            if is_mistake and before is not None and not has_gone_on:
-                before.put_back()
-                log.add(f"cannot be resumed: {reason(error)}", "ERROR")
-            else:
+            if before is None or not _undo(before, run, log, error, session):
                 _note_failure(run, log, error, _progress(session))
         if isinstance(error, StateError):
             raise InputError(f"{folder}: its checkpoint does not fit this run: {error}") from None
@@ -145,12 +145,35 @@ def carry_out(
     return summary
 
 
+def _undo(
+    before: FilesBefore, run: RunWriter, log: TrainLog, error: BaseException, session: Session | None
+) -> bool:
+    """Put a run back as it was, if it cannot be resumed at all, or was finished and cannot be made longer."""
+    has_gone_on = session is not None and session.reached != before.steps
+    if isinstance(error, InputError | StateError) and not has_gone_on:
+        before.put_back()
+        log.add(f"cannot be resumed: {reason(error)}", "ERROR")
+        return True
+    if not _is_failure(error) or isinstance(error, FolderLostError) or not before.has_result():
+        return False
+    before.put_back()
+    log.add(f"cannot be made longer: {reason(error)}", "ERROR")
+    if not isinstance(error, InputError | StateError):
+        write_text(run.error_file, traceback.format_exc())
+    tell(f"{shown(run.folder)}: stays as it was, finished after {before.steps:,} steps")
+    return True
+
+
+def _is_failure(error: BaseException) -> bool:
+    # What is no `Exception` is a signal's that came before the session takes them itself.
+    return isinstance(error, Exception) and not isinstance(error, OSError)
+
+
 def _note_failure(
     run: RunWriter, log: TrainLog, error: BaseException, progress: dict[str, int | None]
 ) -> None:
     """Write to the manifest and the log why a run ended, and the traceback of what nobody has foreseen."""
-    # What is no `Exception` is a signal's that came before the session takes them itself.
-    failed = isinstance(error, Exception) and not isinstance(error, OSError)
+    failed = _is_failure(error)
     status = "failed" if failed else "interrupted"
     log.add(f"{status}: {reason(error)}", "ERROR")
     if failed and not isinstance(error, InputError | StateError):

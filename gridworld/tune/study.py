@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import math
@@ -18,9 +19,11 @@ from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.command_line import command
 from gridworld.process.terminal import printable
+from gridworld.report.writer import write_over_seeds
 from gridworld.sweep.console import shell_path
 from gridworld.training.tensorboard import hparams
 from gridworld.tune.confirmation import (
+    CONFIRM,
     HeldOutRun,
     held_out_runs,
     prepare,
@@ -145,6 +148,11 @@ def _conclude(spec: StudySpec, study: optuna.Study, ranked: list[Finalist]) -> N
     words = shlex.join(_words_beside(recipe, spec.folders))
     train_it = f"{command('train')} recipe={shell_path(spec.folder)} {words}".rstrip()
     lines = [confirmed["sentence"], f"  recipe: {shell_path(recipe)}", f"  train it: {train_it}"]
+    with contextlib.suppress(InputError, OSError):  # the report says what cannot be used
+        runs = spec.folder / CONFIRM
+        if (over_seeds := write_over_seeds(runs, spec.folder)) is not None:
+            told = f"{shell_path(over_seeds)}  (of each run: {shell_path(runs)})"
+            lines.append(f"  curves over seeds: tensorboard --logdir {told}")
     _print_outcome(spec, values, lines)
 
 

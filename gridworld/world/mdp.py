@@ -33,6 +33,7 @@ Table = TypeVar("Table", bound=NDArray[Any])
 # Of a reward, unless it is 0: the squared sum of 100,000 of the largest is finite, and the smallest is larger
 # than what counts as 0.
 LEAST_REWARD, MOST_REWARD = 1e-100, 1e100
+EXACT = "exact"  # the `truth` of tables that are given
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -74,7 +75,7 @@ class Mdp:
     panel_names: tuple[str, ...] = ()
     max_episode_steps: int | None = None
     own_observation: NDArray[Any] | None = field(default=None, repr=False)
-    truth: str = "exact"
+    truth: str = EXACT
 
     def __repr__(self) -> str:
         sizes = f"{self.num_states} states, {self.num_actions} actions"

@@ -31,7 +31,7 @@ class Metric:
     in_front: bool = False  # in TensorBoard's first group, `eval`
     sb3_name: str | None = None  # what SB3's evaluation calls it, in TensorBoard beside our name
     chart: str | None = None  # of TensorBoard's Custom Scalars tab
-    is_headline: bool = False  # in TensorBoard's HParams table, and in the table at a run's end if in any
+    is_headline: bool = False  # in the table at a run's end, if in any
     has_optimum: bool = False  # the optimum's is written too, as optimal_<name>
     known_optimum: float | None = None  # where it is the same in every world, so that it is not written
     within_limit: bool = True  # it is of an episode within the step limit

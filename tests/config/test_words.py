@@ -10,7 +10,7 @@ from hydra.errors import HydraException
 import gridworld
 from gridworld.config.composition.hydra_errors import sentence
 from gridworld.config.composition.recipe_file import overrides
-from gridworld.config.composition.setting_names import whole_numbers
+from gridworld.config.composition.setting_names import takes_whole_numbers
 from gridworld.config.composition.words import refuse_dashes, with_whole_numbers
 from gridworld.errors import InputError
 
@@ -26,6 +26,10 @@ from gridworld.errors import InputError
         ("total_timesteps=1e3,2E3,3000", "total_timesteps=1000,2000,3000"),
         ("seed=range(0,1e1,step=2.0)", "seed=range(0,10,step=2)"),
         ("seed=-1e0", "seed=-1"),
+        ("agent.policy_kwargs.net_arch=[1e2,64.]", "agent.policy_kwargs.net_arch=[100,64]"),
+        ("+agent.policy_kwargs.net_arch.pi=[1e1]", "+agent.policy_kwargs.net_arch.pi=[10]"),
+        ("agent.policy_kwargs.net_arch={pi:[1e1],vf:[8]}", "agent.policy_kwargs.net_arch={pi:[10],vf:[8]}"),
+        ("agent.train_freq=[4e0,step]", "agent.train_freq=[4,step]"),
         ("hydra.sweeper.max_jobs=1e5", "hydra.sweeper.max_jobs=100000"),
         ("tune.trials=1e2", "tune.trials=100"),
         *((word, word) for word in ("total_timesteps=1.5e0", "seed=1e30", "seed=1e999", "seed='1e1'")),
@@ -42,9 +46,10 @@ def test_a_whole_number_may_be_written_as_a_float(word: str, read: str) -> None:
 
 def test_whole_numbers_are_told_by_the_schemas() -> None:
     """A rate or a schedule keeps its type, and so what a run's settings are hashed from."""
-    names = whole_numbers()
-    assert {"seed", "evaluation.stop_after", "agent.n_steps", "env.num_rows", "recording.fps"} <= names
-    assert not {"agent.learning_rate", "env.slip", "tune.timeout", "agent.train_freq", "device"} & names
+    for name in ("seed", "evaluation.stop_after", "agent.n_steps", "env.num_rows", "agent.train_freq"):
+        assert takes_whole_numbers(name)
+    for name in ("agent.learning_rate", "env.slip", "tune.timeout", "agent.policy_kwargs", "device", "agent"):
+        assert not takes_whole_numbers(name)
 
 
 def test_every_way_into_a_run_takes_whole_numbers(tmp_path: Path) -> None:
@@ -64,6 +69,15 @@ def test_every_way_into_a_run_takes_whole_numbers(tmp_path: Path) -> None:
         assert config == plain
         assert (type(config.total_timesteps), type(config.n_envs)) == (int, int)
     assert configure("agent=q_learning", "total_timesteps=1e5", "n_envs=8") == plain
+    mine.write_text("# @package _global_\nagent: {policy_kwargs: {net_arch: {pi: [1e1], vf: [8.0, 4]}}}\n")
+    own = ["experiment=mine", f"hydra.searchpath=[file://{tmp_path}]"]
+    for words in (
+        [*own],
+        [f"recipe={mine}"],
+        ["agent.policy_kwargs.net_arch={pi:[1e1],vf:[8.0,4]}"],
+    ):
+        arch = gridworld.compose("agent=ppo", *words).agent.policy_kwargs.net_arch
+        assert repr(arch) == "{'pi': [10], 'vf': [8, 4]}"
     for word, told in (("1.5e0", "could not be converted to Integer"), ("1e30", "could not be converted")):
         with pytest.raises(InputError, match=told):
             gridworld.compose(f"total_timesteps={word}")

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import itertools
 import json
 import math
 import os
@@ -422,6 +423,45 @@ def test_a_search_for_runs_ends(maker: Maker, tmp_path: Path, monkeypatch: pytes
         f"{tmp_path}: holds more than 50 files and folders, the rest was not searched; name the folders of "
         "the runs",
     )
+
+
+@pytest.fixture(scope="module")
+def many_keys(tmp_path_factory: pytest.TempPathFactory) -> TaskAnalysis:
+    """Of three swept keys every combination, one with a seed that has no certificate."""
+    folder, maker = tmp_path_factory.mktemp("many"), Maker("agent=ppo")
+    for rate, depth, gamma in itertools.product((0.01, 0.002, 0.1), (3, 10), (0.95, 0.9)):
+        at = math.inf if rate == 0.1 else 1000 * depth
+        settings = {"agent__learning_rate": rate, "agent__n_epochs": depth, "agent__gamma": gamma}
+        maker.write(folder / f"{rate} {depth} {gamma}", 0, at, **settings)
+    (task,) = gather([folder]).tasks
+    return task
+
+
+def test_three_swept_settings_are_a_heatmap_for_each_value_of_the_third(many_keys: TaskAnalysis) -> None:
+    (swept,) = sweeps(many_keys.results)
+    assert swept.keys == ("agent.learning_rate", "agent.gamma", "agent.n_epochs")
+    drawn = {each.name: each for each in sweep_charts(swept, "classic")}
+    heat = drawn["classic ppo certified by learning_rate, gamma and n_epochs"]
+    words = [text.text for text in ElementTree.fromstring(heat.svg).iter(f"{SVG}text")]
+    assert [word for word in words if " = " in str(word)] == ["n_epochs = 3", "n_epochs = 10"]
+    assert (words.count("1/1"), words.count("0/1"), words.count("0.002")) == (8, 4, 2)
+    heights = {bar.get_y() for bar in heat.figure.axes[0].patches}
+    assert len(heights) == 6  # three rates, twice, none over another
+
+
+def test_settings_that_were_swept_without_a_grid_are_ranked(many_keys: TaskAnalysis) -> None:
+    (swept,) = sweeps(many_keys.results)
+    some = dict(itertools.islice(sorted(swept.results.items()), 0, None, 3))
+    (few,) = sweeps(list(some.values()))
+    assert len(few.results) == 4
+    spread = replace(few, values=tuple((*each, "other", "more") for each in few.values))
+    chart = next(sweep_charts(spread, "classic"))
+    assert "the best first" in chart.description
+    words = [str(text.text) for text in ElementTree.fromstring(chart.svg).iter(f"{SVG}text")]
+    shares = [word for word in words if word in ("1/1", "0/1")]
+    assert shares == sorted(shares, reverse=True)
+    assert {"learning_rate", "gamma", "n_epochs", "seeds certified"} <= set(words)
+    assert not sweeps(list(some.values())[:3])  # no more than settings that differ: a comparison
 
 
 def test_a_folder_that_may_not_be_read(maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ import pytest
 from helpers.browser import chromium
 from helpers.support import SHORT, script, train_in
 
-from gridworld.training.sinks import CHARTS, HPARAM_METRICS
+from gridworld.training.sinks import CHARTS
 
 # Walks through the shadow roots that TensorBoard's components hide behind.
 PAGE_TEXT = """
@@ -123,9 +123,15 @@ def test_the_policy_develops_and_the_episode_moves(served: str) -> None:
             assert answer.read(6) == b"GIF89a"
 
 
+RESULTS = [
+    f"eval/{name}"
+    for name in ("goal_probability", "mean_ep_length", "mean_reward", "regret", "success_rate", "value")
+]
+
+
 def hparams_table(address: str) -> list[dict[str, Any]]:
     question = {
-        "colParams": [{"metric": {"tag": tag}} for tag in HPARAM_METRICS],
+        "colParams": [{"metric": {"tag": tag}} for tag in RESULTS],
         "allowedStatuses": ["STATUS_SUCCESS"],
         "startIndex": 0,
         "sliceSize": 100,
@@ -140,7 +146,15 @@ def test_the_hparams_table_has_settings_and_metrics(served: str) -> None:
     assert {group["hparams"]["agent.name"] for group in groups} == set(SHOWN)
     for group in groups:
         assert group["hparams"]["env.layout"] == "classic"
-        assert {value["name"]["tag"] for value in group["metricValues"]} == set(HPARAM_METRICS)
+        assert {value["name"]["tag"] for value in group["metricValues"]} >= set(RESULTS)
+
+
+def test_the_hparams_table_opens_with_what_varies_and_the_results(served_sweep: str) -> None:
+    table = ask(served_sweep, "data/plugin/hparams/experiment", includeMetrics=True)
+    differing = {info["name"] for info in table["hparamInfos"] if info["differs"]}
+    assert {"agent.learning_rate", "seed"} <= differing
+    assert {info["name"] for info in table["hparamInfos"][: len(differing)]} == differing
+    assert [info["name"]["tag"] for info in table["metricInfos"]][: len(RESULTS)] == RESULTS
 
 
 def test_a_sweep_has_every_run_by_its_name_with_its_metrics(served_sweep: str) -> None:
@@ -148,7 +162,7 @@ def test_a_sweep_has_every_run_by_its_name_with_its_metrics(served_sweep: str) -
     groups = hparams_table(served_sweep)
     assert {session["name"] for group in groups for session in group["sessions"]} == SWEPT
     for group in groups:
-        assert {value["name"]["tag"] for value in group["metricValues"]} == set(HPARAM_METRICS)
+        assert {value["name"]["tag"] for value in group["metricValues"]} >= set(RESULTS)
     bands, curves = ask(served_sweep, "data/plugin/custom_scalars/layout")["category"]
     assert {chart["title"] for chart in bands["chart"]} == {
         "regret",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Optional
 
-from gridworld.config.agents import AgentConfig, Schedule
+from gridworld.config.agents import AgentConfig, Schedule, WholeNumbers
 from gridworld.config.effects import Effect, affects
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
@@ -15,7 +15,7 @@ from gridworld.config.effects import Effect, affects
 class PolicyKwargs:
     """SB3's `policy_kwargs`; null or {} leaves SB3's own default. Classes are import paths, torch.nn.ReLU."""
 
-    net_arch: Any = None  # layer widths, [64, 64]
+    net_arch: WholeNumbers = None  # layer widths, [64, 64]
     activation_fn: Optional[str] = None  # noqa: UP045
     features_extractor_class: Optional[str] = None  # noqa: UP045
     features_extractor_kwargs: dict[str, Any] = field(default_factory=dict)
@@ -90,7 +90,7 @@ class DQNConfig(SB3CheckedConfig):
     buffer_size: int = 1_000_000
     learning_starts: int = 100
     tau: float = 1.0
-    train_freq: Any = 4  # steps of the batch, or [n, step] or [n, episode]
+    train_freq: WholeNumbers = 4  # steps of the batch, or [n, step] or [n, episode]
     gradient_steps: int = 1
     replay_buffer_class: Optional[str] = None  # noqa: UP045
     replay_buffer_kwargs: dict[str, Any] = field(default_factory=dict)

@@ -83,18 +83,27 @@ def _options(command: str) -> dict[str, list[str]]:
     """The options of a command with the values that its code names for them."""
     if command == "train":
         return {option: [] for option in _OF_TRAIN}
-    here = Path(__file__).parents[1]
-    texts = [(here / f"{command}.py").read_text("utf-8")]
-    if "parser_for_a_run" in texts[0]:
-        texts.append((here / "__init__.py").read_text("utf-8"))
     found: dict[str, list[str]] = {"--help": []}
-    for call in (node for text in texts for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)):
+    for call in _calls(command):
         if isinstance(call.func, ast.Attribute) and call.func.attr == "add_argument":
             strings = [each.value for each in ast.walk(call) if isinstance(each, ast.Constant)]
             name = next((each for each in strings if str(each).startswith("--")), None)
             if name is not None:
                 found[str(name)] = list(_choices(call))
     return found
+
+
+def _calls(command: str) -> Iterator[ast.Call]:
+    """The calls in a command's module, and in what it calls in that of all commands."""
+    here = Path(__file__).parents[1]
+    own, shared = (ast.parse((here / f"{name}.py").read_text("utf-8")) for name in (command, "__init__"))
+    functions = {each.name: each for each in shared.body if isinstance(each, ast.FunctionDef)}
+    unread: list[ast.AST] = [own]
+    while unread:
+        for call in (node for node in ast.walk(unread.pop()) if isinstance(node, ast.Call)):
+            if isinstance(call.func, ast.Name) and call.func.id in functions:
+                unread.append(functions[call.func.id])
+            yield call
 
 
 def _choices(call: ast.Call) -> Iterator[str]:
@@ -122,7 +131,7 @@ def _overrides(word: str, earlier: Sequence[str], command: str) -> list[str]:
 
 def _groups(words: Sequence[str]) -> dict[str, list[str]]:
     """The choices of every group, those in the folder that `--config-dir` names included."""
-    found: dict[str, list[str]] = {}
+    found = {"hydra/launcher": ["basic"]}  # Hydra's own, in no folder of ours
     for folder in (conf_folder(), *own_conf_folders(words)):
         for file in folder.glob("**/*.yaml"):
             group = file.parent.relative_to(folder).as_posix()

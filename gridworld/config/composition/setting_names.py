@@ -8,6 +8,7 @@ import types
 from collections.abc import Iterator
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
+from gridworld.config.agents import WholeNumbers
 from gridworld.config.alternatives import alternatives
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig
 from gridworld.config.train import TrainConfig
@@ -27,9 +28,17 @@ def settings_of_a_run() -> dict[str, tuple[Any, ...]]:
     return found
 
 
+def takes_whole_numbers(name: str) -> bool:
+    """Whether a setting, or the one that it is an entry of, must be a whole number or consist of such.
+
+    Args:
+        name: its dotted name; settings of sweeps and of tuning are known too.
+    """
+    return name in _whole_numbers() or ("." in name and takes_whole_numbers(name.rpartition(".")[0]))
+
+
 @functools.cache
-def whole_numbers() -> frozenset[str]:
-    """The dotted names of the settings that must be whole numbers, those of sweeps and of tuning included."""
+def _whole_numbers() -> frozenset[str]:
     found = dict(settings_of_a_run()) | dict(_settings(TuneConfig, "tune."))
     found |= dict(_settings(SweepConfig, "hydra.sweeper."))
     for launcher in LAUNCHER_SCHEMAS.values():
@@ -38,7 +47,7 @@ def whole_numbers() -> frozenset[str]:
 
 
 def _settings(schema: type, section: str) -> Iterator[tuple[str, tuple[Any, ...]]]:
-    for name, hint in get_type_hints(schema).items():
+    for name, hint in get_type_hints(schema, include_extras=True).items():
         if dataclasses.is_dataclass(hint):
             assert isinstance(hint, type)
             for each in alternatives(hint):
@@ -50,4 +59,4 @@ def _settings(schema: type, section: str) -> Iterator[tuple[str, tuple[Any, ...]
 def _is_whole(hint: Any) -> bool:
     if get_origin(hint) in (Union, types.UnionType):
         return int in get_args(hint) and float not in get_args(hint)
-    return hint is int
+    return hint in (int, WholeNumbers)

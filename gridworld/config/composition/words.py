@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from gridworld.config.composition.setting_names import settings_of_a_run, whole_numbers
+from gridworld.config.composition.setting_names import settings_of_a_run, takes_whole_numbers
 from gridworld.errors import InputError
 
 OF_THE_COMMAND = (
@@ -56,12 +56,17 @@ def with_whole_numbers(words: Sequence[str]) -> list[str]:
 
 def _with_whole_number(word: str) -> str:
     key, equals, value = word.partition("=")
-    if not equals or not re.search(r"[.eE]", value) or key.lstrip("+") not in whole_numbers():
+    if not equals or not re.search(r"[.eE]", value) or not takes_whole_numbers(key.lstrip("+")):
         return word
-    return f"{key}={_FLOAT.sub(lambda found: _digits(found.group()), value)}"
+    return f"{key}={_FLOAT.sub(lambda found: digits(found.group()), value)}"
 
 
-def _digits(text: str) -> str:
+def digits(text: str) -> str:
+    """A number as people write it; a whole one without point and exponent: 1e5 as 100000.
+
+    Raises:
+        ValueError: it is no number.
+    """
     number = float(text)
     return text if text.lstrip("+-").isdecimal() or not _is_whole(number) else str(int(number))
 
@@ -71,7 +76,9 @@ def _is_whole(number: float) -> bool:
 
 
 def as_whole(value: Any) -> Any:
-    """A float that is a whole number as an int; anything else as it is."""
+    """A float that is a whole number as an int, in lists too; anything else as it is."""
+    if isinstance(value, list):
+        return [as_whole(each) for each in value]
     return int(value) if isinstance(value, float) and _is_whole(value) else value
 
 
@@ -83,5 +90,6 @@ def make_whole(settings: DictConfig, section: str = "") -> None:
         name = f"{section}{key!s}"
         if isinstance(value, DictConfig):
             make_whole(value, f"{name}.")
-        elif isinstance(value, float) and name in whole_numbers():
-            settings[key] = as_whole(value)
+        elif isinstance(value, float | ListConfig) and takes_whole_numbers(name):
+            plain = OmegaConf.to_container(value) if isinstance(value, ListConfig) else value
+            settings[key] = as_whole(plain)

@@ -257,6 +257,7 @@ UNSEEN = {
 }
 
 
+@pytest.mark.filterwarnings("ignore:Pickle, copy, and deepcopy support:DeprecationWarning")  # Python 3.12
 @pytest.mark.parametrize("name", UNSEEN)
 def test_hidden_state_is_found_and_refused(name: str, tmp_path: Path, fresh: Callable[[], None]) -> None:
     with pytest.raises(InputError) as refused:
