@@ -1,6 +1,7 @@
 """Pictures of worlds that are no maps: panels, other actions, states without a place, foreign frames."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,8 +12,10 @@ from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
 from gridworld.config.pictures import PICTURES
-from gridworld.config.train import EnvConfig, TrainConfig
+from gridworld.config.train import TrainConfig
+from gridworld.config.worlds import EnvConfig, GymnasiumConfig
 from gridworld.envs.board import Kind, Panel, board_of
+from gridworld.envs.real_env import RealEnvFrames
 from gridworld.envs.rendering import AGENT, GOAL, TRAP, UNKNOWN, Frame, ansi, draw_frame, fitting_cell_size
 from gridworld.envs.rollout import Episode, play
 from gridworld.visualization.animation import Animation, animation_of_rendered
@@ -305,26 +308,23 @@ def test_an_episode_in_text_tells_state_action_and_reward() -> None:
     assert (draw_frame(world, 2) < 128).any()
 
 
-class _Noisy(EnvConfig):
-    """Draws frames of more colours than a palette has."""
-
-    def frames(self, mdp: Mdp, states: IntArray) -> list[NDArray[np.uint8]]:
-        self.asked = states.tolist()
-        ramp = np.indices((40, 80)).transpose(1, 2, 0)
-        blue = np.zeros((40, 80, 1), dtype=int)
-        return [np.concatenate([3 * ramp, blue + 100 * state], axis=2).astype(np.uint8) for state in states]
+def _noisy(env: RealEnvFrames, mdp: Mdp, states: Sequence[int]) -> list[NDArray[np.uint8]]:
+    """Frames of more colours than a palette has."""
+    ramp = np.indices((40, 80)).transpose(1, 2, 0)
+    blue = np.zeros((40, 80, 1), dtype=int)
+    return [np.concatenate([3 * ramp, blue + 100 * state], axis=2).astype(np.uint8) for state in states]
 
 
-def test_an_episode_shows_the_frames_of_the_environment_that_has_some() -> None:
-    env = _Noisy()
+def test_an_episode_shows_the_frames_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RealEnvFrames, "episode", _noisy)
+    env = GymnasiumConfig(id="FrozenLake-v1")
     walk = Episode(np.array([2, 0, 2, 1]), np.zeros(3, dtype=int), np.zeros(3))
     prepared = film(env, FROZEN_LAKE, [walk])
-    assert env.asked == [0, 1, 2]  # each state once
     shown = prepared(None)
     assert shown.size == (80, 40)
     pictures = [np.asarray(shown.draw(key).convert("RGB")).astype(int) for key in shown.keys]
     for picture, state in zip(pictures, walk.states, strict=True):
-        assert np.abs(picture - env.frames(FROZEN_LAKE, np.array([state]))[0]).mean() < 12
+        assert np.abs(picture - _noisy(RealEnvFrames(env.id), FROZEN_LAKE, [state])[0]).mean() < 12
     assert np.array_equal(pictures[0], pictures[2])
     assert prepared(5).size == (30, 15)  # a board with such cells has six of them on a side
     assert prepared(100).size == (80, 40)

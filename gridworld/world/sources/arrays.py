@@ -81,12 +81,12 @@ def mdp_from_arrays(name: str, arrays: Mapping[str, Any], where: str) -> Mdp:
     """
     _check_names(where, arrays)
     given = {key: _array(where, key, value) for key, value in arrays.items()}
-    if given["next_state"].ndim == 2:
-        for key in set(_TABLES) & given.keys():
+    shape = given["next_state"].shape
+    if len(shape) == 2:
+        for key in [key for key in _TABLES if key in given]:
             if given[key].ndim != 2:
                 raise InputError(
-                    f"{where}: {key} has shape {given[key].shape}, next_state has "
-                    f"{given['next_state'].shape}; give one shape"
+                    f"{where}: {key} has shape {given[key].shape}, next_state has {shape}; give one shape"
                 )
             given[key] = given[key][:, :, None]
         given.setdefault("probability", np.ones(given["next_state"].shape))
