@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from helpers.support import script
 
-from gridworld.commands import run
 from gridworld.errors import InputError
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.reader import read_run
@@ -51,41 +50,32 @@ def test_a_run_goes_on_in_the_world_that_it_keeps(folder: Path) -> None:
     assert curve[:3] == (folder / "short" / "curve.csv").read_text().splitlines()[:3]
 
 
-def test_a_run_is_repeated_scored_and_shown_again(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(folder)
-    run("reproduce", ["short"])
-    assert capsys.readouterr().out.endswith("identical\n")
-    run("evaluate", ["short", "--episodes", "50"])
-    assert "greedy policy of q_learning" in capsys.readouterr().out
-    run("record", ["short", "--format", "gif", "policy"])
+def test_a_run_is_repeated_scored_and_shown_again(folder: Path) -> None:
+    for words, told in (
+        (("reproduce.py", "short"), "identical\n"),
+        (("evaluate.py", "short", "--episodes", "50"), "greedy policy of"),
+        (("record.py", "short", "--format", "gif", "policy"), "episode.gif"),
+    ):
+        done = script(*words, cwd=folder)
+        assert done.returncode == 0, done.stderr
+        assert told in done.stdout
     assert (folder / "short" / "recording" / "episode.gif").stat().st_size > 1000
 
 
-def test_a_sweep_ends_with_a_table_and_a_report(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(folder)
-    run("report", ["sweep", "--formats", "svg"])
-    assert "which this version does not know" not in capsys.readouterr().err
-    page = (folder / "sweep" / "report" / "report.html").read_text()
-    assert "FrozenLake-v1" in page
+def test_a_sweep_ends_with_a_report(folder: Path) -> None:
+    done = script("report.py", "sweep", "--formats", "svg", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert "which this version does not know" not in done.stdout + done.stderr
+    assert "FrozenLake-v1" in (folder / "sweep" / "report" / "report.html").read_text()
 
 
 @pytest.mark.parametrize(
-    ("command", "words", "told"),
-    [
-        ("play", ["--agent", "short"], "was trained on FrozenLake-v1, which is no map"),
-        ("evaluate", ["short", "--layout", "maze"], "was trained on FrozenLake-v1, which is no map"),
-    ],
+    "words", [("play.py", "--agent", "short"), ("evaluate.py", "short", "--layout", "maze")]
 )
-def test_what_only_a_map_has_is_refused(
-    command: str, words: list[str], told: str, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(folder)
-    with pytest.raises(InputError, match=told):
-        run(command, words)
+def test_what_only_a_map_has_is_refused(words: tuple[str, ...], folder: Path) -> None:
+    done = script(*words, cwd=folder)
+    assert done.returncode == 1
+    assert "was trained on FrozenLake-v1, which is no map" in done.stderr
 
 
 def test_a_world_that_was_changed_is_refused(folder: Path, tmp_path: Path) -> None:
