@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from gridworld.world.grid import compile_mdp
     from gridworld.world.layout import Layout, load, shipped_layouts
     from gridworld.world.mdp import Mdp
+    from gridworld.world.sources.arrays import load_world
 
 __version__ = "0.1.0"
 
@@ -58,6 +59,7 @@ _HOME = {
     "compose": "api.settings",
     "evaluate": "api.scores",
     "load": "world.layout",
+    "load_world": "world.sources.arrays",
     "make_vec": "api.worlds",
     "make_vec_env": "agents.sb3.interop.make_vec_env",
     "open_run": "api.runs",
@@ -87,6 +89,7 @@ __all__ = [
     "compose",
     "evaluate",
     "load",
+    "load_world",
     "make_vec",
     "make_vec_env",
     "open_run",

@@ -136,9 +136,7 @@ def _game(options: argparse.Namespace) -> Game:
     saved = SavedRun(options.agent, best=options.best)
     config, world = saved.config, saved.evaluator(options.layout).mdp
     if not isinstance(config.env, MapConfig) or not isinstance(world, GridMdp):
-        raise InputError(
-            f"--agent {options.agent}: was trained on {config.env.name}; only maps can be played"
-        )
+        raise InputError(f"--agent {options.agent}: was trained on {config.env.name}, which is no map")
     env = dataclasses.replace(config.env, **given)
     mdp = env.compile_on(world.layout)
     gamma = config.evaluation.gamma if options.gamma is None else options.gamma

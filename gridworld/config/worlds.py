@@ -135,9 +135,9 @@ class ArraysConfig(EnvConfig):
 
     def compile(self) -> Mdp:
         """See `EnvConfig.compile`."""
-        from gridworld.world.sources.arrays import load_arrays
+        from gridworld.world.sources.arrays import load_world
 
-        return load_arrays(self.path)
+        return load_world(self.path)
 
 
 @dataclass

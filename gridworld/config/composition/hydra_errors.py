@@ -37,9 +37,9 @@ def sentence(error: BaseException) -> str:
     if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
         mark = error.problem_mark
         return f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}: is no yaml, {error.problem}"
-    if missing := re.search(r"Missing mandatory value: (\S+)", message):
-        key = missing.group(1)
-        return f"{key}: has no value; the yaml that {key.split('.')[0]}=... chooses must give it one"
+    if missing := re.search(r"[Mm]issing mandatory value: (\S+)", message):
+        key = getattr(error, "full_key", None) or missing.group(1)
+        return f"{key}: has no value; give {key}=..., or have the yaml that is chosen for it do so"
     if "Could not find" in message and "Available options in" in message:
         return _unknown_choice(message)
     if added := re.search(

@@ -51,8 +51,8 @@ _MOST_BYTES = 4 * 2**30
 _FORMAT = np.array("gridworld world 1")
 
 
-def load_arrays(path: str | PathLike[str]) -> Mdp:
-    """Read a world of one's own; the module says what is in the file.
+def load_world(path: str | PathLike[str]) -> Mdp:
+    """Read a world from a file: one of one's own, or a run's `world.npz`. The module says what is in them.
 
     Args:
         path: an .npz file, relative to the folder that the program was started in.
@@ -65,6 +65,8 @@ def load_arrays(path: str | PathLike[str]) -> Mdp:
     """
     content = _read(path)
     arrays = npz_arrays(path, content, "an .npz file of arrays", _MOST_BYTES)
+    if "format" in arrays:
+        return _from_fields(arrays, str(path))
     return mdp_from_arrays(Path(path).stem, arrays, str(path))
 
 
@@ -213,7 +215,10 @@ def world_from_bytes(content: bytes, where: str) -> Mdp:
     Raises:
         InputError: it is no such file, or the tables in it are no world.
     """
-    found = npz_arrays(where, content, "a world")
+    return _from_fields(npz_arrays(where, content, "a world"), where)
+
+
+def _from_fields(found: dict[str, NDArray[Any]], where: str) -> Mdp:
     fields = {field.name: field for field in dataclasses.fields(Mdp)}
     if not np.array_equal(found.pop("format", np.array("")), _FORMAT):
         raise InputError(f"{where}: not a world of this version, must hold format={_FORMAT}")

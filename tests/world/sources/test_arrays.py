@@ -16,7 +16,7 @@ from gridworld.process.npz import npz_bytes
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 from gridworld.world.solver import value_iteration
-from gridworld.world.sources.arrays import load_arrays, world_bytes, world_from_bytes
+from gridworld.world.sources.arrays import load_world, world_bytes, world_from_bytes
 from gridworld.world.sources.classics import river_swim
 
 TWO_ROOMS = {
@@ -35,7 +35,7 @@ def written(folder, save=np.savez, **changed):
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_a_deterministic_world_needs_five_lines(tmp_path, save):
-    mdp = load_arrays(written(tmp_path, save))
+    mdp = load_world(written(tmp_path, save))
     assert (mdp.name, mdp.action_names, mdp.places, mdp.max_episode_steps) == (
         "rooms",
         ("0", "1"),
@@ -60,7 +60,7 @@ def test_everything_optional(tmp_path):
         max_episode_steps=9,
         name="two rooms",
     )
-    mdp = load_arrays(str(path))
+    mdp = load_world(str(path))
     assert (mdp.name, mdp.action_names, mdp.max_episode_steps) == ("two rooms", ("back", "on"), 9)
     assert mdp.places.tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 1], [0, 0, 1]]
     assert mdp.goal.sum() == mdp.trap.sum() == 1
@@ -92,14 +92,14 @@ def test_everything_optional(tmp_path):
 def test_arrays_that_make_no_world_are_refused(tmp_path, changed, told):
     path = written(tmp_path, **changed)
     with pytest.raises(InputError, match=f"^{path}: .*{told}") as refused:
-        load_arrays(path)
+        load_world(path)
     assert "\n" not in str(refused.value)
 
 
 def test_no_file_of_arrays(tmp_path, monkeypatch):
     def refused(path, told):
         with pytest.raises(InputError, match=told):
-            load_arrays(path)
+            load_world(path)
 
     refused(tmp_path / "none.npz", "env.path=.*none.npz: cannot be read .No such file")
     refused(tmp_path, "env.path=.*: is a folder; give an .npz file")
