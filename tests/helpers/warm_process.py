@@ -24,6 +24,7 @@ import sys
 import tempfile
 import threading
 import time
+import weakref
 from multiprocessing import process as multiprocessing_process
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import recv_handle
@@ -31,26 +32,40 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
+import PIL.Image
 import torch
 
 import gridworld
 from gridworld.config.composition.compose import compose
+from gridworld.envs.rendering import import_pygame
 from gridworld.process import progress
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 
 # What is imported only once it is needed.
-_LATE = ("sb3_contrib", "torch.utils.tensorboard", "optuna", "joblib", "av", "hydra._internal.hydra")
+_LATE = (
+    *("sb3_contrib", "torch.utils.tensorboard", "torch.utils.serialization", "optuna", "joblib", "av"),
+    *("hydra._internal.hydra", "hydra._internal.logging_config", "hydra.core.plugins"),
+    *("matplotlib.backends.backend_svg", "matplotlib.backends.backend_pdf", "fontTools.subset"),
+)
 _NOT_FOR_FORKS = ".on_ray"  # Ray has threads as soon as it is imported
 _WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 
 
 def _import_everything() -> None:
     ours = (module.name for module in pkgutil.walk_packages(gridworld.__path__, "gridworld."))
+    import_pygame()
     for name in (*ours, *_LATE):
         if not name.endswith(_NOT_FOR_FORKS):
             with contextlib.suppress(ModuleNotFoundError):  # an extra that is not installed
                 importlib.import_module(name)
+    PIL.Image.init()  # its file formats
+
+
+def _end_without_finalizers() -> None:
+    """Drop what the imported modules do at the end, for torch half of a short script's time."""
+    for finalizer in list(weakref.finalize._registry):  # type: ignore[attr-defined]
+        finalizer.atexit = False
 
 
 def _serve(connection: "Connection[Any, Any]") -> None:
@@ -187,6 +202,7 @@ if __name__ == "__main__":
     _import_everything()
     progress._SECONDS_BETWEEN_LINES = 600.0
     compose(CONF, [])  # Hydra's parsers learn the grammar with the first words that they read
+    _end_without_finalizers()
     gc.collect()
     gc.freeze()  # so that a fork shares what is there
     end = Connection(int(sys.argv[1]))
