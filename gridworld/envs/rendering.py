@@ -42,10 +42,16 @@ _log = logging.getLogger("gridworld")
 
 
 def import_pygame() -> ModuleType:
-    """pygame, without its greeting."""
+    """pygame, without its greeting, and without `pkg_resources`, which takes longest to import."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    import pygame
-
+    hidden = {"pygame", "pkg_resources"}.isdisjoint(sys.modules)
+    if hidden:
+        sys.modules["pkg_resources"] = None  # type: ignore[assignment]
+    try:
+        import pygame
+    finally:
+        if hidden:
+            del sys.modules["pkg_resources"]
     return pygame
 
 

@@ -29,11 +29,12 @@ from gridworld.commands import record as record_command
 from gridworld.commands.shell.help import manual
 from gridworld.errors import InputError
 
-TRAINED_WITHOUT_THE_COMPILER = f"""
+TRAINED_WITHOUT_NEEDLESS_IMPORTS = f"""
 import runpy, sys
 sys.argv = ["train.py", *sys.argv[1:]]
 runpy.run_path({str(ROOT / "scripts" / "train.py")!r}, run_name="__main__")
-assert "torch" in sys.modules and "torch._dynamo" not in sys.modules
+assert "torch" in sys.modules and "pygame" in sys.modules
+assert not {{"torch._dynamo", "sympy", "pkg_resources"}} & sys.modules.keys()
 """
 
 
@@ -41,10 +42,10 @@ assert "torch" in sys.modules and "torch._dynamo" not in sys.modules
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run from a process of its own, its output in output.txt beside it.
 
-    The process never imports torch's compiler, which would take longer than the run.
+    The process never imports torch's compiler, sympy or pkg_resources, which would take longer than the run.
     """
     folder = tmp_path_factory.mktemp("finished")
-    command = [sys.executable, "-c", TRAINED_WITHOUT_THE_COMPILER, *SHORT["dqn"], "hydra.run.dir=run"]
+    command = [sys.executable, "-c", TRAINED_WITHOUT_NEEDLESS_IMPORTS, *SHORT["dqn"], "hydra.run.dir=run"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     (folder / "output.txt").write_text(done.stdout)
