@@ -37,11 +37,17 @@ IN_TURN = (
     *("sweep/test_sweep_cluster.py", "sweep/test_sweep_kills.py"),
     *("training/test_tensorboard.py", "report/test_report_page.py"),
 )
-# Few tests, a minute or nearly: they start processes.
+# What takes longest, in this order; most have few tests that start processes.
 LONG = (
-    *("commands/test_hostile_runs.py", "tune/test_tune.py", "sweep/test_sweep.py", "restore/test_resume.py"),
-    *("restore/test_reproduce.py", "restore/test_resume_commands.py", "restore/test_resume_states.py"),
-    *("process/test_output.py", "process/test_forks.py", "tests/test_docs.py"),
+    *("in turn", "tests/test_docs.py", "commands/test_commands.py", "commands/test_hostile_runs.py"),
+    *("api/test_scores.py", "sweep/test_sweep.py", "tune/test_tune.py", "restore/test_reproduce.py"),
+    *("restore/test_resume_kills.py", "process/test_output.py", "tune/test_tune_parts.py"),
+    *("commands/test_bad_input.py", "agents/tabular/test_tabular.py", "api/test_runs.py"),
+    *("report/test_report.py", "config/test_experiments.py", "restore/test_resume.py"),
+    *("restore/test_resume_commands.py", "restore/test_resume_states.py", "training/test_certified.py"),
+    *("training/test_training.py", "storage/test_other_systems.py", "commands/test_console.py"),
+    *("agents/sb3/test_resume_own_classes.py", "agents/sb3/test_any_class.py", "export/test_export.py"),
+    *("run/test_power_cuts.py", "docs/test_examples.py", "process/test_forks.py", "run/test_lost_folders.py"),
 )
 
 
@@ -54,8 +60,8 @@ def scope(nodeid: str) -> str:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What takes longest comes first, so that no process is alone with it at the end."""
     sizes = Counter(scope(item.nodeid) for item in items)
-    slow = Counter(scope(item.nodeid) for item in items if item.get_closest_marker("slow"))
-    longest_first = sorted(sizes, key=lambda name: (-slow[name], not name.endswith(LONG), -sizes[name]))
+    long = {name: place for place, end in enumerate(LONG) for name in sizes if name.endswith(end)}
+    longest_first = sorted(sizes, key=lambda name: (long.get(name, len(LONG)), -sizes[name]))
     places = {name: place for place, name in enumerate(longest_first)}
     items.sort(key=lambda item: places[scope(item.nodeid)])
 
@@ -68,6 +74,8 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 def pytest_collection_finish() -> None:
     """What was imported stays, and need not be looked through each time that garbage is collected."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)  # networks this small take longer with more
     gc.collect()
     gc.freeze()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from types import ModuleType
 from typing import Any
 
@@ -17,10 +18,16 @@ _fonts: dict[int, Any] = {}  # a font draws its letters once, and takes its time
 
 
 def import_pygame() -> ModuleType:
-    """pygame, without its greeting."""
+    """pygame, without its greeting, and without `pkg_resources`, which takes longest to import."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    import pygame
-
+    hidden = {"pygame", "pkg_resources"}.isdisjoint(sys.modules)
+    if hidden:
+        sys.modules["pkg_resources"] = None  # type: ignore[assignment]
+    try:
+        import pygame
+    finally:
+        if hidden:
+            del sys.modules["pkg_resources"]
     return pygame
 
 

@@ -33,7 +33,10 @@ SHORT = {
     ],
     "ppo": ["agent=ppo", "total_timesteps=2000", "n_envs=16", "agent.n_steps=32", "agent.batch_size=64"],
     "a2c": ["agent=a2c", "total_timesteps=500", "n_envs=4", "evaluation.every=200"],
-    "qrdqn": ["agent=qrdqn", "total_timesteps=1000", "n_envs=4", "+agent.arguments.learning_starts=500"],
+    "qrdqn": [
+        *("agent=qrdqn", "total_timesteps=1000", "n_envs=4"),
+        *("+agent.arguments.learning_starts=500", "agent.arguments.gradient_steps=4"),
+    ],
     "trpo": [
         *("agent=trpo", "total_timesteps=500", "n_envs=4"),
         *("agent.arguments.n_steps=32", "agent.arguments.batch_size=64"),

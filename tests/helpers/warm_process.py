@@ -24,6 +24,8 @@ import sys
 import tempfile
 import threading
 import time
+import weakref
+from collections.abc import Callable
 from multiprocessing import process as multiprocessing_process
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import recv_handle
@@ -31,26 +33,43 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
+import PIL.Image
+import reserve
 import torch
 
 import gridworld
 from gridworld.config.composition.compose import compose
+from gridworld.envs.rendering import import_pygame
 from gridworld.process import progress
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 
 # What is imported only once it is needed.
-_LATE = ("sb3_contrib", "torch.utils.tensorboard", "optuna", "joblib", "av", "hydra._internal.hydra")
+_LATE = (
+    *("sb3_contrib", "torch.utils.tensorboard", "torch.utils.serialization", "torch._dynamo", "av"),
+    *("optuna.storages._rdb.storage", "sqlalchemy.dialects.sqlite.pysqlite", "alembic.command", "joblib"),
+    *("hydra._internal.hydra", "hydra._internal.logging_config", "hydra.core.plugins"),
+    *("matplotlib.backends.backend_svg", "matplotlib.backends.backend_pdf", "fontTools.subset"),
+)
 _NOT_FOR_FORKS = ".on_ray"  # Ray has threads as soon as it is imported
+_IN_RESERVE = 6  # two workers, joblib's watch over resources, and some for workers that are killed
 _WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 
 
 def _import_everything() -> None:
     ours = (module.name for module in pkgutil.walk_packages(gridworld.__path__, "gridworld."))
+    import_pygame()
     for name in (*ours, *_LATE):
         if not name.endswith(_NOT_FOR_FORKS):
             with contextlib.suppress(ModuleNotFoundError):  # an extra that is not installed
                 importlib.import_module(name)
+    PIL.Image.init()  # its file formats
+
+
+def _end_without_finalizers() -> None:
+    """Drop what the imported modules do at the end, for torch half of a short script's time."""
+    for finalizer in list(weakref.finalize._registry):  # type: ignore[attr-defined]
+        finalizer.atexit = False
 
 
 def _serve(connection: "Connection[Any, Any]") -> None:
@@ -100,24 +119,36 @@ def _run(
         os.close(file)
     if session:
         os.setsid()
+    if "tune.py" in script or any(word.endswith("launcher=joblib") for word in words):
+        reserve.keep(_IN_RESERVE, _run_as)
+
+    def program() -> None:
+        if watched is not None:
+            _watch(cwd, **watched)
+        runpy.run_path(script, run_name="__main__")
+
+    _run_as([script, *words], cwd, environment, program)
+
+
+def _run_as(
+    words: list[str], cwd: str, environment: dict[str, str], program: Callable[[], object]
+) -> NoReturn:
     os.chdir(cwd)
     os.environ.clear()
     os.environ.update(environment)
     paths = [path for path in environment.get("PYTHONPATH", "").split(os.pathsep) if path]
-    sys.path[:1] = [os.path.dirname(script), *paths]
-    sys.argv = [script, *words]
+    sys.path[:1] = [os.path.dirname(words[0]), *paths]
+    sys.argv = words
     np.random.seed()  # `random` sees to it itself
     torch.default_generator.seed()
     tempfile.tempdir = None
     multiprocessing_process.ORIGINAL_DIR = cwd  # type: ignore[attr-defined]
-    if watched is not None:
-        _watch(cwd, **watched)
-    _end(_exit_code(script))
+    _end(_exit_code(program))
 
 
-def _exit_code(script: str) -> int:
+def _exit_code(program: Callable[[], object]) -> int:
     try:
-        runpy.run_path(script, run_name="__main__")
+        program()
     except SystemExit as end:
         if end.code is None or isinstance(end.code, int):
             return end.code or 0
@@ -134,7 +165,8 @@ def _end(code: int) -> NoReturn:
     threading._shutdown()  # type: ignore[attr-defined]
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
-        stream.flush()
+        if not stream.closed:
+            stream.flush()
     os._exit(code)
 
 
@@ -187,6 +219,7 @@ if __name__ == "__main__":
     _import_everything()
     progress._SECONDS_BETWEEN_LINES = 600.0
     compose(CONF, [])  # Hydra's parsers learn the grammar with the first words that they read
+    _end_without_finalizers()
     gc.collect()
     gc.freeze()  # so that a fork shares what is there
     end = Connection(int(sys.argv[1]))

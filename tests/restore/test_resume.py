@@ -8,7 +8,10 @@ from helpers.support import SHORT
 
 CASES = {
     "dqn": [*SHORT["dqn"], "agent.learning_rate=lin_0.003"],
-    "dqn stock": [*SHORT["dqn"], "agent.engine=stock", "n_envs=8", "agent.buffer_size=2000"],
+    "dqn stock": [
+        *(*SHORT["dqn"], "agent.engine=stock", "n_envs=8"),
+        *("agent.buffer_size=2000", "agent.gradient_steps=4"),
+    ],
     "ppo": SHORT["ppo"],
     "ppo stock": [*SHORT["ppo"], "agent.engine=stock", "agent.log_interval=2"],
     **{name: SHORT[name] for name in ("a2c", "qrdqn", "trpo", "q_learning", "sarsa", "expected_sarsa")},

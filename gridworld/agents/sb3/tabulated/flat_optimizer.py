@@ -24,6 +24,8 @@ ELEMENTWISE: tuple[type[torch.optim.Optimizer], ...] = (
     *(torch.optim.NAdam, torch.optim.RAdam, torch.optim.RMSprop, torch.optim.SGD),
 )
 
+_ENGINE: Any = torch.autograd.Variable._execution_engine
+
 
 class FlatOptimizer:
     """Takes the steps of `optimizer` as SB3 does: gradients from zero, clipped by their common norm."""
@@ -58,12 +60,16 @@ class FlatOptimizer:
         if self._parameters[0].grad is not self._gradients[0]:
             for parameter, view in zip(self._parameters, self._gradients, strict=True):
                 parameter.grad = view
-        torch.autograd.backward(
-            outputs,
-            [
+        # What torch.autograd.backward calls once it has imported sympy, for shapes that are symbols.
+        _ENGINE.run_backward(
+            tuple(outputs),
+            tuple(
                 torch.as_tensor(slope, dtype=output.dtype, device=output.device).view_as(output)
                 for output, slope in zip(outputs, slopes, strict=True)
-            ],
+            ),
+            *(False, False, ()),  # the graph is not kept, no graph of the gradients, all parameters
+            allow_unreachable=True,
+            accumulate_grad=True,
         )
         # As torch.nn.utils.clip_grad_norm_ does it.
         norm = self._gradient.norm().item()
