@@ -13,31 +13,21 @@ a good policy, and each step must be an outcome of its row.
 from __future__ import annotations
 
 import copy
-import inspect
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError
-from gridworld.world.bellman import backup
 from gridworld.world.mdp import IntArray, Mdp
 from gridworld.world.outcomes import Outcomes, check_size, mdp_from_outcomes
+from gridworld.world.sources.known_envs import known_env
+from gridworld.world.sources.making import make_env, told
+from gridworld.world.sources.table_walk import SEED, walk
 
 if TYPE_CHECKING:
     import gymnasium as gym
-
-_SWEEPS = 100  # of value iteration, for the policy of the walk
-_GAMMA = 0.99
-# The walk: episodes with these shares of random actions in turn. The passenger of a fickle Taxi changes its
-# mind in 3 of 10 episodes, on the way to the destination, where random actions do not come.
-_RANDOM_SHARES = (0.0, 0.1, 1.0)
-_MOST_STEPS = (200, 200, 50)  # of one episode of each
-_WALK = 2000  # steps in all
-_MOST_EPISODES = 150
-_SEED = 20_240_501
 
 
 def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> Mdp:
@@ -55,9 +45,9 @@ def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> M
             not what its table says.
     """
     arguments = dict(kwargs or {})
-    env = _made(env_id, arguments)
+    env = make_env(env_id, arguments)
     mdp, table = _compiled(env)
-    again = _made(env_id, arguments)  # only now: a large environment takes long, and may be refused
+    again = make_env(env_id, arguments)  # only now: a large environment takes long, and may be refused
     if _differ(table, _table(mdp.name, again.unwrapped)):
         raise InputError(
             f"env.id={env_id}: has another table each time that it is made, so no exact truth is known; "
@@ -92,60 +82,11 @@ def has_table(env: Any) -> bool:
     return getattr(env, "P", None) is not None
 
 
-def _made(env_id: str, arguments: dict[str, Any]) -> gym.Env[Any, Any]:
-    import gymnasium as gym
-
-    if arguments.get("render_mode") is not None:
-        raise InputError(
-            f"env.kwargs: render_mode={arguments['render_mode']} is no part of the world; leave it out"
-        )
-    try:
-        spec = gym.spec(env_id)
-    except Exception as error:  # an id may name a module, which may raise anything
-        raise InputError(
-            f"env.id={str(env_id)[:80]}: is no environment that Gymnasium knows ({_told(error)}); give a "
-            "registered id, e.g. FrozenLake-v1"
-        ) from None
-    try:
-        with np.errstate(all="ignore"):
-            return gym.make(env_id, **{"disable_env_checker": True, **arguments})
-    except Exception as error:  # as above
-        given = f"env.kwargs={_shown(arguments)}: {env_id}" if arguments else f"env.id={env_id}:"
-        takes = _arguments(spec) if arguments else ""
-        raise InputError(f"{given} cannot be made ({_told(error)}){takes}") from None
-
-
-def _told(error: Exception) -> str:
-    """What an exception says, in short."""
-    text = str(error).split(" was raised from the environment creator")[0].strip().splitlines()
-    kind = type(error).__name__
-    return f"{kind}: {text[0][:200].rstrip(' .')}" if text else kind
-
-
-def _shown(arguments: Mapping[str, Any]) -> str:
-    return "{" + ", ".join(f"{key}: {value}" for key, value in arguments.items())[:100] + "}"
-
-
-def _arguments(spec: Any) -> str:
-    """What an environment can be made with, as the end of a sentence."""
-    from gymnasium.envs.registration import load_env_creator
-
-    try:
-        point = spec.entry_point
-        parameters = inspect.signature(
-            load_env_creator(point) if isinstance(point, str) else point
-        ).parameters
-    except Exception:
-        return "; see its documentation"
-    names = [name for name in parameters if name not in ("self", "render_mode")]
-    return f"; it takes {', '.join(names)}" if names else "; it takes no arguments"
-
-
 def _compiled(env: gym.Env[Any, Any]) -> tuple[Mdp, Outcomes]:
     real = env.unwrapped
     name = real.spec.id if real.spec is not None else type(real).__name__
     table = _table(name, real)
-    known = _known(real)
+    known = known_env(real)
     num_states, num_actions = table.next_state.shape[:2]
     names = known.action_names if known is not None and len(known.action_names) == num_actions else None
     places = known.places(real) if known is not None else None
@@ -289,18 +230,18 @@ def _copied(real: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
     except Exception:  # a window, say; what a step sets anew is the copy's own all the same
         other = copy.copy(real)
     other.render_mode = None
-    other.np_random = seeding.np_random(_SEED)[0]
+    other.np_random = seeding.np_random(SEED)[0]
     return other
 
 
 def _check_steps(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> None:
     mistake = None
     try:
-        _walk(mdp, table, real)
+        walk(mdp, table, real)
     except InputError as error:
         mistake = error
     except Exception as error:  # an environment of the user's own may raise anything
-        raise InputError(f"{mdp.name}: cannot be stepped ({_told(error)})") from error
+        raise InputError(f"{mdp.name}: cannot be stepped ({told(error)})") from error
     if _differ(table, _table(mdp.name, real)):
         raise InputError(
             f"{mdp.name}: its table P changes when it is reset or stepped, so no exact truth is known; must "
@@ -308,110 +249,3 @@ def _check_steps(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> None:
         )
     if mistake is not None:
         raise mistake
-
-
-def _walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> None:
-    """Compare steps of the real environment with the table, for episodes of `_WALK` steps in all."""
-    policy = _good_policy(mdp)
-    rng = np.random.default_rng(_SEED)
-    steps = 0
-    for episode in range(_MOST_EPISODES):
-        share, most = _RANDOM_SHARES[episode % 3], _MOST_STEPS[episode % 3]
-        state = _number(mdp, real.reset(seed=_SEED if episode == 0 else None)[0])
-        if not table.start[state] > 0:
-            raise InputError(
-                f"{mdp.name}: started in state {state}, which has no probability in initial_state_distrib"
-            )
-        for _ in range(most):
-            action = int(rng.integers(mdp.num_actions) if rng.random() < share else policy[state])
-            observation, reward, terminated, truncated, _ = real.step(action)
-            following = _number(mdp, observation)
-            _check_step(mdp.name, table, (state, action), (following, float(reward), bool(terminated)))
-            if truncated:
-                raise InputError(
-                    f"{mdp.name}: cuts its episodes by itself, which its table P does not have; must leave "
-                    "that to the wrapper TimeLimit"
-                )
-            steps += 1
-            if terminated:
-                break
-            state = following
-        if steps >= _WALK:
-            break
-
-
-def _good_policy(mdp: Mdp) -> IntArray:
-    """(S,), an optimal action of each state, up to what `_SWEEPS` of value iteration leave open."""
-    v = np.zeros(mdp.num_states)
-    for _ in range(_SWEEPS):
-        q = backup(mdp, v, _GAMMA)
-        v = q.max(axis=1)
-    return np.asarray(q.argmax(axis=1))
-
-
-def _number(mdp: Mdp, observation: Any) -> int:
-    number = int(observation)
-    if not 0 <= number < mdp.num_numbers:
-        raise InputError(f"{mdp.name}: shows state {number}, its table has states 0 to {mdp.num_numbers - 1}")
-    return number
-
-
-def _check_step(name: str, table: Outcomes, pair: tuple[int, int], found: tuple[int, float, bool]) -> None:
-    following, reward, terminated = found
-    same = (table.next_state[pair] == following) & (table.reward[pair] == reward)
-    if not (same & (table.terminated[pair] == terminated) & (table.probability[pair] > 0)).any():
-        state, action = pair
-        raise InputError(
-            f"{name}: leaves its own table: in state {state}, action {action} led to state {following} with "
-            f"reward {reward:g}{' and ended' if terminated else ''}, which P[{state}][{action}] does not "
-            "have, so no exact truth is known; must step by P alone"
-        )
-
-
-@dataclass(frozen=True)
-class _Known:
-    """What is known of a class of environments beside its table."""
-
-    action_names: tuple[str, ...]
-    places: Callable[[Any], NDArray[np.int64]]  # (N, 3), see `Mdp`
-    panel_names: tuple[str, ...] = ()  # see `Mdp`
-    refused: Callable[[Any], str] = lambda env: ""  # why its table is not true, if that can be seen
-
-
-def _grid_places(rows: int, cols: int) -> NDArray[np.int64]:
-    row, col = np.divmod(np.arange(rows * cols), cols)
-    return np.stack([np.zeros_like(row), row, col], axis=1).astype(np.int64)
-
-
-def _taxi_places(env: Any) -> NDArray[np.int64]:
-    """One panel for each passenger and destination: passenger * 4 + destination."""
-    cell, panel = np.divmod(np.arange(500), 20)
-    return np.stack([panel, cell // 5, cell % 5], axis=1).astype(np.int64)
-
-
-def _is_fickle(env: Any) -> str:
-    if not (getattr(env, "fickle_passenger", False) and getattr(env, "fickle_probability", 1) > 0):
-        return ""
-    return (
-        "fickle_passenger=True changes the destination in a way that its table P does not have, so no exact "
-        "truth is known; leave it out"
-    )
-
-
-_KNOWN = {
-    "FrozenLakeEnv": _Known(("left", "down", "right", "up"), lambda env: _grid_places(*env.desc.shape)),
-    "CliffWalkingEnv": _Known(("up", "right", "down", "left"), lambda env: _grid_places(*env.shape)),
-    "TaxiEnv": _Known(
-        ("south", "north", "east", "west", "pickup", "dropoff"),
-        _taxi_places,
-        tuple(f"{passenger} to {destination}" for passenger in (*"RGYB", "taxi") for destination in "RGYB"),
-        refused=_is_fickle,
-    ),
-}
-
-
-def _known(real: Any) -> _Known | None:
-    for each in type(real).__mro__:
-        if each.__module__.startswith("gymnasium.envs.toy_text."):
-            return _KNOWN.get(each.__name__)
-    return None
