@@ -73,5 +73,5 @@ def test_large_frames_are_made_smaller():
 
 
 def test_what_cannot_be_rendered_is_one_sentence():
-    with pytest.raises(InputError, match=r"^env.id=NoSuchWorld-v0: cannot be made: .*doesn't exist"):
+    with pytest.raises(InputError, match=r"^env.id=NoSuchWorld-v0: is no environment .*doesn't exist"):
         RealEnvFrames("NoSuchWorld-v0").episode(tables("FrozenLake-v1"), [0])

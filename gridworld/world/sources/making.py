@@ -34,7 +34,7 @@ def make_env(
             f"env.kwargs: render_mode={arguments['render_mode']} is no part of the world; leave it out"
         )
     for beginning, package in _PACKAGES.items():
-        if env_id.startswith(beginning):
+        if str(env_id).startswith(beginning):
             _import(env_id, package)
     try:
         spec = gym.spec(env_id)

@@ -213,7 +213,7 @@ def test_an_observation_that_is_no_array_is_left_out() -> None:
     ],
 )
 def test_what_cannot_be_enumerated_is_refused(env_id: str, kwargs: dict[str, Any], reason: str) -> None:
-    with pytest.raises(InputError, match=f"^env.id={env_id}: .*{reason}") as refused:
+    with pytest.raises(InputError, match=f"^env.*{env_id}.*{reason}") as refused:
         enumerate_env(env_id, kwargs, most_states=300)
     assert "\n" not in str(refused.value)
 

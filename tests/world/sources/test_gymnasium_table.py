@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from gridworld import GridWorldVectorEnv, InputError
 from gridworld.world.solver import value_iteration
-from gridworld.world.sources import gymnasium_table
+from gridworld.world.sources import gymnasium_table, table_walk
 from gridworld.world.sources.gymnasium_table import compile_gymnasium, compile_table
 
 DETERMINISTIC = {
@@ -347,8 +347,8 @@ def test_an_id_that_makes_no_world_is_refused(env_id, kwargs, told):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_walk_alone_finds_a_fickle_passenger(seed, monkeypatch):
-    monkeypatch.setattr(gymnasium_table, "_SEED", seed)
-    monkeypatch.setattr(gymnasium_table, "_known", lambda env: None)
+    monkeypatch.setattr(table_walk, "SEED", seed)
+    monkeypatch.setattr(gymnasium_table, "known_env", lambda env: None)
     with pytest.raises(InputError, match=re.escape("Taxi-v4: leaves its own table: in state")):
         compile_gymnasium("Taxi-v4", {"fickle_passenger": True})
 
