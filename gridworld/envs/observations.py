@@ -4,7 +4,7 @@ An observation is a function of the state alone, so each kind is a table of S ro
 all there is to it, for one environment, a batch, a replay buffer or the whole state space at once.
 
     kind         dtype    shape        row of a state
-    one_hot      float32  (S,)         1 at the state's number
+    one_hot      float32  (N,)         1 at the state's number; N is S but for further ends
     coordinates  float32  (2,), (3,)   row and column (and panel, if there are several), scaled to [0, 1]
     image        uint8    (3, H, W)    the pixels of its frame, channels first as SB3's CnnPolicy takes them
     own          its own  its own      what the environment itself shows, where the world was made from one
@@ -85,9 +85,12 @@ Rows = tuple[gym.Space[Any], NDArray[Any] | None]  # of one observation; (S, *sh
 
 
 def _one_hot(mdp: Mdp, cell_size: int) -> Rows:
-    size = mdp.num_states
-    small = size * size * 4 <= _SMALL_TABLE_BYTES
-    return spaces.Box(0.0, 1.0, (size,), np.float32), np.eye(size, dtype=np.float32) if small else None
+    size = mdp.num_numbers
+    space = spaces.Box(0.0, 1.0, (size,), np.float32)
+    if size == mdp.num_states and size * size * 4 > _SMALL_TABLE_BYTES:
+        return space, None
+    check_memory("observation one_hot", mdp.num_states * size * 4)
+    return space, np.eye(size, dtype=np.float32)[mdp.number]
 
 
 def _coordinates(mdp: Mdp, cell_size: int) -> Rows:
