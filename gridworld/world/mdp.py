@@ -56,7 +56,7 @@ class Mdp:
         places: (S, 3), int64, or None: panel, row and column of each state in pictures, -1 where it has none.
         panel_names: what pictures call each panel; none: they do not name them.
         max_episode_steps: the step limit that belongs to the world; None: it has none of its own.
-        own_observation: (S, *shape), or None: what the environment itself shows of each state.
+        own_observation: (S, ...), or None: what the environment itself shows of each state.
         truth: where the tables come from, as tables and pictures say it.
     """
 
