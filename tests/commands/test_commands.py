@@ -278,12 +278,13 @@ def test_the_benchmark_prints_tables_and_writes_json(
     defaults = training.sb3_defaults
     monkeypatch.setattr(training, "sb3_defaults", lambda algorithm, envs: defaults(training.DQN, 1))
     out = tmp_path / "benchmark.json"
-    benchmark.main(["--quick", "--only", "stepping", "training", "--out", str(out)])
+    benchmark.main(["--quick", "--only", "stepping", "training", "worlds", "--out", str(out)])
     output = capsys.readouterr().out
     results = json.loads(out.read_text())["results"]
     assert {result["table"] for result in results} == {
         "stepping, environment steps per second",
         "training, environment steps per second",
+        "compiling, seconds",
     }
     for result in results:
         assert result["name"] in output
