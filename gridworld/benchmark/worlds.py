@@ -10,42 +10,45 @@ from typing import Any
 import gymnasium as gym
 import torch
 from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env as dummy_vec_env
 
 from gridworld.agents.sb3.interop.make_vec_env import make_vec_env
 from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
 from gridworld.benchmark.measure import Comparison, Workload
-from gridworld.benchmark.training import DQN_BATCH, PPO_SMALL, learner
+from gridworld.benchmark.training import DQN_BATCH, PPO_LARGE, learner
 from gridworld.config.worlds import GymnasiumConfig
 
-_WORLDS = [GymnasiumConfig(id=name) for name in ("FrozenLake-v1", "CliffWalking-v1", "Taxi-v4")]
-# With 8 environments in place of 64: rollouts as large, and as many transitions an update.
-_PPO_OF_8: dict[str, Any] = {**PPO_SMALL, "n_steps": 8 * PPO_SMALL["n_steps"]}
-_DQN_OF_8: dict[str, Any] = {**DQN_BATCH, "train_freq": 8}
+WORLDS = ("FrozenLake-v1", "CliffWalking-v1", "Taxi-v4")
+ENVS = 1024
+# Each transition is replayed 8 times, as by SB3's defaults. With 8 environments, rollouts are as large, and
+# as many transitions lie between two updates.
+DQN_LARGE: dict[str, Any] = {**DQN_BATCH, "batch_size": 8 * ENVS}
+LEARNERS: tuple[tuple[type[BaseAlgorithm], type[BaseAlgorithm], dict[str, Any], str], ...] = (
+    (TabulatedPPO, PPO, PPO_LARGE, "n_steps"),
+    (TabulatedDQN, DQN, DQN_LARGE, "train_freq"),
+)
 
 
 def comparisons(workload: Workload) -> Iterator[Comparison]:
     """Compiling each world, then PPO and DQN on each."""
     torch.set_num_threads(1)
-    for world in _WORLDS:
-        make = partial(gym.make, world.id)
-        name = f"gymnasium.make({world.id!r})"
-        yield Comparison(
-            "compiling, seconds", world.id, partial(_seconds, world.compile), name, partial(_seconds, make)
-        )
-    for world in _WORLDS:
+    worlds = [GymnasiumConfig(id=name) for name in WORLDS]
+    for world in worlds:
+        peer, make = f"gymnasium.make({world.id!r})", partial(gym.make, world.id)
+        ours, theirs = partial(_seconds, world.compile), partial(_seconds, make)
+        yield Comparison("compiling, seconds", world.id, ours, peer, theirs)
+    for world in worlds:
         mdp = world.compile()
         limit = world.step_limit(mdp)
-        batch = partial(make_vec_env, n_envs=64, mdp=mdp, max_episode_steps=limit)
+        batch = partial(make_vec_env, n_envs=ENVS, mdp=mdp, max_episode_steps=limit)
         usual = partial(dummy_vec_env, world.id, n_envs=8, env_kwargs={"max_episode_steps": limit})
-        for fast, stock, settings, settings_of_8 in (
-            (TabulatedPPO, PPO, PPO_SMALL, _PPO_OF_8),
-            (TabulatedDQN, DQN, DQN_BATCH, _DQN_OF_8),
-        ):
-            ours = learner(fast, batch, workload.steps, **settings)
+        for fast, stock, settings, per_env in LEARNERS:
+            ours = learner(fast, batch, 4 * workload.steps, **settings)
+            of_8 = {**settings, per_env: settings[per_env] * ENVS // 8}
             for peer, theirs in (
-                ("8 envs in DummyVecEnv", learner(stock, usual, workload.steps // 8, **settings_of_8)),
+                ("8 envs in DummyVecEnv", learner(stock, usual, workload.steps, **of_8)),
                 ("same batch", learner(stock, batch, workload.steps, **settings)),
             ):
                 yield Comparison(
