@@ -11,15 +11,15 @@ import gymnasium as gym
 import torch
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.env_util import make_vec_env as dummy_vec_env
+from stable_baselines3.common.vec_env import VecEnv
 
+from gridworld.agents.sb3.interop.make_vec_env import make_vec_env
 from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
-from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.benchmark import peers
 from gridworld.benchmark.measure import Comparison, Workload
-from gridworld.envs.observations import OneHotObservation, make_observation
-from gridworld.envs.vector_env import GridWorldVectorEnv
+from gridworld.envs.observations import OneHotObservation
 
 _TABLE = "training, environment steps per second"
 
@@ -38,21 +38,22 @@ DQN_BATCH: dict[str, Any] = {  # with 64 environments: one update of 512 per ste
 def comparisons(workload: Workload) -> Iterator[Comparison]:
     """PPO and DQN on 5x6, then on 200x200."""
     torch.set_num_threads(1)
+    batch = partial(make_vec_env, n_envs=64)
     ppo, dqn = (
-        learner(TabulatedPPO, 64, workload.steps, **PPO_SMALL),
-        learner(TabulatedDQN, 64, workload.steps, **DQN_BATCH),
+        learner(TabulatedPPO, batch, workload.steps, **PPO_SMALL),
+        learner(TabulatedDQN, batch, workload.steps, **DQN_BATCH),
     )
     yield Comparison(
         _TABLE,
         "PPO, 64 envs x 128, batch 2048, 4 epochs",
         ppo,
         "stock SB3, same batch and settings",
-        learner(PPO, 64, workload.steps, **PPO_SMALL),
+        learner(PPO, batch, workload.steps, **PPO_SMALL),
     )
     yield Comparison(
         _TABLE, "the same", ppo, "stock SB3, defaults, 8 envs in DummyVecEnv", sb3_defaults(PPO, 8)
     )
-    large = learner(TabulatedPPO, 1024, 4 * workload.steps, **PPO_LARGE)
+    large = learner(TabulatedPPO, partial(make_vec_env, n_envs=1024), 4 * workload.steps, **PPO_LARGE)
     yield Comparison(
         _TABLE,
         "PPO, 1024 envs x 32, batch 8192, 4 epochs",
@@ -66,7 +67,7 @@ def comparisons(workload: Workload) -> Iterator[Comparison]:
         "DQN, 64 envs, an update of 512 per step",
         dqn,
         "stock SB3, same batch and settings",
-        learner(DQN, 64, workload.steps, **DQN_BATCH),
+        learner(DQN, batch, workload.steps, **DQN_BATCH),
     )
     yield Comparison(_TABLE, "the same", dqn, "stock SB3, defaults, one env", sb3_defaults(DQN, 1))
     for name, ours, num_envs in (("PPO", ppo, 8), ("DQN", dqn, 1)):
@@ -78,6 +79,7 @@ def comparisons(workload: Workload) -> Iterator[Comparison]:
             None if peers.why_not("SBX") else partial(peers.sbx, name, num_envs),
             peers.why_not("SBX"),
         )
+    large_map = partial(make_vec_env, n_envs=64, num_rows=200, num_cols=200)
     for name, ours, algorithm, settings in (
         ("PPO", ppo, TabulatedPPO, PPO_SMALL),
         ("DQN", dqn, TabulatedDQN, DQN_BATCH),
@@ -85,28 +87,23 @@ def comparisons(workload: Workload) -> Iterator[Comparison]:
         yield Comparison(
             _TABLE,
             f"{name}, 64 envs, on 200x200",
-            learner(algorithm, 64, workload.steps // 4, (200, 200), **settings),
+            learner(algorithm, large_map, workload.steps // 4, **settings),
             "the same on 5x6",
             ours,
         )
 
 
 def learner(
-    algorithm: type[BaseAlgorithm],
-    num_envs: int,
-    steps: int,
-    size: tuple[int, int] = (5, 6),
-    **settings: Any,
+    algorithm: type[BaseAlgorithm], envs: Callable[[], VecEnv], steps: int, **settings: Any
 ) -> Callable[[], float]:
-    """Measures `learn` on our batch; the first call makes the model and warms it up."""
+    """Measures `learn` on a batch; the first call makes both, and warms up the model."""
     made: list[BaseAlgorithm] = []
 
     def measure() -> float:
         if not made:
-            envs = GridWorldVectorEnv(num_envs, *size, autoreset_mode="SameStep")
-            observed = GridWorldVecEnv(envs, make_observation(envs.mdp, "one_hot"))
-            made.append(_model(algorithm, observed, **settings))
-            made[0].learn(num_envs * settings.get("n_steps", 16))
+            batch = envs()
+            made.append(_model(algorithm, batch, **settings))
+            made[0].learn(batch.num_envs * settings.get("n_steps", 16))
         return _steps_per_second(made[0], steps)
 
     return measure
@@ -116,7 +113,7 @@ def sb3_defaults(algorithm: type[BaseAlgorithm], num_envs: int) -> Callable[[], 
     """Measures SB3's defaults on `make_vec_env`, over 2048 steps of each environment."""
 
     def measure() -> float:
-        envs = make_vec_env(lambda: OneHotObservation(gym.make("GridWorld-v0")), n_envs=num_envs)
+        envs = dummy_vec_env(lambda: OneHotObservation(gym.make("GridWorld-v0")), n_envs=num_envs)
         return _steps_per_second(_model(algorithm, envs), 2048 * num_envs)
 
     return measure

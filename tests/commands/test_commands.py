@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 
 import gridworld
 from gridworld.benchmark import end_to_end as whole
-from gridworld.benchmark import training
+from gridworld.benchmark import training, worlds
 from gridworld.benchmark.measure import QUICK, Comparison
 from gridworld.commands import benchmark, evaluate, run
 from gridworld.commands import record as record_command
@@ -278,13 +278,18 @@ def test_the_benchmark_prints_tables_and_writes_json(
     # One rollout of SB3's PPO at its defaults takes as long as all the rest: its DQN runs in its place.
     defaults = training.sb3_defaults
     monkeypatch.setattr(training, "sb3_defaults", lambda algorithm, envs: defaults(training.DQN, 1))
+    small = zip(worlds.LEARNERS, (training.PPO_SMALL, training.DQN_BATCH), strict=True)
+    monkeypatch.setattr(worlds, "LEARNERS", [(*both, less, per_env) for (*both, _, per_env), less in small])
+    monkeypatch.setattr(worlds, "WORLDS", ["FrozenLake-v1"])
+    monkeypatch.setattr(worlds, "ENVS", 16)
     out = tmp_path / "benchmark.json"
-    benchmark.main(["--quick", "--only", "stepping", "training", "--out", str(out)])
+    benchmark.main(["--quick", "--only", "stepping", "training", "worlds", "--out", str(out)])
     output = capsys.readouterr().out
     results = json.loads(out.read_text())["results"]
     assert {result["table"] for result in results} == {
         "stepping, environment steps per second",
         "training, environment steps per second",
+        "compiling, seconds",
     }
     for result in results:
         assert result["name"] in output

@@ -14,8 +14,14 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from gridworld.agents.sb3.constructor_arguments import algorithm_and_arguments
 from gridworld.commands.shell.help import manual
 
-TASKS = ("aima_4x3", "classic", "cliff", "four_rooms", "frozen_lake_4x4", "maze")
 AGENTS = sorted(file.stem for file in (CONF / "agent").glob("*.yaml"))
+EVERY = {agent for agent in AGENTS if not agent.endswith("_sb3_defaults")}
+OF_OTHER_SOURCES = {"q_learning", "sarsa", "expected_sarsa", "dqn", "ppo"}
+TASKS = {
+    **dict.fromkeys(("aima_4x3", "classic", "cliff", "four_rooms", "frozen_lake_4x4", "maze"), EVERY),
+    **dict.fromkeys(("frozen_lake_v1", "frozen_lake_v1_dry", "cliff_walking_v1"), OF_OTHER_SOURCES),
+    **dict.fromkeys(("taxi_v4", "deep_sea", "river_swim"), OF_OTHER_SOURCES),
+}
 RECIPES = sorted(file.stem for file in (CONF / "experiment").glob("*.yaml"))
 NO_FILES = (
     *("recording.frames=false", "recording.gif=false", "recording.policy_map=false"),
@@ -26,8 +32,7 @@ NO_FILES = (
 
 @pytest.mark.parametrize("task", TASKS)
 def test_every_agent_has_a_recipe_for_the_task(task: str) -> None:
-    everywhere = [agent for agent in AGENTS if not agent.endswith("_sb3_defaults")]
-    assert {f"{task}_{agent}" for agent in everywhere} <= set(RECIPES)
+    assert {f"{task}_{agent}" for agent in TASKS[task]} <= set(RECIPES)
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
@@ -35,8 +40,11 @@ def test_a_recipe_trains_as_its_name_says(recipe: str, tmp_path: Path) -> None:
     """Long enough for a first update: past learning_starts, and through a rollout."""
     summary = train_in(tmp_path, f"experiment={recipe}", "total_timesteps=200", *NO_FILES)
     config = configure(f"experiment={recipe}")
-    task = config.env.layout.removesuffix("_walking")  # the textbook's own rule for the same task
+    task = recipe.removesuffix(f"_{config.agent.name}")
+    # The textbook's recipes are of its own rule for the same task.
+    world = "cliff_walking" if config.agent.name.endswith("_textbook") else task
     assert recipe == f"{task}_{config.agent.name}"
+    assert config.env == configure(f"env={world}").env
     assert summary["timesteps"] == 0 or int(summary["timesteps"]) >= 200
 
 

@@ -66,7 +66,7 @@ Examples:
       a recipe: that agent and that task, with settings that were tuned for them
   python scripts/train.py recipe=runs/tune_ppo_maze seed=3
       the winner of a study
-  python scripts/train.py -m 'experiment=glob(cliff_*)' seed='range(20)'
+  python scripts/train.py -m 'experiment=glob(maze_*)' seed='range(20)'
       every recipe of a task, with twenty seeds each
 
 Afterwards: scripts/evaluate.py, scripts/record.py and scripts/play.py --agent, with a run's folder;

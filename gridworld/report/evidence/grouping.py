@@ -90,7 +90,7 @@ def task_key(run: Evidence) -> Key:
     world = {
         name.removeprefix("env."): value
         for name, value in run.settings.items()
-        if effect_of(name) is Effect.TASK and name not in _MAP
+        if effect_of(name) is Effect.TASK and name not in _MAP and value != _EMPTY
     }
     digest = sha256(run.layout.encode())[:6]
     world |= {"layout": run.env, "map": digest, "evaluation.gamma": str(run.gamma)}
