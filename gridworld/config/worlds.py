@@ -14,6 +14,7 @@ from typing import Any, Optional
 
 from gridworld.bounds import STEP_LIMIT, at_least, at_most
 from gridworld.config.agents import MISSING
+from gridworld.errors import InputError
 from gridworld.world.grid import GridMdp, compile_mdp
 from gridworld.world.layout import Layout, load
 from gridworld.world.mdp import Mdp
@@ -43,15 +44,28 @@ class EnvConfig:
         raise NotImplementedError
 
     def step_limit(self, mdp: Mdp) -> int:
-        """The step limit of an episode in the compiled world."""
-        return self.max_episode_steps or mdp.max_episode_steps or STEP_LIMIT
+        """The step limit of an episode in the compiled world.
+
+        Raises:
+            InputError: the world's own is one that an exact evaluation would not come to the end of.
+        """
+        limit = self.max_episode_steps or mdp.max_episode_steps or STEP_LIMIT
+        if limit > MOST_STEPS:
+            raise InputError(
+                f"env.max_episode_steps: {mdp.name} has a step limit of {limit:,} of its own; give one of at "
+                f"most {MOST_STEPS:,}"
+            )
+        return limit
 
     def check(self) -> None:
         """Check the step limit: one that can be, and that an exact evaluation comes to the end of.
 
         Raises:
-            InputError: it is another one.
+            InputError: it is another one; or a source that is not this schema's.
         """
+        source = getattr(self, "source", None)
+        if source is not None and SOURCES.get(source) is not type(self):
+            raise InputError(f"env.source={source}: is no setting of its own; choose a source by env=...")
         if self.max_episode_steps is not None:
             at_least("env.max_episode_steps", self.max_episode_steps, 1)
             at_most("env.max_episode_steps", self.max_episode_steps, MOST_STEPS)
@@ -120,6 +134,16 @@ class EnumeratedConfig(GymnasiumConfig):
 
         return enumerate_env(self.id, self.kwargs)
 
+    def step_limit(self, mdp: Mdp) -> int:
+        """See `EnvConfig.step_limit`; the environment itself ends its episodes at its own limit."""
+        limit, own = super().step_limit(mdp), mdp.max_episode_steps
+        if own is not None and limit > own:
+            raise InputError(
+                f"env.max_episode_steps={limit}: {mdp.name} truncates its episodes after {own} steps; "
+                f"give at most {own}"
+            )
+        return limit
+
 
 @dataclass
 class ArraysConfig(EnvConfig):
@@ -178,7 +202,10 @@ class ClassicConfig(EnvConfig):
         sizes = asdict(self)
         del sizes["source"], sizes["max_episode_steps"]
         make: Callable[..., Mdp] = getattr(classics, self.source)
-        return make(**sizes)
+        try:
+            return make(**sizes)
+        except InputError as error:
+            raise InputError(f"env.{error}") from None
 
 
 @dataclass

@@ -15,6 +15,7 @@ from typing import Any
 import yaml
 
 from gridworld.config.worlds import EnvConfig, MapConfig
+from gridworld.envs.registration import ENV_ID
 from gridworld.errors import InputError
 from gridworld.export.exported_run import ExportedRun
 from gridworld.report.table import Table, to_markdown
@@ -147,6 +148,7 @@ def _world(env: EnvConfig) -> str:
 
 
 def _metadata(run: ExportedRun, is_sb3: bool) -> dict[str, Any]:
+    world = ENV_ID if isinstance(run.config.env, MapConfig) else run.config.env.name
     library = {"library_name": "stable-baselines3"} if is_sb3 else {}
     scores = [
         {"type": name, "name": f"{name} (exact)", "value": score, "verified": False}
@@ -154,10 +156,10 @@ def _metadata(run: ExportedRun, is_sb3: bool) -> dict[str, Any]:
     ]
     result = {
         "task": {"type": "reinforcement-learning", "name": "reinforcement-learning"},
-        "dataset": {"type": "GridWorld-v0", "name": f"GridWorld-v0, {run.env}"},
+        "dataset": {"type": world, "name": f"{world}, {run.env}" if run.env != world else world},
         "metrics": scores,
     }
-    tags = ["GridWorld-v0", "deep-reinforcement-learning" if is_sb3 else "tabular", "reinforcement-learning"]
+    tags = [world, "deep-reinforcement-learning" if is_sb3 else "tabular", "reinforcement-learning"]
     index = {"name": run.config.agent.algorithm, "results": [result]}
     return {**library, "tags": [*tags, *library.values()], "model-index": [index]}
 

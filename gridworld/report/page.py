@@ -178,8 +178,13 @@ def _facts(task: TaskAnalysis) -> list[str]:
             f"return {number(world.random_return)}"
         )
     names = ("slip", "step_reward", "goal_reward", "trap_reward", "max_episode_steps")
+    if "env.source" in run.settings:
+        names = tuple(sorted(name.removeprefix("env.") for name in run.settings if name.startswith("env.")))
     settings = ((name.replace("_", " "), run.settings.get(f"env.{name}")) for name in names)
-    told.append("World: " + ", ".join(f"{name} {value}" for name, value in settings if value is not None))
+    shown = [f"{name} {value}" for name, value in settings if value not in (None, "null", "{}")]
+    if run.settings.get("env.max_episode_steps") in (None, "null"):
+        shown.append(f"max episode steps {run.step_limit}")
+    told.append("World: " + ", ".join(shown))
     return [f"{sentence}." for sentence in told]
 
 

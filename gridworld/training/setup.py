@@ -53,6 +53,7 @@ def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = comp
     check(config)
     family(config.agent).check(config)
     mdp = world(config.env)
+    config.env.step_limit(mdp)
     check_recording(config, mdp)
     return mdp
 

@@ -106,7 +106,8 @@ class Evaluator:
         Raises:
             InputError: it is no policy of this world.
         """
-        return [self.mdp.coordinates(int(state)) for state in Chain(self.mdp, policy).endless_states()]
+        states = Chain(self.mdp, policy).endless_states()
+        return [self.mdp.coordinates(int(state)) for state in states if not self.mdp.absorbing[state]]
 
     def _at_start(self, values: FloatArray) -> float:
         starts = self.mdp.start_states

@@ -50,9 +50,9 @@ class GridMdp(Mdp):
         """The map."""
         return self.layout.text()
 
-    def rewards_text(self) -> str:
+    def rewards_text(self) -> tuple[str, str]:
         """See `Mdp.rewards_text`."""
-        return f"step_reward={self.step_reward}"
+        return f"step_reward={self.step_reward}", " or a step_reward of at most 0"
 
     def coordinates(self, state: int) -> tuple[int, ...]:
         """Row and column."""

@@ -158,9 +158,9 @@ class Mdp:
         """What messages call a state."""
         return f"state {int(self.number[state])}"
 
-    def rewards_text(self) -> str:
-        """What messages call that which pays on the way."""
-        return f"the rewards of {self.name}"
+    def rewards_text(self) -> tuple[str, str]:
+        """What messages call that which pays on the way, and how it could be changed, if it can."""
+        return f"the rewards of {self.name}", ""
 
     def action_choices(self) -> str:
         """The actions for a message: 0 (up), 1 (right), 2 (down) or 3 (left)."""

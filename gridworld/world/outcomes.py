@@ -11,7 +11,7 @@ which are.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ from gridworld.world.mdp import (
 MOST_ACTIONS = 256
 MOST_STATES = 512 * 512
 _SUM = 1e-9  # how far probabilities may be from 1 in sum
+_DOUBLE = 8  # bytes of a number
 _BYTES = 64  # of an outcome in all tables, and while they are made
 _MOST_BYTES = 4 * 2**30
 
@@ -88,7 +89,7 @@ def mdp_from_outcomes(
     Raises:
         InputError: shapes that do not fit, no probabilities, numbers of no state, or too many of them.
     """
-    check_outcomes(name, outcomes)
+    outcomes = checked(name, outcomes)
     _check_extras(name, outcomes, action_names, places, max_episode_steps, own_observation)
     ends = _Ends(outcomes)
     extra = ends.number[len(outcomes.start) :]
@@ -218,12 +219,48 @@ _KINDS = {  # of arrays, as numpy's `dtype.kind` names them
 }
 
 
-def check_outcomes(name: str, outcomes: Outcomes) -> None:
-    """Check the tables of outcomes.
+def checked(name: str, outcomes: Outcomes) -> Outcomes:
+    """Check the tables of outcomes, and convert them to the types that are computed with.
+
+    Args:
+        name: of the world, for messages.
+        outcomes: of any kind of numbers. What is impossible may lead anywhere and pay anything.
+
+    Returns:
+        The same in float64 and int64. Probabilities of less precision than that are made to sum to 1.
 
     Raises:
         InputError: see `mdp_from_outcomes`.
     """
+    _check_kinds(name, outcomes)
+    least = outcomes.probability.dtype, outcomes.start.dtype
+    probability, start = (
+        np.asarray(table, dtype=np.float64) for table in (outcomes.probability, outcomes.start)
+    )
+    _check_distribution(name, "start", start[None], least[1])
+    _check_distribution(name, "probability", probability, least[0])
+    possible = probability > 0
+    here = np.arange(len(start))[:, None, None]
+    leads_to = outcomes.next_state.astype(np.int64)
+    exists = (leads_to >= 0) & (leads_to < len(start))
+    found = replace(
+        outcomes,
+        next_state=np.where(possible | exists, leads_to, here),
+        probability=_summing_to_one(probability, least[0]),
+        start=_summing_to_one(start, least[1]),
+        reward=np.where(possible, outcomes.reward.astype(np.float64), 0.0),
+    )
+    _check_next_states(name, found.next_state)
+    _check_rewards(name, found.reward)
+    return found
+
+
+def _summing_to_one(table: FloatArray, given: np.dtype[Any]) -> FloatArray:
+    precise = given.kind != "f" or given.itemsize >= _DOUBLE
+    return table if precise else table / table.sum(axis=-1, keepdims=True)
+
+
+def _check_kinds(name: str, outcomes: Outcomes) -> None:
     for what, (kinds, words) in _KINDS.items():
         table = getattr(outcomes, what)
         if what == "success" and table is None:
@@ -243,22 +280,21 @@ def check_outcomes(name: str, outcomes: Outcomes) -> None:
     if outcomes.start.shape != shape[:1]:
         raise InputError(f"{name}: start has shape {outcomes.start.shape}, must be ({shape[0]},)")
     check_size(name, *shape)
-    _check_distribution(name, "start", outcomes.start[None])
-    _check_distribution(name, "probability", outcomes.probability)
-    wrong = (outcomes.next_state < 0) | (outcomes.next_state >= shape[0])
-    if wrong.any():
-        state, action, outcome = (int(index) for index in np.argwhere(wrong)[0])
+
+
+def _check_next_states(name: str, next_state: IntArray) -> None:
+    wrong = (next_state < 0) | (next_state >= len(next_state))
+    for state, action, outcome in np.argwhere(wrong)[:1]:
         raise InputError(
             f"{name}: next_state of state {state}, action {action} is "
-            f"{outcomes.next_state[state, action, outcome]}, must be from 0 to {shape[0] - 1}"
+            f"{next_state[state, action, outcome]}, must be from 0 to {len(next_state) - 1}"
         )
-    _check_rewards(name, outcomes.reward, outcomes.probability > 0)
 
 
-def _check_rewards(name: str, reward: FloatArray, possible: BoolArray) -> None:
+def _check_rewards(name: str, reward: FloatArray) -> None:
     size = np.abs(reward)
     for state, action, outcome in np.argwhere(
-        possible & (reward != 0) & ~((size >= LEAST_REWARD) & (size <= MOST_REWARD))
+        (reward != 0) & ~((size >= LEAST_REWARD) & (size <= MOST_REWARD))
     )[:1]:
         where = f"{name}: reward of state {state}, action {action}"
         checked_reward(where, float(reward[state, action, outcome]))
@@ -281,13 +317,16 @@ def _check_extras(
         positive_int(f"{name}: max_episode_steps", limit)
 
 
-def _check_distribution(name: str, what: str, table: FloatArray) -> None:
-    table = table.astype(np.float64)
-    wrong = ~((table >= 0).all(axis=-1) & (np.abs(table.sum(axis=-1) - 1) <= _SUM))
+def _check_distribution(name: str, what: str, table: FloatArray, given: np.dtype[Any]) -> None:
+    inexact = given.kind == "f" and given.itemsize < _DOUBLE
+    most = max(_SUM, table.shape[-1] * float(np.finfo(given).eps)) if inexact else _SUM
+    wrong = ~((table >= 0).all(axis=-1) & (np.abs(table.sum(axis=-1) - 1) <= most))
     if wrong.any():
         where = np.argwhere(wrong)[0]
         place = "" if what == "start" else f" of state {where[0]}, action {where[1]}"
+        shown = ", ".join(f"{each:.6g}" for each in table[tuple(where)][:8])
+        more = ", ..." if table.shape[-1] > 8 else ""
         raise InputError(
-            f"{name}: {what}{place} is {table[tuple(where)].tolist()[:8]}, with sum "
+            f"{name}: {what}{place} is [{shown}{more}], with sum "
             f"{table[tuple(where)].sum():.12g}; must be probabilities with sum 1"
         )

@@ -152,9 +152,10 @@ def _resting_policy(mdp: Mdp) -> IntArray:
     playing = ~mdp.absorbing
     going_on = _staying(mdp, possible, playing, np.ones(possible.shape[:2], dtype=np.bool_))
     if (going_on & (possible & (mdp.reward > 0)).any(axis=2)).any():
+        paid, remedy = mdp.rewards_text()
         raise InputError(
-            f"gamma=1 with {mdp.rewards_text()}: who goes on for ever is paid on the way, so that the "
-            "return may grow without end; take a gamma below 1 or a step_reward of at most 0"
+            f"gamma=1 with {paid}: who goes on for ever is paid on the way, so that the return may grow "
+            f"without end; take a gamma below 1{remedy}"
         )
     free = ~np.asarray((possible & (mdp.reward != 0)).any(axis=2))
     resting = _staying(mdp, possible, playing, free)

@@ -18,10 +18,11 @@ from hydra.errors import OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from yaml import MarkedYAMLError, YAMLError
 
-from gridworld.config import sweep, train, tune
+from gridworld.config import sweep, train, tune, worlds
 from gridworld.config.agents import AgentConfig, agent_schemas
 from gridworld.config.composition.setting_names import settings_of_a_run
 from gridworld.config.composition.words import OF_THE_COMMAND
+from gridworld.config.worlds import EnvConfig
 from gridworld.errors import InputError, failure
 
 _LISTED = 24  # choices of a group that are listed at most; of more, those with a similar name
@@ -135,14 +136,21 @@ def _suggestion(facts: str) -> str:
 
 def _schemas() -> dict[str, Any]:
     """All schemas by the names of their classes, beside what else their modules hold."""
-    modules = [train, sweep, tune, *(sys.modules[schema.__module__] for schema in agent_schemas().values())]
+    modules = [
+        train,
+        worlds,
+        sweep,
+        tune,
+        *(sys.modules[schema.__module__] for schema in agent_schemas().values()),
+    ]
     return {name: value for module in modules for name, value in vars(module).items()}
 
 
 def _elsewhere(key: str, schema: type) -> list[str]:
     """What `key` may be instead: a word that is no setting, or the dotted name of one in another section."""
     words = difflib.get_close_matches(key, OF_THE_COMMAND, n=1) if schema is train.TrainConfig else []
-    own = "agent." if issubclass(schema, AgentConfig) else "."  # another agent's settings are of no use
+    # Another agent's or source's settings are of no use.
+    own = "agent." if issubclass(schema, AgentConfig) else "env." if issubclass(schema, EnvConfig) else "."
     last = {name: name.rpartition(".")[2] for name in settings_of_a_run() if not name.startswith(own)}
     alike = difflib.get_close_matches(key, set(last.values()), n=1, cutoff=0.8)
     return words or sorted(name for name, part in last.items() if [part] == alike)

@@ -19,6 +19,9 @@ from gridworld.storage.safe_read import sha256
 
 _OF_LEARNING = (Effect.LEARNING, Effect.LENGTH, Effect.EVALUATION)
 _MAP = ("env.layout", "env.num_rows", "env.num_cols")
+_SOURCE = "env.source"  # of a world that is no map
+_OF_TABLES = ("layout", "max_episode_steps", "evaluation.gamma")
+_NULL = "null"
 _EMPTY = "{}"  # a mapping; in what its entries are, it is told by these
 _UNSET = "(not set)"
 _LONGEST_VALUE = 24  # characters in a label
@@ -64,7 +67,7 @@ def arrange(runs: Iterable[Evidence]) -> Study:
     tasks: dict[Key, list[Evidence]] = defaultdict(list)
     for run in runs:
         tasks[task_key(run)].append(run)
-    task_labels = labels([(dict(key)["layout"], dict(key)) for key in tasks])
+    task_labels = labels([(dict(key)["layout"], _world_of(members[0])) for key, members in tasks.items()])
     groups = []
     for task, members in zip(task_labels, tasks.values(), strict=True):
         configurations: dict[tuple[str, Key], list[Evidence]] = defaultdict(list)
@@ -86,15 +89,24 @@ def arrange(runs: Iterable[Evidence]) -> Study:
 
 def task_key(run: Evidence) -> Key:
     """What makes the task: map, dynamics, rewards, step limit and the discount of the evaluation."""
+    world = _world_of(run)
+    if _SOURCE in run.settings:  # its tables count, not what they were made from
+        world = {key: world[key] for key in _OF_TABLES} | {"tables": run.layout}
+    return tuple(sorted(world.items()))
+
+
+def _world_of(run: Evidence) -> dict[str, str]:
+    """What labels tell tasks apart by."""
     # The map itself counts, not the path it was read from or the size that is told beside it.
     world = {
         name.removeprefix("env."): value
         for name, value in run.settings.items()
-        if effect_of(name) is Effect.TASK and name not in _MAP and value != _EMPTY
+        if effect_of(name) is Effect.TASK and name not in _MAP and value not in (_EMPTY, _NULL)
     }
-    digest = sha256(run.layout.encode())[:6]
-    world |= {"layout": run.env, "map": digest, "evaluation.gamma": str(run.gamma)}
-    return tuple(sorted(world.items()))
+    world |= {"layout": run.env, "evaluation.gamma": str(run.gamma)}
+    if _SOURCE in run.settings:
+        return world | {"max_episode_steps": str(run.step_limit)}
+    return world | {"map": sha256(run.layout.encode())[:6]}
 
 
 def learning_key(run: Evidence) -> Key:
@@ -141,9 +153,11 @@ def _difference(settings: Settings, namesakes: Sequence[Settings]) -> str:
 
 
 def _told(settings: Settings, names: Sequence[str]) -> str:
-    return ", ".join(
-        f"{name.removeprefix('agent.')}={settings.get(name, _UNSET)[:_LONGEST_VALUE]}" for name in names
-    )
+    return ", ".join(f"{name.removeprefix('agent.')}={_short(settings.get(name, _UNSET))}" for name in names)
+
+
+def _short(value: str) -> str:
+    return value if len(value) <= _LONGEST_VALUE else f"{value[: _LONGEST_VALUE - 3]}..."
 
 
 def _splits(task: str, configurations: Iterable[tuple[str, Key]]) -> list[str]:

@@ -45,6 +45,7 @@ class Evidence:
         version: The version of this package; "?" where the manifest does not say.
         curve: Columns (evaluations,): those of `curve_reader.REQUIRED`, and optional ones that the file has.
         pictures: As `RunReader.pictures`.
+        step_limit: Of an episode, as the summary has it.
     """
 
     folder: Path
@@ -61,6 +62,7 @@ class Evidence:
     version: str
     curve: Mapping[str, FloatArray]
     pictures: Mapping[str, str | None]
+    step_limit: Any = None
 
     @property
     def steps(self) -> int:
@@ -135,6 +137,7 @@ def _evidence(run: RunReader) -> Evidence:
         version=_version(manifest),
         curve=curve,
         pictures=run.pictures(),
+        step_limit=summary.get("max_episode_steps"),
     )
     _check_agreement(evidence, summary)
     return evidence

@@ -37,11 +37,18 @@ def build(builder: str | Callable[..., Any], kwargs: Mapping[str, Any] | None = 
         found = function(**dict(kwargs or {}))
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
-    except Exception as error:  # a function of the user's own may raise anything
-        text = str(error).strip().splitlines()
-        told = f"{type(error).__name__}: {text[0][:200]}" if text else type(error).__name__
-        raise InputError(f"{where}: raised {told}") from error
+    except (Exception, SystemExit) as error:  # a function of the user's own may raise anything
+        raise InputError(f"{where}: raised {_told(error)}") from error
     return _world(where, _name_of(function), found)
+
+
+def _told(error: BaseException) -> str:
+    kind = type(error).__name__
+    try:
+        text = str(error).strip().splitlines()
+    except Exception:  # it cannot even be told
+        return kind
+    return f"{kind}: {text[0][:200]}" if text else kind
 
 
 def _name_of(function: Any) -> str:

@@ -61,7 +61,7 @@ def river_swim(length: int = 6) -> Mdp:
             probability=probability,
             reward=reward,
             terminated=np.zeros(next_state.shape, dtype=np.bool_),
-            start=np.eye(length)[0],
+            start=np.eye(1, length)[0],
         ),
         action_names=_LEFT_RIGHT,
         places=_row(length),

@@ -12,7 +12,7 @@ import numpy as np
 from gridworld.errors import InputError
 from gridworld.world.layout import positive_int
 from gridworld.world.mdp import Mdp
-from gridworld.world.outcomes import Outcomes, check_outcomes, thresholds_of
+from gridworld.world.outcomes import Outcomes, checked, thresholds_of
 
 _LONGEST_TEXT = 200
 _MOST_PLACES = 2**22  # cells of all panels
@@ -53,7 +53,7 @@ def verified(mdp: Mdp, where: str) -> Mdp:
     if mdp.max_episode_steps is not None:
         positive_int(f"{where}: max_episode_steps", mdp.max_episode_steps)
     _check_shapes(mdp, where)
-    check_outcomes(
+    found = checked(
         where,
         Outcomes(
             next_state=mdp.next_state,
@@ -63,6 +63,9 @@ def verified(mdp: Mdp, where: str) -> Mdp:
             start=mdp.start,
         ),
     )
+    for key in ("next_state", "reward"):
+        if not np.array_equal(getattr(found, key), getattr(mdp, key)):
+            raise InputError(f"{where}: {key} of an outcome of probability 0 must be 0 or a state")
     _check_ends(mdp, where)
     _check_thresholds(mdp, where)
     _check_numbers(mdp, where)
