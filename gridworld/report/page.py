@@ -177,9 +177,9 @@ def _facts(task: TaskAnalysis) -> list[str]:
             f"Uniformly random policy: value {number(world.random_value)}, "
             f"return {number(world.random_return)}"
         )
-    names = ("slip", "step_reward", "goal_reward", "trap_reward", "max_episode_steps")
+    names: Sequence[str] = ("slip", "step_reward", "goal_reward", "trap_reward", "max_episode_steps")
     if "env.source" in run.settings:
-        names = tuple(sorted(name.removeprefix("env.") for name in run.settings if name.startswith("env.")))
+        names = sorted(name.removeprefix("env.") for name in run.settings if name.startswith("env."))
     settings = ((name.replace("_", " "), run.settings.get(f"env.{name}")) for name in names)
     shown = [f"{name} {value}" for name, value in settings if value not in (None, "null", "{}")]
     if run.settings.get("env.max_episode_steps") in (None, "null"):

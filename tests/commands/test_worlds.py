@@ -88,3 +88,28 @@ def test_a_world_that_was_changed_is_refused(folder: Path, tmp_path: Path) -> No
     (then / "world.npz").write_bytes(b"no world")
     with pytest.raises(InputError, match=r"world\.npz"):
         stored_world(reader, env)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["env=gymnasium"], "env.id: has no value; give env.id=..."),
+        (["env=taxi_v4", "env.slip=0.1"], "Key 'slip' not in 'GymnasiumConfig'; there are max_episode_steps"),
+        (["env=taxi_v4", "env.kwrgs.x=1"], "did you mean kwargs?"),
+        (["env=deep_sea", "env.size=1"], "env.size=1: must be a whole number from 2 to 500"),
+        (
+            ["env=combination_lock", "env.length=20000"],
+            "has a step limit of 200,000 of its own; give one of at",
+        ),
+        (["env=taxi_v4", "env.source=built"], "env.source=built: is no setting of its own"),
+        (["env=river_swim", "evaluation.gamma=1"], "grow without end; take a gamma below 1\n"),
+        (["env=arrays", "env.path=none.npz"], "env.path=none.npz: cannot be read"),
+        (["env=frozen_lake_v1", "env.kwargs.slippery=1"], "it takes desc, map_name, is_slippery"),
+    ],
+)
+def test_a_mistake_is_told_before_training(words: list[str], told: str, tmp_path: Path) -> None:
+    done = script("train.py", "agent=q_learning", *words, cwd=tmp_path)
+    assert done.returncode != 0
+    assert told in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.rglob("manifest.json"))

@@ -23,7 +23,7 @@ from gridworld.config.composition.loader import composing_from
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.config.tune import SearchConfig
-from gridworld.config.worlds import SOURCES, EnvConfig, schema_of
+from gridworld.config.worlds import SOURCES, EnvConfig
 
 _LONGEST_NAME = 100  # characters of a job's folder
 _ONE_AT_A_TIME = threading.RLock()  # Hydra composes with variables of the process
@@ -107,7 +107,8 @@ def _store_schemas() -> None:
 def _world_name(env: DictConfig) -> str:
     """What folders call the world of the section `env`."""
     plain = OmegaConf.to_container(env, throw_on_missing=False)  # composing says what is missing
-    return schema_of(plain)(**cast(dict[str, Any], plain)).name
+    schema = cast(type[EnvConfig], OmegaConf.get_type(env))
+    return schema(**cast(dict[str, Any], plain)).name
 
 
 def _open(source: type[EnvConfig]) -> DictConfig:

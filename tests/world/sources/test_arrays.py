@@ -235,3 +235,29 @@ def test_a_world_that_would_grow_is_refused():
         archive.writestr("start.npy", b"0" * 10**6)
     with pytest.raises(InputError, match="its members are larger than itself"):
         world_from_bytes(content.getvalue(), "world.npz")
+
+
+def test_numbers_of_less_precision_make_the_same_world(tmp_path):
+    thirds = np.full((2, 2, 3), 1 / 3)
+    nowhere = np.array([[[0, 1, 1], [1, 0, 0]]] * 2)
+    tables = {"next_state": nowhere, "probability": thirds, "terminated": np.zeros((2, 2, 3), dtype=bool)}
+    tables |= {"reward": nowhere, "start": np.array([1, 0])}
+    exact = load_world(written(tmp_path, **tables))
+    for kind in (np.float32, np.float16):
+        found = load_world(written(tmp_path, **tables | {"probability": thirds.astype(kind)}))
+        assert found.probability.sum(axis=2) == pytest.approx(1, abs=1e-15)
+        assert np.array_equal(found.reward, exact.reward)
+    assert exact.reward.dtype == np.float64
+
+
+def test_what_is_impossible_may_lead_anywhere(tmp_path):
+    tables = {
+        "next_state": np.array([[[1, -1], [0, 99]]] * 2),
+        "probability": np.array([[[1.0, 0.0], [1.0, 0.0]]] * 2),
+        "reward": np.array([[[0.0, np.nan], [0.0, 0.0]]] * 2),
+        "terminated": np.array([[[True, False], [False, False]]] * 2),
+    }
+    found = load_world(written(tmp_path, **tables))
+    assert found.next_state.min() >= 0
+    assert np.isfinite(found.reward).all()
+    assert np.array_equal(world_from_bytes(world_bytes(found), "here").next_state, found.next_state)
