@@ -67,7 +67,8 @@ def arrange(runs: Iterable[Evidence]) -> Study:
     tasks: dict[Key, list[Evidence]] = defaultdict(list)
     for run in runs:
         tasks[task_key(run)].append(run)
-    task_labels = labels([(dict(key)["layout"], _world_of(members[0])) for key, members in tasks.items()])
+    plainest = [min(map(_world_of, members), key=len) for members in tasks.values()]
+    task_labels = labels([(world["layout"], world) for world in plainest], with_unset=False)
     groups = []
     for task, members in zip(task_labels, tasks.values(), strict=True):
         configurations: dict[tuple[str, Key], list[Evidence]] = defaultdict(list)
@@ -118,12 +119,18 @@ def learning_key(run: Evidence) -> Key:
     )
 
 
-def labels(named: Sequence[tuple[str, Settings]]) -> list[str]:
-    """A label for each (name, settings): the name, with the settings that tell it from its namesakes."""
+def labels(named: Sequence[tuple[str, Settings]], with_unset: bool = True) -> list[str]:
+    """A label for each (name, settings): the name, with the settings that tell it from its namesakes.
+
+    Args:
+        named: names, which may be the same, and settings.
+        with_unset: whether to tell of a setting that only others have that it is not set.
+    """
     out = []
     for name, settings in named:
         namesakes = [other for other_name, other in named if other_name == name]
-        out.append(name if len(namesakes) == 1 else f"{name} ({_difference(settings, namesakes)})")
+        told = "" if len(namesakes) == 1 else _difference(settings, namesakes, with_unset)
+        out.append(f"{name} ({told})" if told else name)
     return out
 
 
@@ -135,25 +142,29 @@ def differing(settings: Sequence[Settings]) -> list[str]:
     return [name for name in names if len({each.get(name, _UNSET) for each in settings}) > 1]
 
 
-def _difference(settings: Settings, namesakes: Sequence[Settings]) -> str:
+def _difference(settings: Settings, namesakes: Sequence[Settings], with_unset: bool) -> str:
     """The differing settings that it takes until no two labels are the same, the first ones before others."""
     names = differing(namesakes)
 
     def tell_apart(chosen: Sequence[str]) -> bool:
-        return len({_told(each, chosen) for each in namesakes}) == len(namesakes)
+        return len({_told(each, chosen, with_unset) for each in namesakes}) == len(namesakes)
 
     for count in range(1, len(names) + 1):
         if tell_apart(chosen := names[:count]):
             for name in chosen[:-1]:
                 if tell_apart(without := [other for other in chosen if other != name]):
                     chosen = without
-            return _told(settings, chosen)
-    digest = sha256(repr(sorted(settings.items())).encode())[:6]
-    return f"{_told(settings, names[:3])}, {digest}"  # values too long to be told apart by their beginnings
+            return _told(settings, chosen, with_unset)
+    digest = sha256(repr(sorted(settings.items())).encode())[:6]  # where values begin alike and are long
+    return f"{_told(settings, names[:3], with_unset)}, {digest}"
 
 
-def _told(settings: Settings, names: Sequence[str]) -> str:
-    return ", ".join(f"{name.removeprefix('agent.')}={_short(settings.get(name, _UNSET))}" for name in names)
+def _told(settings: Settings, names: Sequence[str], with_unset: bool) -> str:
+    return ", ".join(
+        f"{name.removeprefix('agent.')}={_short(settings.get(name, _UNSET))}"
+        for name in names
+        if with_unset or name in settings
+    )
 
 
 def _short(value: str) -> str:
