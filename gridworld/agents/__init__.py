@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from gridworld.config.agents import MISSING
 from gridworld.errors import InputError
-from gridworld.world.markov_chain import one_hot_policy
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -49,6 +48,8 @@ class PolicySnapshot:
 
     def greedy_policy(self) -> FloatArray:
         """The greedy policy's action probabilities, (S, A)."""
+        from gridworld.world.markov_chain import one_hot_policy  # here, since settings are read without numpy
+
         return one_hot_policy(self.greedy, self.sampled.shape[1])
 
 

@@ -10,14 +10,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Optional
+from typing import TYPE_CHECKING, Any, Optional
 
 from gridworld.bounds import STEP_LIMIT, at_least, at_most
 from gridworld.config.agents import MISSING
 from gridworld.errors import InputError
-from gridworld.world.grid import GridMdp, compile_mdp
-from gridworld.world.layout import Layout, load
-from gridworld.world.mdp import Mdp
+
+if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
+    from gridworld.world.grid import GridMdp
+    from gridworld.world.layout import Layout
+    from gridworld.world.mdp import Mdp
 
 # OmegaConf reads the annotations at run time and knows no `X | None`.
 
@@ -91,6 +93,8 @@ class MapConfig(EnvConfig):
 
     def compile(self) -> GridMdp:
         """See `EnvConfig.compile`."""
+        from gridworld.world.layout import load
+
         return self.compile_on(load(self.layout, self.num_rows, self.num_cols))
 
     def compile_on(self, layout: Layout) -> GridMdp:
@@ -99,6 +103,8 @@ class MapConfig(EnvConfig):
         Raises:
             InputError: a reward that cannot be.
         """
+        from gridworld.world.grid import compile_mdp
+
         return compile_mdp(layout, self.slip, self.step_reward, self.goal_reward, self.trap_reward)
 
 
