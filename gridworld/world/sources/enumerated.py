@@ -29,7 +29,7 @@ from gridworld.world.mdp import IntArray, Mdp
 from gridworld.world.outcomes import MOST_STATES, Outcomes, mdp_from_outcomes
 from gridworld.world.sources.elapsed_time import Trials, find_clocks, outcomes_of, own_limit, with_time
 from gridworld.world.sources.exploring import Clocks, Graph, Subject, TimeMattersError, explore
-from gridworld.world.sources.making import make_env
+from gridworld.world.sources.making import make_env, refuse_changed
 from gridworld.world.sources.replays import Replays
 
 
@@ -57,6 +57,7 @@ def enumerate_env(
             table = _tabulate(subject, _limit_of_id(env), most_states)
             mdp = _compile(env_id, table, subject)
             Replays(subject, mdp, table.graph, table.clocks, table.state).check(make_env(env_id, kwargs))
+            refuse_changed(f"env.id={env_id}", env)
         finally:
             env.close()
     return mdp
