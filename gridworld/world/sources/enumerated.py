@@ -32,6 +32,8 @@ from gridworld.world.sources.exploring import Clocks, Graph, Subject, TimeMatter
 from gridworld.world.sources.making import make_env, refuse_changed
 from gridworld.world.sources.replays import Replays
 
+_BEYOND = 5_000  # states more than a step limit away; `env.max_episode_steps` may be larger than the id's
+
 
 def enumerate_env(
     env_id: str, kwargs: Mapping[str, Any] | None = None, *, most_states: int = MOST_STATES
@@ -80,19 +82,19 @@ def _limit_of_id(env: gym.Env[Any, Any]) -> int | None:
 
 
 def _tabulate(subject: Subject, limit_of_id: int | None, most_states: int) -> _Table:
-    clocks = find_clocks(subject)
+    clocks = find_clocks(subject, limit_of_id)
     if clocks:
         try:
             return _without_time(subject, clocks, limit_of_id, most_states)
         except TimeMattersError:
             pass
-    graph = explore(subject, {}, most_states, limit_of_id if clocks else None)
+    graph = explore(subject, {}, most_states, limit_of_id, 0 if clocks else _BEYOND)
     limit = _least(_common_limit(subject, graph), limit_of_id)
     return _Table(graph, {}, _plain(graph), np.arange(len(graph.keys)), limit)
 
 
 def _without_time(subject: Subject, clocks: Clocks, limit_of_id: int | None, most_states: int) -> _Table:
-    graph = explore(subject, clocks, most_states)
+    graph = explore(subject, clocks, most_states, limit_of_id, _BEYOND)
     if len(np.unique(graph.truncated[graph.tried])) > 1:
         raise _no_common_limit(subject)
     own = own_limit(subject, graph, clocks, limit_of_id)

@@ -27,7 +27,7 @@ class Corridor(gym.Env[Any, int]):
     def __init__(self, render_mode: str | None = None, variant: str = "plain", limit: int = 0) -> None:
         self.action_space = spaces.Discrete(2)
         self.render_mode, self.variant, self.limit = render_mode, variant, limit
-        self.cell = self.steps = 0
+        self.cell = self.steps = self.fuel = 0
         self.past: deque[int] = deque(maxlen=2)
         if variant == "pixels":
             self.observation_space = spaces.Box(0, 255, (2, 2, 3), np.uint8)
@@ -38,7 +38,8 @@ class Corridor(gym.Env[Any, int]):
         super().reset(seed=seed)
         self.cell = int(self.np_random.integers(3)) if self.variant == "layout" else 0
         self.steps = 0
-        self.past.clear()
+        self.fuel = 300
+        self.past = deque(maxlen=2)
         return self._observation(), {}
 
     def _observation(self) -> Any:
@@ -62,6 +63,12 @@ class Corridor(gym.Env[Any, int]):
         if self.variant == "past":
             self.past.append(action)
             forward = forward and sum(self.past) == 2
+        if self.variant == "fuel":
+            self.fuel -= 1
+            if self.fuel < 280:
+                raise RuntimeError("no fuel")
+        if self.variant == "double":  # steps that are not counted one by one
+            self.steps += 1
         if self.variant == "endless":
             self.past = deque([*self.past, action])
         self.cell = min(self.cell + 1, CELLS - 1) if forward else max(self.cell - 1, 0)
@@ -183,6 +190,21 @@ def test_a_world_without_a_step_limit() -> None:
     assert (mdp.num_states, mdp.max_episode_steps, mdp.action_names) == (CELLS, None, ("0", "1"))
     assert mdp.goal.tolist() == [False] * 4 + [True]
     assert mdp.next_state[:, :, 0].tolist() == [[0, 1], [0, 2], [1, 3], [2, 4], [4, 4]]
+
+
+@pytest.mark.parametrize("variant", ["double", "fuel", "endless"])
+def test_states_that_hold_the_time_end_at_the_step_limit(variant: str) -> None:
+    limit = 7 if variant == "endless" else 12  # whose states are all sequences of actions
+    mdp = enumerate_env("ShortCorridor-v0", {"variant": variant, "max_episode_steps": limit}, most_states=500)
+    assert mdp.max_episode_steps == limit
+    assert Evaluator(mdp, 1.0, limit).optimal_value == 1
+    walk_beside(mdp, gym.make("ShortCorridor-v0", variant=variant, max_episode_steps=limit), 500)
+
+
+def test_states_beyond_the_step_limit_that_have_an_end_are_found() -> None:
+    mdp = enumerate_env("ShortCorridor-v0", {"max_episode_steps": 2})
+    assert (mdp.num_states, mdp.max_episode_steps) == (CELLS, 2)
+    assert Evaluator(mdp, 1.0, 2).optimum.expected_return == 0
 
 
 def test_an_observation_that_is_no_array_is_left_out() -> None:
