@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import check_memory
+from gridworld.process.progress import ProgressLine
+from gridworld.process.terminal import printable
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 from gridworld.world.outcomes import MOST_ACTIONS
 from gridworld.world.sources.snapshots import Snapshots, key_of, random_states
@@ -25,6 +27,7 @@ from gridworld.world.sources.snapshots import Snapshots, key_of, random_states
 Clocks = Mapping[str, int]  # attributes that count steps, and what they are at a reset
 _Rows = dict[int, list[tuple[int, float, bool, bool]]]  # next state, reward, terminated, truncated, by action
 
+_MANY_STATES = 20_000  # from which on their number is told
 _MOST_BYTES = 2**31  # of all copies and observations together
 _SEEDS = 8  # resets that must lead to the same state
 
@@ -225,7 +228,7 @@ def explore(
         InputError: too many states; or what `Subject.try_action` refuses.
     """
     _, observation = subject.reset(0)
-    found = _Found(array_reader(subject.env.observation_space))
+    found = _Found(_array_reader(subject))
     found.add(subject.key(clocks), key_of(observation), observation, subject.copy(), 0)
     found.goes_on[0] = True
     search = _Search(subject, clocks, found, [0])
@@ -253,6 +256,7 @@ class _Search:
     def go_on(self, most_states: int, deepest: int | None) -> None:
         """Try what is pending, and what is found by that; states at the depth `deepest` are left pending."""
         subject, clocks, found, left = self.subject, self.clocks, self.found, []
+        line = ProgressLine(True)
         for state in self.pending:  # which grows
             if found.depth[state] == deepest:
                 left.append(state)
@@ -267,7 +271,17 @@ class _Search:
                     found.goes_on[following] = True
                     self.pending.append(following)
             self.rows[state] = row
+            if len(found.number) > _MANY_STATES and state % 500 == 0:
+                line.show(lambda: self._how_far(deepest, most_states))
+        line.clear()
         self.pending = left
+
+    def _how_far(self, deepest: int | None, most_states: int) -> str:
+        hint = "" if deepest else ", no step limit ends them (env.kwargs.max_episode_steps would)"
+        return (
+            f"enumerating {printable(self.subject.name)}: {len(self.found.number):,} states so far, at most "
+            f"{most_states:,}{hint}; Ctrl-C ends it"
+        )
 
 
 def _state_of(
@@ -317,11 +331,27 @@ def _as_graph(found: _Found, rows: _Rows, num_actions: int) -> Graph:
     )
 
 
-def array_reader(space: gym.Space[Any]) -> Callable[[Any], NDArray[Any] | None]:
+def _array_reader(subject: Subject) -> Callable[[Any], NDArray[Any] | None]:
     """How an observation is made an array: as it is, of a Dict the `image`; None where there is none."""
-    if isinstance(space, spaces.Dict):
-        if isinstance(space.spaces.get("image"), spaces.Box):
-            return lambda observation: np.array(observation["image"])
-    elif isinstance(space, spaces.Box | spaces.Discrete):
-        return lambda observation: np.array(observation, dtype=space.dtype)
-    return lambda observation: None
+    space = subject.env.observation_space
+    of_image = isinstance(space, spaces.Dict)
+    part = space.spaces.get("image") if isinstance(space, spaces.Dict) else space
+    if not isinstance(part, spaces.Box if of_image else spaces.Box | spaces.Discrete):
+        return lambda observation: None
+
+    def read(observation: Any) -> NDArray[Any]:
+        try:
+            array = np.array(observation["image"]) if of_image else np.array(observation, dtype=space.dtype)
+            fits = array.shape == part.shape and array.dtype.kind in "biuf"
+            if isinstance(part, spaces.Discrete):
+                fits = fits and bool(part.start <= array < part.start + part.n)
+        except (TypeError, ValueError, KeyError, IndexError, OverflowError):
+            fits = False
+        if not fits:
+            raise subject.refusal(
+                f"an observation is {' '.join(str(observation).split())[:80]}, which does not fit its "
+                f"space {' '.join(str(space).split())[:120]}"
+            )
+        return array
+
+    return read

@@ -2,6 +2,7 @@
 
 import random
 from collections import deque
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -10,13 +11,26 @@ import pytest
 from gymnasium import spaces
 
 from gridworld.errors import InputError
+from gridworld.process.progress import ProgressLine
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
+from gridworld.world.sources import exploring
 from gridworld.world.sources.enumerated import enumerate_env
 
 CELLS = 5
 MINIGRID = "MiniGrid-Empty-5x5-v0"
 _of_the_process = [0]  # state where no copy of an environment has it
+
+IMAGE = spaces.Box(0, 255, (2, 2), np.uint8)
+NO_OBSERVATIONS: dict[str, tuple[gym.Space[Any], Any]] = {  # what does not fit its space
+    "none": (spaces.Discrete(CELLS), None),
+    "too large": (spaces.Discrete(CELLS), CELLS),
+    "no pixels": (IMAGE, None),
+    "flat": (IMAGE, np.zeros(4, np.uint8)),
+    "ragged": (IMAGE, [[1], [2, 3]]),
+    "no image": (spaces.Dict(image=IMAGE), {"picture": np.zeros((2, 2), np.uint8)}),
+    "no dict": (spaces.Dict(image=IMAGE), 3),
+}
 
 
 class Corridor(gym.Env[Any, int]):
@@ -43,6 +57,10 @@ class Corridor(gym.Env[Any, int]):
         return self._observation(), {}
 
     def _observation(self) -> Any:
+        if self.variant in NO_OBSERVATIONS:
+            space, shown = NO_OBSERVATIONS[self.variant]
+            self.observation_space = space
+            return shown
         if self.variant == "pixels":
             return np.full((2, 2, 3), 255 * self.cell // (CELLS - 1), dtype=np.uint8)
         return str(self.cell) if self.variant == "text" else self.cell
@@ -238,6 +256,23 @@ def test_what_cannot_be_enumerated_is_refused(env_id: str, kwargs: dict[str, Any
     with pytest.raises(InputError, match=f"^env.*{env_id}.*{reason}") as refused:
         enumerate_env(env_id, kwargs, most_states=300)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("variant", NO_OBSERVATIONS)
+def test_an_observation_must_fit_its_space(variant: str) -> None:
+    with pytest.raises(
+        InputError, match=r"^env.id=Corridor-v0: an observation is .*not fit its space"
+    ) as refused:
+        enumerate_env("Corridor-v0", {"variant": variant})
+    assert "\n" not in str(refused.value)
+
+
+def test_many_states_are_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(exploring, "_MANY_STATES", 100)
+    monkeypatch.setattr(exploring, "ProgressLine", partial(ProgressLine, seconds_between_lines=0))
+    with pytest.raises(InputError, match="more than 1,200 states"):
+        enumerate_env("Corridor-v0", {"variant": "endless"}, most_states=1200)
+    assert "states so far, at most 1,200, no step limit ends them" in capsys.readouterr().err
 
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
