@@ -28,8 +28,13 @@ _WALK = 40  # steps that an attribute must count to be a clock
 Rewards = dict[tuple[int, int], FloatArray]  # (L,) by (state, action), NaN where it cannot be reached
 
 
-def find_clocks(subject: Subject) -> Clocks:
-    """The attributes that count the steps, with their values at a reset; what merely looks so is included."""
+def find_clocks(subject: Subject, limit: int | None) -> Clocks:
+    """The attributes that count the steps, with their values at a reset; what merely looks so is included.
+
+    Args:
+        subject: the environment.
+        limit: the steps of its episodes, if that is known.
+    """
     subject.reset(0)
     first = {name: value for name, value in vars(subject.env).items() if type(value) is int}
     counting, steps = set(first), 0
@@ -37,7 +42,7 @@ def find_clocks(subject: Subject) -> Clocks:
         *_, terminated, truncated = subject.step(action)
         steps += 1
         counting = {name for name in counting if getattr(subject.env, name, None) == first[name] + steps}
-        if terminated or truncated:
+        if terminated or truncated or steps == limit:
             subject.reset(0)
             steps = 0
     return {name: first[name] for name in sorted(counting)}

@@ -29,8 +29,10 @@ from gridworld.world.mdp import IntArray, Mdp
 from gridworld.world.outcomes import MOST_STATES, Outcomes, mdp_from_outcomes
 from gridworld.world.sources.elapsed_time import Trials, find_clocks, outcomes_of, own_limit, with_time
 from gridworld.world.sources.exploring import Clocks, Graph, Subject, TimeMattersError, explore
-from gridworld.world.sources.making import make_env
+from gridworld.world.sources.making import make_env, refuse_changed
 from gridworld.world.sources.replays import Replays
+
+_BEYOND = 5_000  # states more than a step limit away; `env.max_episode_steps` may be larger than the id's
 
 
 def enumerate_env(
@@ -57,6 +59,7 @@ def enumerate_env(
             table = _tabulate(subject, _limit_of_id(env), most_states)
             mdp = _compile(env_id, table, subject)
             Replays(subject, mdp, table.graph, table.clocks, table.state).check(make_env(env_id, kwargs))
+            refuse_changed(f"env.id={env_id}", env)
         finally:
             env.close()
     return mdp
@@ -79,19 +82,19 @@ def _limit_of_id(env: gym.Env[Any, Any]) -> int | None:
 
 
 def _tabulate(subject: Subject, limit_of_id: int | None, most_states: int) -> _Table:
-    clocks = find_clocks(subject)
+    clocks = find_clocks(subject, limit_of_id)
     if clocks:
         try:
             return _without_time(subject, clocks, limit_of_id, most_states)
         except TimeMattersError:
             pass
-    graph = explore(subject, {}, most_states, limit_of_id if clocks else None)
+    graph = explore(subject, {}, most_states, limit_of_id, 0 if clocks else _BEYOND)
     limit = _least(_common_limit(subject, graph), limit_of_id)
     return _Table(graph, {}, _plain(graph), np.arange(len(graph.keys)), limit)
 
 
 def _without_time(subject: Subject, clocks: Clocks, limit_of_id: int | None, most_states: int) -> _Table:
-    graph = explore(subject, clocks, most_states)
+    graph = explore(subject, clocks, most_states, limit_of_id, _BEYOND)
     if len(np.unique(graph.truncated[graph.tried])) > 1:
         raise _no_common_limit(subject)
     own = own_limit(subject, graph, clocks, limit_of_id)

@@ -18,12 +18,16 @@ from numpy.typing import NDArray
 
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import check_memory
+from gridworld.process.progress import ProgressLine
+from gridworld.process.terminal import printable
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 from gridworld.world.outcomes import MOST_ACTIONS
 from gridworld.world.sources.snapshots import Snapshots, key_of, random_states
 
 Clocks = Mapping[str, int]  # attributes that count steps, and what they are at a reset
+_Rows = dict[int, list[tuple[int, float, bool, bool]]]  # next state, reward, terminated, truncated, by action
 
+_MANY_STATES = 20_000  # from which on their number is told
 _MOST_BYTES = 2**31  # of all copies and observations together
 _SEEDS = 8  # resets that must lead to the same state
 
@@ -173,7 +177,7 @@ class Graph:
 
 @dataclass(eq=False)
 class _Found:
-    """The states found so far; `rows` and `tried` are of those whose actions were tried."""
+    """The states found so far; `goes_on`: whether an episode may go on from there."""
 
     as_array: Callable[[Any], NDArray[Any] | None]
     number: dict[bytes, int] = field(default_factory=dict)
@@ -197,37 +201,87 @@ class _Found:
             self.num_bytes += array.nbytes
         return len(self.number) - 1
 
+    def forget(self, first: int) -> None:
+        """Leave out the states from this number on."""
+        for each in (self.depth, self.goes_on, self.seen, self.observations, self.snapshots):
+            del each[first:]
+        self.number = {key: state for key, state in self.number.items() if state < first}
 
-def explore(subject: Subject, clocks: Clocks, most_states: int, deepest: int | None = None) -> Graph:
+
+def explore(
+    subject: Subject, clocks: Clocks, most_states: int, deepest: int | None = None, beyond: int = 0
+) -> Graph:
     """Find all states that can be reached, breadth first, and what every action does there.
+
+    At `deepest` steps from the start episodes are over. What lies beyond is found too where there are few
+    such states, and left out otherwise: a state may hold the time in any form, and then they have no end.
 
     Args:
         subject: the environment.
         clocks: attributes that are no part of a state; they are as after a reset before each step.
         most_states: more are refused.
-        deepest: states that are this many steps from the start are not tried.
+        deepest: the step limit, if one is known.
+        beyond: states beyond it; if there are more, or one cannot be tried, all are left out.
 
     Raises:
         TimeMattersError: the clocks do not count every step, or observations show them.
         InputError: too many states; or what `Subject.try_action` refuses.
     """
     _, observation = subject.reset(0)
-    found = _Found(array_reader(subject.env.observation_space))
+    found = _Found(_array_reader(subject))
     found.add(subject.key(clocks), key_of(observation), observation, subject.copy(), 0)
     found.goes_on[0] = True
-    rows: dict[int, list[tuple[int, float, bool, bool]]] = {}
-    pending = [0]
-    for state in pending:  # which grows
-        rows[state] = []
-        for action in range(subject.num_actions):
-            move = subject.try_action(found.snapshots[state], clocks, 0, action)
-            following = _state_of(subject, found, move, found.depth[state] + 1, clocks, most_states)
-            rows[state].append((following, move.reward, move.terminated, move.truncated))
-            over = move.terminated or (move.truncated and not clocks) or found.depth[following] == deepest
-            if not (over or found.goes_on[following]):
-                found.goes_on[following] = True
-                pending.append(following)
-    return _as_graph(found, rows, subject.num_actions)
+    search = _Search(subject, clocks, found, [0])
+    search.go_on(most_states, deepest)
+    if search.pending and beyond:
+        size, rows = len(found.number), dict(search.rows)
+        try:
+            search.go_on(min(most_states, size + beyond), None)
+        except InputError:
+            found.forget(size)
+            search.rows = rows
+    return _as_graph(found, search.rows, subject.num_actions)
+
+
+@dataclass(eq=False)
+class _Search:
+    """A search, breadth first, that can stop at a depth: `pending` is what is to be tried."""
+
+    subject: Subject
+    clocks: Clocks
+    found: _Found
+    pending: list[int]
+    rows: _Rows = field(default_factory=dict)
+
+    def go_on(self, most_states: int, deepest: int | None) -> None:
+        """Try what is pending, and what is found by that; states at the depth `deepest` are left pending."""
+        subject, clocks, found, left = self.subject, self.clocks, self.found, []
+        line = ProgressLine(True)
+        for state in self.pending:  # which grows
+            if found.depth[state] == deepest:
+                left.append(state)
+                continue
+            row = []
+            for action in range(subject.num_actions):
+                move = subject.try_action(found.snapshots[state], clocks, 0, action)
+                following = _state_of(subject, found, move, found.depth[state] + 1, clocks, most_states)
+                row.append((following, move.reward, move.terminated, move.truncated))
+                over = move.terminated or (move.truncated and not clocks)
+                if not (over or found.goes_on[following]):
+                    found.goes_on[following] = True
+                    self.pending.append(following)
+            self.rows[state] = row
+            if len(found.number) > _MANY_STATES and state % 500 == 0:
+                line.show(lambda: self._how_far(deepest, most_states))
+        line.clear()
+        self.pending = left
+
+    def _how_far(self, deepest: int | None, most_states: int) -> str:
+        hint = "" if deepest else ", no step limit ends them (env.kwargs.max_episode_steps would)"
+        return (
+            f"enumerating {printable(self.subject.name)}: {len(self.found.number):,} states so far, at most "
+            f"{most_states:,}{hint}; Ctrl-C ends it"
+        )
 
 
 def _state_of(
@@ -257,7 +311,7 @@ def _state_of(
     return state
 
 
-def _as_graph(found: _Found, rows: dict[int, list[tuple[int, float, bool, bool]]], num_actions: int) -> Graph:
+def _as_graph(found: _Found, rows: _Rows, num_actions: int) -> Graph:
     size = len(found.number)
     still = [[(state, 0.0, False, False)] * num_actions for state in range(size)]
     for state, row in rows.items():
@@ -268,7 +322,7 @@ def _as_graph(found: _Found, rows: dict[int, list[tuple[int, float, bool, bool]]
         reward=columns[:, :, 1],
         terminated=columns[:, :, 2] > 0,
         truncated=columns[:, :, 3] > 0,
-        tried=np.array(found.goes_on),
+        tried=np.isin(np.arange(size), list(rows)),
         depth=np.array(found.depth),
         keys=list(found.number),
         seen=found.seen,
@@ -277,11 +331,27 @@ def _as_graph(found: _Found, rows: dict[int, list[tuple[int, float, bool, bool]]
     )
 
 
-def array_reader(space: gym.Space[Any]) -> Callable[[Any], NDArray[Any] | None]:
+def _array_reader(subject: Subject) -> Callable[[Any], NDArray[Any] | None]:
     """How an observation is made an array: as it is, of a Dict the `image`; None where there is none."""
-    if isinstance(space, spaces.Dict):
-        if isinstance(space.spaces.get("image"), spaces.Box):
-            return lambda observation: np.array(observation["image"])
-    elif isinstance(space, spaces.Box | spaces.Discrete):
-        return lambda observation: np.array(observation, dtype=space.dtype)
-    return lambda observation: None
+    space = subject.env.observation_space
+    of_image = isinstance(space, spaces.Dict)
+    part = space.spaces.get("image") if isinstance(space, spaces.Dict) else space
+    if not isinstance(part, spaces.Box if of_image else spaces.Box | spaces.Discrete):
+        return lambda observation: None
+
+    def read(observation: Any) -> NDArray[Any]:
+        try:
+            array = np.array(observation["image"]) if of_image else np.array(observation, dtype=space.dtype)
+            fits = array.shape == part.shape and array.dtype.kind in "biuf"
+            if isinstance(part, spaces.Discrete):
+                fits = fits and bool(part.start <= array < part.start + part.n)
+        except (TypeError, ValueError, KeyError, IndexError, OverflowError):
+            fits = False
+        if not fits:
+            raise subject.refusal(
+                f"an observation is {' '.join(str(observation).split())[:80]}, which does not fit its "
+                f"space {' '.join(str(space).split())[:120]}"
+            )
+        return array
+
+    return read

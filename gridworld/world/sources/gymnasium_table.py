@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,11 +24,23 @@ from gridworld.errors import InputError
 from gridworld.world.mdp import IntArray, Mdp
 from gridworld.world.outcomes import Outcomes, check_size, mdp_from_outcomes
 from gridworld.world.sources.known_envs import known_env
-from gridworld.world.sources.making import make_env, told
+from gridworld.world.sources.making import make_env, refuse_changed, told, wrappers_of
 from gridworld.world.sources.table_walk import SEED, walk
 
-if TYPE_CHECKING:
-    import gymnasium as gym
+_LIBRARIES = ("gymnasium.wrappers.", "stable_baselines3.common.monitor")
+_WATCHING = {  # wrappers of these libraries that leave steps as they are, but for the step limit
+    "TimeLimit",
+    "OrderEnforcing",
+    "PassiveEnvChecker",
+    "RecordEpisodeStatistics",
+    "RecordVideo",
+    "RenderCollection",
+    "HumanRendering",
+    "AddWhiteNoise",
+    "ObstructView",
+    "Autoreset",
+    "Monitor",
+}
 
 
 def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> Mdp:
@@ -46,14 +59,16 @@ def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> M
     """
     arguments = dict(kwargs or {})
     env = make_env(env_id, arguments)
-    mdp, table = _compiled(env)
-    again = make_env(env_id, arguments)  # only now: a large environment takes long, and may be refused
+    mdp, table = _compiled(env, env_id)
+    # Only now: a large environment takes long, and may be refused. Its own step limit may be set otherwise.
+    again = make_env(env_id, {**arguments, "max_episode_steps": -1})
     if _differ(table, _table(mdp.name, again.unwrapped)):
         raise InputError(
             f"env.id={env_id}: has another table each time that it is made, so no exact truth is known; "
             "give what it draws as env.kwargs, e.g. desc of a FrozenLake"
         )
-    _check_steps(mdp, table, env.unwrapped)
+    refuse_changed(env_id, env)
+    _check_steps(mdp, table, again)
     env.close()
     again.close()
     return mdp
@@ -63,17 +78,20 @@ def compile_table(env: gym.Env[Any, Any]) -> Mdp:
     """Compile the transition table of an environment, which is left as it is.
 
     Args:
-        env: an environment with `unwrapped.P` and `unwrapped.initial_state_distrib`. Wrappers count for the
-            step limit only.
+        env: an environment with `unwrapped.P` and `unwrapped.initial_state_distrib`. Of its wrappers, those
+            that only watch, or only change what is seen, count for the step limit only; the others must
+            leave the steps what they are.
 
     Returns:
         The world, with the environment's id as its name, or its class where it has none.
 
     Raises:
-        InputError: no table, or an environment that is not what its table says.
+        InputError: no table, or an environment or wrapper that does not do what the table says.
     """
-    mdp, table = _compiled(env)
-    _check_steps(mdp, table, _copied(env.unwrapped))
+    spec = env.unwrapped.spec
+    mdp, table = _compiled(env, spec.id if spec is not None else type(env.unwrapped).__name__)
+    refuse_changed(mdp.name, env)
+    _check_steps(mdp, table, _wrapped_alike(mdp.name, env, _copied(env.unwrapped)))
     return mdp
 
 
@@ -82,9 +100,8 @@ def has_table(env: Any) -> bool:
     return getattr(env, "P", None) is not None
 
 
-def _compiled(env: gym.Env[Any, Any]) -> tuple[Mdp, Outcomes]:
+def _compiled(env: gym.Env[Any, Any], name: str) -> tuple[Mdp, Outcomes]:
     real = env.unwrapped
-    name = real.spec.id if real.spec is not None else type(real).__name__
     table = _table(name, real)
     known = known_env(real)
     num_states, num_actions = table.next_state.shape[:2]
@@ -234,10 +251,35 @@ def _copied(real: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
     return other
 
 
-def _check_steps(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> None:
+def _wrapped_alike(name: str, env: gym.Env[Any, Any], real: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+    """An environment to walk in, with copies of the wrappers that may change what a step does."""
+    for wrapper in list(wrappers_of(env))[::-1]:  # from the inside
+        kind = type(wrapper)
+        inherits = all(getattr(kind, each) is getattr(gym.Wrapper, each) for each in ("step", "reset"))
+        if inherits or isinstance(wrapper, gym.ObservationWrapper) or _watches(kind):
+            continue
+        try:
+            real = copy.deepcopy(wrapper, {id(wrapper.env): real})
+        except Exception as error:
+            raise InputError(
+                f"{name}: its wrapper {kind.__name__} cannot be copied ({told(error)}), so that what it "
+                "changes cannot be found out; leave it out"
+            ) from None
+    return real
+
+
+def _watches(kind: type) -> bool:
+    """Whether wrappers of a class leave what steps do as it is."""
+    if kind.__module__ == "gymnasium.wrappers.stateful_observation":
+        return kind.__name__ != "MaxAndSkipObservation"  # which repeats actions
+    return kind.__module__.startswith(_LIBRARIES) and kind.__name__ in _WATCHING
+
+
+def _check_steps(mdp: Mdp, table: Outcomes, env: gym.Env[Any, Any]) -> None:
+    real = env.unwrapped
     mistake = None
     try:
-        walk(mdp, table, real)
+        walk(mdp, table, env)
     except InputError as error:
         mistake = error
     except Exception as error:  # an environment of the user's own may raise anything

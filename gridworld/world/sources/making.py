@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -13,6 +13,7 @@ import numpy as np
 from gridworld.errors import InputError
 
 _PACKAGES = {"MiniGrid-": "minigrid", "BabyAI-": "minigrid"}  # which register ids that begin so
+_CHANGING: dict[type, str] = {gym.RewardWrapper: "rewards", gym.ActionWrapper: "actions"}
 
 
 def make_env(
@@ -33,11 +34,14 @@ def make_env(
         raise InputError(
             f"env.kwargs: render_mode={arguments['render_mode']} is no part of the world; leave it out"
         )
+    module, _, registered = str(env_id).rpartition(":")
+    if module:
+        _import_module(env_id, module)
     for beginning, package in _PACKAGES.items():
-        if str(env_id).startswith(beginning):
+        if registered.startswith(beginning):
             _import(env_id, package)
     try:
-        spec = gym.spec(env_id)
+        spec = gym.spec(registered)
     except Exception as error:  # an id may name a module, which may raise anything
         raise InputError(
             f"env.id={str(env_id)[:80]}: is no environment that Gymnasium knows ({told(error)}); give a "
@@ -52,7 +56,33 @@ def make_env(
         raise InputError(f"{given} cannot be made ({told(error)}){takes}") from None
 
 
-def told(error: Exception) -> str:
+def refuse_changed(name: str, env: gym.Env[Any, Any]) -> None:
+    """Refuse an environment with a wrapper that is there to change rewards or actions.
+
+    Args:
+        name: what the message calls the environment.
+        env: the environment with its wrappers.
+
+    Raises:
+        InputError: it has such a wrapper.
+    """
+    for wrapper in wrappers_of(env):
+        for kind, changed in _CHANGING.items():
+            if isinstance(wrapper, kind):
+                raise InputError(
+                    f"{name}: its wrapper {type(wrapper).__name__} changes {changed}, so the environment "
+                    "below it, of which the truth is known, is not what an agent is in; leave it out"
+                )
+
+
+def wrappers_of(env: Any) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
+    """The wrappers of an environment, from the outside."""
+    while isinstance(env, gym.Wrapper):
+        yield env
+        env = env.env
+
+
+def told(error: BaseException) -> str:
     """What an exception says, in short."""
     text = str(error).split(" was raised from the environment creator")[0].strip().splitlines()
     kind = type(error).__name__
@@ -76,6 +106,18 @@ def _arguments(spec: Any) -> str:
         return "; see its documentation"
     names = [name for name in parameters if name not in ("self", "render_mode")]
     return f"; it takes {', '.join(names)}" if names else "; it takes no arguments"
+
+
+def _import_module(env_id: str, module: str) -> None:
+    """Import what an id "module:id" names, which registers the environment."""
+    try:
+        importlib.import_module(module)
+    except (Exception, SystemExit) as error:  # it may raise anything
+        reason = f"the module {module} cannot be imported ({told(error)})"
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        if missing and f"{module}.".startswith(f"{missing}."):
+            reason = f"there is no module {missing}; install it, or name its folder in PYTHONPATH"
+        raise InputError(f"env.id={str(env_id)[:80]}: {reason}") from None
 
 
 def _import(env_id: str, package: str) -> None:

@@ -31,7 +31,7 @@ def walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> None:
     Args:
         mdp: the world that was made of the table.
         table: what the environment says of itself.
-        real: the environment, which is stepped.
+        real: the environment with its wrappers, which is stepped.
 
     Raises:
         InputError: a start or a step that the table does not have.
@@ -46,18 +46,18 @@ def walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> None:
             raise InputError(
                 f"{mdp.name}: started in state {state}, which has no probability in initial_state_distrib"
             )
-        for _ in range(most):
+        for step in range(most):
             action = int(rng.integers(mdp.num_actions) if rng.random() < share else policy[state])
             observation, reward, terminated, truncated, _ = real.step(action)
             following = _number(mdp, observation)
             _check_step(mdp.name, table, (state, action), (following, float(reward), bool(terminated)))
-            if truncated:
+            if truncated and step + 1 < (mdp.max_episode_steps or np.inf):
                 raise InputError(
                     f"{mdp.name}: cuts its episodes by itself, which its table P does not have; must leave "
                     "that to the wrapper TimeLimit"
                 )
             steps += 1
-            if terminated:
+            if terminated or truncated:
                 break
             state = following
         if steps >= _WALK:
@@ -74,7 +74,15 @@ def _good_policy(mdp: Mdp) -> IntArray:
 
 
 def _number(mdp: Mdp, observation: Any) -> int:
-    number = int(observation)
+    try:
+        number = int(observation)
+        is_number = bool(number == observation)
+    except (TypeError, ValueError, OverflowError):
+        is_number = False
+    if not is_number:
+        raise InputError(
+            f"{mdp.name}: shows {str(observation)[:80]!r}, must show the number of a state of its table"
+        )
     if not 0 <= number < mdp.num_numbers:
         raise InputError(f"{mdp.name}: shows state {number}, its table has states 0 to {mdp.num_numbers - 1}")
     return number

@@ -2,6 +2,7 @@
 
 import random
 from collections import deque
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -10,13 +11,26 @@ import pytest
 from gymnasium import spaces
 
 from gridworld.errors import InputError
+from gridworld.process.progress import ProgressLine
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
+from gridworld.world.sources import exploring
 from gridworld.world.sources.enumerated import enumerate_env
 
 CELLS = 5
 MINIGRID = "MiniGrid-Empty-5x5-v0"
 _of_the_process = [0]  # state where no copy of an environment has it
+
+IMAGE = spaces.Box(0, 255, (2, 2), np.uint8)
+NO_OBSERVATIONS: dict[str, tuple[gym.Space[Any], Any]] = {  # what does not fit its space
+    "none": (spaces.Discrete(CELLS), None),
+    "too large": (spaces.Discrete(CELLS), CELLS),
+    "no pixels": (IMAGE, None),
+    "flat": (IMAGE, np.zeros(4, np.uint8)),
+    "ragged": (IMAGE, [[1], [2, 3]]),
+    "no image": (spaces.Dict(image=IMAGE), {"picture": np.zeros((2, 2), np.uint8)}),
+    "no dict": (spaces.Dict(image=IMAGE), 3),
+}
 
 
 class Corridor(gym.Env[Any, int]):
@@ -27,7 +41,7 @@ class Corridor(gym.Env[Any, int]):
     def __init__(self, render_mode: str | None = None, variant: str = "plain", limit: int = 0) -> None:
         self.action_space = spaces.Discrete(2)
         self.render_mode, self.variant, self.limit = render_mode, variant, limit
-        self.cell = self.steps = 0
+        self.cell = self.steps = self.fuel = 0
         self.past: deque[int] = deque(maxlen=2)
         if variant == "pixels":
             self.observation_space = spaces.Box(0, 255, (2, 2, 3), np.uint8)
@@ -38,10 +52,15 @@ class Corridor(gym.Env[Any, int]):
         super().reset(seed=seed)
         self.cell = int(self.np_random.integers(3)) if self.variant == "layout" else 0
         self.steps = 0
-        self.past.clear()
+        self.fuel = 300
+        self.past = deque(maxlen=2)
         return self._observation(), {}
 
     def _observation(self) -> Any:
+        if self.variant in NO_OBSERVATIONS:
+            space, shown = NO_OBSERVATIONS[self.variant]
+            self.observation_space = space
+            return shown
         if self.variant == "pixels":
             return np.full((2, 2, 3), 255 * self.cell // (CELLS - 1), dtype=np.uint8)
         return str(self.cell) if self.variant == "text" else self.cell
@@ -62,6 +81,12 @@ class Corridor(gym.Env[Any, int]):
         if self.variant == "past":
             self.past.append(action)
             forward = forward and sum(self.past) == 2
+        if self.variant == "fuel":
+            self.fuel -= 1
+            if self.fuel < 280:
+                raise RuntimeError("no fuel")
+        if self.variant == "double":  # steps that are not counted one by one
+            self.steps += 1
         if self.variant == "endless":
             self.past = deque([*self.past, action])
         self.cell = min(self.cell + 1, CELLS - 1) if forward else max(self.cell - 1, 0)
@@ -185,6 +210,21 @@ def test_a_world_without_a_step_limit() -> None:
     assert mdp.next_state[:, :, 0].tolist() == [[0, 1], [0, 2], [1, 3], [2, 4], [4, 4]]
 
 
+@pytest.mark.parametrize("variant", ["double", "fuel", "endless"])
+def test_states_that_hold_the_time_end_at_the_step_limit(variant: str) -> None:
+    limit = 7 if variant == "endless" else 12  # whose states are all sequences of actions
+    mdp = enumerate_env("ShortCorridor-v0", {"variant": variant, "max_episode_steps": limit}, most_states=500)
+    assert mdp.max_episode_steps == limit
+    assert Evaluator(mdp, 1.0, limit).optimal_value == 1
+    walk_beside(mdp, gym.make("ShortCorridor-v0", variant=variant, max_episode_steps=limit), 500)
+
+
+def test_states_beyond_the_step_limit_that_have_an_end_are_found() -> None:
+    mdp = enumerate_env("ShortCorridor-v0", {"max_episode_steps": 2})
+    assert (mdp.num_states, mdp.max_episode_steps) == (CELLS, 2)
+    assert Evaluator(mdp, 1.0, 2).optimum.expected_return == 0
+
+
 def test_an_observation_that_is_no_array_is_left_out() -> None:
     assert enumerate_env("Corridor-v0", {"variant": "text"}).own_observation is None
 
@@ -216,6 +256,23 @@ def test_what_cannot_be_enumerated_is_refused(env_id: str, kwargs: dict[str, Any
     with pytest.raises(InputError, match=f"^env.*{env_id}.*{reason}") as refused:
         enumerate_env(env_id, kwargs, most_states=300)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("variant", NO_OBSERVATIONS)
+def test_an_observation_must_fit_its_space(variant: str) -> None:
+    with pytest.raises(
+        InputError, match=r"^env.id=Corridor-v0: an observation is .*not fit its space"
+    ) as refused:
+        enumerate_env("Corridor-v0", {"variant": variant})
+    assert "\n" not in str(refused.value)
+
+
+def test_many_states_are_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(exploring, "_MANY_STATES", 100)
+    monkeypatch.setattr(exploring, "ProgressLine", partial(ProgressLine, seconds_between_lines=0))
+    with pytest.raises(InputError, match="more than 1,200 states"):
+        enumerate_env("Corridor-v0", {"variant": "endless"}, most_states=1200)
+    assert "states so far, at most 1,200, no step limit ends them" in capsys.readouterr().err
 
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,7 @@
 """Gymnasium's own environments and the worlds compiled from their tables are the same."""
 
 import re
+import threading
 
 import gymnasium as gym
 import numpy as np
@@ -290,6 +291,103 @@ def test_an_environment_that_is_not_its_table_is_refused(kind, told):
         compile_table(kind())
 
 
+class FloatRows(TableEnv):
+    """Its rows are arrays, so that what it shows are floats."""
+
+    def __init__(self):
+        super().__init__()
+        self.P = {s: [np.array(row, np.float32) for row in rows.values()] for s, rows in self.P.items()}
+        self.P[1][1][0, 2] = 0.1
+
+
+class Shown(TableEnv):
+    def reset(self, **kwargs):
+        super().reset(**kwargs)
+        return None, {}
+
+
+def test_rows_may_be_arrays():
+    assert compile_table(FloatRows()).reward.max() == np.float32(0.1)
+    with pytest.raises(InputError, match="Shown: shows 'None', must show the number of a state"):
+        compile_table(Shown())
+
+
+class Paid(gym.Wrapper):
+    """A wrapper of no kind that says what it changes: each step costs more."""
+
+    cost = 0.1
+
+    def step(self, action):
+        state, reward, *others = self.env.step(action)
+        return state, reward - self.cost, *others
+
+
+class Counting(Paid):
+    cost, steps = 0.0, 0
+
+    def step(self, action):
+        self.steps += 1
+        return super().step(action)
+
+
+class Mirrored(gym.ActionWrapper):
+    def action(self, action):
+        return 1 - action
+
+
+class Locked(Counting):
+    def __init__(self, env):
+        super().__init__(env)
+        self.lock = threading.Lock()
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "told"),
+    [
+        (
+            lambda env: gym.wrappers.TransformReward(env, lambda r: -r),
+            "its wrapper TransformReward changes rewa",
+        ),
+        (Mirrored, "its wrapper Mirrored changes actions"),
+        (Paid, "leaves its own table: in state 0, action . led to state . with reward -0.1"),
+        (Locked, "its wrapper Locked cannot be copied"),
+        (lambda env: gym.wrappers.MaxAndSkipObservation(env, 2), "leaves its own table|shows"),
+    ],
+)
+def test_a_wrapper_that_changes_steps_is_refused(wrapper, told):
+    with pytest.raises(InputError, match=f"^TableEnv: .*{told}"):
+        compile_table(wrapper(TableEnv()))
+    gym.register("WrappedTable-v0", lambda **_: wrapper(TableEnv()), max_episode_steps=20)
+    if wrapper is not Locked:
+        with pytest.raises(InputError, match=f"^WrappedTable-v0: .*{told}"):
+            compile_gymnasium("WrappedTable-v0")
+    del gym.registry["WrappedTable-v0"]
+
+
+def test_a_wrapper_that_changes_what_is_seen_must_not_belong_to_the_id():
+    def numbers(env):
+        return gym.wrappers.TransformObservation(env, lambda state: 1 - state, env.observation_space)
+
+    assert compile_table(numbers(TableEnv())).num_actions == 2
+    gym.register(
+        "Seen-v0", lambda **_: TableEnv(), additional_wrappers=(_wrapper_spec(lambda state: 1 - state),)
+    )
+    with pytest.raises(InputError, match="started in state 1"):
+        compile_gymnasium("Seen-v0")
+    del gym.registry["Seen-v0"]
+
+
+def _wrapper_spec(function):
+    kwargs = {"func": function, "observation_space": spaces.Discrete(2)}
+    return gym.envs.registration.WrapperSpec("Seen", "gymnasium.wrappers:TransformObservation", kwargs)
+
+
+def test_wrappers_that_only_watch_are_left_as_they_are():
+    env = Counting(gym.wrappers.RecordEpisodeStatistics(gym.wrappers.TimeLimit(TableEnv(), 3)))
+    assert compile_table(env).max_episode_steps == 3
+    assert env.steps == 0
+
+
 ROW = [(1.0, 0, 0.0, False)]
 
 
@@ -326,6 +424,10 @@ def test_a_table_that_is_none_is_refused(changed, told):
         ("FrozenLake-v9", {}, "env.id=FrozenLake-v9: .*`v1`"),
         ("no such id", {}, "env.id=no such id: "),
         (3, {}, "env.id=3: "),
+        ("no_module.here:Any-v0", {}, "env.id=no_module.here:Any-v0: there is no module no_module; install"),
+        (":Any-v0", {}, "env.id=:Any-v0: is no environment"),
+        ("gymnasium:Lake-v1", {}, "env.id=gymnasium:Lake-v1: is no environment"),
+        ("gridworld:GridWorld-v0", {}, "gridworld:GridWorld-v0: has no transition table P"),
         ("CartPole-v1", {}, "CartPole-v1: has no transition table P.*env=enumerated"),
         (
             "FrozenLake-v1",
@@ -343,6 +445,18 @@ def test_an_id_that_makes_no_world_is_refused(env_id, kwargs, told):
     with pytest.raises(InputError, match=told.replace("{", r"\{").replace("}", r"\}")) as refused:
         compile_gymnasium(env_id, kwargs)
     assert "\n" not in str(refused.value)
+
+
+def test_an_id_may_name_the_module_that_registers_it(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    lines = 'import gymnasium\ngymnasium.register("Lake-v7", "gymnasium.envs.toy_text:FrozenLakeEnv")\n'
+    (tmp_path / "lake_registry.py").write_text(lines)
+    (tmp_path / "lake_mistake.py").write_text("import sys\nsys.exit('no lake')\n")
+    with pytest.raises(InputError, match=r"lake_mistake cannot be imported .SystemExit: no lake"):
+        compile_gymnasium("lake_mistake:Lake-v7")
+    mdp = compile_gymnasium("lake_registry:Lake-v7", {"is_slippery": False})
+    assert (mdp.name, mdp.max_episode_steps) == ("lake_registry:Lake-v7", None)
+    del gym.registry["Lake-v7"]
 
 
 @pytest.mark.parametrize("seed", range(3))
