@@ -90,7 +90,7 @@ TRAIN = [
     ("experiment=cliff_qlearning", "there is no such choice; close to it are cliff_q_learning, "),
     ("experiment=maze", "close to it are maze_a2c, maze_dqn, "),
     ("experiment=zz", "experiment=zz: there is no such choice; --help lists them all"),
-    ("env=mars", "env=mars: there is no such choice; there are aima_4x3, classic"),
+    ("env=mars", "env=mars: there is no such choice; there are aima_4x3, arrays"),
     ("env=null", "Config group override must be a string or a list"),
     ("ganma=1", "Key 'ganma' not in 'TrainConfig'"),
     ("agent.learning_rat=1", "Key 'learning_rat' not in 'DQNConfig'; did you mean learning_rate"),
@@ -148,7 +148,7 @@ TRAIN = [
     ),
     (
         "--config-dir {conf} agent=empty",
-        "agent.name: has no value; the yaml that agent=... chooses must give",
+        "agent.name: has no value; give agent.name=...",
     ),
     ("--config-dir {conf} agent=binary", "agent/binary.yaml: byte 1 is no UTF-8"),
     ("--config-dir {conf} agent=endless", "agent/endless.yaml: is nested too deeply, or contains itself"),
