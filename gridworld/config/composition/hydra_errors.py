@@ -39,7 +39,8 @@ def sentence(error: BaseException) -> str:
         mark = error.problem_mark
         return f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}: is no yaml, {error.problem}"
     if missing := re.search(r"[Mm]issing mandatory value: (\S+)", message):
-        key = getattr(error, "full_key", None) or missing.group(1)
+        key = missing.group(1)
+        key = key if "." in key else getattr(error, "full_key", None) or key
         return f"{key}: has no value; give {key}=..., or have the yaml that is chosen for it do so"
     if "Could not find" in message and "Available options in" in message:
         return _unknown_choice(message)
