@@ -56,7 +56,9 @@ def test_tune_shows_what_train_would_run(capsys: pytest.CaptureFixture[str], tmp
     assert whole.startswith(job)
     assert "\n  trials: 10\n" in whole
     assert shows(*words, "-c", "job", "-p", "agent.gamma") == "# @package agent.gamma\n0.9\n"
-    assert shows(*words, "--cfg", "--package", "env").startswith("# @package env\nlayout: classic\n")
+    assert shows(*words, "--cfg", "--package", "env").startswith(
+        "# @package env\nmax_episode_steps: 100\nlayout: classic\n"
+    )
     for more, told in (
         (["--cfg", "--package", "nowhere"], "--package nowhere: there is no such part of the configuration"),
         (["-p", "env"], "--package env: shows a part of the configuration; it goes with --cfg"),
