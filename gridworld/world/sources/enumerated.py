@@ -27,10 +27,16 @@ from gridworld.process.memory_budget import check_memory
 from gridworld.process.progress import telling_if_slow
 from gridworld.world.mdp import IntArray, Mdp
 from gridworld.world.outcomes import MOST_STATES, Outcomes, mdp_from_outcomes
-from gridworld.world.sources.elapsed_time import Trials, find_clocks, outcomes_of, own_limit, with_time
-from gridworld.world.sources.exploring import Clocks, Graph, Subject, TimeMattersError, explore
+from gridworld.world.sources.enumeration.elapsed_time import (
+    Trials,
+    find_clocks,
+    outcomes_of,
+    own_limit,
+    with_time,
+)
+from gridworld.world.sources.enumeration.exploring import Clocks, Graph, Subject, TimeMattersError, explore
+from gridworld.world.sources.enumeration.replays import Replays
 from gridworld.world.sources.making import make_env, refuse_changed
-from gridworld.world.sources.replays import Replays
 
 _BEYOND = 5_000  # states more than a step limit away; `env.max_episode_steps` may be larger than the id's
 

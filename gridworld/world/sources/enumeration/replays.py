@@ -15,8 +15,8 @@ import gymnasium as gym
 import numpy as np
 
 from gridworld.world.mdp import IntArray, Mdp
-from gridworld.world.sources.exploring import Clocks, Graph, Subject
-from gridworld.world.sources.snapshots import Snapshots, key_of
+from gridworld.world.sources.enumeration.exploring import Clocks, Graph, Subject
+from gridworld.world.sources.enumeration.snapshots import Snapshots, key_of
 
 _STEPS = 3_000  # at least
 _EPISODES = 5  # at least

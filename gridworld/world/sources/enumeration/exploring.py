@@ -22,7 +22,7 @@ from gridworld.process.progress import ProgressLine
 from gridworld.process.terminal import printable
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 from gridworld.world.outcomes import MOST_ACTIONS
-from gridworld.world.sources.snapshots import Snapshots, key_of, random_states
+from gridworld.world.sources.enumeration.snapshots import Snapshots, key_of, random_states
 
 Clocks = Mapping[str, int]  # attributes that count steps, and what they are at a reset
 _Rows = dict[int, list[tuple[int, float, bool, bool]]]  # next state, reward, terminated, truncated, by action

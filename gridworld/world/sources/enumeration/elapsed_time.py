@@ -19,7 +19,7 @@ import numpy as np
 
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 from gridworld.world.outcomes import Outcomes
-from gridworld.world.sources.exploring import Clocks, Graph, Subject, TimeMattersError
+from gridworld.world.sources.enumeration.exploring import Clocks, Graph, Subject, TimeMattersError
 
 _LONGEST = 10_000  # steps; who truncates later is taken to have no limit
 _UNLIMITED = 1_000  # steps within which rewards must not depend on the time where there is no limit
