@@ -17,19 +17,16 @@ cliff, there is one start to be sent back to.
 from __future__ import annotations
 
 import operator
-import os
-import stat
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.resources import files
 from os import PathLike, fspath
-from pathlib import Path
 from typing import Any
 
 from gridworld.errors import InputError
-from gridworld.process.command_line import users_folder
+from gridworld.process.users_file import open_users_file
 
 Cell = tuple[int, int]  # (row, column), both from 0, the top-left cell first
 
@@ -238,12 +235,11 @@ def _read(layout: str | PathLike[str]) -> Layout:
         raise InputError(f"layout={layout!r}: must be a layout's name, a map file's path or a Layout")
     if given in shipped_layouts():
         return parse(files("gridworld").joinpath("layouts", f"{given}.txt").read_text("utf-8"), name=given)
-    path = Path(given)
     try:
         # A row may end in blanks or \r\n; far more than that is no map, and is not read.
-        with open(users_folder() / path, "rb", opener=_without_waiting) as file:
-            is_ordinary = stat.S_ISREG(os.fstat(file.fileno()).st_mode)
-            raw = file.read(4 * MAX_CELLS + 1) if is_ordinary else b""
+        with open_users_file(given) as file:
+            is_ordinary = file is not None
+            raw = b"" if file is None else file.read(4 * MAX_CELLS + 1)
     except (FileNotFoundError, NotADirectoryError, ValueError):
         shipped = ", ".join(shipped_layouts())
         raise InputError(f"layout {given!r}: neither a shipped layout ({shipped}) nor a file") from None
@@ -251,7 +247,7 @@ def _read(layout: str | PathLike[str]) -> Layout:
         raise InputError(
             f"layout {given!r}: the map cannot be read ({error.strerror}); give a readable text file"
         ) from None
-    if not is_ordinary:  # a pipe or a device, which need not end
+    if not is_ordinary:
         raise InputError(f"layout {given!r}: is no ordinary file; give a readable text file")
     if len(raw) > 4 * MAX_CELLS:
         raise InputError(f"{given}: the map is too large; at most {MAX_CELLS} cells fit")
@@ -259,11 +255,6 @@ def _read(layout: str | PathLike[str]) -> Layout:
         return parse(raw.decode("utf-8-sig"), name=given)
     except UnicodeDecodeError as error:
         raise InputError(f"{given}: not a text file (byte {error.start + 1} is not UTF-8)") from None
-
-
-def _without_waiting(path: str, flags: int) -> int:
-    """Open a file; a pipe too is opened at once, whether somebody writes into it or not."""
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def _check_size(name: str, num_rows: int, num_cols: int) -> None:

@@ -27,7 +27,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import os
-import stat
 from collections.abc import Mapping
 from os import PathLike, fspath
 from pathlib import Path
@@ -37,9 +36,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError
-from gridworld.process.command_line import users_folder
 from gridworld.process.memory_budget import check_memory
 from gridworld.process.npz import npz_arrays, npz_bytes
+from gridworld.process.users_file import open_users_file
 from gridworld.world.mdp import Mdp, frozen
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 from gridworld.world.sources.verification import checked_text, verified
@@ -162,15 +161,15 @@ def _read(path: str | PathLike[str]) -> bytes:
     if not isinstance(given, str) or not given:
         raise InputError(f"env.path={path!r}: must be the path of an .npz file")
     try:
-        with open(users_folder() / given, "rb", opener=_without_waiting) as file:
-            found = os.fstat(file.fileno())
-            if not stat.S_ISREG(found.st_mode):  # a pipe or a device, which need not end
+        with open_users_file(given) as file:
+            if file is None:
                 raise InputError(f"env.path={given}: is no ordinary file; give an .npz file")
-            if found.st_size > _MOST_BYTES:
+            size = os.fstat(file.fileno()).st_size
+            if size > _MOST_BYTES:
                 raise InputError(
                     f"env.path={given}: is larger than {_MOST_BYTES / 2**30:.0f} GiB; give a smaller world"
                 )
-            check_memory(given, 2 * found.st_size)
+            check_memory(given, 2 * size)
             return file.read(_MOST_BYTES)
     except IsADirectoryError:
         raise InputError(f"env.path={given}: is a folder; give an .npz file") from None
@@ -179,11 +178,6 @@ def _read(path: str | PathLike[str]) -> bytes:
             raise
         told = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"env.path={given}: cannot be read ({told}); give an .npz file") from None
-
-
-def _without_waiting(path: str, flags: int) -> int:
-    """Open a file; a pipe too is opened at once, whether somebody writes into it or not."""
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def world_bytes(mdp: Mdp) -> bytes:
