@@ -34,6 +34,16 @@ def reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
 
 
+def in_short(error: BaseException) -> str:
+    """The kind of an exception of somebody else's code, and the first line of what it says."""
+    kind = type(error).__name__
+    try:
+        lines = str(error).strip().splitlines()
+    except Exception:  # it cannot even be told
+        return kind
+    return f"{kind}: {lines[0][:200]}" if lines else kind
+
+
 def failure(error: OSError) -> str:
     """Which file, what went wrong with it, and what would be right where that is known, as a sentence."""
     where = str(error.filename or "")

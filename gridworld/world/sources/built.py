@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from gridworld.errors import InputError
+from gridworld.errors import InputError, in_short
 from gridworld.process.import_path import imported
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
@@ -38,17 +38,8 @@ def build(builder: str | Callable[..., Any], kwargs: Mapping[str, Any] | None = 
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     except (Exception, SystemExit) as error:  # a function of the user's own may raise anything
-        raise InputError(f"{where}: raised {_told(error)}") from error
+        raise InputError(f"{where}: raised {in_short(error)}") from error
     return _world(where, _name_of(function), found)
-
-
-def _told(error: BaseException) -> str:
-    kind = type(error).__name__
-    try:
-        text = str(error).strip().splitlines()
-    except Exception:  # it cannot even be told
-        return kind
-    return f"{kind}: {text[0][:200]}" if text else kind
 
 
 def _name_of(function: Any) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from gridworld.errors import InputError
+from gridworld.errors import InputError, in_short, install_command
 
 _PACKAGES = {"MiniGrid-": "minigrid", "BabyAI-": "minigrid"}  # which register ids that begin so
 _CHANGING: dict[type, str] = {gym.RewardWrapper: "rewards", gym.ActionWrapper: "actions"}
@@ -84,9 +84,7 @@ def wrappers_of(env: Any) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
 
 def told(error: BaseException) -> str:
     """What an exception says, in short."""
-    text = str(error).split(" was raised from the environment creator")[0].strip().splitlines()
-    kind = type(error).__name__
-    return f"{kind}: {text[0][:200].rstrip(' .')}" if text else kind
+    return in_short(error).split(" was raised from the environment creator")[0].rstrip(" .")
 
 
 def _shown(arguments: Mapping[str, Any]) -> str:
@@ -125,6 +123,5 @@ def _import(env_id: str, package: str) -> None:
         importlib.import_module(package)
     except ImportError:
         raise InputError(
-            f"env.id={env_id}: needs the package {package}; install it with "
-            f"pip install 'gridworld-sb3[{package}]'"
+            f"env.id={env_id}: needs the package {package}; install it with {install_command(package)}"
         ) from None
