@@ -16,7 +16,7 @@ import numpy as np
 
 from gridworld.errors import InputError
 from gridworld.world.layout import CLASSIC, MOVES, NUM_COLS, NUM_ROWS, Cell, Layout, load_by_default_size
-from gridworld.world.mdp import BoolArray, IntArray, Mdp, checked_reward, finite, frozen
+from gridworld.world.mdp import BoolArray, IntArray, Mdp, checked_reward, finite, frozen, grid_places
 
 ACTION_NAMES = ("up", "right", "down", "left")
 NUM_ACTIONS = len(MOVES)
@@ -133,7 +133,7 @@ def compile_mdp(
         cliff=frozen(cliff),
         start=frozen(start),
         number=frozen(np.arange(goal.size)),
-        places=frozen(np.array([(0, *cell) for cell in layout.cells()], dtype=np.int64)),
+        places=frozen(grid_places(layout.num_rows, layout.num_cols)),
     )
 
 

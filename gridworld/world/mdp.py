@@ -191,6 +191,12 @@ class Mdp:
         return frozen(origins.astype(self.next_state.dtype)), frozen(first)
 
 
+def grid_places(num_rows: int, num_cols: int) -> NDArray[np.int64]:
+    """`Mdp.places` of a grid in one panel, row by row from the top left: (num_rows * num_cols, 3)."""
+    row, col = np.divmod(np.arange(num_rows * num_cols), num_cols)
+    return np.stack([np.zeros_like(row), row, col], axis=1)
+
+
 def frozen(table: Table) -> Table:
     """Make an array read-only.
 

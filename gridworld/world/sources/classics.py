@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError
-from gridworld.world.mdp import Mdp
+from gridworld.world.mdp import Mdp, grid_places
 from gridworld.world.outcomes import MOST_ACTIONS, MOST_STATES, Outcomes, mdp_from_outcomes
 
 LEFT, RIGHT = 0, 1
@@ -64,7 +64,7 @@ def river_swim(length: int = 6) -> Mdp:
             start=np.eye(1, length)[0],
         ),
         action_names=_LEFT_RIGHT,
-        places=_row(length),
+        places=grid_places(1, length),
         max_episode_steps=-(-20 * length // 6),
     )
 
@@ -151,7 +151,7 @@ def combination_lock(length: int = 10, num_actions: int = 2, seed: int | None = 
     return mdp_from_outcomes(
         f"combination lock {length}",
         _deterministic(next_state, reward, terminated, None, start=0),
-        places=_row(length + 1),
+        places=grid_places(1, length + 1),
         max_episode_steps=10 * length,
     )
 
@@ -187,7 +187,7 @@ def random_walk(length: int = 5) -> Mdp:
         f"random walk {length}",
         _deterministic(next_state, reward, terminated, None, start=(length + 1) // 2),
         action_names=_LEFT_RIGHT,
-        places=_row(length + 2),
+        places=grid_places(1, length + 2),
     )
 
 
@@ -209,13 +209,6 @@ def _deterministic(
         success=None if success is None else success[:, :, None],
         start=starts,
     )
-
-
-def _row(length: int) -> NDArray[np.int64]:
-    """Places in one row."""
-    places = np.zeros((length, 3), dtype=np.int64)
-    places[:, 2] = np.arange(length)
-    return places
 
 
 def _check_whole(key: str, value: Any, least: int, most: int) -> None:

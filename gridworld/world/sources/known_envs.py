@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gridworld.world.mdp import grid_places
+
 
 @dataclass(frozen=True)
 class KnownEnv:
@@ -18,11 +20,6 @@ class KnownEnv:
     places: Callable[[Any], NDArray[np.int64]]  # (N, 3), see `Mdp`
     panel_names: tuple[str, ...] = ()  # see `Mdp`
     refused: Callable[[Any], str] = lambda env: ""  # why its table is not true, if that can be seen
-
-
-def _grid_places(rows: int, cols: int) -> NDArray[np.int64]:
-    row, col = np.divmod(np.arange(rows * cols), cols)
-    return np.stack([np.zeros_like(row), row, col], axis=1).astype(np.int64)
 
 
 def _taxi_places(env: Any) -> NDArray[np.int64]:
@@ -41,8 +38,8 @@ def _is_fickle(env: Any) -> str:
 
 
 _KNOWN = {
-    "FrozenLakeEnv": KnownEnv(("left", "down", "right", "up"), lambda env: _grid_places(*env.desc.shape)),
-    "CliffWalkingEnv": KnownEnv(("up", "right", "down", "left"), lambda env: _grid_places(*env.shape)),
+    "FrozenLakeEnv": KnownEnv(("left", "down", "right", "up"), lambda env: grid_places(*env.desc.shape)),
+    "CliffWalkingEnv": KnownEnv(("up", "right", "down", "left"), lambda env: grid_places(*env.shape)),
     "TaxiEnv": KnownEnv(
         ("south", "north", "east", "west", "pickup", "dropoff"),
         _taxi_places,
