@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import operator
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from functools import partial
 from numbers import Real
@@ -88,6 +89,7 @@ class GridWorldEnv(gym.Env[int, int]):
         if not isinstance(world, GridMdp):
             raise InputError(f"mdp={world.name}: has no map; a batch of it is GridWorldVectorEnv(mdp=...)")
         self.mdp: GridMdp = world
+        self._thresholds: tuple[float, ...] = tuple(world.thresholds[0, 0].tolist())  # of all cells and moves
         self.render_mode = render_mode
         self.delay: float = delay
         self.cell_size: int = positive_int("cell_size", cell_size)
@@ -178,7 +180,7 @@ class GridWorldEnv(gym.Env[int, int]):
             if self.render_mode == "human":
                 self._show()
             return state, 0.0, True, False, {}
-        outcome = 0 if mdp.slip == 0 else slip_outcome(mdp.slip, self.np_random.random())
+        outcome = bisect_right(self._thresholds, self.np_random.random()) if self._thresholds else 0
         self._state = int(mdp.next_state[state, move, outcome])
         if self.render_mode == "human":
             self._show()
@@ -278,11 +280,6 @@ def check_action(action: Any) -> int:
     if not 0 <= move < NUM_ACTIONS:
         raise InputError(f"action={action!r}: must be 0 (up), 1 (right), 2 (down) or 3 (left)")
     return move
-
-
-def slip_outcome(slip: float, draw: float) -> int:
-    """The outcome, 0 to 2, that a uniform draw from [0, 1) means under a slip probability."""
-    return int(draw >= 1 - slip) + int(draw >= 1 - slip / 2)
 
 
 def play_random_episode() -> None:
