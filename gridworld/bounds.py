@@ -7,6 +7,7 @@ import math
 from gridworld.errors import InputError
 
 STEP_LIMIT = 100  # steps of an episode, where neither the world nor a setting says another
+MOST_STEPS = 100_000  # of an episode; an evaluation goes through all of them
 NEAREST_GAMMA = 1 - 1e-11  # to 1, but for 1 itself
 
 

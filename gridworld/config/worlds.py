@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Optional
 
-from gridworld.bounds import STEP_LIMIT, at_least, at_most
+from gridworld.bounds import MOST_STEPS, STEP_LIMIT, at_least, at_most
 from gridworld.config.agents import MISSING
 from gridworld.errors import InputError
 
@@ -22,8 +22,6 @@ if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
     from gridworld.world.mdp import Mdp
 
 # OmegaConf reads the annotations at run time and knows no `X | None`.
-
-MOST_STEPS = 100_000  # of an episode; an evaluation goes through all of them
 
 
 @dataclass

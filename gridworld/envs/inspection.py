@@ -6,7 +6,7 @@ the libraries need be imported for it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from os import PathLike
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from gridworld.bounds import STEP_LIMIT, at_most
+from gridworld.bounds import MOST_STEPS, STEP_LIMIT, at_most
 from gridworld.envs.observations import KINDS, ObservationTable, TableObservation, make_observation
 from gridworld.envs.rendering import frame_size
 from gridworld.errors import InputError
@@ -24,8 +24,8 @@ from gridworld.world.grid import GridMdp, compile_mdp
 from gridworld.world.layout import Layout, load, positive_int
 from gridworld.world.mdp import Mdp
 from gridworld.world.sources.gymnasium_table import compile_table
+from gridworld.world.sources.making import wrappers_of
 
-_MOST_STEPS = 100_000
 _LIMITS = ("_max_episode_steps", "max_episode_steps")  # of TimeLimit, of a native batch
 _STATEFUL = "gymnasium.wrappers.stateful_observation"
 
@@ -59,7 +59,7 @@ def task_of(env: Any, max_episode_steps: int | None = None) -> Task:
         limit = _step_limit(env) if limit is None else limit
     limit = mdp.max_episode_steps if limit is None else limit
     limit = STEP_LIMIT if limit is None else positive_int("max_episode_steps", limit)
-    at_most("max_episode_steps", limit, _MOST_STEPS)
+    at_most("max_episode_steps", limit, MOST_STEPS)
     return Task(mdp, limit)
 
 
@@ -154,7 +154,7 @@ def observation_of(env: gym.Env[Any, Any], mdp: Mdp) -> ObservationTable:
     Raises:
         InputError: what it sees or does is not a function of the state alone.
     """
-    wrappers = list(_wrappers(env))[::-1]  # from the inside
+    wrappers: list[Any] = list(wrappers_of(env))[::-1]  # from the inside
     seeing = [each for each in wrappers if _sees(each)]
     first = seeing[0] if seeing else None
     if first is None:
@@ -172,12 +172,6 @@ def observation_of(env: gym.Env[Any, Any], mdp: Mdp) -> ObservationTable:
 def tabulated(space: gym.Space[Any], rows: NDArray[Any]) -> ObservationTable:
     """The table of observations `rows` (S, *shape)."""
     return ObservationTable("of its own", space, len(rows), rows)
-
-
-def _wrappers(env: Any) -> Iterator[Any]:
-    while isinstance(env, gym.Wrapper):
-        yield env
-        env = env.env
 
 
 def _sees(wrapper: Any) -> bool:

@@ -7,10 +7,10 @@ import math
 from typing import Any
 
 from gridworld.agents.sb3.schemas import DQNConfig, PPOConfig, SB3CheckedConfig, SB3ClassConfig, SB3Config
-from gridworld.bounds import above_zero, at_least, at_most, within, within_size
+from gridworld.bounds import MOST_STEPS, above_zero, at_least, at_most, within, within_size
 from gridworld.config.agents import MOST_KEPT, check_exploration, parse_schedule
 from gridworld.config.train import TrainConfig
-from gridworld.config.worlds import MOST_STEPS, EnvConfig, MapConfig
+from gridworld.config.worlds import EnvConfig, MapConfig
 from gridworld.errors import InputError
 
 # Arguments that count something, by the names that SB3 and sb3-contrib give them.
@@ -67,7 +67,7 @@ def _check_callback(where: str, entry: Any) -> None:
 
 def _check_rewards(env: EnvConfig) -> None:
     """An episode's return and its square must be numbers of 32 bits."""
-    if not isinstance(env, MapConfig):  # whose rewards are within these bounds where it is compiled
+    if not isinstance(env, MapConfig):  # of others, only the compiled world tells
         return
     for name, times in (("step_reward", env.max_episode_steps or 1), ("goal_reward", 1), ("trap_reward", 1)):
         value, why = getattr(env, name), ", for networks calculate in 32 bits"
