@@ -12,6 +12,8 @@ gradient of the whole batch.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
@@ -28,10 +30,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.dqn.policies import QNetwork
 from torch import Tensor
 
-from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer
+from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer, not_finite
+from gridworld.agents.sb3.tabulated.side_by_side import SideBySide, forward
 from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of, smallest_integer
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv, StateStep
-from gridworld.world.mdp import IntArray
+from gridworld.process.together import chance, meet
+from gridworld.world.mdp import BoolArray, IntArray
 
 Float32Array = NDArray[np.float32]
 
@@ -62,15 +66,17 @@ class StateReplayBuffer(ReplayBuffer):
         self.pos = (at + 1) % self.buffer_size
         self.full |= self.pos == 0
 
-    def draw(self, batch_size: int) -> tuple[IntArray, IntArray, IntArray, Float32Array, Float32Array]:
-        """Draw a minibatch of B transitions; the random numbers are SB3's own.
+    def draw(
+        self, batch_size: int, chance: np.random.RandomState
+    ) -> tuple[IntArray, IntArray, IntArray, Float32Array, Float32Array]:
+        """Draw a minibatch of B transitions; drawn from numpy's global generator, they are SB3's own.
 
         Returns:
             (B,) each: states (int64), actions (uint8), next states (int64), rewards and ends (float32);
             time-outs are no ends.
         """
-        steps = np.random.randint(0, self.buffer_size if self.full else self.pos, size=batch_size)
-        which = steps * self.n_envs + np.random.randint(0, high=self.n_envs, size=batch_size)
+        steps = chance.randint(0, self.buffer_size if self.full else self.pos, size=batch_size)
+        which = steps * self.n_envs + chance.randint(0, high=self.n_envs, size=batch_size)
         ends = self.dones.take(which) * (1 - self.timeouts.take(which))
         states, following = self.observations.take(which), self.next_observations.take(which)
         rewards = self.rewards.take(which)
@@ -82,7 +88,7 @@ class TabulatedDQN(DQN):
 
     env: GridWorldVecEnv
     replay_buffer: StateReplayBuffer
-    derived = ("descent", "inputs", "_q", "_target_values")  # from the rest: no part of a checkpoint
+    derived = ("descent", "inputs", "_q", "_greedy", "_target_values")  # from the rest: no part of a checkpoint
 
     def _setup_model(self) -> None:
         observation = self.env.observation
@@ -93,6 +99,7 @@ class TabulatedDQN(DQN):
         self.descent = FlatOptimizer(self.policy.optimizer)
         self.inputs = StateInputs(self.policy, observation)
         self._q: Tensor | None = None  # of all states, with its graph, until the network changes
+        self._greedy: IntArray | None = None  # (S,), likewise
         self._target_values: Float32Array | None = None  # (S,), until the target network changes
 
     def _excluded_save_params(self) -> list[str]:
@@ -154,13 +161,17 @@ class TabulatedDQN(DQN):
         if self.num_timesteps < learning_starts or np.random.rand() < self.exploration_rate:
             return self.action_space.np_random.integers(self.env.envs.mdp.num_actions, size=len(states))
         which, index = self.inputs.distinct(states)
-        with torch.set_grad_enabled(which is None):
-            q = self._all_q() if which is None else self.q_values(self.q_net, which)
-        greedy: IntArray = q.detach().cpu().numpy().argmax(axis=1)
-        return greedy[index]
+        if which is None:
+            if self._greedy is None:
+                self._greedy = _argmax(self.q_of(None))
+            return self._greedy[index]
+        with torch.no_grad():
+            return _argmax(self.q_of(which))[index]
 
-    def _all_q(self) -> Tensor:
-        """Q of all states; one forward pass serves acting and the update that follows."""
+    def q_of(self, states: IntArray | None) -> Tensor:
+        """Q (U, A) of these states (U,), None for all: then one pass serves acting and the next update."""
+        if states is not None:
+            return self.q_values(self.q_net, states)
         if self._q is None:
             self._q = self.q_values(self.q_net)
         return self._q
@@ -173,40 +184,138 @@ class TabulatedDQN(DQN):
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """See SB3's `DQN.train`."""
         self._update_learning_rate(self.policy.optimizer)
-        losses = []
-        for _ in range(gradient_steps):
-            states, actions, following, rewards, ends = self.replay_buffer.draw(batch_size)
-            targets = rewards + (1 - ends) * np.float32(self.gamma) * self._best_values(following)
-            losses.append(self.descend(states, actions, targets))
-        self._n_updates += gradient_steps
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/loss", np.mean(losses))
+        member = _Member(self, chance(), gradient_steps, batch_size)
+        meet(_train, member, (self.inputs.kind, gradient_steps, batch_size))
 
-    def descend(self, states: IntArray, actions: IntArray, targets: Float32Array) -> float:
-        """Make one step of the optimiser on a minibatch of B transitions.
-
-        Args:
-            states: (B,), integers.
-            actions: (B,), integers.
-            targets: (B,), float32.
-
-        Returns:
-            The Huber loss before the step.
-        """
-        which, index = self.inputs.distinct(states)
-        q = self._all_q() if which is None else self.q_values(self.q_net, which)
-        pair = index * q.shape[1] + actions
-        error = q.detach().cpu().numpy().ravel()[pair] - targets
-        slope = np.maximum(np.minimum(error, 1), -1)
-        gradient = np.bincount(pair, slope, q.numel()) / len(pair)
-        self.descent.step([q], [gradient], self.max_grad_norm)
-        self._q = None
-        return float(slope @ (error - slope / 2)) / len(pair)
-
-    def _best_values(self, states: IntArray) -> Float32Array:
-        """max_a Q(s, a) of the target network."""
+    def best_values(self) -> Float32Array:
+        """max_a Q(s, a) of the target network, (S,)."""
         if self._target_values is None:
             with torch.no_grad():
                 best = self.q_values(self.q_net_target).max(dim=1).values
             self._target_values = best.cpu().numpy()
-        return self._target_values[states]
+        return self._target_values
+
+    def was_updated(self, greedy: IntArray | None = None) -> None:
+        """Forget what the network said before it was changed; `greedy` (S,) are its actions now, if known."""
+        self._q, self._greedy = None, greedy
+
+
+@dataclass
+class _Member:
+    """One of the models that are updated together."""
+
+    model: TabulatedDQN
+    chance: np.random.RandomState  # that its minibatches are drawn with
+    gradient_steps: int
+    batch_size: int
+    losses: list[float] = field(default_factory=list)
+    error: Exception | None = None
+
+
+def _train(members: Sequence[_Member]) -> list[Exception | None]:
+    """Make an update of each of P models of one kind; returns what is to be raised in each."""
+    with SideBySide([member.model.descent for member in members]) as rows:
+        update = Update([member.model for member in members], rows)
+        for _ in range(members[0].gradient_steps):
+            drawn = [each.model.replay_buffer.draw(each.batch_size, each.chance) for each in members]
+            losses, finite = update.step(*(_stacked(arrays) for arrays in zip(*drawn, strict=True)))
+            for member, loss, is_finite in zip(members, losses, finite, strict=True):
+                member.losses.append(loss)
+                member.error = member.error or (None if is_finite else not_finite())
+            if not any(finite):
+                break
+        update.end()
+    for member in members:
+        if member.error is None:
+            model = member.model
+            model._n_updates += member.gradient_steps
+            model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
+            model.logger.record("train/loss", np.mean(member.losses))
+    return [member.error for member in members]
+
+
+class Update:
+    """Steps that P models make together, each on minibatches of its own.
+
+    Args:
+        models: of one kind.
+        rows: their optimisers.
+    """
+
+    def __init__(self, models: Sequence[TabulatedDQN], rows: SideBySide) -> None:
+        self._models, self._rows = models, rows
+        self._best_values = _stacked([model.best_values() for model in models])
+        self._gammas = np.array([[model.gamma] for model in models], dtype=np.float32)
+        self._norms = [model.max_grad_norm for model in models]
+        self._finite = np.ones(len(models), dtype=np.bool_)
+        self._row = np.arange(len(models))[:, None]
+
+    def step(
+        self,
+        states: IntArray,
+        actions: IntArray,
+        following: IntArray,
+        rewards: Float32Array,
+        ends: Float32Array,
+    ) -> tuple[list[float], BoolArray]:
+        """Make one step of each optimiser.
+
+        Args:
+            states: (P, B), and so all others; what `StateReplayBuffer.draw` returns.
+
+        Returns:
+            P, the Huber loss before the step; (P,), which gradients have been finite so far.
+        """
+        targets = rewards + (1 - ends) * self._gammas * self._best_values[self._row, following]
+        return self.descend(states, actions, targets)
+
+    def descend(
+        self, states: IntArray, actions: IntArray, targets: Float32Array
+    ) -> tuple[list[float], BoolArray]:
+        """The same towards targets (P, B), float32, for the values of pairs (P, B)."""
+        index, q = self._values(states)
+        numbers = q.detach().cpu().numpy()
+        num_actions, count = numbers.shape[-1], actions.shape[1]
+        pair = (index + self._row * (numbers.size // num_actions // len(index))) * num_actions + actions
+        error = numbers.ravel()[pair] - targets
+        slope = np.maximum(np.minimum(error, 1), -1)
+        gradient = np.bincount(pair.ravel(), slope.ravel(), numbers.size) / count
+        going = np.flatnonzero(self._finite)
+        self._finite[going] = self._rows.step([q], [gradient], self._norms, going.tolist())
+        for model in self._models:
+            model.was_updated()
+        return [float(s @ (e - s / 2)) / count for s, e in zip(slope, error, strict=True)], self._finite
+
+    def end(self) -> None:
+        """Let the models know what their networks say now."""
+        if len(self._models) > 1:
+            with torch.no_grad():
+                q = self._of_all()
+            for model, greedy in zip(self._models, _argmax(q), strict=True):
+                model.was_updated(greedy)
+
+    def _values(self, states: IntArray) -> tuple[IntArray, Tensor]:
+        """Q of all or some states; where in them each of `states` (P, B) is."""
+        if len(self._models) > 1:
+            return states, self._of_all()
+        which, index = self._models[0].inputs.distinct(states[0])
+        return index[None], self._models[0].q_of(which)
+
+    def _of_all(self) -> Tensor:
+        """Q (P, S, A) of all states."""
+        net, inputs = self._models[0].q_net, self._models[0].inputs
+        observations = inputs.observations(None, net.q_net)
+        features = None
+        if observations is not None:
+            features = net.extract_features(observations, net.features_extractor)
+        return forward(net.q_net, self._rows.leaves, features)
+
+
+def _argmax(q: Tensor) -> IntArray:
+    greedy: IntArray = q.detach().cpu().numpy().argmax(axis=-1)
+    return greedy
+
+
+def _stacked(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Arrays (...) of P models as one (P, ...)."""
+    return arrays[0][None] if len(arrays) == 1 else np.stack(arrays)

@@ -28,21 +28,26 @@ _ENGINE: Any = torch.autograd.Variable._execution_engine
 
 
 class FlatOptimizer:
-    """Takes the steps of `optimizer` as SB3 does: gradients from zero, clipped by their common norm."""
+    """Takes the steps of `optimizer` as SB3 does: gradients from zero, clipped by their common norm.
+
+    Attributes:
+        weights: (N,), all parameters.
+        gradient: (N,), theirs.
+    """
 
     def __init__(self, optimizer: torch.optim.Optimizer) -> None:
         (group,) = optimizer.param_groups
         self._optimizer = optimizer
-        self._parameters: list[Tensor] = group["params"]
-        joined = torch.cat([parameter.detach().ravel() for parameter in self._parameters])
-        self._joined = nn.Parameter(joined)
-        self._gradient = self._joined.grad = torch.zeros_like(joined)
-        for parameter, view in zip(self._parameters, self._views(joined), strict=True):
+        self.parameters: list[Tensor] = group["params"]
+        self.weights = torch.cat([parameter.detach().ravel() for parameter in self.parameters])
+        self._joined = nn.Parameter(self.weights)
+        self.gradient = self._joined.grad = torch.zeros_like(self.weights)
+        for parameter, view in zip(self.parameters, self.cut(self.weights), strict=True):
             parameter.data = view
-        self._gradients = self._views(self._gradient)
+        self._gradients = self.cut(self.gradient)
         twin: Any = type(optimizer)
         self._twin: torch.optim.Optimizer = twin([{**group, "params": [self._joined]}])
-        if isinstance(optimizer, torch.optim.Adam) and joined.device.type == "cpu":
+        if isinstance(optimizer, torch.optim.Adam) and self.weights.device.type == "cpu":
             self._twin.param_groups[0]["fused"] = True
         # Bare of what torch wraps around it for profilers, hooks and the compiler, none of which are here.
         self._step = inspect.unwrap(type(optimizer).step)
@@ -55,56 +60,126 @@ class FlatOptimizer:
             outputs: of the network, with their graph.
             slopes: one array per output, of its shape.
             max_grad_norm: the gradient's norm is clipped to it.
+
+        Raises:
+            FloatingPointError: the gradient is no finite number; no step was made.
         """
-        self._gradient.zero_()
-        if self._parameters[0].grad is not self._gradients[0]:
-            for parameter, view in zip(self._parameters, self._gradients, strict=True):
-                parameter.grad = view
-        # What torch.autograd.backward calls once it has imported sympy, for shapes that are symbols.
-        _ENGINE.run_backward(
-            tuple(outputs),
-            tuple(
-                torch.as_tensor(slope, dtype=output.dtype, device=output.device).view_as(output)
-                for output, slope in zip(outputs, slopes, strict=True)
-            ),
-            *(False, False, ()),  # the graph is not kept, no graph of the gradients, all parameters
-            allow_unreachable=True,
-            accumulate_grad=True,
-        )
-        # As torch.nn.utils.clip_grad_norm_ does it.
-        norm = self._gradient.norm().item()
+        self.gradient.zero_()
+        self._attach()
+        run_backward(outputs, slopes)
+        norm = self.gradient.norm().item()
         if not norm < math.inf:
-            raise FloatingPointError("the gradient is no finite number")
-        scale = max_grad_norm / (norm + 1e-6)
-        if scale < 1:
-            self._gradient *= scale
-        if self._optimizer.state is not self._shared and self._optimizer.state:
-            self._take_over()
-        self._twin.param_groups[0]["lr"] = self._optimizer.param_groups[0]["lr"]
+            raise not_finite()
+        if (scale := clipping(norm, max_grad_norm)) < 1:
+            self.gradient *= scale
+        self.advance()
+
+    def _attach(self) -> None:
+        """Let each parameter's gradient be a view, should somebody have removed it."""
+        if self.parameters[0].grad is not self._gradients[0]:
+            for parameter, view in zip(self.parameters, self._gradients, strict=True):
+                parameter.grad = view
+
+    def advance(self) -> None:
+        """Let the optimiser step on the gradient as it is."""
+        self.settings()
         with torch.no_grad():
             self._step(self._twin)
         if self._optimizer.state is not self._shared:
             self._share()
 
+    def settings(self) -> dict[str, Any]:
+        """The optimiser's settings for its next step, the learning rate among them."""
+        if self._optimizer.state is not self._shared and self._optimizer.state:
+            self._take_over()
+        group = self._twin.param_groups[0]
+        group["lr"] = self._optimizer.param_groups[0]["lr"]
+        return group
+
+    def state(self) -> dict[str, Any] | None:
+        """What the optimiser keeps of all weights in one; None before its first step."""
+        return self._twin.state.get(self._joined)
+
+    @property
+    def is_adam(self) -> bool:
+        """Whether it is torch's Adam in one pass over all weights, and nothing derived from it."""
+        group = self._twin.param_groups[0]
+        return type(self._optimizer) is torch.optim.Adam and bool(group["fused"]) and not group["amsgrad"]
+
+    @property
+    def vectors(self) -> tuple[Tensor, Tensor]:
+        """The weights (N,) that it steps on, and their gradient."""
+        assert self._joined.grad is not None
+        return self._joined.detach(), self._joined.grad
+
+    def work_on(self, weights: Tensor, gradient: Tensor) -> None:
+        """Step on these vectors (N,) from here on; the parameters stay where they are."""
+        self._joined.data, self._joined.grad = weights, gradient
+
+    def take_back(self) -> None:
+        """Copy the vectors of `work_on` into its own, and step on these again."""
+        weights, gradient = self.vectors
+        self.weights.copy_(weights)
+        self.gradient.copy_(gradient)
+        self._attach()
+        self.work_on(self.weights, self.gradient)
+
     def _share(self) -> None:
         """Let the optimiser's state of each parameter be a view of its twin's."""
         for name, value in self._twin.state[self._joined].items():
             whole = isinstance(value, Tensor) and value.shape == self._joined.shape
-            parts = self._views(value) if whole else [value] * len(self._parameters)
-            for parameter, part in zip(self._parameters, parts, strict=True):
+            parts = self.cut(value) if whole else [value] * len(self.parameters)
+            for parameter, part in zip(self.parameters, parts, strict=True):
                 self._optimizer.state[parameter][name] = part
         self._shared = self._optimizer.state
 
     def _take_over(self) -> None:
         """Go on from a state that somebody loaded into the optimiser."""
-        states = [self._optimizer.state[parameter] for parameter in self._parameters]
+        states = [self._optimizer.state[parameter] for parameter in self.parameters]
         for name, value in states[0].items():
-            whole = isinstance(value, Tensor) and value.shape == self._parameters[0].shape
+            whole = isinstance(value, Tensor) and value.shape == self.parameters[0].shape
             self._twin.state[self._joined][name] = (
                 torch.cat([state[name].ravel() for state in states]) if whole else copy.copy(value)
             )
 
-    def _views(self, joined: Tensor) -> list[Tensor]:
-        """A vector of all weights, cut into the parameters' shapes."""
-        parts = torch.split(joined, [parameter.numel() for parameter in self._parameters])
-        return [part.view_as(of) for part, of in zip(parts, self._parameters, strict=True)]
+    def cut(self, joined: Tensor) -> list[Tensor]:
+        """Vectors (..., N) of all weights, cut into views of the parameters' shapes."""
+        parts = torch.split(joined, [parameter.numel() for parameter in self.parameters], dim=-1)
+        return [part.unflatten(-1, of.shape) for part, of in zip(parts, self.parameters, strict=True)]
+
+
+def run_backward(
+    outputs: Sequence[Tensor], slopes: Sequence[NDArray[Any]], leaves: Sequence[Tensor] = ()
+) -> Sequence[Tensor]:
+    """Take a loss's slopes in the outputs back to the weights.
+
+    Args:
+        outputs: of a network, with their graph, which is used up.
+        slopes: an array for each output.
+        leaves: the weights whose gradients are asked for; without them, each weight's is added to its own.
+
+    Returns:
+        The gradients of `leaves`.
+    """
+    # What torch.autograd.backward calls once it has imported sympy, for shapes that are symbols.
+    gradients: Sequence[Tensor] = _ENGINE.run_backward(
+        tuple(outputs),
+        tuple(
+            torch.as_tensor(slope, dtype=output.dtype, device=output.device).view_as(output)
+            for output, slope in zip(outputs, slopes, strict=True)
+        ),
+        *(False, False, tuple(leaves)),  # the graph is not kept, no graph of the gradients
+        allow_unreachable=True,
+        accumulate_grad=not leaves,
+    )
+    return gradients
+
+
+def not_finite() -> FloatingPointError:
+    """The error to raise where a gradient is no finite number."""
+    return FloatingPointError("the gradient is no finite number")
+
+
+def clipping(norm: float, max_grad_norm: float) -> float:
+    """What a gradient of this norm is multiplied by if it is below 1, as `clip_grad_norm_` of torch does."""
+    return max_grad_norm / (norm + 1e-6)

@@ -8,6 +8,8 @@ through the network once. `tabulated.state_inputs` says why that is the gradient
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
@@ -22,7 +24,7 @@ from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
-from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer
+from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer, not_finite
 from gridworld.agents.sb3.tabulated.ppo_loss import (
     Losses,
     Outputs,
@@ -31,9 +33,11 @@ from gridworld.agents.sb3.tabulated.ppo_loss import (
     losses_and_slopes,
     sum_up,
 )
+from gridworld.agents.sb3.tabulated.side_by_side import Leaves, SideBySide, forward
 from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.world.mdp import BoolArray, IntArray
+from gridworld.process.together import chance, meet
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 Float32Array = NDArray[np.float32]
 
@@ -60,7 +64,7 @@ class TabulatedPPO(PPO):
 
     env: GridWorldVecEnv
     policy: ActorCriticPolicy
-    derived = ("descent", "inputs", "_old")  # from the rest: no part of a checkpoint
+    derived = ("descent", "inputs", "old")  # from the rest: no part of a checkpoint
 
     def _setup_model(self) -> None:
         self.rollout_buffer_class = self.rollout_buffer_class or StateRolloutBuffer
@@ -68,7 +72,7 @@ class TabulatedPPO(PPO):
         self.policy.set_training_mode(False)  # SB3's networks know no difference; switching takes time
         self.descent = FlatOptimizer(self.policy.optimizer)
         self.inputs = StateInputs(self.policy, self.env.observation)
-        self._old: Outputs  # of all states, from the policy that collected the rollout
+        self.old: tuple[Float32Array, Float32Array]  # log π (S, A) and values (S,) that the rollout is from
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "rollout_buffer_class", *self.derived]
@@ -84,6 +88,16 @@ class TabulatedPPO(PPO):
         values = policy.value_net(self.inputs.latent(nets[1], states, critic))
         return logits, values
 
+    def outputs_of_all(self, leaves: Leaves) -> tuple[Tensor, Tensor]:
+        """Logits (P, S, A) and values (P, S, 1) of all states from P policies of this shape."""
+        policy, extractor = self.policy, self.policy.mlp_extractor
+        nets = (extractor.policy_net, extractor.value_net)
+        observations = self.inputs.observations(None, *nets)
+        features: Any = None if observations is None else policy.extract_features(observations)
+        actor, critic = features if isinstance(features, tuple) else (features, features)
+        logits = forward([*nets[0], policy.action_net], leaves, actor)
+        return logits, forward([*nets[1], policy.value_net], leaves, critic)
+
     def collect_rollouts(
         self,
         env: VecEnv,
@@ -96,7 +110,8 @@ class TabulatedPPO(PPO):
         rollout_buffer.reset()
         callback.on_rollout_start()
         with torch.no_grad():
-            self._old = log_prob, values = _tables(*self.outputs())
+            tables = _tables(*self.outputs())
+        self.old = log_prob, values = tables.log_prob[0], tables.values[0]
         thresholds = np.exp(log_prob).cumsum(axis=1).T[:-1].copy()  # (A - 1, S)
         draws = torch.rand(n_rollout_steps, env.num_envs).numpy()
 
@@ -133,49 +148,21 @@ class TabulatedPPO(PPO):
     def train(self) -> None:
         """See SB3's `PPO.train`."""
         self._update_learning_rate(self.policy.optimizer)
-        clip_range, clip_range_vf = self._clip_ranges()
         buffer = self.rollout_buffer
-        # Environment by environment, as SB3 lines samples up: the same seed draws the same minibatches.
-        states, actions, advantages, returns = (
-            table.swapaxes(0, 1).ravel()
-            for table in (buffer.observations, buffer.actions, buffer.advantages, buffer.returns)
-        )
-        weights = Weights(clip_range, clip_range_vf, self.ent_coef, self.vf_coef)
-        logged: list[Losses] = []
-        goes_on, epoch = True, 0
-        while goes_on and epoch < self.n_epochs:
-            first = len(logged)
-            for batch in _minibatches(len(states), self.batch_size):
-                which, index = self.inputs.distinct(states[batch])
-                weighed = self._normalized(advantages[batch])
-                old = self._old if which is None else Outputs(*(table[which] for table in self._old))
-                sums = sum_up(index, actions[batch], weighed, returns[batch], old.log_prob.shape)
-                outputs = self.outputs(which)
-                losses, *slopes = losses_and_slopes(_tables(*outputs), old, sums, weights)
-                logged.append(losses)
-                goes_on = self.target_kl is None or losses.approx_kl <= 1.5 * self.target_kl
-                if not goes_on:
-                    break
-                self.descent.step(outputs, slopes, self.max_grad_norm)
-            epoch += 1
-        self._n_updates += epoch
-        self._log(logged, first, weights)
+        shape = (buffer.buffer_size, buffer.n_envs, self.batch_size, self.n_epochs, self.normalize_advantage)
+        meet(_train, _Run(self, chance()), (self.inputs.kind, shape, self.clip_range_vf is None))
 
-    def _clip_ranges(self) -> tuple[float, float | None]:
+    def clip_ranges(self) -> tuple[float, float | None]:
+        """Of the ratio and, if it is clipped, of the value, at this time of training."""
         progress = self._current_progress_remaining
         clip_range, clip_range_vf = cast(Any, self.clip_range), cast(Any, self.clip_range_vf)
         return clip_range(progress), None if clip_range_vf is None else clip_range_vf(progress)
 
-    def _normalized(self, advantages: Float32Array) -> Float32Array:
-        if not self.normalize_advantage or len(advantages) < 2:
-            return advantages
-        normalized: Float32Array = (advantages - advantages.mean()) / (advantages.std(ddof=1) + 1e-8)
-        return normalized
-
-    def _log(self, logged: list[Losses], last_epoch: int, weights: Weights) -> None:
-        """SB3 reports the divergence of the last epoch alone, and the loss of the last minibatch."""
+    def log_update(self, epochs: int, logged: list[Losses], last_epoch: list[Losses]) -> None:
+        """Log an update's losses; SB3 has the divergence of the last epoch and the last minibatch's loss."""
+        self._n_updates += epochs
         means = Losses(*np.mean(logged, axis=0).tolist())._asdict()
-        means["approx_kl"] = float(np.mean([losses.approx_kl for losses in logged[last_epoch:]]))
+        means["approx_kl"] = float(np.mean([losses.approx_kl for losses in last_epoch]))
         means["loss"] = logged[-1].loss
         for name, mean in means.items():
             self.logger.record(f"train/{name}", mean)
@@ -183,17 +170,142 @@ class TabulatedPPO(PPO):
         variance = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
         self.logger.record("train/explained_variance", variance)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/clip_range", weights.clip_range)
-        if weights.clip_range_vf is not None:
-            self.logger.record("train/clip_range_vf", weights.clip_range_vf)
+        clip_range, clip_range_vf = self.clip_ranges()
+        self.logger.record("train/clip_range", clip_range)
+        if clip_range_vf is not None:
+            self.logger.record("train/clip_range_vf", clip_range_vf)
+
+
+def _train(runs: Sequence[_Run]) -> list[Exception | None]:
+    """Make the updates of a rollout of each of P models; returns what is to be raised in each."""
+    with SideBySide([run.model.descent for run in runs]) as rows:
+        update = _Update(runs, rows)
+        for _ in range(runs[0].model.n_epochs):
+            update.make_epoch()
+    for run in runs:
+        if run.error is None:
+            run.model.log_update(run.epochs, run.logged, run.logged[run.last_epoch :])
+    return [run.error for run in runs]
+
+
+@dataclass
+class _Run:
+    """One of the models that are updated together."""
+
+    model: TabulatedPPO
+    chance: np.random.RandomState  # that its minibatches are drawn with
+    logged: list[Losses] = field(default_factory=list)
+    last_epoch: int = 0  # where in `logged` it begins
+    epochs: int = 0
+    error: Exception | None = None
+
+
+class _Update:
+    """The updates that P models make of their rollouts.
+
+    Args:
+        runs: of models of one kind, with rollouts of one size.
+        rows: their optimisers.
+    """
+
+    def __init__(self, runs: Sequence[_Run], rows: SideBySide) -> None:
+        self._runs, self._rows = runs, rows
+        self._models = [run.model for run in runs]
+        self._inputs = self._models[0].inputs
+        self._going = np.arange(len(runs))  # those that have not ended their epochs
+        self._all_going = True
+        # Environment by environment, as SB3 lines samples up: the same seed draws the same minibatches.
+        buffers = [model.rollout_buffer for model in self._models]
+        self._samples = [
+            np.stack([getattr(buffer, name).swapaxes(0, 1).ravel() for buffer in buffers])
+            for name in ("observations", "actions", "advantages", "returns")
+        ]
+        self._old = Outputs(*map(np.stack, zip(*(model.old for model in self._models), strict=True)))
+        self._weights = _weights(self._models)
+        self._norms = [model.max_grad_norm for model in self._models]
+
+    def make_epoch(self) -> None:
+        """Make the steps of an epoch; the order of samples is SB3's own draw."""
+        going = self._going
+        for run in going:
+            self._runs[run].last_epoch = len(self._runs[run].logged)
+            self._runs[run].epochs += 1
+        count, size = self._samples[0].shape[1], self._models[0].batch_size
+        order = np.zeros((len(self._runs), count), dtype=np.int64)
+        for run in going:
+            order[run] = self._runs[run].chance.permutation(count)
+        for start in range(0, count, size):
+            if len(self._going):
+                self._make_step(order[self._going, start : start + size])
+
+    def _make_step(self, batch: IntArray) -> None:
+        """Make a step on the samples (P, B) of those that go on."""
+        states, actions, advantages, returns = (each[self._going[:, None], batch] for each in self._samples)
+        which, index = self._inputs.distinct(states.ravel())
+        old = self._of_going(self._old)
+        if which is not None:  # of a model by itself
+            old = Outputs(*(table[:, which] for table in old))
+        if self._models[0].normalize_advantage and batch.shape[1] > 1:
+            advantages = _normalized(advantages)
+        sums = sum_up(index.reshape(states.shape), actions, advantages, returns, old.log_prob.shape)
+        outputs = self._outputs(which)
+        new = self._of_going(_tables(*outputs))
+        weights = self._weights if self._all_going else self._weights.of(self._going)
+        losses, *slopes = losses_and_slopes(new, old, sums, weights)
+        goes_on = [self._takes(run, found) for run, found in zip(self._going, losses, strict=True)]
+        self._end(goes_on)
+        if len(self._going):
+            slopes = [self._of_all(slope[goes_on]) for slope in slopes]
+            finite = self._rows.step(outputs, slopes, self._norms, self._going.tolist())
+            for run, is_finite in zip(self._going, finite, strict=True):
+                self._runs[run].error = None if is_finite else not_finite()
+            self._end(finite)
+
+    def _outputs(self, which: IntArray | None) -> tuple[Tensor, Tensor]:
+        if len(self._models) == 1:
+            return self._models[0].outputs(which)
+        return self._models[0].outputs_of_all(self._rows.leaves)
+
+    def _takes(self, run: int, losses: Losses) -> bool:
+        """Note a step's losses; returns whether the step is to be made."""
+        self._runs[run].logged.append(losses)
+        target_kl = self._models[run].target_kl
+        return target_kl is None or losses.approx_kl <= 1.5 * target_kl
+
+    def _end(self, goes_on: list[bool]) -> None:
+        if not all(goes_on):
+            self._going, self._all_going = self._going[goes_on], False
+
+    def _of_going(self, outputs: Outputs) -> Outputs:
+        return outputs if self._all_going else Outputs(*(table[self._going] for table in outputs))
+
+    def _of_all(self, slopes: FloatArray) -> FloatArray:
+        """Slopes of those that go on, and 0 for the others."""
+        if self._all_going:
+            return slopes
+        whole = np.zeros((len(self._runs), *slopes.shape[1:]))
+        whole[self._going] = slopes
+        return whole
+
+
+def _weights(models: Sequence[TabulatedPPO]) -> Weights:
+    clip_ranges, clip_ranges_vf = zip(*(model.clip_ranges() for model in models), strict=True)
+    vf = None if clip_ranges_vf[0] is None else _column(clip_ranges_vf)
+    coefficients = ([getattr(model, name) for model in models] for name in ("ent_coef", "vf_coef"))
+    return Weights(_column(clip_ranges), vf, *map(_column, coefficients))
+
+
+def _column(numbers: Sequence[float]) -> FloatArray:
+    return np.array(numbers, dtype=np.float64).reshape(-1, 1, 1)
+
+
+def _normalized(advantages: Float32Array) -> Float32Array:
+    mean, deviation = advantages.mean(axis=1, keepdims=True), advantages.std(axis=1, ddof=1, keepdims=True)
+    normalized: Float32Array = (advantages - mean) / (deviation + 1e-8)
+    return normalized
 
 
 def _tables(logits: Tensor, values: Tensor) -> Outputs:
-    """The numbers alone, where the loss works on them."""
-    return Outputs(log_softmax(logits.detach().cpu().numpy()), values.detach().cpu().numpy()[:, 0])
-
-
-def _minibatches(count: int, batch_size: int) -> list[IntArray]:
-    """All samples in random order, cut into batches; the draw is SB3's own."""
-    order = np.random.permutation(count)
-    return [order[start : start + batch_size] for start in range(0, count, batch_size)]
+    """The numbers alone, where the loss works on them; of P models, or of one."""
+    log_prob, numbers = log_softmax(logits.detach().cpu().numpy()), values.detach().cpu().numpy()[..., 0]
+    return Outputs(log_prob, numbers) if logits.dim() == 3 else Outputs(log_prob[None], numbers[None])

@@ -17,6 +17,8 @@ function of the state. Their slopes at the network's outputs are as short:
     ∂ squares   / ∂ V(s)       =  2/B n_s (V(s) - m_s)
 
 and a slope g in log π is g - π Σ_a g in the logits.
+All arrays have a leading axis P, of the runs that train together (`process.together`): whatever adds up
+over samples or states does so per run, in the order in which it does for one run alone.
 J. Schulman et al., Proximal Policy Optimization Algorithms, 2017, has the losses.
 """
 
@@ -32,23 +34,23 @@ from gridworld.world.mdp import FloatArray, IntArray
 
 
 class Outputs(NamedTuple):
-    """What a policy says of U states."""
+    """What P policies say of U states."""
 
-    log_prob: NDArray[Any]  # (U, A)
-    values: NDArray[Any]  # (U,)
+    log_prob: NDArray[Any]  # (P, U, A)
+    values: NDArray[Any]  # (P, U)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Sums:
-    """Sums over a minibatch, in which U states occur; everything is divided by the number of samples.
+    """Sums over P minibatches, in which U states occur; everything is divided by the number of samples.
 
     Attributes:
-        positive: (U, A), the sum of positive advantages.
-        negative: (U, A), the sum of negative advantages.
-        pairs: (U, A), the share of the samples.
-        states: (U,), the share of the samples.
-        mean_return: (U,).
-        deviation: of returns from their state's mean, squared.
+        positive: (P, U, A), the sum of positive advantages.
+        negative: (P, U, A), the sum of negative advantages.
+        pairs: (P, U, A), the share of the samples.
+        states: (P, U), the share of the samples.
+        mean_return: (P, U).
+        deviation: (P,), of returns from their state's mean, squared.
     """
 
     positive: FloatArray
@@ -56,17 +58,23 @@ class Sums:
     pairs: FloatArray
     states: FloatArray
     mean_return: FloatArray
-    deviation: float
+    deviation: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False, slots=True)
 class Weights:
-    """The settings that the loss depends on."""
+    """The settings that the losses depend on, (P, 1, 1) each."""
 
-    clip_range: float
-    clip_range_vf: float | None
-    ent_coef: float
-    vf_coef: float
+    clip_range: FloatArray
+    clip_range_vf: FloatArray | None
+    ent_coef: FloatArray
+    vf_coef: FloatArray
+
+    def of(self, rows: IntArray) -> Weights:
+        """Those of some of the runs."""
+        vf = self.clip_range_vf
+        clip_range_vf = None if vf is None else vf[rows]
+        return Weights(self.clip_range[rows], clip_range_vf, self.ent_coef[rows], self.vf_coef[rows])
 
 
 class Losses(NamedTuple):
@@ -81,9 +89,9 @@ class Losses(NamedTuple):
 
 
 def log_softmax(logits: NDArray[Any]) -> NDArray[Any]:
-    """log π (U, A) of logits (U, A)."""
-    shifted: NDArray[Any] = logits - logits.max(axis=1, keepdims=True)
-    shifted -= np.log(np.exp(shifted).sum(axis=1, keepdims=True))
+    """log π (..., A) of logits (..., A)."""
+    shifted: NDArray[Any] = logits - logits.max(axis=-1, keepdims=True)
+    shifted -= np.log(np.exp(shifted).sum(axis=-1, keepdims=True))
     return shifted
 
 
@@ -94,66 +102,79 @@ def sum_up(
     returns: NDArray[Any],
     shape: tuple[int, ...],
 ) -> Sums:
-    """Sum up a minibatch of B samples.
+    """Sum up P minibatches of B samples.
 
     Args:
-        index: (B,), which of the states each sample has.
-        actions: (B,), integers.
-        advantages: (B,), float32.
-        returns: (B,), float32.
-        shape: (U, A), how many states occur and how many actions there are.
+        index: (P, B), which of the states each sample has.
+        actions: (P, B), integers.
+        advantages: (P, B), float32.
+        returns: (P, B), float32.
+        shape: (P, U, A), how many states occur and how many actions there are.
     """
-    count, size = len(index), shape[0] * shape[1]
-    pair = index * shape[1]
-    pair += actions
-    positive = np.bincount(pair, np.maximum(advantages, 0), size).reshape(shape) / count
-    negative = np.bincount(pair, np.minimum(advantages, 0), size).reshape(shape) / count
+    runs, num_states, num_actions = shape
+    count, size = index.shape[1], runs * num_states * num_actions
+    state = index + num_states * np.arange(runs)[:, None]
+    pair = (state * num_actions + actions).ravel()
+    positive = np.bincount(pair, np.maximum(advantages, 0).ravel(), size).reshape(shape) / count
+    negative = np.bincount(pair, np.minimum(advantages, 0).ravel(), size).reshape(shape) / count
     pairs = np.bincount(pair, None, size).reshape(shape) / count
-    states = pairs.sum(axis=1)
-    mean_return = np.bincount(index, returns, shape[0]) / np.maximum(states * count, 1)
-    apart = returns - mean_return[index]
-    return Sums(positive, negative, pairs, states, mean_return, float(apart @ apart) / count)
+    states = pairs.sum(axis=-1)
+    total_return = np.bincount(state.ravel(), returns.ravel(), runs * num_states).reshape(states.shape)
+    mean_return = total_return / np.maximum(states * count, 1)
+    apart = returns - mean_return.ravel()[state]
+    deviation = np.array([each @ each for each in apart]) / count
+    return Sums(positive, negative, pairs, states, mean_return, deviation)
 
 
 def losses_and_slopes(
     new: Outputs, old: Outputs, sums: Sums, weights: Weights
-) -> tuple[Losses, FloatArray, FloatArray]:
+) -> tuple[list[Losses], FloatArray, FloatArray]:
     """Compute PPO's losses and their slopes, see above.
 
     Args:
-        new: the outputs of the policy that learns.
-        old: the outputs of the policy that collected the samples.
-        sums: of the minibatch.
+        new: the outputs of the policies that learn.
+        old: the outputs of the policies that collected the samples.
+        sums: of the minibatches.
         weights: of the losses.
 
     Returns:
-        The losses; the slopes of `loss` in the logits (U, A) and in the values (U,).
+        The losses of each run; the slopes of `loss` in the logits (P, U, A) and in the values (P, U).
     """
-    low, high = 1 - weights.clip_range, 1 + weights.clip_range
+    # Bounds are as exact as the outputs that are compared with them.
+    low, high, width = (
+        bound.astype(np.float32)
+        for bound in (1 - weights.clip_range, 1 + weights.clip_range, weights.clip_range)
+    )
     log_ratio = new.log_prob - old.log_prob
     ratio, prob = np.exp(log_ratio), np.exp(new.log_prob)
     gains = sums.positive * np.minimum(ratio, high) + sums.negative * np.maximum(ratio, low)
-    negative_entropy = (prob * new.log_prob).sum(axis=1)
+    negative_entropy = (prob * new.log_prob).sum(axis=-1)
     slope = -ratio * (sums.positive * (ratio <= high) + sums.negative * (ratio >= low))
-    slope += weights.ent_coef * sums.states[:, None] * prob * (new.log_prob + 1)
-    slope -= prob * slope.sum(axis=1, keepdims=True)
+    slope += weights.ent_coef * sums.states[..., None] * prob * (new.log_prob + 1)
+    slope -= prob * slope.sum(axis=-1, keepdims=True)
 
-    values, moves = new.values, np.float32(1)
+    values, moves = new.values, (2 * weights.vf_coef[:, :, 0]).astype(np.float32)
     if weights.clip_range_vf is not None:
+        most = weights.clip_range_vf[:, :, 0].astype(np.float32)
         change = new.values - old.values
-        values = old.values + np.clip(change, -weights.clip_range_vf, weights.clip_range_vf)
-        moves = abs(change) <= weights.clip_range_vf
+        values = old.values + np.minimum(np.maximum(change, -most), most)
+        moves = 2 * weights.vf_coef[:, :, 0] * (abs(change) <= most)
     error = values - sums.mean_return
     pull = sums.states * error
 
-    policy_loss, entropy_loss = -float(gains.sum()), float(sums.states @ negative_entropy)
-    value_loss = float(pull @ error) + sums.deviation
-    found = Losses(
-        loss=policy_loss + weights.ent_coef * entropy_loss + weights.vf_coef * value_loss,
-        policy_gradient_loss=policy_loss,
-        value_loss=value_loss,
-        entropy_loss=entropy_loss,
-        approx_kl=float((sums.pairs * (ratio - 1 - log_ratio)).sum()),
-        clip_fraction=float((sums.pairs * (abs(ratio - 1) > weights.clip_range)).sum()),
+    kl = sums.pairs * (ratio - 1 - log_ratio)
+    clipped = sums.pairs * (abs(ratio - 1) > width)
+    policy_loss, approx_kl, clip_fraction = (
+        each.reshape(len(each), -1).sum(axis=1).tolist() for each in (-gains, kl, clipped)
     )
-    return found, slope, 2 * weights.vf_coef * moves * pull
+    entropy_loss = [float(a @ b) for a, b in zip(sums.states, negative_entropy, strict=True)]
+    square = [float(a @ b) for a, b in zip(pull, error, strict=True)]
+    ent_coefs, vf_coefs = weights.ent_coef.ravel().tolist(), weights.vf_coef.ravel().tolist()
+    found = []
+    for run, deviation in enumerate(sums.deviation.tolist()):
+        value_loss = square[run] + deviation
+        loss = policy_loss[run] + ent_coefs[run] * entropy_loss[run] + vf_coefs[run] * value_loss
+        found.append(
+            Losses(loss, policy_loss[run], value_loss, entropy_loss[run], approx_kl[run], clip_fraction[run])
+        )
+    return found, slope, moves * pull

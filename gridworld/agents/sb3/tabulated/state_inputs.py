@@ -16,7 +16,8 @@ layer is a look-up as well, and no matrix of S x S is ever made.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Hashable, Mapping
 from typing import Any, cast
 
 import numpy as np
@@ -26,6 +27,7 @@ from torch import Tensor, nn
 
 from gridworld.agents.sb3.schemas import DQNConfig, PPOConfig, SB3CheckedConfig
 from gridworld.agents.sb3.tabulated.flat_optimizer import ELEMENTWISE
+from gridworld.agents.sb3.tabulated.side_by_side import can_stand
 from gridworld.agents.sb3.vec_env import StateStep
 from gridworld.envs.observations import ObservationTable
 from gridworld.world.mdp import IntArray
@@ -92,6 +94,14 @@ class StateInputs:
         self._observation = observation
         self._one_hot = observation.kind in ("one_hot", "none")  # SB3 makes unit vectors of numbers
         self._all: Tensor | None = None  # the observations of all states, once they were asked for
+
+    @functools.cached_property
+    def kind(self) -> Hashable:
+        """Equal for policies that can be run side by side: of one shape, with the same inputs."""
+        if self.num_states > _FEW_STATES or self._policy.device.type != "cpu" or not can_stand(self._policy):
+            return id(self)
+        rows = b"" if self._one_hot else self._observation.rows(np.arange(self.num_states)).tobytes()
+        return type(self._policy), repr(self._policy), self.num_states, self._observation.kind, rows
 
     def distinct(self, states: IntArray) -> tuple[IntArray | None, IntArray]:
         """Find the states to run the network on.

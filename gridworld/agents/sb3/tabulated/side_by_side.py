@@ -1,0 +1,211 @@
+"""Networks of one shape side by side: P of them make a step in the time that one takes.
+
+While several runs train together (`process.together`), an update is made for all of them at once: their
+weights stand in one matrix (P, N), a layer is a batched product of (P, U, in) with (P, in, out), and each
+row is clipped and stepped as it would be alone. A batched product calls, for each of its matrices, the
+routine that a single one calls, so each network's numbers are the same to the last bit. That depends on the
+processor and on the build of torch; `agree` tries it out on the networks at hand.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer, clipping, run_backward
+
+_adam: Any = inspect.unwrap(sys.modules["torch.optim.adam"].adam)
+_ALIGNMENT = 16  # numbers; torch begins every tensor at a multiple of 64 bytes
+Leaves = Mapping[int, Tensor]  # by the identity of the first network's parameter: (P, *its shape)
+
+
+class SideBySide:
+    """The weights of P optimisers while they step together, as a context manager.
+
+    Inside the block the optimisers' own parameters are stale, except that a single optimiser steps on them
+    as it always does.
+
+    Args:
+        optimizers: of P networks of the same shapes.
+
+    Attributes:
+        leaves: the weights, for `forward`; none where there is one optimiser.
+    """
+
+    def __init__(self, optimizers: Sequence[FlatOptimizer]) -> None:
+        self._optimizers = optimizers
+        self.leaves: Leaves = {}
+        self._adams: dict[tuple[int, ...], list[_Adams]] = {}  # by the rows that step
+
+    def __enter__(self) -> Self:
+        if len(self._optimizers) == 1:
+            return self
+        own = [each.weights for each in self._optimizers]
+        # Each row begins where a vector of its own would: products with vectors add up by alignment.
+        width = -(-len(own[0]) // _ALIGNMENT) * _ALIGNMENT
+        rows = torch.empty(len(own), width)[:, : len(own[0])]
+        self._weights = torch.stack(own, out=rows)
+        self._gradients = torch.zeros(len(own), width)[:, : len(own[0])]
+        first = self._optimizers[0]
+        leaves = [view.detach().requires_grad_() for view in first.cut(self._weights)]
+        self.leaves = {id(of): leaf for of, leaf in zip(first.parameters, leaves, strict=True)}
+        for each, weights, gradient in zip(self._optimizers, self._weights, self._gradients, strict=True):
+            each.work_on(weights, gradient)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if len(self._optimizers) == 1:
+            return
+        for each in self._optimizers:
+            each.take_back()
+
+    def step(
+        self,
+        outputs: Sequence[Tensor],
+        slopes: Sequence[NDArray[Any]],
+        max_grad_norms: Sequence[float],
+        rows: Sequence[int],
+    ) -> list[bool]:
+        """Make one step of some of the optimisers.
+
+        Args:
+            outputs: of the networks, (P, ...) each, with their graph.
+            slopes: an array for each output, of its shape.
+            max_grad_norms: P, what each gradient's norm is clipped to.
+            rows: which of the P are to step.
+
+        Returns:
+            Of each of `rows`, whether its gradient was finite; if not, it made no step.
+        """
+        if len(self._optimizers) == 1:
+            try:
+                self._optimizers[0].step(outputs, slopes, max_grad_norms[0])
+            except FloatingPointError:
+                return [False]
+            return [True]
+        gradients = run_backward(outputs, slopes, tuple(self.leaves.values()))
+        torch.cat([each.flatten(1) for each in gradients], dim=1, out=self._gradients)
+        self._gradients += 0  # as each is added to 0 where there is one network, and -0 becomes 0
+        norms = torch.linalg.vector_norm(self._gradients, dim=1).tolist()
+        scales = [clipping(norm, most) for norm, most in zip(norms, max_grad_norms, strict=True)]
+        if min(scales) < 1:
+            self._gradients *= torch.tensor([[min(scale, 1.0)] for scale in scales])
+        finite = [norms[row] < math.inf for row in rows]
+        self._advance(tuple(row for row, goes in zip(rows, finite, strict=True) if goes))
+        return finite
+
+    def _advance(self, rows: tuple[int, ...]) -> None:
+        if rows not in self._adams:
+            adams = _adams([self._optimizers[row] for row in rows])
+            if adams is None:
+                for row in rows:
+                    self._optimizers[row].advance()
+                return
+            self._adams = {rows: adams}
+        for each in self._adams[rows]:
+            each.step()
+
+
+def forward(network: Iterable[nn.Module], leaves: Leaves, features: Tensor | None) -> Tensor:
+    """Run P networks of one shape.
+
+    Args:
+        network: the layers of the first of them.
+        leaves: the weights of all, of `SideBySide`.
+        features: (U, n), the same for all; None: the first layer is linear and its input the unit vectors.
+
+    Returns:
+        (P, U, m).
+    """
+    hidden = features
+    for layer in network:
+        if not isinstance(layer, nn.Linear):
+            hidden = layer(hidden)
+            continue
+        weight, bias = leaves[id(layer.weight)], leaves[id(layer.bias)][:, None]
+        if hidden is None:
+            hidden = weight.transpose(1, 2) + bias
+            continue
+        if hidden.dim() == 2:
+            hidden = hidden.expand(len(weight), *hidden.shape)
+        hidden = _Linear.apply(hidden, weight, bias)
+    assert hidden is not None
+    return hidden
+
+
+class _Linear(torch.autograd.Function):
+    """P linear layers, with the products that torch makes for a single one, in both directions."""
+
+    @staticmethod
+    def forward(ctx: Any, inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        ctx.save_for_backward(inputs, weight)
+        if weight.shape[1] == 1:  # a product with a vector
+            return torch.bmm(weight, inputs.transpose(1, 2)).transpose(1, 2) + bias
+        return torch.baddbmm(bias, inputs, weight.transpose(1, 2))
+
+    @staticmethod
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
+        inputs, weight = ctx.saved_tensors
+        of_inputs = None
+        if ctx.needs_input_grad[0] and inputs.stride()[1:] == (1, inputs.shape[1]):
+            of_inputs = torch.bmm(weight.transpose(1, 2), slope.transpose(1, 2)).transpose(1, 2)
+        elif ctx.needs_input_grad[0]:
+            of_inputs = torch.bmm(slope, weight)
+        return of_inputs, torch.bmm(slope.transpose(1, 2), inputs), slope.sum(1, keepdim=True)
+
+
+def can_stand(*networks: nn.Module) -> bool:
+    """Whether all that these networks learn is in linear layers with a bias, as `forward` runs them."""
+    layers = [layer for network in networks for layer in network.modules() if not list(layer.children())]
+    return all(
+        layer.bias is not None if isinstance(layer, nn.Linear) else not list(layer.parameters())
+        for layer in layers
+    )
+
+
+def _adams(optimizers: Sequence[FlatOptimizer]) -> list[_Adams] | None:
+    """These optimisers in groups of the same settings, if all are torch's Adam and have begun."""
+    if not all(each.is_adam and each.state() for each in optimizers):
+        return None
+    groups: dict[Any, list[FlatOptimizer]] = {}
+    for each in optimizers:
+        settings = each.settings()
+        groups.setdefault(tuple(settings[name] for name in _SETTINGS), []).append(each)
+    return [_Adams(dict(zip(_SETTINGS, values, strict=True)), same) for values, same in groups.items()]
+
+
+_SETTINGS = ("lr", "betas", "weight_decay", "eps", "maximize", "decoupled_weight_decay")
+
+
+class _Adams:
+    """Several of torch's Adam with the same settings, which step in one call."""
+
+    def __init__(self, settings: dict[str, Any], optimizers: Sequence[FlatOptimizer]) -> None:
+        states = [each.state() or {} for each in optimizers]
+        vectors = [each.vectors for each in optimizers]
+        beta1, beta2 = settings.pop("betas")
+        self._tensors = (
+            [weights for weights, _ in vectors],
+            [gradient for _, gradient in vectors],
+            *([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq")),
+            [],
+            [state["step"] for state in states],
+        )
+        self._settings = {
+            **settings,
+            **{"fused": True, "amsgrad": False, "has_complex": False, "beta1": beta1, "beta2": beta2},
+        }
+
+    def step(self) -> None:
+        with torch.no_grad():
+            _adam(*self._tensors, **self._settings)
