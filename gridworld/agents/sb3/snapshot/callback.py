@@ -216,7 +216,9 @@ def check_finite(model: BaseAlgorithm) -> None:
 
 def not_finite(model: BaseAlgorithm) -> str | None:
     """What the last update left that is no finite number, in words; None: nothing."""
-    if not all(bool(torch.isfinite(weights).all()) for weights in model.policy.parameters()):
+    descent = getattr(model, "descent", None)  # of a tabulated engine, with all weights in one
+    weights = model.policy.parameters() if descent is None else [descent.weights]
+    if not all(bool(torch.isfinite(each).all()) for each in weights):
         return "the network's weights are no finite number"
     losses = [v for key, v in model.logger.name_to_value.items() if "loss" in key]
     return None if all(math.isfinite(loss) for loss in losses) else "a loss is no finite number"

@@ -216,11 +216,14 @@ class _Update:
         self._all_going = True
         # Environment by environment, as SB3 lines samples up: the same seed draws the same minibatches.
         buffers = [model.rollout_buffer for model in self._models]
-        self._samples = [
+        states, actions, self._advantages, self._returns = (
             np.stack([getattr(buffer, name).swapaxes(0, 1).ravel() for buffer in buffers])
             for name in ("observations", "actions", "advantages", "returns")
-        ]
+        )
         self._old = Outputs(*map(np.stack, zip(*(model.old for model in self._models), strict=True)))
+        runs_with, num_states, num_actions = self._old.log_prob.shape
+        self._states = states + num_states * np.arange(runs_with)[:, None]
+        self._pairs = self._states * num_actions + actions
         self._weights = _weights(self._models)
         self._norms = [model.max_grad_norm for model in self._models]
 
@@ -230,7 +233,7 @@ class _Update:
         for run in going:
             self._runs[run].last_epoch = len(self._runs[run].logged)
             self._runs[run].epochs += 1
-        count, size = self._samples[0].shape[1], self._models[0].batch_size
+        count, size = self._states.shape[1], self._models[0].batch_size
         order = np.zeros((len(self._runs), count), dtype=np.int64)
         for run in going:
             order[run] = self._runs[run].chance.permutation(count)
@@ -239,24 +242,32 @@ class _Update:
                 self._make_step(order[self._going, start : start + size])
 
     def _make_step(self, batch: IntArray) -> None:
-        """Make a step on the samples (P, B) of those that go on."""
-        states, actions, advantages, returns = (each[self._going[:, None], batch] for each in self._samples)
-        which, index = self._inputs.distinct(states.ravel())
-        old = self._of_going(self._old)
-        if which is not None:  # of a model by itself
-            old = Outputs(*(table[:, which] for table in old))
+        """Make a step on the samples (R, B) of those R runs that go on."""
+        flat = batch + self._going[:, None] * self._states.shape[1]
+        states, pairs = self._states.take(flat), self._pairs.take(flat)
+        advantages, returns = self._advantages.take(flat), self._returns.take(flat)
         if self._models[0].normalize_advantage and batch.shape[1] > 1:
             advantages = _normalized(advantages)
-        sums = sum_up(index.reshape(states.shape), actions, advantages, returns, old.log_prob.shape)
+        old, which = self._old, None
+        if len(self._models) == 1:
+            which, index = self._inputs.distinct(states[0])
+            if which is not None:
+                actions = pairs - states * old.log_prob.shape[2]
+                old = Outputs(*(table[:, which] for table in old))
+                states = index[None]
+                pairs = states * old.log_prob.shape[2] + actions
+        sums = sum_up(states, pairs, advantages, returns, old.log_prob.shape)
         outputs = self._outputs(which)
-        new = self._of_going(_tables(*outputs))
-        weights = self._weights if self._all_going else self._weights.of(self._going)
+        new, weights = _tables(*outputs), self._weights
+        if not self._all_going:
+            new, old, sums, weights = (each.of(self._going) for each in (new, old, sums, weights))
         losses, *slopes = losses_and_slopes(new, old, sums, weights)
         goes_on = [self._takes(run, found) for run, found in zip(self._going, losses, strict=True)]
+        slopes = [slope[goes_on] if not all(goes_on) else slope for slope in slopes]
         self._end(goes_on)
         if len(self._going):
-            slopes = [self._of_all(slope[goes_on]) for slope in slopes]
-            finite = self._rows.step(outputs, slopes, self._norms, self._going.tolist())
+            whole = [self._of_all(slope) for slope in slopes]
+            finite = self._rows.step(outputs, whole, self._norms, self._going.tolist())
             for run, is_finite in zip(self._going, finite, strict=True):
                 self._runs[run].error = None if is_finite else not_finite()
             self._end(finite)
@@ -275,9 +286,6 @@ class _Update:
     def _end(self, goes_on: list[bool]) -> None:
         if not all(goes_on):
             self._going, self._all_going = self._going[goes_on], False
-
-    def _of_going(self, outputs: Outputs) -> Outputs:
-        return outputs if self._all_going else Outputs(*(table[self._going] for table in outputs))
 
     def _of_all(self, slopes: FloatArray) -> FloatArray:
         """Slopes of those that go on, and 0 for the others."""

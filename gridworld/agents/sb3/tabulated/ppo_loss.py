@@ -24,6 +24,7 @@ J. Schulman et al., Proximal Policy Optimization Algorithms, 2017, has the losse
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -38,6 +39,10 @@ class Outputs(NamedTuple):
 
     log_prob: NDArray[Any]  # (P, U, A)
     values: NDArray[Any]  # (P, U)
+
+    def of(self, rows: IntArray) -> Outputs:
+        """Those of some of the policies."""
+        return Outputs(self.log_prob[rows], self.values[rows])
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -59,6 +64,11 @@ class Sums:
     states: FloatArray
     mean_return: FloatArray
     deviation: FloatArray
+
+    def of(self, rows: IntArray) -> Sums:
+        """Those of some of the runs; the deviation is theirs already."""
+        tables = (self.positive, self.negative, self.pairs, self.states, self.mean_return)
+        return Sums(*(table[rows] for table in tables), self.deviation)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -96,34 +106,35 @@ def log_softmax(logits: NDArray[Any]) -> NDArray[Any]:
 
 
 def sum_up(
-    index: IntArray,
-    actions: IntArray,
+    states: IntArray,
+    pairs: IntArray,
     advantages: NDArray[Any],
     returns: NDArray[Any],
     shape: tuple[int, ...],
 ) -> Sums:
-    """Sum up P minibatches of B samples.
+    """Sum up minibatches of B samples each.
 
     Args:
-        index: (P, B), which of the states each sample has.
-        actions: (P, B), integers.
-        advantages: (P, B), float32.
-        returns: (P, B), float32.
-        shape: (P, U, A), how many states occur and how many actions there are.
+        states: (R, B), run · U + state of each sample, for R of the P runs.
+        pairs: (R, B), states · A + action.
+        advantages: (R, B), float32.
+        returns: (R, B), float32.
+        shape: (P, U, A), how many runs and states there are, and how many actions.
+
+    Returns:
+        The sums of all P runs, all 0 where a run has no samples; the deviation of R.
     """
-    runs, num_states, num_actions = shape
-    count, size = index.shape[1], runs * num_states * num_actions
-    state = index + num_states * np.arange(runs)[:, None]
-    pair = (state * num_actions + actions).ravel()
+    count, pair, state = pairs.shape[1], pairs.ravel(), states.ravel()
+    size = math.prod(shape)
     positive = np.bincount(pair, np.maximum(advantages, 0).ravel(), size).reshape(shape) / count
     negative = np.bincount(pair, np.minimum(advantages, 0).ravel(), size).reshape(shape) / count
-    pairs = np.bincount(pair, None, size).reshape(shape) / count
-    states = pairs.sum(axis=-1)
-    total_return = np.bincount(state.ravel(), returns.ravel(), runs * num_states).reshape(states.shape)
-    mean_return = total_return / np.maximum(states * count, 1)
-    apart = returns - mean_return.ravel()[state]
+    share = np.bincount(pair, None, size).reshape(shape) / count
+    of_states = share.sum(axis=-1)
+    total = np.bincount(state, returns.ravel(), of_states.size).reshape(of_states.shape)
+    mean_return = total / np.maximum(of_states * count, 1)
+    apart = returns - mean_return.ravel().take(states)
     deviation = np.array([each @ each for each in apart]) / count
-    return Sums(positive, negative, pairs, states, mean_return, deviation)
+    return Sums(positive, negative, share, of_states, mean_return, deviation)
 
 
 def losses_and_slopes(
