@@ -31,7 +31,7 @@ from stable_baselines3.dqn.policies import QNetwork
 from torch import Tensor
 
 from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer, not_finite
-from gridworld.agents.sb3.tabulated.side_by_side import SideBySide, forward
+from gridworld.agents.sb3.tabulated.side_by_side import Leaves, SideBySide, forward, update_together
 from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of, smallest_integer
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv, StateStep
 from gridworld.process.together import chance, meet
@@ -117,6 +117,18 @@ class TabulatedDQN(DQN):
             features = network.extract_features(observations, network.features_extractor)
         return self.inputs.latent(network.q_net, states, features)
 
+    def outputs(self) -> tuple[Tensor]:
+        """See `side_by_side.Tabulated`."""
+        return (self.q_values(self.q_net),)
+
+    def outputs_of_all(self, leaves: Leaves) -> tuple[Tensor]:
+        """See `side_by_side.Tabulated`."""
+        net, features = self.q_net, None
+        observations = self.inputs.observations(None, net.q_net)
+        if observations is not None:
+            features = net.extract_features(observations, net.features_extractor)
+        return (forward(net.q_net, leaves, features),)
+
     def collect_rollouts(
         self,
         env: VecEnv,
@@ -185,7 +197,7 @@ class TabulatedDQN(DQN):
         """See SB3's `DQN.train`."""
         self._update_learning_rate(self.policy.optimizer)
         member = _Member(self, chance(), gradient_steps, batch_size)
-        meet(_train, member, (self.inputs.kind, gradient_steps, batch_size))
+        meet(_train_together, member, (self.inputs.kind, gradient_steps, batch_size))
 
     def best_values(self) -> Float32Array:
         """max_a Q(s, a) of the target network, (S,)."""
@@ -210,6 +222,10 @@ class _Member:
     batch_size: int
     losses: list[float] = field(default_factory=list)
     error: Exception | None = None
+
+
+def _train_together(members: Sequence[_Member]) -> list[Exception | None]:
+    return update_together(_train, members)
 
 
 def _train(members: Sequence[_Member]) -> list[Exception | None]:
@@ -290,25 +306,16 @@ class Update:
         """Let the models know what their networks say now."""
         if len(self._models) > 1:
             with torch.no_grad():
-                q = self._of_all()
+                (q,) = self._models[0].outputs_of_all(self._rows.leaves)
             for model, greedy in zip(self._models, _argmax(q), strict=True):
                 model.was_updated(greedy)
 
     def _values(self, states: IntArray) -> tuple[IntArray, Tensor]:
         """Q of all or some states; where in them each of `states` (P, B) is."""
         if len(self._models) > 1:
-            return states, self._of_all()
+            return states, self._models[0].outputs_of_all(self._rows.leaves)[0]
         which, index = self._models[0].inputs.distinct(states[0])
         return index[None], self._models[0].q_of(which)
-
-    def _of_all(self) -> Tensor:
-        """Q (P, S, A) of all states."""
-        net, inputs = self._models[0].q_net, self._models[0].inputs
-        observations = inputs.observations(None, net.q_net)
-        features = None
-        if observations is not None:
-            features = net.extract_features(observations, net.features_extractor)
-        return forward(net.q_net, self._rows.leaves, features)
 
 
 def _argmax(q: Tensor) -> IntArray:

@@ -64,15 +64,19 @@ class FlatOptimizer:
         Raises:
             FloatingPointError: the gradient is no finite number; no step was made.
         """
-        self.gradient.zero_()
-        self._attach()
-        run_backward(outputs, slopes)
+        self.backward(outputs, slopes)
         norm = self.gradient.norm().item()
         if not norm < math.inf:
             raise not_finite()
         if (scale := clipping(norm, max_grad_norm)) < 1:
             self.gradient *= scale
         self.advance()
+
+    def backward(self, outputs: Sequence[Tensor], slopes: Sequence[NDArray[Any]]) -> None:
+        """Set the gradient to that of a loss with these slopes in the network's outputs."""
+        self.gradient.zero_()
+        self._attach()
+        run_backward(outputs, slopes)
 
     def _attach(self) -> None:
         """Let each parameter's gradient be a view, should somebody have removed it."""

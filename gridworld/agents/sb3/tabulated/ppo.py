@@ -33,7 +33,7 @@ from gridworld.agents.sb3.tabulated.ppo_loss import (
     losses_and_slopes,
     sum_up,
 )
-from gridworld.agents.sb3.tabulated.side_by_side import Leaves, SideBySide, forward
+from gridworld.agents.sb3.tabulated.side_by_side import Leaves, SideBySide, forward, update_together
 from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.process.together import chance, meet
@@ -150,7 +150,7 @@ class TabulatedPPO(PPO):
         self._update_learning_rate(self.policy.optimizer)
         buffer = self.rollout_buffer
         shape = (buffer.buffer_size, buffer.n_envs, self.batch_size, self.n_epochs, self.normalize_advantage)
-        meet(_train, _Run(self, chance()), (self.inputs.kind, shape, self.clip_range_vf is None))
+        meet(_train_together, _Run(self, chance()), (self.inputs.kind, shape, self.clip_range_vf is None))
 
     def clip_ranges(self) -> tuple[float, float | None]:
         """Of the ratio and, if it is clipped, of the value, at this time of training."""
@@ -174,6 +174,10 @@ class TabulatedPPO(PPO):
         self.logger.record("train/clip_range", clip_range)
         if clip_range_vf is not None:
             self.logger.record("train/clip_range_vf", clip_range_vf)
+
+
+def _train_together(runs: Sequence[_Run]) -> list[Exception | None]:
+    return update_together(_train, runs)
 
 
 def _train(runs: Sequence[_Run]) -> list[Exception | None]:

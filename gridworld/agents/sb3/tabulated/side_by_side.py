@@ -12,19 +12,93 @@ from __future__ import annotations
 import inspect
 import math
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self, TypeVar
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer, clipping, run_backward
+from gridworld.process.terminal import tell
 
 _adam: Any = inspect.unwrap(sys.modules["torch.optim.adam"].adam)
 _ALIGNMENT = 16  # numbers; torch begins every tensor at a multiple of 64 bytes
 Leaves = Mapping[int, Tensor]  # by the identity of the first network's parameter: (P, *its shape)
+
+
+class Tabulated(Protocol):
+    """A model that can be updated side by side with others of its kind."""
+
+    descent: FlatOptimizer
+    inputs: Any  # `state_inputs.StateInputs`
+
+    def outputs(self) -> tuple[Tensor, ...]:
+        """What its network says of all states, (S, ...) each, with the graph."""
+
+    def outputs_of_all(self, leaves: Leaves) -> tuple[Tensor, ...]:
+        """The same of P networks of this shape, (P, S, ...) each."""
+
+
+class Member(Protocol):
+    """A model's part in an update."""
+
+    @property
+    def model(self) -> Tabulated: ...
+
+
+M = TypeVar("M", bound=Member)
+Errors = list[Exception | None]  # to raise in each member
+
+
+def update_together(update: Callable[[Sequence[M]], Errors], members: Sequence[M]) -> Errors:
+    """Update models at once, or one by one where that would not give the same numbers.
+
+    Args:
+        update: does it for several, or one; `meet` has seen to it that they are of one kind.
+        members: the models' parts.
+    """
+    if len(members) > 1 and not agree([member.model for member in members]):
+        return [error for member in members for error in update([member])]
+    return update(members)
+
+
+_agreed: dict[Hashable, bool] = {}
+
+
+def agree(models: Sequence[Tabulated]) -> bool:
+    """Whether these models side by side give the numbers of each alone, to the last bit.
+
+    It is tried out once in a process for each kind and number of them, forwards and backwards.
+    """
+    key = models[0].inputs.kind, len(models)
+    if key not in _agreed:
+        _agreed[key] = _try_out(models)
+        if not _agreed[key]:
+            tell(
+                "population: this processor or torch adds up otherwise for several networks at once; these "
+                "runs train one by one"
+            )
+    return _agreed[key]
+
+
+def _try_out(models: Sequence[Tabulated]) -> bool:
+    generator = np.random.default_rng(0)
+    optimizers = [model.descent for model in models]
+    with SideBySide(optimizers) as rows:
+        outputs = models[0].outputs_of_all(rows.leaves)
+        slopes = [generator.normal(size=output.shape) for output in outputs]
+        gradients = rows.backward(outputs, slopes)
+        for row, model in enumerate(models):
+            alone = model.outputs()
+            if not all(torch.equal(mine, all_[row]) for mine, all_ in zip(alone, outputs, strict=True)):
+                return False
+            model.descent.backward(alone, [slope[row] for slope in slopes])
+            if not torch.equal(model.descent.gradient, gradients[row]):
+                return False
+    return True
 
 
 class SideBySide:
@@ -93,9 +167,7 @@ class SideBySide:
             except FloatingPointError:
                 return [False]
             return [True]
-        gradients = run_backward(outputs, slopes, tuple(self.leaves.values()))
-        torch.cat([each.flatten(1) for each in gradients], dim=1, out=self._gradients)
-        self._gradients += 0  # as each is added to 0 where there is one network, and -0 becomes 0
+        self.backward(outputs, slopes)
         norms = torch.linalg.vector_norm(self._gradients, dim=1).tolist()
         scales = [clipping(norm, most) for norm, most in zip(norms, max_grad_norms, strict=True)]
         if min(scales) < 1:
@@ -103,6 +175,13 @@ class SideBySide:
         finite = [norms[row] < math.inf for row in rows]
         self._advance(tuple(row for row, goes in zip(rows, finite, strict=True) if goes))
         return finite
+
+    def backward(self, outputs: Sequence[Tensor], slopes: Sequence[NDArray[Any]]) -> Tensor:
+        """Take a loss's slopes in the outputs back to the gradients (P, N) of several."""
+        gradients = run_backward(outputs, slopes, tuple(self.leaves.values()))
+        torch.cat([each.flatten(1) for each in gradients], dim=1, out=self._gradients)
+        self._gradients += 0  # as each is added to 0 where there is one network, and -0 becomes 0
+        return self._gradients
 
     def _advance(self, rows: tuple[int, ...]) -> None:
         if rows not in self._adams:
