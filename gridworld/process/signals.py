@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
 from types import FrameType
 
 Handler = Callable[[int, FrameType | None], None]
@@ -117,6 +118,8 @@ def _set_alarm(seconds: float) -> None:
 class StopRequest:
     """Whether SIGINT or SIGTERM has asked training to stop.
 
+    Of trainings that run together (`process.together`) each has its own, and a signal asks all of them.
+
     Attributes:
         number: of the signal; None as long as there was none.
         patient: whether training is left a second to come to a safe point. If not, and at a second signal,
@@ -133,14 +136,16 @@ class StopRequest:
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        handlers: dict[signal.Signals, Handler] = {signal.SIGINT: self._asked, signal.SIGTERM: self._asked}
-        if _HAS_ALARM:
-            handlers[signal.SIGALRM] = self._late
-        with handling(handlers):
-            try:
-                yield
-            finally:
-                _set_alarm(0)
+        outer = _inside.get()
+        if not _listeners or _listeners[-1].outer is not outer:
+            _listeners.append(_Listeners(outer))
+        listeners, token = _listeners[-1], _inside.set(self)
+        listeners.add(self)
+        try:
+            yield
+        finally:
+            _inside.reset(token)
+            listeners.remove(self)
 
     def obey(self) -> None:
         """Stop here if a signal asked for it.
@@ -155,11 +160,58 @@ class StopRequest:
         """Let what follows take longer than the second that a patient request leaves."""
         _set_alarm(0)
 
+
+class _Listeners:
+    """The requests of trainings that run together, inside the block of another one perhaps."""
+
+    def __init__(self, outer: StopRequest | None) -> None:
+        self.outer = outer
+        self.at_once: Interrupted | None = None  # what was raised in the one that ran, for the others
+        self._requests: list[StopRequest] = []
+
+    def add(self, request: StopRequest) -> None:
+        if not self._requests:
+            handlers = {signal.SIGINT: self._asked, signal.SIGTERM: self._asked}
+            if _HAS_ALARM:
+                handlers[signal.SIGALRM] = self._late
+            self._before = {number: signal.getsignal(number) for number in handlers}
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+        self._requests.append(request)
+
+    def remove(self, request: StopRequest) -> None:
+        self._requests.remove(request)
+        if not self._requests:
+            _set_alarm(0)
+            for number, handler in self._before.items():
+                signal.signal(number, handler)
+            _listeners.remove(self)
+
     def _asked(self, number: int, frame: FrameType | None) -> None:
-        again, self.number = self.number is not None, number
-        if again or not self.patient:
+        running = _inside.get()
+        again = self._requests[0].number is not None
+        for request in self._requests:
+            request.number = number
+        if again:
+            self._stop(number)
+        if running in self._requests and not running.patient:
             raise Interrupted(number)
         _set_alarm(_SECONDS_TO_SAFE_POINT)
 
     def _late(self, number: int, frame: FrameType | None) -> None:
-        self.obey()
+        asked = self._requests[0].number
+        if asked is not None:
+            self._stop(asked)
+
+    def _stop(self, number: int) -> None:
+        self.at_once = Interrupted(number)
+        raise self.at_once
+
+
+_inside: ContextVar[StopRequest | None] = ContextVar("inside", default=None)
+_listeners: list[_Listeners] = []  # the innermost last
+
+
+def stopped() -> Interrupted | None:
+    """What trainings that run together are to be ended with at once, if one of them was."""
+    return _listeners[-1].at_once if _listeners else None

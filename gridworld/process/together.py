@@ -22,6 +22,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from greenlet import getcurrent, greenlet
 
+from gridworld.process.signals import stopped
+
 T = TypeVar("T")
 M = TypeVar("M")
 Work = Callable[[Sequence[M]], Sequence[Exception | None]]
@@ -95,23 +97,26 @@ def run_together(tasks: Sequence[Callable[[], T]]) -> list[T | Exception]:
         What each returned, or the exception that it raised.
 
     Raises:
-        BaseException: one that is no `Exception`, such as `SystemExit`. It was raised in every other task
-            too, where that waited.
+        SystemExit: a task raised it. The others have gone on until they ended.
+        BaseException: one of another kind, which is no `Exception`. It was raised in the others too.
     """
     running = [_Task(function) for function in tasks]
     try:
         for task in running:
-            task.resume()
-            _stop_at(task)
+            task.resume(stopped())
+            _pass_on(task.error)
         while waiting := [task for task in running if not task.dead]:
             for task, error in _met(waiting):
-                task.resume(error)
-                _stop_at(task)
+                task.resume(error or stopped())
+                _pass_on(task.error)
     except BaseException as stop:
         for task in running:
             while not task.dead:  # it may wait once more on its way out
                 task.resume(stop)
         raise
+    ends = [task.error for task in running if isinstance(task.error, SystemExit)]
+    if ends:
+        raise ends[0]
     return [task.result if task.error is None else _exception(task.error) for task in running]
 
 
@@ -157,9 +162,10 @@ def _met(waiting: Sequence[_Task]) -> list[tuple[_Task, Exception | None]]:
     return [(task, errors[task]) for task in waiting]
 
 
-def _stop_at(task: _Task) -> None:
-    if task.dead and task.error is not None and not isinstance(task.error, Exception):
-        raise task.error
+def _pass_on(error: BaseException | None) -> None:
+    """Raise what is to end all tasks."""
+    if error is not None and not isinstance(error, Exception | SystemExit):
+        raise error
 
 
 def _exception(error: BaseException) -> Exception:

@@ -6,10 +6,11 @@ import contextlib
 import logging
 import os
 import warnings
+from contextvars import ContextVar
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Self, TextIO
+from typing import Any, ClassVar, Self, TextIO
 
 from gridworld.errors import FolderLostError
 from gridworld.process.terminal import TOLD, plain
@@ -22,8 +23,12 @@ _printed: set[tuple[str, str, str, int]] = set()  # warnings that this process h
 class TrainLog(logging.Handler):
     """Takes Python's warnings, what is logged as one, and what is told on standard error, inside its block.
 
-    The lines are kept until there is a file. What goes to the terminal is the same as without it.
+    The lines are kept until there is a file. What goes to the terminal is the same as without it. Of runs that
+    train together (`process.together`), each has its own, which takes what comes while its run is at work.
     """
+
+    _all: ClassVar[list[TrainLog]] = []  # inside whose blocks the process is
+    _show: ClassVar[Any]  # what Python warns with otherwise
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
@@ -32,19 +37,26 @@ class TrainLog(logging.Handler):
 
     def __enter__(self) -> Self:
         root = logging.getLogger()
-        self._is_alone = not root.handlers  # then Python prints warnings only while there is no handler
+        others = [handler for handler in root.handlers if not isinstance(handler, TrainLog)]
+        self._is_alone = not others  # then Python prints warnings only while there is no handler
         for logger in (root, TOLD):
             logger.addHandler(self)
-        self._show = warnings.showwarning
         with warnings.catch_warnings():  # forgets what was warned about before, in another run
             pass
-        warnings.showwarning = self._warn
+        if not self._all:
+            TrainLog._show = warnings.showwarning
+            warnings.showwarning = _warn
+        self._all.append(self)
+        self._token = _current.set(self)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        warnings.showwarning = self._show
+        _current.reset(self._token)
+        self._all.remove(self)
+        if not self._all:
+            warnings.showwarning = TrainLog._show
         for logger in (logging.getLogger(), TOLD):
             logger.removeHandler(self)
 
@@ -60,6 +72,8 @@ class TrainLog(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """See `logging.Handler`."""
+        if self._at_work() is not self:
+            return
         if record.name != TOLD.name and record.levelno < logging.WARNING:
             return
         self.add(record.getMessage(), record.levelname)
@@ -68,20 +82,10 @@ class TrainLog(logging.Handler):
         if last is not None and record.levelno >= last.level and not has_handler:
             last.handle(record)
 
-    def _warn(
-        self,
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
-    ) -> None:
-        self.add(f"{category.__name__}: {message} ({filename}, line {lineno})", "WARNING")
-        key = (str(message), category.__name__, filename, lineno)
-        if key not in _printed:
-            _printed.add(key)
-            self._show(message, category, filename, lineno, file, line)
+    @classmethod
+    def _at_work(cls) -> TrainLog | None:
+        """The log of the run that is at work here; in a thread, of the only one, if it is the only one."""
+        return _current.get() or (cls._all[0] if len(cls._all) == 1 else None)
 
     def _append(self, text: str) -> None:
         if self._path is None:
@@ -91,3 +95,23 @@ class TrainLog(logging.Handler):
             check_ours(self._path)
             with open(open_carefully(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND), "ab") as file:
                 file.write(text.encode("utf-8", "backslashreplace"))
+
+
+_current: ContextVar[TrainLog | None] = ContextVar("current", default=None)  # of the run that is at work
+
+
+def _warn(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """Stands for `warnings.showwarning` while a log is open."""
+    if (log := TrainLog._at_work()) is not None:
+        log.add(f"{category.__name__}: {message} ({filename}, line {lineno})", "WARNING")
+    key = (str(message), category.__name__, filename, lineno)
+    if key not in _printed:
+        _printed.add(key)
+        TrainLog._show(message, category, filename, lineno, file, line)
