@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
 from types import ModuleType
@@ -17,6 +18,7 @@ _GREYS = 17  # steps between ink and paper at the edge of a letter
 _fonts: dict[int, Any] = {}  # a font draws its letters once, and takes its time over it
 
 
+@functools.cache  # it is asked for by every line of a picture
 def import_pygame() -> ModuleType:
     """pygame, without its greeting, and without `pkg_resources`, which takes longest to import."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
