@@ -38,7 +38,7 @@ class Canvas(Sheet):
 
     def point(self, state: int, right: float, down: float) -> Point:
         """Return the point that many cells right of and below the state's corner, in pixels of `world`."""
-        row, col = self.board.cell[state].tolist()
+        row, col = self.board.place[state]
         return (col + 1 + right) * self.cell, (row + 1 + down) * self.cell
 
     @property

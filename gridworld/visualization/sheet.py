@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gridworld.envs.rendering import BACKGROUND, UNKNOWN, Frame, Point, surface_to_frame
+from gridworld.envs.rendering import BACKGROUND, UNKNOWN, Frame, Packed, Point, surface_to_frame
 from gridworld.envs.text_drawing import INK as INK
 from gridworld.envs.text_drawing import SMALLEST_TEXT, Colour, font, import_pygame, text_width, write
 from gridworld.visualization.colormaps import ColourArray, Scale
@@ -59,7 +59,7 @@ class Sheet:
         top = names + max(0, round(2.2 * self.text_size) - cell)
         bottom = max(0, round(below * self.text_size) - cell)
         side = max(0, 21 * self.text_size - width + 1) // 2
-        self._surface = import_pygame().Surface((width + 2 * side, top + height + bottom))
+        self._surface = import_pygame().Surface((width + 2 * side, top + height + bottom), 0, 32)
         self._surface.fill(PAPER)
         self._world = self._surface.subsurface((side, top, width, height))
 
@@ -152,6 +152,11 @@ class Sheet:
     def frame(self) -> Frame:
         """The picture's pixels."""
         return surface_to_frame(self._surface)
+
+    def packed(self) -> Packed:
+        """The same with one number per pixel, a fresh array."""
+        columns = np.asarray(self._surface.get_view("2"))
+        return columns.T & np.uint32(0xFFFFFF)
 
     def _draw_bar(self, scale: Scale, box: Box) -> None:
         left, top, width, height = box
