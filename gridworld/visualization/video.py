@@ -17,7 +17,7 @@ from gridworld.envs.rendering import Frame
 from gridworld.errors import InputError, install_command
 from gridworld.storage.atomic_write import replacing, replacing_folder, write_bytes
 from gridworld.visualization.animation import Animation
-from gridworld.visualization.png import encode_png
+from gridworld.visualization.png import encode_palette_png, encode_png
 
 FORMATS = ("png", "gif", "apng", "mp4")
 MOST_APNG_PIXELS = 500_000_000  # of all pictures together, which Pillow holds in memory, a byte each
@@ -25,7 +25,6 @@ MOST_MP4_PIXELS = 4096 * 2304  # of a picture: level 5.2 of H.264, which is as f
 
 _LAST_FRAME_HOLD = 4  # frames; the last one is shown for so many more before the animation starts again
 _LONGEST_GIF_FRAME = 0xFFFF  # hundredths of a second
-_RUN_LENGTHS = 3  # zlib's Z_RLE: the fastest way to store flat colour, and smaller than its default here
 
 
 def save_pngs(film: Animation, folder: Path) -> None:
@@ -35,9 +34,7 @@ def save_pngs(film: Animation, folder: Path) -> None:
     with replacing_folder(folder) as part:
         for index, key in enumerate(film.keys):
             if key not in encoded:
-                buffer = io.BytesIO()
-                film.draw(key).save(buffer, "PNG", compress_type=_RUN_LENGTHS)
-                encoded[key] = buffer.getvalue()
+                encoded[key] = encode_palette_png(film.draw(key))
             (part / f"{index:0{digits}}.png").write_bytes(encoded[key])
 
 

@@ -251,7 +251,7 @@ def test_a_policy_table_frames_the_greedy_action() -> None:
     snapshot = PolicySnapshot(q.argmax(axis=1), np.full(q.shape, 0.5), q.max(axis=1), q)
     states, known = table_states(world), np.arange(6) < 4
     for each in (snapshot, dataclasses.replace(snapshot, q=None)):
-        frame = draw_policy_table(world, states, held(each, states), each.greedy, best.optimal, known)
+        frame = draw_policy_table(world, states, held(each, states), each.greedy, best.optimal, known).frame()
         table = StateTable(world, states, world.action_names, legend_rows=2)
         for row in range(5):
             cells = [table_cell(table, frame, row, column) for column in range(2)]
