@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +24,16 @@ from gridworld.world.mdp import IntArray, Mdp
 
 _MOST_COLOURS = 256
 _LONGEST_SIDE = 1000  # pixels, where no cell size is asked for
+_MOST_SIZES = 2  # of a world's boards that are kept: of the files, and of TensorBoard
+_MOST_ENCODED = 8_000_000  # bytes that are kept of each
 _SAMPLED = 3_000_000  # bytes of all frames that a common palette is made from
 
 Palette = NDArray[np.uint8]  # (colours, 3), RGB
 Numbered = tuple[list[NDArray[np.uint8]], Palette]  # pictures, (height, width) each, and what they refer to
+
+
+# Parts of files, by the keys of the pictures that they depend on.
+Encoded = dict[tuple[object, ...], bytes]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +42,7 @@ class Animation:
 
     keys: Sequence[int]  # one per picture; equal keys are equal pictures
     draw: Callable[[int], Image.Image]  # a fresh palette image for a key, all of one size and palette
+    encoded: Encoded = field(default_factory=dict)  # files' parts, by the keys that they depend on
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -65,18 +73,45 @@ def animation_of_states(mdp: Mdp, states: IntArray, cell_size: int | None = None
         InputError: for a cell size below 1, or where the frame would be too large to draw.
     """
     size = automatic_cell_size(mdp) if cell_size is None else positive_int("cell_size", cell_size)
-    empty = drawing.pack(drawing.draw_frame(mdp, None, size))
-    numbered = _number([empty], first=[drawing.AGENT, drawing.BACKGROUND])
-    assert numbered is not None  # colours of walls, cliffs, ends, lines and the greys of letters
-    [background], palette = numbered
+    empty = _empty_board(mdp, size)
 
     def draw(state: int) -> Image.Image:
         left, top, width, height = drawing.agent_box(mdp, state, size)
-        picture = background.copy()
+        picture = empty.picture.copy()
         picture[top : top + height, left : left + width] = 0  # the palette's first
-        return _image(picture, palette)
+        return _image(picture, empty.palette)
 
-    return Animation(states.tolist(), draw)
+    return Animation(states.tolist(), draw, empty.encoded)
+
+
+@dataclass(frozen=True, eq=False)
+class _EmptyBoard:
+    """What the episodes of all runs in a world have in common."""
+
+    picture: NDArray[np.uint8]
+    palette: Palette
+    encoded: Encoded = field(default_factory=dict)
+
+
+_boards: WeakKeyDictionary[Mdp, dict[int, _EmptyBoard]] = WeakKeyDictionary()
+
+
+def _empty_board(mdp: Mdp, size: int) -> _EmptyBoard:
+    """The board in cells of `size` pixels, drawn once per process; of a world the newest few sizes are kept."""
+    boards = _boards.setdefault(mdp, {})
+    board = boards.pop(size, None)
+    if board is None:
+        empty = drawing.pack(drawing.draw_frame(mdp, None, size))
+        numbered = _number([empty], first=[drawing.AGENT, drawing.BACKGROUND])
+        assert numbered is not None  # colours of walls, cliffs, ends, lines and the greys of letters
+        board = _EmptyBoard(numbered[0][0], numbered[1])
+    if sum(map(len, board.encoded.values())) > _MOST_ENCODED:
+        board.encoded.clear()
+    if board.picture.size <= _MOST_ENCODED:
+        boards[size] = board
+    for oldest in list(boards)[:-_MOST_SIZES]:
+        del boards[oldest]
+    return board
 
 
 def animation_of_cards(mdp: Mdp, episodes: Sequence[Episode], cell_size: int | None = None) -> Animation:
