@@ -13,6 +13,7 @@ import functools
 import struct
 import zlib
 from collections.abc import Iterable
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +76,7 @@ def _deflated(rows: NDArray[np.uint8], strategy: int) -> bytes:
     parts, done = [_HEADER], 0
     is_full = rows[:, 1:].any(axis=1)
     edges = [0, *(np.flatnonzero(np.diff(is_full)) + 1).tolist(), len(rows)]
-    for start, stop in zip(edges[:-1], edges[1:], strict=True):
+    for start, stop in pairwise(edges):
         if not is_full[start] and stop - start >= _LEAST_EMPTY:
             # A full flush ends at a whole byte, and what follows does not refer to what was before.
             parts += [packer.compress(rows[done:start].data), packer.flush(zlib.Z_FULL_FLUSH)]

@@ -126,4 +126,6 @@ class PolicyHistory:
             drawn = Numbers("value", numbers, scale, written=False)
             return draw_policy_table(mdp, states, drawn, greedy, optimal, known, words)
 
-        return animation_of_frames((sheet(moment).packed() for moment in moments), [PAPER, *scale.ramp.tolist()])
+        return animation_of_frames(
+            (sheet(moment).packed() for moment in moments), [PAPER, *scale.ramp.tolist()]
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -160,13 +161,19 @@ class Sheet:
 
     def _draw_bar(self, scale: Scale, box: Box) -> None:
         left, top, width, height = box
-        steps = np.linspace(0, len(scale.ramp) - 1, width).round().astype(np.intp)
-        row = np.full((width, 4), 255, dtype=np.uint8)
-        row[:, :3] = scale.ramp[steps]
-        pygame = import_pygame()
-        image = pygame.image.frombuffer(np.tile(row, (height, 1, 1)), (width, height), "RGBX")
+        image = _bar(scale.ramp.tobytes(), width, height)
         self._surface.blit(image, (left, top))
-        pygame.draw.rect(self._surface, INK, box, 1)
+        import_pygame().draw.rect(self._surface, INK, box, 1)
+
+
+@functools.lru_cache(maxsize=32)
+def _bar(ramp: bytes, width: int, height: int) -> Any:
+    """A ramp of colours, (steps, 3) bytes, from left to right."""
+    colours = np.frombuffer(ramp, dtype=np.uint8).reshape(-1, 3)
+    steps = np.linspace(0, len(colours) - 1, width).round().astype(np.intp)
+    row = np.full((width, 4), 255, dtype=np.uint8)
+    row[:, :3] = colours[steps]
+    return import_pygame().image.frombuffer(np.tile(row, (height, 1, 1)), (width, height), "RGBX")
 
 
 def short(number: float, largest: float | None = None) -> str:

@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-from PIL import GifImagePlugin, Image, ImageChops
+from PIL import GifImagePlugin, ImageChops
 
 from gridworld.envs.rendering import Frame
 from gridworld.errors import InputError, install_command
