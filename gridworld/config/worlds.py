@@ -7,6 +7,7 @@ A schema is the section `env` of a run's settings. `SOURCES` has them by the nam
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -101,9 +102,7 @@ class MapConfig(EnvConfig):
         Raises:
             InputError: a reward that cannot be.
         """
-        from gridworld.world.grid import compile_mdp
-
-        return compile_mdp(layout, self.slip, self.step_reward, self.goal_reward, self.trap_reward)
+        return _compiled(layout, self.slip, self.step_reward, self.goal_reward, self.trap_reward)
 
 
 @dataclass
@@ -245,6 +244,15 @@ class RandomWalkConfig(ClassicConfig):
 
     source: str = "random_walk"
     length: int = 5  # states without the ends, an odd number
+
+
+@functools.lru_cache(maxsize=4, typed=True)  # the jobs of a sweep have few worlds
+def _compiled(
+    layout: Layout, slip: float, step_reward: float, goal_reward: float, trap_reward: float
+) -> GridMdp:
+    from gridworld.world.grid import compile_mdp
+
+    return compile_mdp(layout, slip, step_reward, goal_reward, trap_reward)
 
 
 def compiled(env: EnvConfig) -> Mdp:

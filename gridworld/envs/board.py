@@ -7,6 +7,7 @@ pictures are tables and cards of text.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from enum import IntEnum
 from weakref import WeakKeyDictionary
@@ -62,17 +63,26 @@ class Board:
     state: IntArray
     kind: IntArray
 
+    @functools.cached_property
+    def place(self) -> list[list[int]]:
+        """`cell` as a list, which is faster to ask for one state after the other."""
+        places: list[list[int]] = self.cell.tolist()
+        return places
+
+    @functools.cached_property
+    def _by_kind(self) -> dict[int, list[list[int]]]:
+        return {kind: np.argwhere(self.kind == kind).tolist() for kind in Kind}
+
     def cells(self, kind: Kind) -> list[list[int]]:
         """Row and column of all cells of a kind."""
-        cells: list[list[int]] = np.argwhere(self.kind == kind).tolist()
-        return cells
+        return self._by_kind[kind]
 
-    @property
+    @functools.cached_property
     def floor(self) -> BoolArray:
         """(S,), the states that are shown and that an agent can act in."""
         shown = np.zeros(len(self.cell), dtype=np.bool_)
         shown[self.state[self.kind == Kind.FLOOR]] = True
-        return shown
+        return frozen(shown)
 
 
 _boards: WeakKeyDictionary[Mdp, Board] = WeakKeyDictionary()

@@ -32,6 +32,7 @@ MARGIN = 10  # pixels
 
 Point = tuple[float, float]
 Frame = NDArray[np.uint8]  # (height, width, 3), RGB
+Packed = NDArray[np.uint32]  # (height, width), 0xRRGGBB: a number per colour
 
 BACKGROUND: Colour = (255, 255, 255)
 GRID_LINE: Colour = (0, 0, 0)
@@ -95,6 +96,15 @@ def surface_to_frame(surface: Any) -> Frame:
     width, height = surface.get_size()
     pixels = import_pygame().image.tobytes(surface, "RGB")
     return np.frombuffer(pixels, dtype=np.uint8).reshape(height, width, 3).copy()
+
+
+def pack(frame: Frame) -> Packed:
+    """The frame with one number per pixel, a fresh array."""
+    packed = frame[..., 0].astype(np.uint32)
+    for channel in (1, 2):
+        packed <<= 8
+        packed |= frame[..., channel]
+    return packed
 
 
 def draw_world(surface: Any, mdp: Mdp, state: int | None, cell_size: int = CELL_SIZE) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
 from types import ModuleType
@@ -17,6 +18,7 @@ _GREYS = 17  # steps between ink and paper at the edge of a letter
 _fonts: dict[int, Any] = {}  # a font draws its letters once, and takes its time over it
 
 
+@functools.cache  # it is asked for by every line of a picture
 def import_pygame() -> ModuleType:
     """pygame, without its greeting, and without `pkg_resources`, which takes longest to import."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -43,6 +45,7 @@ def font(size: int) -> Any:
     return _fonts[size]
 
 
+@functools.lru_cache(maxsize=1 << 12)
 def text_width(text: str, size: int) -> int:
     """The width of a text in pixels."""
     return int(font(size).size(text)[0])
@@ -62,11 +65,16 @@ def write(surface: Any, text: str, left: int, middle: int, size: int) -> int:
     Returns:
         Where it ends, in pixels.
     """
-    pygame = import_pygame()
+    image = _in_greys(text, size)
+    surface.blit(image, (left, middle - image.get_height() // 2))
+    return left + int(image.get_width())
+
+
+@functools.lru_cache(maxsize=1 << 7)  # captions and legends of a run's pictures have many words in common
+def _in_greys(text: str, size: int) -> Any:
     image = font(size).render(text, True, INK)
-    alpha = pygame.surfarray.pixels_alpha(image)
+    alpha = import_pygame().surfarray.pixels_alpha(image)
     step = 255 // (_GREYS - 1)
     alpha[...] = alpha // step * step
     del alpha  # unlocks the image
-    surface.blit(image, (left, middle - image.get_height() // 2))
-    return left + int(image.get_width())
+    return image

@@ -17,7 +17,7 @@ import json
 import math
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -39,6 +39,10 @@ _MOST_DIMENSIONS = 16
 _MOST_JSON = 1 << 26  # bytes
 _MOST_PACKED = 1 << 28
 _MOST_MEMORY = 1 << 38
+_PLAIN = frozenset((bool, int, float, str))
+_SAMPLE = 1 << 10  # bytes in each of about four places of an array
+_WORTH_IT = 0.85  # of its size
+_ZLIB_HEADER = b"\x78\x01"
 _CHUNK = 1 << 16
 _ZEROS = bytes(_CHUNK)
 
@@ -61,13 +65,13 @@ def encode(state: State, compress: bool = False) -> list[bytes | memoryview]:
         TypeError: something in it is not part of a state.
     """
     arrays: list[NDArray[Any]] = []
-    tree = _fold(state, arrays, "state")
+    tree = _fold(state, arrays, (None, "state"))
     stored = [_without_zeros(array) for array in arrays]
     table = [[a.dtype.str, list(a.shape), len(data)] for a, data in zip(arrays, stored, strict=True)]
     text = json.dumps({"arrays": table, "state": tree}, separators=(",", ":")).encode()
     pieces: list[bytes | memoryview] = [struct.pack("<Q", len(text)), text, *stored]
     if compress and sum(map(len, pieces)) <= _MOST_PACKED:
-        pieces = [b"z", zlib.compress(b"".join(pieces), 1)]
+        pieces = [b"z", *_packed(pieces)]
     else:
         pieces.insert(0, b"-")
     checksum = hashlib.sha256()
@@ -166,21 +170,55 @@ def fill(target: NDArray[Any], value: Any, where: str) -> None:
     target[...] = value
 
 
-def _fold(node: Any, arrays: list[NDArray[Any]], where: str) -> Any:
+def _packed(pieces: Sequence[bytes | memoryview]) -> Iterator[bytes | memoryview]:
+    """The pieces in zlib's format. Weights do not get smaller, which is found out in a sample of them."""
+    checksum, packer = zlib.adler32(b""), zlib.compressobj(1, zlib.DEFLATED, -zlib.MAX_WBITS)
+    yield _ZLIB_HEADER
+    for piece in pieces:
+        checksum = zlib.adler32(piece, checksum)
+        if _gets_smaller(piece):
+            yield packer.compress(piece)
+            continue
+        as_it_is = zlib.compressobj(0, zlib.DEFLATED, -zlib.MAX_WBITS)
+        # A full flush ends at a whole byte, and what follows does not refer to what was before.
+        yield packer.flush(zlib.Z_FULL_FLUSH)
+        yield as_it_is.compress(piece) + as_it_is.flush(zlib.Z_FULL_FLUSH)
+    yield packer.flush() + struct.pack(">I", checksum)
+
+
+def _gets_smaller(piece: bytes | memoryview) -> bool:
+    if len(piece) < 8 * _SAMPLE:
+        return True  # it takes no longer to do it
+    sample = b"".join(piece[start : start + _SAMPLE] for start in range(0, len(piece), len(piece) // 4))
+    return len(zlib.compress(sample, 1)) < _WORTH_IT * len(sample)
+
+
+_Place = tuple[Any, object]  # the place of what it is in, and its key there
+
+
+def _fold(node: Any, arrays: list[NDArray[Any]], where: _Place) -> Any:
+    kind = type(node)
+    if node is None or kind in _PLAIN:
+        return node
     if isinstance(node, dict):
-        if not all(isinstance(key, str) and key != _ARRAY for key in node):
-            raise TypeError(f"{where}: a state's keys are strings")
-        return {key: _fold(value, arrays, f"{where}.{key}") for key, value in node.items()}
+        if not all(type(key) is str and key != _ARRAY for key in node):
+            raise TypeError(f"{_told(where)}: a state's keys are strings")
+        return {key: _fold(value, arrays, (where, key)) for key, value in node.items()}
     if isinstance(node, list):
-        return [_fold(value, arrays, f"{where}[{index}]") for index, value in enumerate(node)]
+        return [_fold(value, arrays, (where, index)) for index, value in enumerate(node)]
     if isinstance(node, np.ndarray):
         if node.dtype.str not in _DTYPES:
-            raise TypeError(f"{where}: arrays of {node.dtype} are not part of a state")
+            raise TypeError(f"{_told(where)}: arrays of {node.dtype} are not part of a state")
         arrays.append(node)
         return {_ARRAY: len(arrays) - 1}
-    if node is None or type(node) in (bool, int, float, str):
-        return node
-    raise TypeError(f"{where}: a {type(node).__name__} is not part of a state")
+    raise TypeError(f"{_told(where)}: a {kind.__name__} is not part of a state")
+
+
+def _told(where: _Place) -> str:
+    before, key = where
+    if before is None:
+        return str(key)
+    return f"{_told(before)}[{key}]" if isinstance(key, int) else f"{_told(before)}.{key}"
 
 
 def _without_zeros(array: NDArray[Any]) -> memoryview:

@@ -37,10 +37,12 @@ class GridWorldSweeper(Sweeper):
     def sweep(self, arguments: list[str]) -> None:
         """Run the jobs that `arguments` ask for. Raises `SystemExit` unless all are done."""
         from gridworld.config.sweep import SweepConfig
+        from gridworld.sweep.hydra_job import in_place_of_hydras
         from gridworld.sweep.sweeper import run_sweep
 
         settings = SweepConfig(**self._settings)
-        run_sweep(arguments, self._loader, self._launcher, self._config, settings)
+        with in_place_of_hydras(type(self._launcher)):
+            run_sweep(arguments, self._loader, self._launcher, self._config, settings)
 
 
 class _OwnLauncher:

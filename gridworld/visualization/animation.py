@@ -7,15 +7,16 @@ exact; what an environment of another library draws may have more than a palette
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from gridworld.envs import rendering as drawing
-from gridworld.envs.rendering import Colour, Frame
+from gridworld.envs.rendering import Frame, Packed
 from gridworld.envs.rollout import Episode
 from gridworld.errors import InputError
 from gridworld.world.layout import positive_int
@@ -23,9 +24,16 @@ from gridworld.world.mdp import IntArray, Mdp
 
 _MOST_COLOURS = 256
 _LONGEST_SIDE = 1000  # pixels, where no cell size is asked for
+_MOST_SIZES = 2  # of a world's boards that are kept: of the files, and of TensorBoard
+_MOST_ENCODED = 8_000_000  # bytes that are kept of each
 _SAMPLED = 3_000_000  # bytes of all frames that a common palette is made from
 
 Palette = NDArray[np.uint8]  # (colours, 3), RGB
+Numbered = tuple[list[NDArray[np.uint8]], Palette]  # pictures, (height, width) each, and what they refer to
+
+
+# Parts of files, by the keys of the pictures that they depend on.
+Encoded = dict[tuple[object, ...], bytes]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +42,7 @@ class Animation:
 
     keys: Sequence[int]  # one per picture; equal keys are equal pictures
     draw: Callable[[int], Image.Image]  # a fresh palette image for a key, all of one size and palette
+    encoded: Encoded = field(default_factory=dict)  # files' parts, by the keys that they depend on
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -64,18 +73,45 @@ def animation_of_states(mdp: Mdp, states: IntArray, cell_size: int | None = None
         InputError: for a cell size below 1, or where the frame would be too large to draw.
     """
     size = automatic_cell_size(mdp) if cell_size is None else positive_int("cell_size", cell_size)
-    empty = [drawing.draw_frame(mdp, None, size)]
-    colours = _colours(empty, also=[drawing.AGENT])
-    assert colours is not None  # of walls, cliffs, ends, lines and the greys of letters
-    [background], palette = _numbered(empty, colours)
+    empty = _empty_board(mdp, size)
 
     def draw(state: int) -> Image.Image:
         left, top, width, height = drawing.agent_box(mdp, state, size)
-        picture = background.copy()
+        picture = empty.picture.copy()
         picture[top : top + height, left : left + width] = 0  # the palette's first
-        return _image(picture, palette)
+        return _image(picture, empty.palette)
 
-    return Animation(states.tolist(), draw)
+    return Animation(states.tolist(), draw, empty.encoded)
+
+
+@dataclass(frozen=True, eq=False)
+class _EmptyBoard:
+    """What the episodes of all runs in a world have in common."""
+
+    picture: NDArray[np.uint8]
+    palette: Palette
+    encoded: Encoded = field(default_factory=dict)
+
+
+_boards: WeakKeyDictionary[Mdp, dict[int, _EmptyBoard]] = WeakKeyDictionary()
+
+
+def _empty_board(mdp: Mdp, size: int) -> _EmptyBoard:
+    """The board in cells of `size` pixels, drawn once per process; of a world the newest few sizes are kept."""
+    boards = _boards.setdefault(mdp, {})
+    board = boards.pop(size, None)
+    if board is None:
+        empty = drawing.pack(drawing.draw_frame(mdp, None, size))
+        numbered = _number([empty], first=[drawing.AGENT, drawing.BACKGROUND])
+        assert numbered is not None  # colours of walls, cliffs, ends, lines and the greys of letters
+        board = _EmptyBoard(numbered[0][0], numbered[1])
+    if sum(map(len, board.encoded.values())) > _MOST_ENCODED:
+        board.encoded.clear()
+    if board.picture.size <= _MOST_ENCODED:
+        boards[size] = board
+    for oldest in list(boards)[:-_MOST_SIZES]:
+        del boards[oldest]
+    return board
 
 
 def animation_of_cards(mdp: Mdp, episodes: Sequence[Episode], cell_size: int | None = None) -> Animation:
@@ -114,11 +150,12 @@ def _cards(mdp: Mdp, episode: Episode) -> Iterator[tuple[str, ...]]:
         yield mdp.state_name(state), f"step {step}: {what}", f"reward so far {earned[step]:.6g}"
 
 
-def animation_of_frames(frames: Sequence[Frame]) -> Animation:
+def animation_of_frames(frames: Iterable[Packed], likely: Iterable[Sequence[int]] = ()) -> Animation:
     """Show frames one after the other.
 
     Args:
-        frames: (height, width, 3) each, RGB.
+        frames: (height, width) each, see `envs.rendering.Packed`.
+        likely: colours that the palette begins with; to know those of most pixels before saves time.
 
     Returns:
         A picture for each frame.
@@ -126,10 +163,10 @@ def animation_of_frames(frames: Sequence[Frame]) -> Animation:
     Raises:
         InputError: where they have more colours together than a palette holds.
     """
-    colours = _colours(frames)
-    if colours is None:
+    numbered = _number(frames, likely)
+    if numbered is None:
         raise InputError(f"more than {_MOST_COLOURS} colours are too many for a film, which has one palette")
-    pictures, palette = _numbered(frames, colours)
+    pictures, palette = numbered
     return Animation(range(len(pictures)), lambda index: _image(pictures[index], palette))
 
 
@@ -147,9 +184,8 @@ def animation_of_rendered(
         A picture for each key; quantised where the frames have more colours than a palette.
     """
     pictures = [_scaled_down(frame, longest_side) for frame in frames]
-    colours = _colours(pictures)
-    if colours is not None:
-        numbers, palette = _numbered(pictures, colours)
+    if (numbered := _number(map(drawing.pack, pictures))) is not None:
+        numbers, palette = numbered
         return Animation(keys, lambda key: _image(numbers[key], palette))
     every = 1 + sum(picture.size for picture in pictures) // _SAMPLED
     sample = np.concatenate([picture.reshape(-1, 3)[::every] for picture in pictures])[None]
@@ -173,40 +209,29 @@ def _image(picture: NDArray[np.uint8], palette: Palette) -> Image.Image:
     return image
 
 
-def _colours(frames: Sequence[Frame], also: Sequence[drawing.Colour] = ()) -> dict[Colour, int] | None:
-    """The number of each colour, from `also` on; None where there are too many."""
-    colours = {colour: number for number, colour in enumerate(also)}
-    for frame in frames:
-        found = Image.fromarray(frame).getcolors(_MOST_COLOURS)
-        for _, colour in found or []:
-            colours.setdefault(colour, len(colours))  # type: ignore[arg-type]
-        if found is None or len(colours) > _MOST_COLOURS:
-            return None
-    return colours
-
-
-def _numbered(frames: Sequence[Frame], colours: dict[Colour, int]) -> tuple[list[NDArray[np.uint8]], Palette]:
-    """The frames as numbers into one palette."""
-    number = _colour_numbers()
-    for (red, green, blue), index in colours.items():
-        number[red << 16 | green << 8 | blue] = index
-    pictures = [np.concatenate([number[_packed(part)] for part in _bands(frame)]) for frame in frames]
-    return pictures, np.array(list(colours), dtype=np.uint8)
-
-
-def _bands(frame: Frame) -> list[Frame]:
-    """The frame cut into bands of about a million pixels, to need little memory beside a large one."""
-    return np.array_split(frame, 1 + frame.size // 3_000_000)
-
-
-def _packed(frame: Frame) -> NDArray[np.uint32]:
-    """(height, width), a number per colour."""
-    red, green, blue = np.moveaxis(frame.astype(np.uint32), -1, 0)
-    packed: NDArray[np.uint32] = red << 16 | green << 8 | blue
-    return packed
+def _number(pictures: Iterable[Packed], first: Iterable[Sequence[int]] = ()) -> Numbered | None:
+    """The pictures as numbers into one palette, which begins with these colours; None for too many colours."""
+    numbers = _colour_numbers()
+    palette = list(dict.fromkeys(red << 16 | green << 8 | blue for red, green, blue in first))
+    numbers[palette] = range(1, 1 + len(palette))
+    numbered = []
+    try:
+        for picture in pictures:
+            found = numbers[picture]
+            if not found.all():
+                new = np.unique(picture[found == 0])
+                if len(palette) + len(new) > _MOST_COLOURS:
+                    return None
+                numbers[new] = range(1 + len(palette), 1 + len(palette) + len(new))
+                palette += new.tolist()
+                found = numbers[picture]
+            numbered.append(np.subtract(found, 1, dtype=np.uint8, casting="unsafe"))
+    finally:
+        numbers[palette] = 0
+    return numbered, np.array(palette, dtype=">u4").view(np.uint8).reshape(-1, 4)[:, 1:]
 
 
 @functools.cache
-def _colour_numbers() -> NDArray[np.uint8]:
-    """A number for every RGB colour, 16 MB of which only the pages of used colours are ever touched."""
-    return np.zeros(1 << 24, dtype=np.uint8)
+def _colour_numbers() -> NDArray[np.uint16]:
+    """Zeros for all RGB colours: 32 MB of which only the pages of used colours are ever touched."""
+    return np.zeros(1 << 24, dtype=np.uint16)

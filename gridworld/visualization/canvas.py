@@ -22,6 +22,19 @@ from gridworld.world.mdp import BoolArray, IntArray, Mdp
 _LONGEST_SIDE = 640  # pixels, of the grid with its border
 _LONGEST_MOSAIC = 1000  # pixels, of several panels
 _LARGEST_CELL = 80  # pixels
+_FLOOR = int(Kind.FLOOR)
+_COLOURS = {  # of the cells that have no numbers
+    Kind.BLANK: PAPER,
+    Kind.UNREACHABLE: UNKNOWN,
+    Kind.FLOOR: PAPER,
+    Kind.WALL: drawing.WALL,
+    Kind.CLIFF: drawing.CLIFF,
+    Kind.GOAL: drawing.GOAL,
+    Kind.TRAP: drawing.TRAP,
+}
+_WITHOUT_GRID = np.array([_COLOURS[kind] for kind in Kind], dtype=np.uint8)
+_WITH_GRID = _WITHOUT_GRID.copy()
+_WITH_GRID[[Kind.GOAL, Kind.TRAP]] = PAPER  # below what is drawn there
 _NO_GRID = 8  # pixels; on smaller cells grid lines would hide the colours
 
 
@@ -38,7 +51,7 @@ class Canvas(Sheet):
 
     def point(self, state: int, right: float, down: float) -> Point:
         """Return the point that many cells right of and below the state's corner, in pixels of `world`."""
-        row, col = self.board.cell[state].tolist()
+        row, col = self.board.place[state]
         return (col + 1 + right) * self.cell, (row + 1 + down) * self.cell
 
     @property
@@ -59,12 +72,9 @@ class Canvas(Sheet):
             parts: (cell, cell), which part each pixel of a cell belongs to; None: all to the first.
         """
         board, cell = self.board, self.cell
-        cells = colours[board.state]
-        terminal = (PAPER, PAPER) if self.has_grid else (drawing.GOAL, drawing.TRAP)
-        fixed = PAPER, UNKNOWN, drawing.WALL, drawing.CLIFF, *terminal
-        kinds = Kind.BLANK, Kind.UNREACHABLE, Kind.WALL, Kind.CLIFF, Kind.GOAL, Kind.TRAP
-        for kind, colour in zip(kinds, fixed, strict=True):
-            cells[board.kind == kind] = colour
+        cells, is_fixed = colours[board.state], board.kind != _FLOOR
+        fixed = _WITH_GRID if self.has_grid else _WITHOUT_GRID
+        cells[is_fixed] = fixed[board.kind[is_fixed]][:, None]
         packed = np.full((*cells.shape[:3], 4), 255, dtype=np.uint8)
         packed[..., :3] = cells
         pixels = packed.view(np.uint32)[..., 0]

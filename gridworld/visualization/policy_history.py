@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
 from gridworld.envs.board import board_of
-from gridworld.envs.rendering import Frame, fitting_cell_size
+from gridworld.envs.rendering import fitting_cell_size
 from gridworld.storage.serialization import State
 from gridworld.visualization.animation import Animation, animation_of_frames
 from gridworld.visualization.canvas import shown
 from gridworld.visualization.colormaps import VIRIDIS, linear
 from gridworld.visualization.picture import Draw, Subject
 from gridworld.visualization.policy_map import caption_at, draw_policy_map, explored_by
+from gridworld.visualization.sheet import PAPER, Sheet
 from gridworld.visualization.state_table import Numbers, draw_policy_table, table_states
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import BoolArray
@@ -116,7 +117,7 @@ class PolicyHistory:
         scale = linear(VIRIDIS, np.stack([moment.values[visited] for moment in moments]))
         cell_size = fitting_cell_size(mdp, _SIDE if len(board.panels) <= 1 else _MOSAIC_SIDE)
 
-        def frame(moment: Moment) -> Frame:
+        def sheet(moment: Moment) -> Sheet:
             values, greedy, words = moment.values.astype(np.float64), moment.greedy, caption(moment.step)
             if board.panels:
                 return draw_policy_map(mdp, values, greedy, optimal, words, cell_size, scale, known)
@@ -125,4 +126,6 @@ class PolicyHistory:
             drawn = Numbers("value", numbers, scale, written=False)
             return draw_policy_table(mdp, states, drawn, greedy, optimal, known, words)
 
-        return animation_of_frames([frame(moment) for moment in moments])
+        return animation_of_frames(
+            (sheet(moment).packed() for moment in moments), [PAPER, *scale.ramp.tolist()]
+        )

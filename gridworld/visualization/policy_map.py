@@ -6,6 +6,7 @@ a red frame. What training never acted in is grey: its values are guesses, and n
 
 from __future__ import annotations
 
+import functools
 import math
 from itertools import pairwise
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from gridworld.envs import rendering as drawing
 from gridworld.envs.board import board_of
-from gridworld.envs.rendering import AGENT, UNKNOWN, Colour, Frame, Point
+from gridworld.envs.rendering import AGENT, UNKNOWN, Colour, Point
 from gridworld.envs.text_drawing import SMALLEST_TEXT
 from gridworld.errors import InputError
 from gridworld.visualization.canvas import Canvas, shown
@@ -37,6 +38,15 @@ from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 TENSORBOARD_SIDE: int | None = IMAGES_TAB
 _UNKNOWN_DISAGREES: Colour = (226, 178, 174)
 
+_ARROW = (  # its corners along and across its way, in its lengths
+    (-0.28, 0.05),
+    (0.04, 0.05),
+    (0.04, 0.17),
+    (0.3, 0.0),
+    (0.04, -0.17),
+    (0.04, -0.05),
+    (-0.28, -0.05),
+)
 _SMALLEST_ARROW_CELL = 12  # pixels; below it an arrow is a blot
 
 
@@ -49,11 +59,11 @@ def draw(subject: Subject) -> Draw:
     if not board_of(mdp).panels:
         states = table_states(mdp, visits_of(subject))
         numbers = held(snapshot, states[known[states]])
-        picture = draw_policy_table(mdp, states, numbers, snapshot.greedy, optimal, known, caption)
+        picture = draw_policy_table(mdp, states, numbers, snapshot.greedy, optimal, known, caption).frame()
         return lambda cell_size: picture
     return lambda cell_size: draw_policy_map(
         mdp, snapshot.values, snapshot.greedy, optimal, caption, cell_size, known=known
-    )
+    ).frame()
 
 
 def caption_at(subject: Subject, steps: int) -> str:
@@ -83,7 +93,7 @@ def draw_policy_map(
     cell_size: int | None = None,
     scale: Scale | None = None,
     known: BoolArray | None = None,
-) -> Frame:
+) -> Canvas:
     """Draw values as colours, greedy actions as arrows, and the greedy path from the start.
 
     Args:
@@ -97,7 +107,7 @@ def draw_policy_map(
         known: (S,), the states that training acted in; the others are grey. None: all are known.
 
     Returns:
-        (height, width, 3), RGB.
+        The finished picture.
 
     Raises:
         InputError: where the picture would be too large to draw.
@@ -115,18 +125,23 @@ def draw_policy_map(
     with_numbers = scale is None and len(canvas.board.panels) <= 1  # of several panels the cells are small
     texts = {value: short(value, own.high) for value in set(values[known].tolist()) if with_numbers}
     size = canvas.number_size(0.8, texts.values())
-    inks = [PAPER if dark else INK for dark in is_dark(colours).tolist()]
+    dark = is_dark(colours)
+    inks = np.where(known[:, None], np.where(dark[:, None], PAPER, INK), UNKNOWN_INK).tolist()
     middle = 0.5 if size is None else 0.4  # of the arrows, above the numbers
     paths = greedy_paths(mdp, greedy)
     ways = directions(mdp)[np.arange(mdp.num_states), greedy]
     _draw_paths(canvas, paths, ways, middle)
+    pointing = ways.tolist()
     length = canvas.cell if size is None else 0.85 * canvas.cell
     if canvas.cell >= _SMALLEST_ARROW_CELL:
         for state in states.tolist():
-            ink = inks[state] if known[state] else UNKNOWN_INK
-            point = canvas.point(state, 0.5, middle)
-            name, paper = mdp.action_names[greedy[state]], colours[state].tolist()
-            _draw_action(canvas, point, ways[state], name, length, ink, paper)
+            ink, point = inks[state], canvas.point(state, 0.5, middle)
+            if any(pointing[state]):
+                arrow = _arrow(*point, *pointing[state], length)
+                drawing.import_pygame().draw.polygon(canvas.world, ink, arrow)
+            else:
+                name, paper = mdp.action_names[greedy[state]], colours[state].tolist()
+                _draw_disc(canvas, point, name, length, ink, paper)
     on_path = set().union(*paths)
     if size is not None:
         for state in np.flatnonzero(known).tolist():
@@ -143,7 +158,7 @@ def draw_policy_map(
         short(ends.high),
         _swatches(canvas.cell, bool(paths), bool(known[states].all()) and not canvas.hidden),
     )
-    return canvas.frame()
+    return canvas
 
 
 def _swatches(cell: int, has_path: bool, all_known: bool) -> list[Swatch]:
@@ -176,35 +191,19 @@ def _draw_paths(canvas: Canvas, paths: list[list[int]], ways: IntArray, middle: 
             canvas.ring(canvas.point(placed[0], 0.5, middle), AGENT)
 
 
-def _draw_action(
-    canvas: Canvas, middle: Point, way: IntArray, name: str, size: float, ink: Colour, paper: Colour
-) -> None:
-    """An arrow; for an action that does not move a disc, with its first letter where there is room for it."""
-    if way.any():
-        _draw_arrow(canvas, middle, way, size, ink)
-        return
+def _draw_disc(canvas: Canvas, middle: Point, name: str, size: float, ink: Colour, paper: Colour) -> None:
+    """For an action that does not move a disc, with the action's first letter where there is room for it."""
     drawing.import_pygame().draw.circle(canvas.world, ink, middle, round(0.2 * size))
     letter = min(round(0.32 * size), 20)
     if letter >= SMALLEST_TEXT:
         canvas.number(name[:1].upper(), middle, letter, paper)
 
 
-def _draw_arrow(canvas: Canvas, middle: Point, way: IntArray, size: float, ink: Colour) -> None:
-    down, right = (way / math.hypot(*way)).tolist()
-    shape = [
-        (-0.28, 0.05),
-        (0.04, 0.05),
-        (0.04, 0.17),
-        (0.3, 0.0),
-        (0.04, -0.17),
-        (0.04, -0.05),
-        (-0.28, -0.05),
+@functools.lru_cache(maxsize=1 << 14)  # the same arrows are drawn in every picture of an animation
+def _arrow(x: float, y: float, down: int, right: int, size: float) -> list[Point]:
+    length = math.hypot(down, right)
+    to_down, to_right = down / length, right / length
+    return [
+        (x + size * (along * to_right - across * to_down), y + size * (along * to_down + across * to_right))
+        for along, across in _ARROW
     ]
-    points = [
-        (
-            middle[0] + size * (along * right - across * down),
-            middle[1] + size * (along * down + across * right),
-        )
-        for along, across in shape
-    ]
-    drawing.import_pygame().draw.polygon(canvas.world, ink, points)

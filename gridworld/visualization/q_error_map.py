@@ -23,7 +23,7 @@ from gridworld.visualization.sheet import INK, PAPER, UNREACHABLE, Swatch, short
 from gridworld.visualization.state_table import draw_error_table, table_states
 from gridworld.world.layout import MOVES
 from gridworld.world.mdp import FloatArray, Mdp
-from gridworld.world.solver import Solution, value_iteration
+from gridworld.world.solver import Solution, solved
 
 TENSORBOARD_SIDE: int | None = IMAGES_TAB
 
@@ -41,7 +41,7 @@ def draw(subject: Subject) -> Draw:
     best = evaluator.solution
     gamma = agents_gamma(subject)
     if gamma != best.gamma:
-        best = value_iteration(evaluator.mdp, gamma)
+        best = solved(evaluator.mdp, gamma)
     error = value_error(snapshot, best)
     name = "|V - V*|" if snapshot.q is None else "|Q - Q*|"
     caption = f"{name} after {subject.steps:,} steps, at the agent's gamma {gamma:g}"

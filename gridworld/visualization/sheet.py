@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from gridworld.envs.rendering import BACKGROUND, UNKNOWN, Frame, Point, surface_to_frame
+from gridworld.envs.rendering import BACKGROUND, UNKNOWN, Frame, Packed, Point, surface_to_frame
 from gridworld.envs.text_drawing import INK as INK
 from gridworld.envs.text_drawing import SMALLEST_TEXT, Colour, font, import_pygame, text_width, write
 from gridworld.visualization.colormaps import ColourArray, Scale
@@ -59,7 +60,7 @@ class Sheet:
         top = names + max(0, round(2.2 * self.text_size) - cell)
         bottom = max(0, round(below * self.text_size) - cell)
         side = max(0, 21 * self.text_size - width + 1) // 2
-        self._surface = import_pygame().Surface((width + 2 * side, top + height + bottom))
+        self._surface = import_pygame().Surface((width + 2 * side, top + height + bottom), 0, 32)
         self._surface.fill(PAPER)
         self._world = self._surface.subsurface((side, top, width, height))
 
@@ -153,15 +154,26 @@ class Sheet:
         """The picture's pixels."""
         return surface_to_frame(self._surface)
 
+    def packed(self) -> Packed:
+        """The same with one number per pixel, a fresh array."""
+        columns = np.asarray(self._surface.get_view("2"))
+        return columns.T & np.uint32(0xFFFFFF)
+
     def _draw_bar(self, scale: Scale, box: Box) -> None:
         left, top, width, height = box
-        steps = np.linspace(0, len(scale.ramp) - 1, width).round().astype(np.intp)
-        row = np.full((width, 4), 255, dtype=np.uint8)
-        row[:, :3] = scale.ramp[steps]
-        pygame = import_pygame()
-        image = pygame.image.frombuffer(np.tile(row, (height, 1, 1)), (width, height), "RGBX")
+        image = _bar(scale.ramp.tobytes(), width, height)
         self._surface.blit(image, (left, top))
-        pygame.draw.rect(self._surface, INK, box, 1)
+        import_pygame().draw.rect(self._surface, INK, box, 1)
+
+
+@functools.lru_cache(maxsize=32)
+def _bar(ramp: bytes, width: int, height: int) -> Any:
+    """A ramp of colours, (steps, 3) bytes, from left to right."""
+    colours = np.frombuffer(ramp, dtype=np.uint8).reshape(-1, 3)
+    steps = np.linspace(0, len(colours) - 1, width).round().astype(np.intp)
+    row = np.full((width, 4), 255, dtype=np.uint8)
+    row[:, :3] = colours[steps]
+    return import_pygame().image.frombuffer(np.tile(row, (height, 1, 1)), (width, height), "RGBX")
 
 
 def short(number: float, largest: float | None = None) -> str:

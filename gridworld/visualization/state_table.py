@@ -151,7 +151,7 @@ def draw_policy_table(
     optimal: BoolArray,
     known: BoolArray,
     caption: str = "",
-) -> Frame:
+) -> Sheet:
     """Draw what an agent holds of its actions as colours, with a frame around the greedy one.
 
     Args:
@@ -164,7 +164,7 @@ def draw_policy_table(
         caption: a line above the table.
 
     Returns:
-        (height, width, 3), RGB.
+        The finished picture.
     """
     table = StateTable(mdp, states, mdp.action_names, legend_rows=2)
     table.paint(numbers, known)
@@ -175,7 +175,7 @@ def draw_policy_table(
     never = [] if known[states].all() else [NEVER_VISITED]
     low, high = short(numbers.scale.low, numbers.scale.high), short(numbers.scale.high)
     table.legend(numbers.scale, f"{numbers.name} {low}", high, [_GREEDY, _WRONG, *never])
-    return table.frame()
+    return table
 
 
 def draw_error_table(mdp: Mdp, states: IntArray, error: FloatArray, caption: str = "") -> Frame:

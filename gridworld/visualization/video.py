@@ -6,18 +6,19 @@ PNG, APNG and GIF keep every pixel exact. MP4 needs PyAV (the extra `video`).
 from __future__ import annotations
 
 import io
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
-from PIL import GifImagePlugin, Image, ImageChops
+from PIL import GifImagePlugin, ImageChops
 
 from gridworld.envs.rendering import Frame
 from gridworld.errors import InputError, install_command
 from gridworld.storage.atomic_write import replacing, replacing_folder, write_bytes
 from gridworld.visualization.animation import Animation
-from gridworld.visualization.png import encode_png
+from gridworld.visualization.png import encode_palette_png, encode_png
 
 FORMATS = ("png", "gif", "apng", "mp4")
 MOST_APNG_PIXELS = 500_000_000  # of all pictures together, which Pillow holds in memory, a byte each
@@ -25,20 +26,25 @@ MOST_MP4_PIXELS = 4096 * 2304  # of a picture: level 5.2 of H.264, which is as f
 
 _LAST_FRAME_HOLD = 4  # frames; the last one is shown for so many more before the animation starts again
 _LONGEST_GIF_FRAME = 0xFFFF  # hundredths of a second
-_RUN_LENGTHS = 3  # zlib's Z_RLE: the fastest way to store flat colour, and smaller than its default here
 
 
 def save_pngs(film: Animation, folder: Path) -> None:
     """Write 0000.png, 0001.png, ... into `folder`, which is replaced as a whole, also where it is a link."""
     digits = max(4, len(str(len(film) - 1)))
-    encoded: dict[int, bytes] = {}
     with replacing_folder(folder) as part:
         for index, key in enumerate(film.keys):
-            if key not in encoded:
-                buffer = io.BytesIO()
-                film.draw(key).save(buffer, "PNG", compress_type=_RUN_LENGTHS)
-                encoded[key] = buffer.getvalue()
-            (part / f"{index:0{digits}}.png").write_bytes(encoded[key])
+            content = _encoded(film, ("png", key), partial(_encode_png_frame, film, key))
+            (part / f"{index:0{digits}}.png").write_bytes(content)
+
+
+def _encode_png_frame(film: Animation, key: int) -> bytes:
+    return encode_palette_png(film.draw(key))
+
+
+def _encoded(film: Animation, place: tuple[object, ...], encode: Callable[[], bytes]) -> bytes:
+    if place not in film.encoded:
+        film.encoded[place] = encode()
+    return film.encoded[place]
 
 
 def save_png(frame: Frame, path: Path) -> None:
@@ -60,18 +66,26 @@ def encode_gif(film: Animation, fps: int) -> bytes:
         The file's content. After the first picture it has only the box of each in which something changed.
     """
     parts: list[bytes] = []
-    before: Image.Image | None = None
+    before: int | None = None
     for key, duration in _gif_frames(film, round(100 / fps)):
-        now = film.draw(key)
-        if before is None:
-            parts += GifImagePlugin.getheader(now, info={"loop": 0})[0]
-            box = (0, 0, *now.size)
-        else:
-            box = ImageChops.subtract_modulo(now, before).getbbox() or (0, 0, 1, 1)
-        # milliseconds; disposal 1: the next picture is drawn over this one
-        parts += GifImagePlugin.getdata(now.crop(box), box[:2], duration=10 * duration, disposal=1)
-        before = now
+        encode = partial(_encode_gif_frame, film, before, key, duration)
+        parts.append(_encoded(film, ("gif", before, key, duration), encode))
+        before = key
     return b"".join([*parts, b";"])
+
+
+def _encode_gif_frame(film: Animation, before: int | None, key: int, duration: int) -> bytes:
+    """A picture after another one, for hundredths of a second; the first one with the file's header."""
+    now, header = film.draw(key), []
+    if before is None:
+        header = GifImagePlugin.getheader(now, info={"loop": 0})[0]
+        box = (0, 0, *now.size)
+    else:
+        box = ImageChops.subtract_modulo(now, film.draw(before)).getbbox() or (0, 0, 1, 1)
+    # milliseconds; disposal 1: the next picture is drawn over this one
+    return b"".join(
+        [*header, *GifImagePlugin.getdata(now.crop(box), box[:2], duration=10 * duration, disposal=1)]
+    )
 
 
 def _gif_frames(film: Animation, delay: int) -> Iterator[tuple[int, int]]:

@@ -18,7 +18,7 @@ import numpy as np
 from gridworld.process.progress import telling_if_slow
 from gridworld.world.markov_chain import Chain, Outcome, one_hot_policy
 from gridworld.world.mdp import FloatArray, Mdp
-from gridworld.world.solver import Solution, value_iteration
+from gridworld.world.solver import Solution, solved
 
 REGRET_TOLERANCE = 1e-6  # relative; a detour of one step costs at least 1 % at the default discount
 
@@ -39,7 +39,8 @@ class Score:
 
 
 class Evaluator:
-    """Scores policies of one world under one discount and step limit. Solves the world when it is built.
+    """Scores policies of one world under one discount and step limit. Solves the world when it is built,
+    unless this process has.
 
     Args:
         mdp: the world.
@@ -59,7 +60,7 @@ class Evaluator:
         self.mdp = mdp
         self.max_episode_steps = max_episode_steps
         with telling_if_slow(f"solving the world, {mdp.num_states:,} states"):
-            self.solution: Solution = value_iteration(mdp, gamma)
+            self.solution: Solution = solved(mdp, gamma)
         self.optimal_value = self._at_start(self.solution.v)
         with telling_if_slow(f"following the optimum for up to {max_episode_steps:,} steps"):
             self.optimum: Outcome = Chain(mdp, self.optimal_policy()).outcome(max_episode_steps)

@@ -14,12 +14,13 @@ Learning, 2nd ed., 2018, chapter 4.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from gridworld.world.bellman import backup, pick
 from gridworld.world.markov_chain import ORDINARY_GAMMA, Chain, check_gamma, one_hot_policy
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, frozen
 from gridworld.world.undiscounted import better_or_resting, solve_by_value_and_slope
 
 # Two actions whose values agree to this relative precision are equally good. Rounding stays far below it.
@@ -28,6 +29,7 @@ TIE = 1e-9
 _SWEEP_TOLERANCE = 1e-3  # sweeps need only find a good policy; the rest is solved exactly
 _IMPROVEMENT = 1e-11  # relative; less than that is rounding
 _PATIENT = 100.0  # steps; a longer horizon, 1 / (1 - γ), adds up more of what counts as a tie in one step
+_MOST_SOLUTIONS = 4  # of a world that are kept
 _NOTHING = 1e-290  # a value that has faded so far is 0: the smallest numbers of all never get smaller
 
 
@@ -72,6 +74,22 @@ def value_iteration(mdp: Mdp, gamma: float) -> Solution:
         greedy = better_or_resting(mdp, greedy)
     found, optimal = solve_by_value_and_slope(mdp, gamma, greedy)
     return Solution(gamma, found.value, backup(mdp, found.value, gamma), optimal, found.scale)
+
+
+_solved: WeakKeyDictionary[Mdp, dict[float, Solution]] = WeakKeyDictionary()
+
+
+def solved(mdp: Mdp, gamma: float) -> Solution:
+    """What `value_iteration` finds, found once for a world and discount; its arrays are read-only."""
+    gamma, solutions = check_gamma(gamma), _solved.setdefault(mdp, {})
+    if gamma not in solutions:
+        solution = value_iteration(mdp, gamma)
+        for table in (solution.v, solution.q, solution.optimal, solution.scale):
+            frozen(table)
+        while len(solutions) >= _MOST_SOLUTIONS:
+            del solutions[next(iter(solutions))]
+        solutions[gamma] = solution
+    return solutions[gamma]
 
 
 def _solve_discounted(mdp: Mdp, gamma: float, greedy: IntArray) -> Solution:

@@ -95,12 +95,12 @@ def test_policy_map_colours_cells_by_value_and_frames_mistakes(name: str) -> Non
     mdp = compile_mdp(load(name))
     best = value_iteration(mdp, 0.99)
     greedy = np.argmax(best.optimal, axis=1)
-    cells = cell_pictures(mdp, draw_policy_map(mdp, best.v, greedy, best.optimal, "all right"))
+    cells = cell_pictures(mdp, draw_policy_map(mdp, best.v, greedy, best.optimal, "all right").frame())
     assert not any(has(picture, DISAGREES) for picture in cells.values())
 
     wrong = int(mdp.start_states[0])
     greedy[wrong] = int(np.argmin(best.optimal[wrong]))
-    cells = cell_pictures(mdp, draw_policy_map(mdp, best.v, greedy, best.optimal, "one wrong"))
+    cells = cell_pictures(mdp, draw_policy_map(mdp, best.v, greedy, best.optimal, "one wrong").frame())
     colours = linear(VIRIDIS, best.v[playing(mdp)]).colours(best.v)
     for state, picture in cells.items():
         corner = tuple(picture[len(picture) // 6, len(picture) // 6])
@@ -124,7 +124,7 @@ def test_policy_map_marks_start_and_path_and_greys_what_was_never_visited() -> N
     known = explored(CLASSIC, visits)
     assert np.flatnonzero(known).tolist() == path[:-1]
     values = np.where(known, best.v, 99.0)  # an initial value that nothing has corrected
-    frame = draw_policy_map(CLASSIC, values, greedy, best.optimal, known=known)
+    frame = draw_policy_map(CLASSIC, values, greedy, best.optimal, known=known).frame()
     for state, picture in cell_pictures(CLASSIC, frame).items():
         corner = tuple(picture[len(picture) // 8, len(picture) // 8])
         if state in playing(CLASSIC):
@@ -147,7 +147,7 @@ def test_an_arrow_points_where_the_action_goes() -> None:
     values, everything = np.zeros(30), np.ones((30, 4), dtype=bool)
     for action, (rows, cols) in enumerate([(-1, 0), (0, 1), (1, 0), (0, -1)]):
         greedy = np.full(30, action)
-        frame = draw_policy_map(CLASSIC, values, greedy, everything, scale=Scale(VIRIDIS, 0, 1))
+        frame = draw_policy_map(CLASSIC, values, greedy, everything, scale=Scale(VIRIDIS, 0, 1)).frame()
         ink = (cell_pictures(CLASSIC, frame)[0] == 255).all(axis=2)
         down, right = (axis.mean() - len(ink) / 2 for axis in np.nonzero(ink))
         head = (down * rows + right * cols) / len(ink)
@@ -211,7 +211,7 @@ def test_large_worlds_are_colours_alone(size: tuple[int, int]) -> None:
     values = np.arange(states) / states
     optimal = np.ones((states, 4), dtype=bool)
     optimal[states // 2] = False
-    frame = draw_policy_map(mdp, values, np.zeros(states, dtype=int), optimal)
+    frame = draw_policy_map(mdp, values, np.zeros(states, dtype=int), optimal).frame()
     assert max(frame.shape) <= 3.5 * max(size)
     cells = cell_pictures(mdp, frame)
     goal = mdp.layout.state(mdp.layout.goals[0])

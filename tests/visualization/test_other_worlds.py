@@ -219,11 +219,11 @@ def test_with_other_actions_a_cell_has_the_largest_error_and_what_cannot_be_reac
 
 def test_the_policy_of_a_mosaic_has_dots_where_no_action_moves_and_diagonal_paths() -> None:
     best = value_iteration(TAXI, 0.95)
-    frame = draw_policy_map(TAXI, best.v, best.optimal.argmax(axis=1), best.optimal)
+    frame = draw_policy_map(TAXI, best.v, best.optimal.argmax(axis=1), best.optimal).frame()
     cells = [cell_of(TAXI, frame, state, 2) for state in np.flatnonzero(shown(TAXI))]
     assert not any(has(cell, DISAGREES) for cell in cells)
     sea = deep_sea(5, mirrored=False)
-    frame = draw_policy_map(sea, np.zeros(26), np.ones(26, dtype=int), np.ones((26, 2), dtype=bool))
+    frame = draw_policy_map(sea, np.zeros(26), np.ones(26, dtype=int), np.ones((26, 2), dtype=bool)).frame()
     assert [has(cell_of(sea, frame, 6 * row, 2), AGENT) for row in range(5)] == [True] * 5
     assert not has(cell_of(sea, frame, 5, 2), AGENT)
 
@@ -251,7 +251,7 @@ def test_a_policy_table_frames_the_greedy_action() -> None:
     snapshot = PolicySnapshot(q.argmax(axis=1), np.full(q.shape, 0.5), q.max(axis=1), q)
     states, known = table_states(world), np.arange(6) < 4
     for each in (snapshot, dataclasses.replace(snapshot, q=None)):
-        frame = draw_policy_table(world, states, held(each, states), each.greedy, best.optimal, known)
+        frame = draw_policy_table(world, states, held(each, states), each.greedy, best.optimal, known).frame()
         table = StateTable(world, states, world.action_names, legend_rows=2)
         for row in range(5):
             cells = [table_cell(table, frame, row, column) for column in range(2)]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gridworld.envs.rendering import draw_frame
+from gridworld.envs.rendering import draw_frame, pack
 from gridworld.errors import InputError, failure
 from gridworld.storage.atomic_write import replacing, replacing_folder, write_array, write_json
 from gridworld.visualization import video as record
@@ -56,7 +56,7 @@ def test_a_gif_holds_any_film_exactly() -> None:
             chance.integers(200)
         ]
         frames.append(frame)
-    shown = frames_of(Image.open(io.BytesIO(record.encode_gif(animation_of_frames(frames), 20))))
+    shown = frames_of(Image.open(io.BytesIO(record.encode_gif(animation_of_frames(map(pack, frames)), 20))))
     assert len(shown) == len(frames)
     assert all(np.array_equal(got, frame) for (got, _), frame in zip(shown, frames, strict=True))
     assert sum(duration for _, duration in shown) == (len(frames) + 4) * 50
@@ -69,12 +69,13 @@ def test_a_gif_holds_any_film_exactly() -> None:
 def test_a_film_has_one_palette() -> None:
     noise = np.random.default_rng(0).integers(256, size=(40, 40, 3), dtype=np.uint8)
     with pytest.raises(InputError, match="more than 256 colours"):
-        animation_of_frames([noise])
+        animation_of_frames([pack(noise)])
 
 
 def test_png_is_exact() -> None:
     noise = np.random.default_rng(0).integers(256, size=(13, 17, 3), dtype=np.uint8)
-    for frame in (noise, draw_frame(CLASSIC, 0, 20), noise[:1, :1]):
+    half = np.concatenate([np.zeros_like(noise), noise, np.tile(noise[-1:], (9, 1, 1))])  # with empty rows
+    for frame in (noise, draw_frame(CLASSIC, 0, 20), half, half[:20], noise[:1, :1]):
         image = Image.open(io.BytesIO(encode_png(frame)))
         image.load()  # checks the sums
         assert image.mode == "RGB"
