@@ -40,6 +40,11 @@ class AgentConfig:
         """Distributions whose versions its results depend on, besides those that every run depends on."""
         return ()
 
+    @property
+    def shape(self) -> str | None:
+        """What must be equal for runs of it to train as one population; None: each trains by itself."""
+        return None
+
 
 @functools.cache
 def agent_schemas() -> dict[str, type[AgentConfig]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Optional
+from typing import Any, Optional, Union
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
 
@@ -19,6 +19,8 @@ class SweepConfig:
     max_jobs: int = 10_000  # more are taken for a slip
     params: dict[str, Any] = field(default_factory=dict)  # settings and their values, as on a command line
     paired: list[Any] = field(default_factory=list)  # swept settings that vary together, or lists of such
+    population: Optional[Union[int, str]] = "auto"  # noqa: UP007, UP045  # runs that train as one; 1: each alone
+    together: list[str] = field(default_factory=list)  # the sweeper's own: the jobs of a population
 
 
 @dataclass

@@ -7,17 +7,14 @@ made once per process. Files, variables and callbacks are Hydra's, which tests/s
 
 from __future__ import annotations
 
-import contextlib
 import os
 import pickle
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
 import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobReturn, JobRuntime, JobStatus, _flush_loggers, configure_log, env_override
-from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf._utils import get_omega_conf_dumper
@@ -27,26 +24,13 @@ _MOST_ENTRIES = 4096
 _entries: dict[tuple[object, ...], str] = {}  # YAML by what it is of
 
 
-@contextlib.contextmanager
-def in_place_of_hydras(launcher: type[Launcher]) -> Iterator[None]:
-    """Have a launcher of Hydra's own, which knows `run_job` by name, run jobs by the one below."""
-    names = cast("Any", launcher.launch).__globals__
-    theirs = names.get("run_job")
-    if theirs is not None:
-        names["run_job"] = run_job
-    try:
-        yield
-    finally:
-        if theirs is not None:
-            names["run_job"] = theirs
-
-
 def run_job(
     task_function: TaskFunction,
     config: DictConfig,
     job_dir_key: str,
     job_subdir_key: str,
     hydra_context: HydraContext,
+    configures_logging: bool = True,
 ) -> JobReturn:
     """Run a job.
 
@@ -56,6 +40,7 @@ def run_job(
         job_dir_key: where the configuration has the sweep's folder.
         job_subdir_key: where it has the job's, in there.
         hydra_context: of the application.
+        configures_logging: as the configuration has it.
 
     Returns:
         What it came to; an `Exception` that it raised is in there. It has no configurations, which would fill
@@ -76,7 +61,8 @@ def run_job(
         if config.hydra.job.chdir:
             os.chdir(output)
         done = JobReturn(list(config.hydra.overrides.task), working_dir=os.getcwd())
-        configure_log(config.hydra.job_logging, config.hydra.verbose)
+        if configures_logging:
+            configure_log(config.hydra.job_logging, config.hydra.verbose)
         with env_override(config.hydra.job.env_set):
             hydra_context.callbacks.on_job_start(config=config, task_function=task_function)
             try:

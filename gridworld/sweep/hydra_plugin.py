@@ -27,22 +27,20 @@ class GridWorldSweeper(Sweeper):
         """Called by Hydra once all is composed. Raises `InputError` for a launcher that cannot work."""
         from gridworld.sweep.config_loader import SweepLoader
         from gridworld.sweep.launchers.select import make_launcher
+        from gridworld.sweep.population import PopulationTask
 
         self._config = config
         self._loader = SweepLoader(hydra_context.config_loader)
-        self._launcher = make_launcher(
-            HydraContext(config_loader=self._loader, callbacks=hydra_context.callbacks), task_function, config
-        )
+        context = HydraContext(config_loader=self._loader, callbacks=hydra_context.callbacks)
+        self._launcher = make_launcher(context, PopulationTask(context, task_function, config), config)
 
     def sweep(self, arguments: list[str]) -> None:
         """Run the jobs that `arguments` ask for. Raises `SystemExit` unless all are done."""
         from gridworld.config.sweep import SweepConfig
-        from gridworld.sweep.hydra_job import in_place_of_hydras
         from gridworld.sweep.sweeper import run_sweep
 
         settings = SweepConfig(**self._settings)
-        with in_place_of_hydras(type(self._launcher)):
-            run_sweep(arguments, self._loader, self._launcher, self._config, settings)
+        run_sweep(arguments, self._loader, self._launcher, self._config, settings)
 
 
 class _OwnLauncher:
@@ -66,6 +64,12 @@ class _OwnLauncher:
             JobRunner(*self._given), self._settings, job_overrides, initial_job_idx
         )
         return results
+
+
+class BasicLauncher(_OwnLauncher, Launcher):
+    """Runs jobs one after the other, in place of Hydra's launcher of this name."""
+
+    _module = "in_process"
 
 
 class JoblibLauncher(_OwnLauncher, Launcher):

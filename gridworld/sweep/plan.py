@@ -21,6 +21,7 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
+from gridworld.config.plain_settings import foreign_imports
 from gridworld.config.settings_by_effect import ON_RESULT, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig
@@ -44,6 +45,7 @@ class Job:
     hash: str  # of the settings that matter
     mistake: str | None  # what is wrong with the settings, as far as it is known before training
     progress: bool  # whether its settings ask for a progress line
+    shape: str | None = None  # equal for jobs that can train as one population; None: it trains alone
 
 
 def expand(
@@ -166,9 +168,26 @@ def plan(
             mistake = str(error)
         digest = settings_hash(dataclasses.asdict(config), layout)
         planned.setdefault(
-            digest, Job(tuple(overrides), tuple(swept), digest, mistake, config.logging.progress)
+            digest,
+            Job(tuple(overrides), tuple(swept), digest, mistake, config.logging.progress, _shape(config)),
         )
     return list(planned.values())
+
+
+def _shape(config: TrainConfig) -> str | None:
+    """What must be equal for jobs to train as one population, as far as settings tell."""
+    if config.agent.shape is None or any(foreign_imports(config.callbacks)):
+        return None
+    return repr(
+        (
+            config.agent.shape,
+            config.n_envs,
+            config.device,
+            config.threads,
+            config.observation,
+            config.callbacks,
+        )
+    )
 
 
 def settings_hash(settings: dict[str, Any], layout: str) -> str:

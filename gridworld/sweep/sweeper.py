@@ -7,10 +7,10 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
-from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig
@@ -38,6 +38,7 @@ from gridworld.sweep.job_table import (
     run_status,
 )
 from gridworld.sweep.plan import Job, expand, plan
+from gridworld.sweep.population import lines, populations
 from gridworld.sweep.progress import sweep_progress
 
 _ORPHANS_END_WITHIN = 5.0  # seconds; workers of a sweep that was killed
@@ -69,6 +70,9 @@ def run_sweep(
     """
     folder = SweepFolder(Path(master.hydra.sweep.dir))
 
+    def divided(shapes: dict[str, str | None], to_do: list[JobEntry]) -> list[list[JobEntry]]:
+        return populations([(entry, shapes[entry.job]) for entry in to_do], settings, master.hydra)
+
     def configure(overrides: Sequence[str]) -> TrainConfig:
         return to_config(loader.load_settings(master, list(overrides)))
 
@@ -76,11 +80,13 @@ def run_sweep(
     jobs = plan(expand(words, loader, settings.max_jobs, settings.paired), configure)
     _refuse_mistakes(jobs, settings)
     folder.check(jobs, settings.extend)
+    populations([], settings, master.hydra)  # finds a mistake
     try:
         with folder.at_work():
             entries = folder.add(jobs, words)
             mistakes = {e.job: job.mistake for e, job in zip(entries, jobs, strict=True) if job.mistake}
-            sweep = _Sweep(folder, entries, launcher)
+            shapes = {e.job: job.shape for e, job in zip(entries, jobs, strict=True)}
+            sweep = _Sweep(folder, entries, launcher, partial(divided, shapes))
             code = sweep.run(mistakes, settings.retry_failed, any(job.progress for job in jobs))
     except ConnectionError:
         raise  # from a cluster, not from a disk
@@ -114,10 +120,17 @@ def _refuse_mistakes(jobs: Sequence[Job], settings: SweepConfig) -> None:
 class _Sweep:
     """The jobs that are asked for in this folder, and the launcher that runs them."""
 
-    def __init__(self, folder: SweepFolder, entries: list[JobEntry], launcher: Launcher) -> None:
+    def __init__(
+        self,
+        folder: SweepFolder,
+        entries: list[JobEntry],
+        launcher: Launcher,
+        divided: Callable[[list[JobEntry]], list[list[JobEntry]]],
+    ) -> None:
         self._folder = folder
         self._entries = entries
         self._launcher = launcher
+        self._divided = divided  # into populations
         self._table = JobTable(folder.path)
         self._launcher_failed = False  # before any job had begun
 
@@ -168,19 +181,14 @@ class _Sweep:
             batch = batches.pop(0)
             if not batch:
                 continue
+            groups = self._divided(batch)
             try:
-                results = self._launcher.launch([self._line(entry) for entry in batch], count)
+                results = self._launcher.launch(lines(self._folder.path, groups, count), count)
             except Exception as error:
                 batches = self._after_a_crash(batch, error) + batches
             else:
-                self._settle(batch, results)
+                self._settle(groups, results)
             count += len(batch)
-
-    def _line(self, entry: JobEntry) -> list[str]:
-        """The job's overrides, with those that name its folder."""
-        where = {"dir": str(self._folder.path.absolute()), "subdir": entry.job}
-        quoted = {key: QuotedString(text, Quote.single).with_quotes() for key, text in where.items()}
-        return [*entry.overrides, *(f"hydra.sweep.{key}={text}" for key, text in quoted.items())]
 
     def _after_a_crash(self, batch: list[JobEntry], error: Exception) -> list[list[JobEntry]]:
         """The batches left to launch: first what had not begun, then, one by one, what was running.
@@ -203,13 +211,14 @@ class _Sweep:
             return [pending]
         return [pending, *([entry] for entry in died)]
 
-    def _settle(self, batch: list[JobEntry], results: Sequence[JobReturn]) -> None:
+    def _settle(self, groups: list[list[JobEntry]], results: Sequence[JobReturn]) -> None:
         """Note the launcher's results of jobs that could write none themselves.
 
         A job that was told to stop, or did not come to its turn, stays as it is for the next start.
         """
         rows = self._repair()  # the table itself may have been edited meanwhile, or deleted
-        for entry, result in zip(batch, results, strict=True):
+        of_jobs = ((entry, result) for group, result in zip(groups, results, strict=True) for entry in group)
+        for entry, result in of_jobs:
             row = rows[entry.job]
             if row.status not in (PENDING, INTERRUPTED):
                 continue

@@ -2,13 +2,39 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Optional
 
 from gridworld.config.agents import AgentConfig, Schedule, WholeNumbers
 from gridworld.config.effects import Effect, affects
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
+
+
+# Arguments of SB3's classes that are a number to compute with: runs of one population may differ in them.
+_NUMBERS = frozenset(
+    [
+        "learning_rate",
+        "gamma",
+        "gae_lambda",
+        "ent_coef",
+        "vf_coef",
+        "max_grad_norm",
+        "clip_range",
+        "clip_range_vf",
+        "target_kl",
+        "exploration_fraction",
+        "exploration_initial_eps",
+        "exploration_final_eps",
+        "learning_starts",
+        "tau",
+        "target_update_interval",
+        "buffer_size",
+        "log_interval",
+        "stats_window_size",
+        "name",
+    ]
+)
 
 
 @dataclass
@@ -50,6 +76,15 @@ class SB3Config(AgentConfig):
     def libraries(self) -> tuple[str, ...]:
         """See `AgentConfig.libraries`."""
         return ("stable-baselines3", "sb3-contrib", "torch")
+
+    @property
+    def shape(self) -> str | None:
+        """See `AgentConfig.shape`: all that says how large arrays are, and what is done with them."""
+        settings = asdict(self)
+        settings |= settings.pop("arguments", {})
+        if settings.get("engine") != "tabulated":
+            return None
+        return repr({key: value for key, value in settings.items() if key not in _NUMBERS})
 
 
 @dataclass

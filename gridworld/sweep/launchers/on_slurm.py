@@ -31,6 +31,7 @@ from gridworld.storage.symlinks import make_inside, remove_inside
 from gridworld.sweep.folder import STOP
 from gridworld.sweep.job import StopSweep
 from gridworld.sweep.launchers.worker import JobRunner, run_in_turn
+from gridworld.sweep.population import count_jobs
 
 Task = submitit.Job[list[str]]
 
@@ -47,15 +48,14 @@ def launch(
 ) -> list[JobReturn]:
     """Run jobs. See `on_joblib.launch`."""
     own = SlurmConfig(**settings)
-    size = own.jobs_per_task
-    starts = range(0, len(jobs), size)
-    _refuse_too_many(len(starts), len(jobs))
+    parts = _parts(jobs, own.jobs_per_task)
+    _refuse_too_many(len(parts), sum(map(count_jobs, jobs)))
     folder = make_inside(runner.sweep, _FOLDER)
     state_file = folder / f"{time.time_ns()}.state"
     with replacing(state_file) as part:
         part.write_bytes(runner.packed())
-    chunks = [[list(overrides) for overrides in jobs[start : start + size]] for start in starts]
-    tasks = _submit(folder, own, state_file, runner.sweep, chunks, [first + start for start in starts])
+    chunks = [[list(overrides) for overrides in jobs[start:end]] for start, end in parts]
+    tasks = _submit(folder, own, state_file, runner.sweep, chunks, [first + start for start, _ in parts])
     try:
         _wait(tasks, runner.sweep / STOP)
     except BaseException:
@@ -67,6 +67,18 @@ def launch(
 def run_task(state_file: str, sweep: str, jobs: list[list[str]], first: int) -> list[str]:
     """Run a task's jobs, on its node. See `run_in_turn`."""
     return run_in_turn(Path(state_file).read_bytes(), Path(sweep), jobs, first)
+
+
+def _parts(jobs: Sequence[Sequence[str]], most: int) -> list[tuple[int, int]]:
+    """From where to where each task's jobs go, so that none has more than `most`; one may be a population."""
+    parts, start, inside = [], 0, 0
+    for number, overrides in enumerate(jobs):
+        count = count_jobs(overrides)
+        if inside and inside + count > most:
+            parts.append((start, number))
+            start, inside = number, 0
+        inside += count
+    return [*parts, (start, len(jobs))] if jobs else []
 
 
 def _submit(

@@ -8,11 +8,12 @@ import shutil
 from hydra.core.plugins import Plugins
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
-from omegaconf import DictConfig
+from omegaconf import DictConfig, open_dict, read_write
 
 from gridworld.bounds import at_least
 from gridworld.errors import InputError, install_command
 
+_HYDRAS = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
 _OURS = "hydra_plugins.gridworld_sweeper."
 # By the launcher's class: the package that it needs, and the extra that installs it.
 _NEEDS = {
@@ -53,6 +54,9 @@ def make_launcher(context: HydraContext, task: TaskFunction, config: DictConfig)
             raise InputError(
                 f"{choice}: there is no {missing[0]} on this machine; start the sweep on one of the cluster's"
             )
+    if settings._target_ == _HYDRAS:
+        with read_write(config), open_dict(config):
+            config.hydra.launcher._target_ = f"{_OURS}BasicLauncher"
     return Plugins.instance().instantiate_launcher(context, task, config)
 
 

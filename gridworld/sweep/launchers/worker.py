@@ -16,12 +16,13 @@ from pathlib import Path
 
 import cloudpickle
 from hydra.core.singleton import Singleton
-from hydra.core.utils import JobReturn, JobStatus, run_job, setup_globals
+from hydra.core.utils import JobReturn, JobStatus, setup_globals
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, open_dict
 
 from gridworld.process.signals import exiting, handling, send_sigterm
 from gridworld.storage.atomic_write import write_bytes
+from gridworld.sweep.hydra_job import run_job
 from gridworld.sweep.folder import STOP
 from gridworld.sweep.job import StopSweep
 
@@ -45,12 +46,13 @@ class JobRunner:
         """This runner and Hydra's state, for `unpack` in another process."""
         return bytes(cloudpickle.dumps((_THIS_PROCESS, os.getcwd(), Singleton.get_state(), self)))
 
-    def run(self, overrides: Sequence[str], number: int) -> JobReturn:
+    def run(self, overrides: Sequence[str], number: int, configures_logging: bool = True) -> JobReturn:
         """Run a job.
 
         Args:
             overrides: the job's.
             number: the job's, `hydra.job.num`.
+            configures_logging: as the settings have it; not for a job among others that are at work.
 
         Returns:
             What it came to; an `Exception` that it raised is in there.
@@ -69,6 +71,7 @@ class JobRunner:
             config=config,
             job_dir_key="hydra.sweep.dir",
             job_subdir_key="hydra.sweep.subdir",
+            configures_logging=configures_logging,
         )
         result.cfg = result.hydra_cfg = None  # they are not used, and would fill the memory
         _spare_the_collector()

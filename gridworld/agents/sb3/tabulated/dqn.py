@@ -88,7 +88,13 @@ class TabulatedDQN(DQN):
 
     env: GridWorldVecEnv
     replay_buffer: StateReplayBuffer
-    derived = ("descent", "inputs", "_q", "_greedy", "_target_values")  # from the rest: no part of a checkpoint
+    derived = (
+        "descent",
+        "inputs",
+        "_q",
+        "_greedy",
+        "_target_values",
+    )  # from the rest: no part of a checkpoint
 
     def _setup_model(self) -> None:
         observation = self.env.observation

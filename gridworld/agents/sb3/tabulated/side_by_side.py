@@ -282,7 +282,11 @@ class _Adams:
         )
         self._settings = {
             **settings,
-            **{"fused": True, "amsgrad": False, "has_complex": False, "beta1": beta1, "beta2": beta2},
+            "fused": True,
+            "amsgrad": False,
+            "has_complex": False,
+            "beta1": beta1,
+            "beta2": beta2,
         }
 
     def step(self) -> None:

