@@ -15,6 +15,7 @@ import contextlib
 import contextvars
 import random
 import sys
+import time
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -50,6 +51,8 @@ class _Task(greenlet):
         self.error: BaseException | None = None
         self._bits = np.random.MT19937(0)
         self.chance = np.random.RandomState(self._bits)
+        self.seconds = 0.0  # of its own work, and its share of what was done for several
+        self.resumed = 0.0
         self._python = random.getstate()
         self._torch: Any = None
 
@@ -68,6 +71,7 @@ class _Task(greenlet):
         if torch is not None and self._torch is not None:
             torch.set_rng_state(self._torch)
         self.waiting = None
+        self.resumed = time.perf_counter()
         try:
             if error is None:
                 self.switch()
@@ -78,6 +82,7 @@ class _Task(greenlet):
                 with contextlib.suppress(BaseException):
                     self.throw()
         finally:
+            self.seconds += time.perf_counter() - self.resumed
             torch = sys.modules.get("torch")
             self._python, self._torch = random.getstate(), _torch_numbers(torch)
             bits, python, numbers = outside
@@ -149,6 +154,14 @@ def chance() -> np.random.RandomState:
     return task.chance if isinstance(task, _Task) else np.random.mtrand._rand
 
 
+def clock() -> float:
+    """Seconds since some moment; of a task among others, only those that were spent on it."""
+    task = getcurrent()
+    if not isinstance(task, _Task):
+        return time.perf_counter()
+    return task.seconds + time.perf_counter() - task.resumed
+
+
 def _met(waiting: Sequence[_Task]) -> list[tuple[_Task, Exception | None]]:
     """Do the work that tasks wait for; returns what to raise in each, in their order."""
     groups: dict[Any, list[_Task]] = {}
@@ -157,7 +170,10 @@ def _met(waiting: Sequence[_Task]) -> list[tuple[_Task, Exception | None]]:
         groups.setdefault((task.waiting.work, task.waiting.key), []).append(task)
     errors: dict[_Task, Exception | None] = {}
     for (work, _), tasks in groups.items():
+        started = time.perf_counter()
         found = work([task.waiting.member for task in tasks if task.waiting is not None])
+        for task in tasks:
+            task.seconds += (time.perf_counter() - started) / len(tasks)
         errors.update(zip(tasks, found, strict=True))
     return [(task, errors[task]) for task in waiting]
 

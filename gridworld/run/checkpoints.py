@@ -9,12 +9,12 @@ that is damaged, or whose files are, is passed over for the one before.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import BudgetError
+from gridworld.process.together import clock
 from gridworld.run.folder import CHECKPOINTS
 from gridworld.storage.atomic_write import replacing, sync_folder
 from gridworld.storage.file_lock import check_ours
@@ -128,17 +128,17 @@ class Pace:
         self.never = every is None
         self._every = every if isinstance(every, int) else None
         self._last = steps
-        self._at = time.monotonic() + _LEAST_SECONDS
+        self._at = clock() + _LEAST_SECONDS
 
     def is_due(self, steps: int) -> bool:
         """Whether a checkpoint is due after so many environment steps."""
         if self.never or steps == 0:
             return False
         if self._every is None:
-            return time.monotonic() >= self._at
+            return clock() >= self._at
         return steps // self._every > self._last // self._every
 
     def took(self, steps: int, seconds: float) -> None:
         """Note that a checkpoint was written after so many environment steps, and the seconds it took."""
         self._last = steps
-        self._at = time.monotonic() + max(_LEAST_SECONDS, seconds / _MOST_SHARE)
+        self._at = clock() + max(_LEAST_SECONDS, seconds / _MOST_SHARE)

@@ -9,7 +9,6 @@ line and pictures.
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -20,6 +19,7 @@ from gridworld.agents import Agent, PolicySnapshot
 from gridworld.config.train import TrainConfig
 from gridworld.envs.statistics_env import NO_EPISODES, Returns, StatisticsVectorEnv
 from gridworld.errors import InputError
+from gridworld.process.together import clock
 from gridworld.storage.serialization import State
 from gridworld.training.best_model import BestModel
 from gridworld.training.certificate import Certificate
@@ -189,10 +189,10 @@ class LearningCurve:
         model_file: Callable[[], bytes],
         returns: Returns,
     ) -> Evaluation:
-        started = time.perf_counter()
+        started = clock()
         evaluation = self._scored(step, snapshot(), returns)
         self.best.offer(step, evaluation.greedy, model_file)
-        self.seconds += time.perf_counter() - started
+        self.seconds += clock() - started
         for sink in self._sinks:
             sink.write(evaluation)
         return evaluation

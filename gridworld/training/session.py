@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 import shlex
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -19,6 +18,7 @@ from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.progress import Progress
 from gridworld.process.signals import StopRequest
+from gridworld.process.together import clock
 from gridworld.run.checkpoints import Checkpoints, Pace
 from gridworld.run.evaluations_file import NEEDED, write_evaluations
 from gridworld.run.fingerprint import environment, identity
@@ -131,7 +131,7 @@ class Session:
         }
         self._pace = Pace(config.checkpoint.every, self._steps)
         self._stop = StopRequest()
-        self._started = time.perf_counter() - (0.0 if state is None else float(state["seconds"]))
+        self._started = clock() - (0.0 if state is None else float(state["seconds"]))
         self._curve_log = AppendLog(run.curve_file, None if state is None else state["marks"]["curve"])
         label = f"{config.agent.name} on {evaluator.mdp.name}"
         self._progress = Progress(config.total_timesteps, label, config.logging.progress)
@@ -201,12 +201,12 @@ class Session:
             self._stop.obey()
             return
         self._stop.take_time()
-        started = time.perf_counter()
+        started = clock()
         try:
             self._save(steps, is_last)
         except OSError as error:
             _log.warning("%s: no checkpoint after step %s, %s", self._run.folder, steps, error.strerror)
-        self._pace.took(steps, time.perf_counter() - started)
+        self._pace.took(steps, clock() - started)
         self._stop.obey()
 
     def _save(self, steps: int, is_last: bool) -> None:
@@ -224,14 +224,14 @@ class Session:
             "manifest": self._run.text(),
             "steps": steps,
             "total_timesteps": self._config.total_timesteps,
-            "seconds": time.perf_counter() - self._started,
+            "seconds": clock() - self._started,
             **self._parts.get_state(),
             "marks": {name: None if log is None else log.mark() for name, log in logs.items()},
         }
         self.checkpoints.save(steps, state, durable, small=is_last)
 
     def _finish(self) -> Summary:
-        seconds = time.perf_counter() - self._started
+        seconds = clock() - self._started
         parts = self._parts
         last = parts.curve.evaluate(self._steps)
         write_bytes(self._run.model_file, parts.agent.agent.model_file())
