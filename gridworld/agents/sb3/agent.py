@@ -20,7 +20,7 @@ from gridworld.agents.sb3.policy_outputs import Reading, epsilon_greedy, of_q, r
 from gridworld.agents.sb3.schemas import SB3Config
 from gridworld.agents.sb3.snapshot.callback import CheckpointCallback, check_finite, diverged
 from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
-from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
+from gridworld.agents.sb3.tabulated.on_policy import TabulatedOnPolicy
 from gridworld.bounds import within
 from gridworld.config.agents import AgentConfig
 from gridworld.errors import InputError
@@ -94,7 +94,7 @@ class SB3Agent:
         return float(getattr(self.model, "exploration_rate", 0.0))
 
     def _read(self, states: IntArray) -> Reading:
-        if isinstance(self.model, TabulatedPPO):
+        if isinstance(self.model, TabulatedOnPolicy):
             logits, values = self.model.outputs(states)
             return Reading(values[:, 0], logits.softmax(dim=1), None)
         if isinstance(self.model, TabulatedDQN):

@@ -9,19 +9,22 @@ import numpy as np
 import pytest
 import torch
 from helpers.support import DEEP, SHORT, configure, train_in
-from stable_baselines3 import DQN, PPO
+from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from gridworld import GridWorldVectorEnv
+from gridworld.agents.sb3 import check
 from gridworld.agents.sb3.constructor_arguments import algorithm_and_arguments
 from gridworld.agents.sb3.schemas import SB3Config
 from gridworld.agents.sb3.tabulated import state_inputs as tabulated
+from gridworld.agents.sb3.tabulated.a2c import TabulatedA2C
 from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.envs.observations import make_observation
+from gridworld.errors import InputError
 
 NUM_ENVS, STEPS = 16, 32
 KINDS = ["one_hot", "coordinates", "none", "image"]
@@ -80,12 +83,13 @@ def assert_same_update(ours: Any, theirs: Any, *arguments: int) -> None:
         assert told[key] == pytest.approx(value, rel=1e-4, abs=1e-6), key
 
 
-def share_rollout(ours: TabulatedPPO, theirs: PPO) -> None:
-    ours.collect_rollouts(ours.env, no_callback(ours), ours.rollout_buffer, STEPS)
+def share_rollout(ours: Any, theirs: Any) -> None:
+    steps = ours.n_steps
+    ours.collect_rollouts(ours.env, no_callback(ours), ours.rollout_buffer, steps)
     source, target = ours.rollout_buffer, theirs.rollout_buffer
     target.reset()
     rows = ours.env.observation.rows(source.observations)
-    target.observations = rows.reshape(STEPS, NUM_ENVS, *target.obs_shape)
+    target.observations = rows.reshape(steps, NUM_ENVS, *target.obs_shape)
     target.actions = source.actions[..., None]
     for name in ("rewards", "episode_starts", "values", "log_probs", "advantages", "returns"):
         setattr(target, name, getattr(source, name).copy())
@@ -129,6 +133,29 @@ def test_ppo_updates_as_stock(
         arguments = {"batch_size": 16, **arguments, "policy_kwargs": policy_kwargs}
     arguments = {"n_epochs": 1, "batch_size": 256, **arguments}
     ours, theirs = twins(TabulatedPPO, PPO, kind, n_steps=STEPS, **arguments)
+    share_rollout(ours, theirs)
+    assert_same_update(ours, theirs)
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments"),
+    [
+        *[(kind, {}) for kind in KINDS],
+        ("one_hot", {"ent_coef": 0.3, "vf_coef": 0.1, "gae_lambda": 0.9, "normalize_advantage": True}),
+        ("one_hot", {"use_rms_prop": False, "max_grad_norm": 0.01}),
+        ("none", {"policy_kwargs": {"net_arch": []}}),
+        ("coordinates", {"policy_kwargs": {"net_arch": {"pi": [8], "vf": [16, 16]}}}),
+        ("image", {"policy_kwargs": {"share_features_extractor": False}}),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("few_states", [1024, 0], ids=["all states", "distinct states"])
+def test_a2c_updates_as_stock(
+    kind: str, arguments: dict[str, Any], few_states: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tabulated, "_FEW_STATES", few_states)
+    steps = STEPS if few_states else 1  # of fewer samples than states
+    ours, theirs = twins(TabulatedA2C, A2C, kind, n_steps=steps, **arguments)
     share_rollout(ours, theirs)
     assert_same_update(ours, theirs)
 
@@ -254,6 +281,7 @@ class Watch(BaseCallback):
     ("ours", "theirs", "arguments"),
     [
         (TabulatedPPO, PPO, {"n_steps": STEPS, "batch_size": 64}),
+        (TabulatedA2C, A2C, {"n_steps": 5}),
         (TabulatedDQN, DQN, {"learning_starts": 100, "exploration_fraction": 1.0}),
     ],
 )
@@ -284,7 +312,7 @@ def test_callbacks_schedules_and_files_are_sb3s(
     loaded.learn(200, reset_num_timesteps=False)  # and it goes on training
 
 
-@pytest.mark.parametrize("agent", DEEP)
+@pytest.mark.parametrize("agent", [*DEEP, "a2c"])
 def test_both_engines_train_and_leave_the_same_kind_of_run(agent: str, tmp_path: Path) -> None:
     runs = [
         train_in(tmp_path / engine, *SHORT[agent], f"agent.engine={engine}")
@@ -371,6 +399,26 @@ def test_what_is_known_is_covered(agent: str, engine: type, settings: list[str])
     config = configure(f"agent={agent}", *settings).agent
     assert isinstance(config, SB3Config)
     assert algorithm_and_arguments(config)[0] is engine
+
+
+@pytest.mark.parametrize(("agent", "stock", "engine"), [("a2c", A2C, TabulatedA2C)])
+def test_a_class_with_its_arguments_is_covered_as_well(
+    agent: str, stock: type, engine: type, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def chosen(*settings: str) -> type:
+        config = configure(f"agent={agent}", *settings).agent
+        assert isinstance(config, SB3Config)
+        return algorithm_and_arguments(config)[0]
+
+    assert chosen() is engine
+    assert chosen("agent.engine=stock") is stock
+    assert chosen("agent.algorithm=sb3_contrib.MaskablePPO", "agent.arguments={}") is not engine
+    assert capsys.readouterr().err == ""
+    assert chosen("+agent.arguments.policy_kwargs.activation_fn=torch.nn.RReLU") is stock
+    reason = "agent.arguments.policy_kwargs.activation_fn=torch.nn.RReLU is not known to give"
+    assert f"engine: stock, since {reason}" in capsys.readouterr().err
+    with pytest.raises(InputError, match="agent.engine=fast: must be tabulated or stock"):
+        check(configure(f"agent={agent}", "agent.engine=fast"))
 
 
 def test_a_policy_of_sb3s_by_its_path_is_covered() -> None:
