@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.support import DEEP, SHORT, configure, train_in
+from sb3_contrib import QRDQN, MaskablePPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import KVWriter, Logger
@@ -18,10 +19,12 @@ from gridworld import GridWorldVectorEnv
 from gridworld.agents.sb3 import check
 from gridworld.agents.sb3.constructor_arguments import algorithm_and_arguments
 from gridworld.agents.sb3.schemas import SB3Config
+from gridworld.agents.sb3.tabulated import qrdqn_loss
 from gridworld.agents.sb3.tabulated import state_inputs as tabulated
 from gridworld.agents.sb3.tabulated.a2c import TabulatedA2C
 from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
+from gridworld.agents.sb3.tabulated.qrdqn import TabulatedQRDQN
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
@@ -186,7 +189,7 @@ def test_advantages_are_sb3s_to_the_last_bit() -> None:
         assert np.array_equal(getattr(ours.rollout_buffer, name), getattr(theirs.rollout_buffer, name))
 
 
-def share_replay(ours: TabulatedDQN, theirs: DQN) -> None:
+def share_replay(ours: Any, theirs: Any) -> None:
     frequency = TrainFreq(STEPS, TrainFrequencyUnit.STEP)
     ours.collect_rollouts(ours.env, no_callback(ours), frequency, ours.replay_buffer)
     source, target = ours.replay_buffer, theirs.replay_buffer
@@ -201,7 +204,8 @@ def share_replay(ours: TabulatedDQN, theirs: DQN) -> None:
     assert source.timeouts.sum() > 0
     assert source.dones.sum() > source.timeouts.sum()
     with torch.no_grad():  # a target network of its own
-        for mine, peer in zip(ours.q_net_target.parameters(), theirs.q_net_target.parameters(), strict=True):
+        targets = (getattr(model, f"{ours.network}_target").parameters() for model in (ours, theirs))
+        for mine, peer in zip(*targets, strict=True):
             mine += 0.1 * torch.randn_like(mine)
             peer.copy_(mine)
     ours._target_values = None
@@ -229,17 +233,67 @@ def test_dqn_updates_as_stock(
     assert_same_update(ours, theirs, steps, size)
 
 
+@pytest.mark.parametrize(
+    ("kind", "arguments"),
+    [
+        *[(kind, {}) for kind in KINDS],
+        ("one_hot", {"max_grad_norm": 1e-3, "gamma": 0.5}),
+        ("one_hot", {"policy_kwargs": {"net_arch": [], "n_quantiles": 7}}),
+        ("none", {"policy_kwargs": {"n_quantiles": 1, "optimizer_class": torch.optim.SGD}}),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("few_states", [1024, 0], ids=["all states", "distinct states"])
+def test_qrdqn_updates_as_stock(
+    kind: str, arguments: dict[str, Any], few_states: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tabulated, "_FEW_STATES", few_states)
+    steps, size = (1, 64) if few_states else (3, 16)
+    policy_kwargs = {"n_quantiles": 20, **arguments.get("policy_kwargs", {})}
+    arguments = {"learning_rate": 1e-3, **arguments, "policy_kwargs": policy_kwargs}
+    ours, theirs = twins(TabulatedQRDQN, QRDQN, kind, buffer_size=800, exploration_fraction=1.0, **arguments)
+    share_replay(ours, theirs)
+    assert_same_update(ours, theirs, steps, size)
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [(TabulatedDQN, DQN), (TabulatedQRDQN, QRDQN)])
+def test_the_same_seed_walks_and_learns_the_same(ours: type, theirs: type) -> None:
+    """The same greedy actions, the same minibatches: the weights agree after as many updates."""
+    settings: dict[str, Any] = {"exploration_initial_eps": 0.0, "exploration_final_eps": 0.0}
+    settings |= {"learning_starts": 0, "batch_size": 32, "learning_rate": 0.05, "train_freq": 1}
+    settings |= {"buffer_size": 2000, "target_update_interval": 160}
+    settings["policy_kwargs"] = {"optimizer_class": torch.optim.SGD}  # Adam would blow rounding up
+    pair = [
+        cls("MlpPolicy", batch("one_hot"), seed=0, device="cpu", **settings).learn(640)
+        for cls in (ours, theirs)
+    ]
+    observations = pair[0].env.observation.rows(pair[0].replay_buffer.observations[:40])
+    assert np.array_equal(observations, pair[1].replay_buffer.observations[:40])
+    assert np.array_equal(pair[0].replay_buffer.actions[:40], pair[1].replay_buffer.actions[:40, :, 0])
+    for mine, peer in zip(pair[0].policy.parameters(), pair[1].policy.parameters(), strict=True):
+        assert torch.allclose(mine, peer, rtol=1e-4, atol=1e-5)
+
+
+def test_losses_of_several_minibatches_at_once_are_those_of_each() -> None:
+    """Arrays may have leading axes, of runs that are trained together."""
+    quantiles, targets = np.random.default_rng(0).normal(size=(2, 3, 7, 16)).astype(np.float32)
+    losses, slopes = qrdqn_loss.losses_and_slopes(quantiles, targets)
+    for one, its_targets, loss, its_slopes in zip(quantiles, targets, losses, slopes, strict=True):
+        alone, slopes_alone = qrdqn_loss.losses_and_slopes(one, its_targets)
+        assert (alone == loss, np.array_equal(slopes_alone, its_slopes)) == (True, True)
+
+
 def test_dqn_looks_up_a_table_only_while_its_network_stands_still() -> None:
     ours, _ = twins(TabulatedDQN, DQN, "one_hot", buffer_size=800, target_update_interval=10_000)
     ours.exploration_rate = 0.0
     states = np.arange(30)
     before = ours._act(states, 0)
-    assert ours._q is not None
+    assert ours._online is not None
     with torch.no_grad():
         expected = ours.q_net(torch.as_tensor(ours.env.observation.table())).argmax(dim=1).numpy()
     assert np.array_equal(before, expected)
     ours.descend(states, (expected + 1) % 4, np.full(30, 50, dtype=np.float32))
-    assert ours._q is None
+    assert ours._online is None
     with torch.no_grad():
         expected = ours.q_net(torch.as_tensor(ours.env.observation.table())).argmax(dim=1).numpy()
     assert np.array_equal(ours._act(states, 0), expected)
@@ -283,6 +337,7 @@ class Watch(BaseCallback):
         (TabulatedPPO, PPO, {"n_steps": STEPS, "batch_size": 64}),
         (TabulatedA2C, A2C, {"n_steps": 5}),
         (TabulatedDQN, DQN, {"learning_starts": 100, "exploration_fraction": 1.0}),
+        (TabulatedQRDQN, QRDQN, {"learning_starts": 100, "policy_kwargs": {"n_quantiles": 5}}),
     ],
 )
 def test_callbacks_schedules_and_files_are_sb3s(
@@ -312,7 +367,7 @@ def test_callbacks_schedules_and_files_are_sb3s(
     loaded.learn(200, reset_num_timesteps=False)  # and it goes on training
 
 
-@pytest.mark.parametrize("agent", [*DEEP, "a2c"])
+@pytest.mark.parametrize("agent", [*DEEP, "a2c", "qrdqn"])
 def test_both_engines_train_and_leave_the_same_kind_of_run(agent: str, tmp_path: Path) -> None:
     runs = [
         train_in(tmp_path / engine, *SHORT[agent], f"agent.engine={engine}")
@@ -401,7 +456,9 @@ def test_what_is_known_is_covered(agent: str, engine: type, settings: list[str])
     assert algorithm_and_arguments(config)[0] is engine
 
 
-@pytest.mark.parametrize(("agent", "stock", "engine"), [("a2c", A2C, TabulatedA2C)])
+@pytest.mark.parametrize(
+    ("agent", "stock", "engine"), [("a2c", A2C, TabulatedA2C), ("qrdqn", QRDQN, TabulatedQRDQN)]
+)
 def test_a_class_with_its_arguments_is_covered_as_well(
     agent: str, stock: type, engine: type, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -410,14 +467,15 @@ def test_a_class_with_its_arguments_is_covered_as_well(
         assert isinstance(config, SB3Config)
         return algorithm_and_arguments(config)[0]
 
+    without = [f"~agent.arguments.{name}" for name in vars(configure(f"agent={agent}").agent)["arguments"]]
     assert chosen() is engine
     assert chosen("agent.engine=stock") is stock
-    assert chosen("agent.algorithm=sb3_contrib.MaskablePPO", "agent.arguments={}") is not engine
+    assert chosen("agent.algorithm=sb3_contrib.MaskablePPO", *without) is MaskablePPO
     assert capsys.readouterr().err == ""
     assert chosen("+agent.arguments.policy_kwargs.activation_fn=torch.nn.RReLU") is stock
     reason = "agent.arguments.policy_kwargs.activation_fn=torch.nn.RReLU is not known to give"
     assert f"engine: stock, since {reason}" in capsys.readouterr().err
-    with pytest.raises(InputError, match="agent.engine=fast: must be tabulated or stock"):
+    with pytest.raises(InputError, match=r"agent\.engine=fast: must be tabulated or stock"):
         check(configure(f"agent={agent}", "agent.engine=fast"))
 
 

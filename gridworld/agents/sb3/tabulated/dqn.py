@@ -1,6 +1,5 @@
 """DQN with the network run once per state.
 
-Greedy actions and targets are look-ups in tables of Q values, refreshed only when a network has changed.
 The loss of a minibatch, the mean Huber distance of Q(s_i, a_i) to its target y_i, touches the network only
 through the table Q, and there its gradient is a sum over samples:
 
@@ -12,201 +11,25 @@ gradient of the whole batch.
 
 from __future__ import annotations
 
-from typing import Any, cast
-
 import numpy as np
-import torch
-from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3 import DQN
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.type_aliases import RolloutReturn, TrainFreq
-from stable_baselines3.common.utils import should_collect_more_steps
-from stable_baselines3.common.vec_env import VecEnv
-from stable_baselines3.dqn.policies import QNetwork
-from torch import Tensor
 
-from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer
-from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of, smallest_integer
-from gridworld.agents.sb3.vec_env import GridWorldVecEnv, StateStep
-from gridworld.world.mdp import IntArray
-
-Float32Array = NDArray[np.float32]
+from gridworld.agents.sb3.tabulated.off_policy import Float32Array, TabulatedOffPolicy
+from gridworld.world.mdp import FloatArray, IntArray
 
 
-class StateReplayBuffer(ReplayBuffer):
-    """SB3's replay buffer with states in the smallest integer type in place of observations."""
-
-    def __init__(
-        self,
-        buffer_size: int,
-        observation_space: Any,
-        *arguments: Any,
-        num_states: int,
-        **options: Any,
-    ) -> None:
-        super().__init__(buffer_size, spaces.Discrete(1), *arguments, **options)
-        shape = (self.buffer_size, self.n_envs)
-        self.observations = np.zeros(shape, dtype=smallest_integer(num_states - 1))
-        self.next_observations = np.zeros_like(self.observations)
-        self.actions = np.zeros(shape, dtype=np.uint8)
-
-    def store(self, states: IntArray, actions: IntArray, step: StateStep) -> None:
-        """Add one step of every environment, from `states` (num_envs,) with `actions` (num_envs,)."""
-        at = self.pos
-        self.observations[at], self.actions[at] = states, actions
-        self.next_observations[at] = step.last_states
-        self.rewards[at], self.dones[at], self.timeouts[at] = step.rewards, step.dones, step.truncated
-        self.pos = (at + 1) % self.buffer_size
-        self.full |= self.pos == 0
-
-    def draw(self, batch_size: int) -> tuple[IntArray, IntArray, IntArray, Float32Array, Float32Array]:
-        """Draw a minibatch of B transitions; the random numbers are SB3's own.
-
-        Returns:
-            (B,) each: states (int64), actions (uint8), next states (int64), rewards and ends (float32);
-            time-outs are no ends.
-        """
-        steps = np.random.randint(0, self.buffer_size if self.full else self.pos, size=batch_size)
-        which = steps * self.n_envs + np.random.randint(0, high=self.n_envs, size=batch_size)
-        ends = self.dones.take(which) * (1 - self.timeouts.take(which))
-        states, following = self.observations.take(which), self.next_observations.take(which)
-        rewards = self.rewards.take(which)
-        return states.astype(np.int64), self.actions.take(which), following.astype(np.int64), rewards, ends
-
-
-class TabulatedDQN(DQN):
+class TabulatedDQN(TabulatedOffPolicy, DQN):
     """SB3's DQN on a `GridWorldVecEnv`, whose files stock `DQN.load` opens."""
 
-    env: GridWorldVecEnv
-    replay_buffer: StateReplayBuffer
-    derived = ("descent", "inputs", "_q", "_target_values")  # from the rest: no part of a checkpoint
+    network = "q_net"
 
-    def _setup_model(self) -> None:
-        observation = self.env.observation
-        self.replay_buffer_class = self.replay_buffer_class or StateReplayBuffer
-        self.replay_buffer_kwargs = {"num_states": observation.num_states}
-        super()._setup_model()
-        self.policy.set_training_mode(False)  # SB3's networks know no difference; switching takes time
-        self.descent = FlatOptimizer(self.policy.optimizer)
-        self.inputs = StateInputs(self.policy, observation)
-        self._q: Tensor | None = None  # of all states, with its graph, until the network changes
-        self._target_values: Float32Array | None = None  # (S,), until the target network changes
-
-    def _excluded_save_params(self) -> list[str]:
-        return [
-            *super()._excluded_save_params(),
-            *("replay_buffer_class", "replay_buffer_kwargs"),
-            *self.derived,
-        ]
-
-    def q_values(self, network: QNetwork, states: IntArray | None = None) -> Tensor:
-        """Q (U, A) of these states (U,) from a network, with its graph. None: of all states."""
-        observations = self.inputs.observations(states, network.q_net)
-        features = None
-        if observations is not None:
-            features = network.extract_features(observations, network.features_extractor)
-        return self.inputs.latent(network.q_net, states, features)
-
-    def collect_rollouts(
-        self,
-        env: VecEnv,
-        callback: BaseCallback,
-        train_freq: TrainFreq,
-        replay_buffer: ReplayBuffer,
-        action_noise: ActionNoise | None = None,
-        learning_starts: int = 0,
-        log_interval: int | None = None,
-    ) -> RolloutReturn:
-        """See SB3's `OffPolicyAlgorithm.collect_rollouts`."""
-        assert isinstance(env, GridWorldVecEnv)
-        assert isinstance(replay_buffer, StateReplayBuffer)
-        steps, episodes = 0, 0
-        callback.on_rollout_start()
-        states = env.states
-        while should_collect_more_steps(train_freq, steps, episodes):
-            actions = self._act(states, learning_starts)
-            done = env.step_states(actions)
-            rewards, dones, infos = done.rewards, done.dones, infos_of(done, env.num_envs)
-            self.num_timesteps += env.num_envs
-            steps += 1
-            callback.update_locals(locals())
-            if not callback.on_step():
-                return RolloutReturn(steps * env.num_envs, episodes, continue_training=False)
-            cast(Any, self.ep_info_buffer).extend([info["episode"] for info in done.ended.values()])
-            replay_buffer.store(states, actions, done)
-            states = done.states
-            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-            self._on_step()
-            for _ in done.ended:
-                episodes += 1
-                self._episode_num += 1
-                if log_interval is not None and self._episode_num % log_interval == 0:
-                    self.dump_logs()
-        self._last_obs = env.observation.rows(states)
-        callback.on_rollout_end()
-        return RolloutReturn(steps * env.num_envs, episodes, continue_training=True)
-
-    def _act(self, states: IntArray, learning_starts: int) -> IntArray:
-        """Uniformly random at first; then one coin decides for the whole batch, as in SB3."""
-        if self.num_timesteps < learning_starts or np.random.rand() < self.exploration_rate:
-            return self.action_space.np_random.integers(self.env.envs.mdp.num_actions, size=len(states))
-        which, index = self.inputs.distinct(states)
-        with torch.set_grad_enabled(which is None):
-            q = self._all_q() if which is None else self.q_values(self.q_net, which)
-        greedy: IntArray = q.detach().cpu().numpy().argmax(axis=1)
-        return greedy[index]
-
-    def _all_q(self) -> Tensor:
-        """Q of all states; one forward pass serves acting and the update that follows."""
-        if self._q is None:
-            self._q = self.q_values(self.q_net)
-        return self._q
-
-    def _on_step(self) -> None:
-        super()._on_step()
-        if self._n_calls % max(self.target_update_interval // self.n_envs, 1) == 0:
-            self._target_values = None
-
-    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """See SB3's `DQN.train`."""
-        self._update_learning_rate(self.policy.optimizer)
-        losses = []
-        for _ in range(gradient_steps):
-            states, actions, following, rewards, ends = self.replay_buffer.draw(batch_size)
-            targets = rewards + (1 - ends) * np.float32(self.gamma) * self._best_values(following)
-            losses.append(self.descend(states, actions, targets))
-        self._n_updates += gradient_steps
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/loss", np.mean(losses))
-
-    def descend(self, states: IntArray, actions: IntArray, targets: Float32Array) -> float:
-        """Make one step of the optimiser on a minibatch of B transitions.
-
-        Args:
-            states: (B,), integers.
-            actions: (B,), integers.
-            targets: (B,), float32.
-
-        Returns:
-            The Huber loss before the step.
-        """
-        which, index = self.inputs.distinct(states)
-        q = self._all_q() if which is None else self.q_values(self.q_net, which)
-        pair = index * q.shape[1] + actions
-        error = q.detach().cpu().numpy().ravel()[pair] - targets
+    @staticmethod
+    def loss_and_slopes(
+        outputs: Float32Array, index: IntArray, actions: IntArray, targets: Float32Array
+    ) -> tuple[float, FloatArray]:
+        """See `TabulatedOffPolicy.loss_and_slopes`; the Huber loss."""
+        pair = index * outputs.shape[1] + actions
+        error = outputs.ravel()[pair] - targets
         slope = np.maximum(np.minimum(error, 1), -1)
-        gradient = np.bincount(pair, slope, q.numel()) / len(pair)
-        self.descent.step([q], [gradient], self.max_grad_norm)
-        self._q = None
-        return float(slope @ (error - slope / 2)) / len(pair)
-
-    def _best_values(self, states: IntArray) -> Float32Array:
-        """max_a Q(s, a) of the target network."""
-        if self._target_values is None:
-            with torch.no_grad():
-                best = self.q_values(self.q_net_target).max(dim=1).values
-            self._target_values = best.cpu().numpy()
-        return self._target_values[states]
+        slopes = np.bincount(pair, slope, outputs.size) / len(pair)
+        return float(slope @ (error - slope / 2)) / len(pair), slopes

@@ -11,6 +11,7 @@ _MODULES = {
     "stable_baselines3.a2c.a2c": "a2c",
     "stable_baselines3.dqn.dqn": "dqn",
     "stable_baselines3.ppo.ppo": "ppo",
+    "sb3_contrib.qrdqn.qrdqn": "qrdqn",
 }
 
 
