@@ -24,16 +24,25 @@ ELEMENTWISE: tuple[type[torch.optim.Optimizer], ...] = (
     *(torch.optim.NAdam, torch.optim.RAdam, torch.optim.RMSprop, torch.optim.SGD),
 )
 
-_ENGINE: Any = torch.autograd.Variable._execution_engine
+# What torch.autograd's functions call once they have imported sympy, for shapes that are symbols.
+ENGINE: Any = torch.autograd.Variable._execution_engine
 
 
 class FlatOptimizer:
-    """Takes the steps of `optimizer` as SB3 does: gradients from zero, clipped by their common norm."""
+    """Takes the steps of `optimizer` as SB3 does: gradients from zero, clipped by their common norm.
 
-    def __init__(self, optimizer: torch.optim.Optimizer) -> None:
+    Args:
+        optimizer: the policy's.
+        parameters: those of its parameters that are to change; None: all.
+    """
+
+    def __init__(
+        self, optimizer: torch.optim.Optimizer, parameters: Sequence[nn.Parameter] | None = None
+    ) -> None:
         (group,) = optimizer.param_groups
         self._optimizer = optimizer
-        self._parameters: list[Tensor] = group["params"]
+        self._parameters: Sequence[Tensor] = group["params"] if parameters is None else parameters
+        self._leaves = () if parameters is None else tuple(parameters)  # of backward passes; (): all
         joined = torch.cat([parameter.detach().ravel() for parameter in self._parameters])
         self._joined = nn.Parameter(joined)
         self._gradient = self._joined.grad = torch.zeros_like(joined)
@@ -60,14 +69,13 @@ class FlatOptimizer:
         if self._parameters[0].grad is not self._gradients[0]:
             for parameter, view in zip(self._parameters, self._gradients, strict=True):
                 parameter.grad = view
-        # What torch.autograd.backward calls once it has imported sympy, for shapes that are symbols.
-        _ENGINE.run_backward(
+        ENGINE.run_backward(
             tuple(outputs),
             tuple(
                 torch.as_tensor(slope, dtype=output.dtype, device=output.device).view_as(output)
                 for output, slope in zip(outputs, slopes, strict=True)
             ),
-            *(False, False, ()),  # the graph is not kept, no graph of the gradients, all parameters
+            *(False, False, self._leaves),  # the graph is not kept, no graph of the gradients
             allow_unreachable=True,
             accumulate_grad=True,
         )

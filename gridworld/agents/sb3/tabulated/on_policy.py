@@ -51,15 +51,18 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
 
     env: GridWorldVecEnv
     policy: ActorCriticPolicy
-    derived = ("descent", "inputs", "_old")  # from the rest: no part of a checkpoint
+    derived: tuple[str, ...] = ("descent", "inputs", "_old")  # from the rest: no part of a checkpoint
 
     def _setup_model(self) -> None:
         self.rollout_buffer_class = self.rollout_buffer_class or StateRolloutBuffer
         super()._setup_model()
         self.policy.set_training_mode(False)  # SB3's networks know no difference; switching takes time
-        self.descent = FlatOptimizer(self.policy.optimizer)
         self.inputs = StateInputs(self.policy, self.env.observation)
+        self.descent = self._make_descent()
         self._old: Outputs  # of all states, from the policy that collected the rollout
+
+    def _make_descent(self) -> FlatOptimizer:
+        return FlatOptimizer(self.policy.optimizer)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "rollout_buffer_class", *self.derived]

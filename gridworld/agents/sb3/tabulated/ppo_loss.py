@@ -81,9 +81,9 @@ class Losses(NamedTuple):
 
 
 def log_softmax(logits: NDArray[Any]) -> NDArray[Any]:
-    """log π (U, A) of logits (U, A)."""
-    shifted: NDArray[Any] = logits - logits.max(axis=1, keepdims=True)
-    shifted -= np.log(np.exp(shifted).sum(axis=1, keepdims=True))
+    """log π (..., A) of logits (..., A)."""
+    shifted: NDArray[Any] = logits - logits.max(axis=-1, keepdims=True)
+    shifted -= np.log(np.exp(shifted).sum(axis=-1, keepdims=True))
     return shifted
 
 

@@ -6,7 +6,7 @@ and a sample's targets are the quantiles of the next state's best action (`tabul
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -47,5 +47,4 @@ class TabulatedQRDQN(TabulatedOffPolicy, QRDQN):  # type: ignore[misc]
         _, count, num_actions = outputs.shape
         where = index * count * num_actions + actions + num_actions * np.arange(count)[:, None]  # (N, B)
         loss, slopes = losses_and_slopes(outputs.ravel()[where], targets)
-        weights: FloatArray = slopes.ravel().astype(np.float64)
-        return float(loss), np.bincount(where.ravel(), weights, outputs.size)
+        return float(loss), cast(FloatArray, np.bincount(where.ravel(), slopes.ravel(), outputs.size))

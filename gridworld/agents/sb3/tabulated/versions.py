@@ -12,6 +12,7 @@ _MODULES = {
     "stable_baselines3.dqn.dqn": "dqn",
     "stable_baselines3.ppo.ppo": "ppo",
     "sb3_contrib.qrdqn.qrdqn": "qrdqn",
+    "sb3_contrib.trpo.trpo": "trpo",
 }
 
 
