@@ -76,6 +76,8 @@ class TabulatedTRPO(TabulatedOnPolicy, TRPO):  # type: ignore[misc]
             self._put(before + scale * step)
             with torch.no_grad():
                 log_prob = log_softmax(self.outputs(which)[0].cpu().numpy())
+            if not np.isfinite(log_prob).all():
+                raise FloatingPointError("the network's weights are no finite number")
             divergence = float(trpo_loss.divergence(log_prob, start, shares))
             reached = float(trpo_loss.surrogate(log_prob, old, gains))
             if divergence < self.target_kl and reached > surrogate:
@@ -94,13 +96,12 @@ class TabulatedTRPO(TabulatedOnPolicy, TRPO):  # type: ignore[misc]
 
         def damped_fisher(vector: Tensor) -> Tensor:
             curved = trpo_loss.curved(prob, shares, jacobian.push(vector))
-            return jacobian.pull(curved) + self.cg_damping * vector
+            return jacobian.pull(curved).add(vector, alpha=self.cg_damping)
 
         gradient = jacobian.pull(trpo_loss.surrogate_slope(start, old, gains))
         direction: Tensor = conjugate_gradient_solver(damped_fisher, gradient, max_iter=self.cg_max_steps)
         squared = 2 * self.target_kl / float(direction @ damped_fisher(direction))
-        step: Tensor = direction * np.sqrt(squared)
-        return step, start
+        return direction.mul(np.sqrt(squared)), start
 
     def _put(self, vector: Tensor) -> None:
         """Set the policy's parameters."""
