@@ -89,7 +89,7 @@ def assert_same_update(ours: Any, theirs: Any, *arguments: int) -> None:
         assert told[key] == pytest.approx(value, rel=1e-4, abs=1e-6), key
 
 
-def share_rollout(ours: Any, theirs: Any) -> None:
+def share_rollout(ours: Any, theirs: Any, is_moved: bool = True) -> None:
     steps = ours.n_steps
     for _ in range(-(-8 // steps)):  # walks have gone apart
         ours.collect_rollouts(ours.env, no_callback(ours), ours.rollout_buffer, steps)
@@ -101,6 +101,8 @@ def share_rollout(ours: Any, theirs: Any) -> None:
     for name in ("rewards", "episode_starts", "values", "log_probs", "advantages", "returns"):
         setattr(target, name, getattr(source, name).copy())
     target.full = True
+    if not is_moved:
+        return
     with torch.no_grad():  # the update begins away from the policy that collected
         for mine, peer in zip(ours.policy.parameters(), theirs.policy.parameters(), strict=True):
             mine += 0.05 * torch.randn_like(mine)
@@ -203,6 +205,29 @@ def test_trpo_updates_as_stock(
     assert all(moved) == (told == 1) == ("line_search_max_iter" not in arguments)
     kept = ours.policy.optimizer.state_dict()["state"].keys()
     assert kept == theirs.policy.optimizer.state_dict()["state"].keys() != set(range(len(moved)))
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "arguments"),
+    [
+        # RMSprop's first steps are of full size, however small a gradient is: rounding would grow.
+        (TabulatedA2C, A2C, {"n_steps": 8, "policy_kwargs": {"optimizer_class": torch.optim.SGD}}),
+        (TabulatedTRPO, TRPO, {"n_steps": 16, "batch_size": 256, "target_kl": 0.05}),
+    ],
+)
+def test_updates_that_follow_each_other_stay_together(
+    ours: Any, theirs: Any, arguments: dict[str, Any]
+) -> None:
+    ours, theirs = twins(ours, theirs, "one_hot", learning_rate=0.05, **arguments)
+    for update in range(12):
+        share_rollout(ours, theirs, is_moved=False)
+        for model in (ours, theirs):
+            model._update_current_progress_remaining(update, 13)
+            np.random.seed(update)
+            torch.manual_seed(update)
+            model.train()
+    for mine, peer in zip(ours.policy.parameters(), theirs.policy.parameters(), strict=True):
+        assert torch.allclose(mine, peer, rtol=1e-3, atol=1e-4)
 
 
 def test_trpos_curvature_is_the_divergences_second_derivative() -> None:

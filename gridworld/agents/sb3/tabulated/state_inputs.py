@@ -1,4 +1,4 @@
-"""Run the network once per state, not once per sample: the idea, and what both algorithms share.
+"""Run the network once per state, not once per sample: the idea, and what all algorithms share.
 
 A batch of B transitions in a world of S states holds at most S different observations. For a network f with
 parameters θ, whatever a loss makes of its outputs, it depends on θ only through the outputs at the states
