@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -14,7 +15,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env as dummy_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
+from gridworld.agents.sb3.constructor_arguments import algorithm_and_arguments
 from gridworld.agents.sb3.interop.make_vec_env import make_vec_env
+from gridworld.agents.sb3.schemas import SB3Config
 from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
 from gridworld.benchmark import peers
@@ -36,7 +39,7 @@ DQN_BATCH: dict[str, Any] = {  # with 64 environments: one update of 512 per ste
 
 
 def comparisons(workload: Workload) -> Iterator[Comparison]:
-    """PPO and DQN on 5x6, then on 200x200."""
+    """PPO and DQN on 5x6, the other tabulated algorithms there, then PPO and DQN on 200x200."""
     torch.set_num_threads(1)
     batch = partial(make_vec_env, n_envs=64)
     ppo, dqn = (
@@ -79,6 +82,14 @@ def comparisons(workload: Workload) -> Iterator[Comparison]:
             None if peers.why_not("SBX") else partial(peers.sbx, name, num_envs),
             peers.why_not("SBX"),
         )
+    for agent in ("a2c", *(("qrdqn", "trpo") if importlib.util.find_spec("sb3_contrib") else ())):
+        yield Comparison(
+            _TABLE,
+            f"{agent}, shipped settings",
+            _shipped(agent, "tabulated", workload.steps // 2),
+            "stock SB3, same batch and settings",
+            _shipped(agent, "stock", workload.steps // 4),
+        )
     large_map = partial(make_vec_env, n_envs=64, num_rows=200, num_cols=200)
     for name, ours, algorithm, settings in (
         ("PPO", ppo, TabulatedPPO, PPO_SMALL),
@@ -91,6 +102,18 @@ def comparisons(workload: Workload) -> Iterator[Comparison]:
             "the same on 5x6",
             ours,
         )
+
+
+def _shipped(agent: str, engine: str, steps: int) -> Callable[[], float]:
+    """Measures an agent as it is shipped, in one of the two loops."""
+    from gridworld.config.composition.compose import compose
+    from gridworld.config.composition.conf_folder import conf_folder
+
+    config = compose(conf_folder(), [f"agent={agent}", f"agent.engine={engine}"])
+    assert isinstance(config.agent, SB3Config)
+    algorithm, settings = algorithm_and_arguments(config.agent)
+    del settings["policy"]
+    return learner(algorithm, partial(make_vec_env, n_envs=config.n_envs), steps, **settings)
 
 
 def learner(

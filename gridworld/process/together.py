@@ -27,6 +27,7 @@ from gridworld.process.signals import stopped
 
 T = TypeVar("T")
 M = TypeVar("M")
+_GLOBAL: Any = np.random  # numpy's stubs do not know all of its functions
 Work = Callable[[Sequence[M]], Sequence[Exception | None]]
 
 
@@ -39,7 +40,7 @@ class _Waiting(Generic[M]):
     key: Hashable
 
 
-class _Task(greenlet):
+class _Task(greenlet):  # type: ignore[misc]
     """A task, its outcome, and its own random numbers while it does not run."""
 
     def __init__(self, function: Callable[[], Any]) -> None:
@@ -65,8 +66,8 @@ class _Task(greenlet):
     def resume(self, error: BaseException | None = None) -> None:
         """Let it run, with its random numbers, until it waits again or has ended; raise `error` in it."""
         torch = sys.modules.get("torch")
-        outside = np.random.get_bit_generator(), random.getstate(), _torch_numbers(torch)
-        np.random.set_bit_generator(self._bits)
+        outside = _GLOBAL.get_bit_generator(), random.getstate(), _torch_numbers(torch)
+        _GLOBAL.set_bit_generator(self._bits)
         random.setstate(self._python)
         if torch is not None and self._torch is not None:
             torch.set_rng_state(self._torch)
@@ -86,7 +87,7 @@ class _Task(greenlet):
             torch = sys.modules.get("torch")
             self._python, self._torch = random.getstate(), _torch_numbers(torch)
             bits, python, numbers = outside
-            np.random.set_bit_generator(bits)
+            _GLOBAL.set_bit_generator(bits)
             random.setstate(python)
             if torch is not None and numbers is not None:
                 torch.set_rng_state(numbers)

@@ -23,8 +23,9 @@ _printed: set[tuple[str, str, str, int]] = set()  # warnings that this process h
 class TrainLog(logging.Handler):
     """Takes Python's warnings, what is logged as one, and what is told on standard error, inside its block.
 
-    The lines are kept until there is a file. What goes to the terminal is the same as without it. Of runs that
-    train together (`process.together`), each has its own, which takes what comes while its run is at work.
+    The lines are kept until there is a file. What goes to the terminal is the same as without it. Of runs
+    that train together (`process.together`), each has its own, which takes what comes while its run is at
+    work.
     """
 
     _all: ClassVar[list[TrainLog]] = []  # inside whose blocks the process is

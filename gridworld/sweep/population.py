@@ -7,6 +7,7 @@ files and a folder of its own; `process.together` has them meet where the networ
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -148,7 +149,7 @@ def populations(
 
 def _even(entries: Sequence[JobEntry], count: int) -> list[Sequence[JobEntry]]:
     bounds = [len(entries) * part // count for part in range(count + 1)]
-    return [entries[start:end] for start, end in zip(bounds, bounds[1:], strict=False)]
+    return [entries[start:end] for start, end in itertools.pairwise(bounds)]
 
 
 def _most(population: int | str | None, launcher: DictConfig) -> int:

@@ -14,6 +14,7 @@ CASES = {
     ],
     "ppo": SHORT["ppo"],
     "ppo stock": [*SHORT["ppo"], "agent.engine=stock", "agent.log_interval=2"],
+    **{f"{name} stock": [*SHORT[name], "agent.engine=stock"] for name in ("a2c", "qrdqn", "trpo")},
     **{name: SHORT[name] for name in ("a2c", "qrdqn", "trpo", "q_learning", "sarsa", "expected_sarsa")},
 }
 LESS = ["recording.frames=false", "recording.gif=false", "env.slip=0.1"]

@@ -19,8 +19,8 @@ from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters
 from gridworld.agents.sb3.policy_outputs import Reading, epsilon_greedy, of_q, read, read_states
 from gridworld.agents.sb3.schemas import SB3Config
 from gridworld.agents.sb3.snapshot.callback import CheckpointCallback, check_finite, diverged
-from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
-from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
+from gridworld.agents.sb3.tabulated.off_policy import TabulatedOffPolicy
+from gridworld.agents.sb3.tabulated.on_policy import TabulatedOnPolicy
 from gridworld.bounds import within
 from gridworld.config.agents import AgentConfig
 from gridworld.errors import InputError
@@ -94,11 +94,11 @@ class SB3Agent:
         return float(getattr(self.model, "exploration_rate", 0.0))
 
     def _read(self, states: IntArray) -> Reading:
-        if isinstance(self.model, TabulatedPPO):
+        if isinstance(self.model, TabulatedOnPolicy):
             logits, values = self.model.outputs(states)
             return Reading(values[:, 0], logits.softmax(dim=1), None)
-        if isinstance(self.model, TabulatedDQN):
-            return of_q(self.model.q_values(self.model.q_net, states))
+        if isinstance(self.model, TabulatedOffPolicy):
+            return of_q(self.model.q_values(states))
         observations, _ = self.model.policy.obs_to_tensor(self.observation.rows(states))
         return read(self.model.policy, observations)
 

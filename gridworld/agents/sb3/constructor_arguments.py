@@ -17,9 +17,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import LinearSchedule
 
 from gridworld.agents.sb3.schemas import SB3CheckedConfig, SB3ClassConfig, SB3Config
-from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
-from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
 from gridworld.agents.sb3.tabulated.state_inputs import why_not
+from gridworld.agents.sb3.tabulated.versions import tabulated_version
 from gridworld.agents.sb3.validation import SCHEDULES
 from gridworld.config.agents import parse_schedule
 from gridworld.config.plain_settings import foreign_imports
@@ -71,26 +70,25 @@ def algorithm_and_arguments(
         fields = (field.name for field in dataclasses.fields(config) if field.name not in _OWN_FIELDS)
         arguments = _convert({name: getattr(config, name) for name in fields}, "agent.")
     arguments["policy"] = _policy(config, algorithm)
-    if isinstance(config, SB3CheckedConfig):
-        algorithm = _with_engine(config, algorithm, arguments, any(foreign_imports(list(callbacks))))
-    return algorithm, arguments
+    return _with_engine(config, algorithm, arguments, any(foreign_imports(list(callbacks)))), arguments
 
 
 def _with_engine(
-    config: SB3CheckedConfig,
+    config: SB3Config,
     algorithm: type[BaseAlgorithm],
     arguments: Arguments,
     has_own_callbacks: bool,
 ) -> type[BaseAlgorithm]:
     """SB3's own class, or the one that runs the network once per state where that gives the same."""
-    if config.engine == "tabulated":
-        own = (algorithm.policy_aliases["MlpPolicy"], algorithm.policy_aliases["CnnPolicy"])
-        reason = why_not(config, arguments["policy_kwargs"], arguments["policy"] in own)
-        if has_own_callbacks:
-            reason = "a callback of your own may read or change what only SB3's own loop has"
-        if reason is None:
-            return TabulatedDQN if config.algorithm == "DQN" else TabulatedPPO
-        tell(f"engine: stock, since {reason}")
+    tabulated = tabulated_version(algorithm)
+    if config.engine != "tabulated" or tabulated is None:
+        return algorithm
+    reason = why_not(config, algorithm, arguments)
+    if has_own_callbacks:
+        reason = "a callback of your own may read or change what only SB3's own loop has"
+    if reason is None:
+        return tabulated
+    tell(f"engine: stock, since {reason}")
     return algorithm
 
 

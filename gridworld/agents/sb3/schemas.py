@@ -71,6 +71,8 @@ class SB3Config(AgentConfig):
     # of SB3's learn(): episodes for DQN, iterations for PPO
     log_interval: int = field(default=1, metadata=affects(Effect.LABELS))
     policy: str = "MlpPolicy"
+    # the network runs once per state, where there is such a version; stock: SB3's own loop, once per sample
+    engine: str = "tabulated"
 
     @property
     def libraries(self) -> tuple[str, ...]:
@@ -105,7 +107,6 @@ class SB3ClassConfig(SB3Config):
 class SB3CheckedConfig(SB3Config):
     """A class of Stable-Baselines3 whose arguments are fields here, with their types."""
 
-    engine: str = "tabulated"  # the network runs once per state; stock: SB3's own loop, once per sample
     learning_rate: Schedule = 1e-3  # a number, or lin_NUMBER to fall linearly to 0 at the end of training
     batch_size: int = 64
     gamma: float = 0.99

@@ -44,6 +44,8 @@ def check(config: TrainConfig) -> None:
     agent = config.agent
     assert isinstance(agent, SB3Config)
     at_least("agent.log_interval", agent.log_interval, 1)
+    if agent.engine not in ENGINES:
+        raise InputError(f"agent.engine={agent.engine}: must be {' or '.join(ENGINES)}")
     for index, entry in enumerate(config.callbacks):
         _check_callback(f"callbacks[{index}]", entry)
     _check_observation(agent, config.observation.kind)
@@ -128,8 +130,6 @@ def _check_class(agent: SB3ClassConfig, n_envs: int) -> None:
 
 
 def _check_fields(agent: SB3CheckedConfig, config: TrainConfig) -> None:
-    if agent.engine not in ENGINES:
-        raise InputError(f"agent.engine={agent.engine}: must be {' or '.join(ENGINES)}")
     parse_schedule("agent.learning_rate", agent.learning_rate)
     at_least("agent.batch_size", agent.batch_size, 1)
     within("agent.gamma", agent.gamma, 0, 1)

@@ -1,4 +1,4 @@
-"""Jobs in this process, one after the other: Hydra's launcher `basic`, in a fifth of its time for each job."""
+"""Jobs in this process, one after the other, as Hydra's launcher `basic` runs them in five times the time."""
 
 from __future__ import annotations
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 import functools
 import gc
 import os
+import pickle
 import signal
 import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cloudpickle
 from hydra.core.singleton import Singleton
 from hydra.core.utils import JobReturn, JobStatus, setup_globals
 from hydra.types import HydraContext, TaskFunction
@@ -22,8 +22,8 @@ from omegaconf import DictConfig, open_dict
 
 from gridworld.process.signals import exiting, handling, send_sigterm
 from gridworld.storage.atomic_write import write_bytes
-from gridworld.sweep.hydra_job import run_job
 from gridworld.sweep.folder import STOP
+from gridworld.sweep.hydra_job import run_job
 from gridworld.sweep.job import StopSweep
 
 _THIS_PROCESS = uuid.uuid4().hex  # a number would not do: on another machine it may be in use too
@@ -44,6 +44,8 @@ class JobRunner:
 
     def packed(self) -> bytes:
         """This runner and Hydra's state, for `unpack` in another process."""
+        import cloudpickle  # here, since a sweep in one process needs none
+
         return bytes(cloudpickle.dumps((_THIS_PROCESS, os.getcwd(), Singleton.get_state(), self)))
 
     def run(self, overrides: Sequence[str], number: int, configures_logging: bool = True) -> JobReturn:
@@ -81,7 +83,7 @@ class JobRunner:
 @functools.lru_cache(maxsize=1)
 def unpack(state: bytes) -> JobRunner:
     """Make this process a worker of the sweep that `JobRunner.packed` is from; returns its runner."""
-    origin, folder, singletons, runner = cloudpickle.loads(state)
+    origin, folder, singletons, runner = pickle.loads(state)
     if origin != _THIS_PROCESS:  # the same where a launcher runs a job itself
         os.chdir(folder)  # map files may be named from there
         setup_globals()

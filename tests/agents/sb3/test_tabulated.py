@@ -9,19 +9,27 @@ import numpy as np
 import pytest
 import torch
 from helpers.support import DEEP, SHORT, configure, train_in
-from stable_baselines3 import DQN, PPO
+from sb3_contrib import QRDQN, TRPO, MaskablePPO
+from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from gridworld import GridWorldVectorEnv
+from gridworld.agents.sb3 import check
 from gridworld.agents.sb3.constructor_arguments import algorithm_and_arguments
 from gridworld.agents.sb3.schemas import SB3Config
+from gridworld.agents.sb3.tabulated import qrdqn_loss, trpo_loss
 from gridworld.agents.sb3.tabulated import state_inputs as tabulated
+from gridworld.agents.sb3.tabulated.a2c import TabulatedA2C
 from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
+from gridworld.agents.sb3.tabulated.ppo_loss import log_softmax
+from gridworld.agents.sb3.tabulated.qrdqn import TabulatedQRDQN
+from gridworld.agents.sb3.tabulated.trpo import TabulatedTRPO
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.envs.observations import make_observation
+from gridworld.errors import InputError
 
 NUM_ENVS, STEPS = 16, 32
 KINDS = ["one_hot", "coordinates", "none", "image"]
@@ -67,6 +75,7 @@ def assert_same_update(ours: Any, theirs: Any, *arguments: int) -> None:
     """Train both on what they hold; gradients, weights and everything logged agree to float32 rounding."""
     for model in (ours, theirs):
         np.random.seed(7)
+        torch.manual_seed(7)
         model.train(*arguments)
         model.logger.dump()
     for mine, peer in zip(ours.policy.parameters(), theirs.policy.parameters(), strict=True):
@@ -80,16 +89,20 @@ def assert_same_update(ours: Any, theirs: Any, *arguments: int) -> None:
         assert told[key] == pytest.approx(value, rel=1e-4, abs=1e-6), key
 
 
-def share_rollout(ours: TabulatedPPO, theirs: PPO) -> None:
-    ours.collect_rollouts(ours.env, no_callback(ours), ours.rollout_buffer, STEPS)
+def share_rollout(ours: Any, theirs: Any, is_moved: bool = True) -> None:
+    steps = ours.n_steps
+    for _ in range(-(-8 // steps)):  # walks have gone apart
+        ours.collect_rollouts(ours.env, no_callback(ours), ours.rollout_buffer, steps)
     source, target = ours.rollout_buffer, theirs.rollout_buffer
     target.reset()
     rows = ours.env.observation.rows(source.observations)
-    target.observations = rows.reshape(STEPS, NUM_ENVS, *target.obs_shape)
+    target.observations = rows.reshape(steps, NUM_ENVS, *target.obs_shape)
     target.actions = source.actions[..., None]
     for name in ("rewards", "episode_starts", "values", "log_probs", "advantages", "returns"):
         setattr(target, name, getattr(source, name).copy())
     target.full = True
+    if not is_moved:
+        return
     with torch.no_grad():  # the update begins away from the policy that collected
         for mine, peer in zip(ours.policy.parameters(), theirs.policy.parameters(), strict=True):
             mine += 0.05 * torch.randn_like(mine)
@@ -133,6 +146,103 @@ def test_ppo_updates_as_stock(
     assert_same_update(ours, theirs)
 
 
+@pytest.mark.parametrize(
+    ("kind", "arguments"),
+    [
+        *[(kind, {}) for kind in KINDS],
+        ("one_hot", {"ent_coef": 0.3, "vf_coef": 0.1, "gae_lambda": 0.9, "normalize_advantage": True}),
+        ("one_hot", {"use_rms_prop": False, "max_grad_norm": 0.01}),
+        ("none", {"policy_kwargs": {"net_arch": []}}),
+        ("coordinates", {"policy_kwargs": {"net_arch": {"pi": [8], "vf": [16, 16]}}}),
+        ("image", {"policy_kwargs": {"share_features_extractor": False}}),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("few_states", [1024, 0], ids=["all states", "distinct states"])
+def test_a2c_updates_as_stock(
+    kind: str, arguments: dict[str, Any], few_states: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tabulated, "_FEW_STATES", few_states)
+    steps = STEPS if few_states else 1  # of fewer samples than states
+    ours, theirs = twins(TabulatedA2C, A2C, kind, n_steps=steps, **arguments)
+    share_rollout(ours, theirs)
+    assert_same_update(ours, theirs)
+
+
+# Conjugate gradients on a convolutional network's weights would blow rounding up, in SB3's class as here.
+FEW_PRODUCTS = {"cg_max_steps": 2, "cg_damping": 1.0, "n_critic_updates": 1}
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments"),
+    [
+        *[(kind, {}) for kind in KINDS if kind != "image"],
+        *[("image", {**FEW_PRODUCTS, "policy_kwargs": {"share_features_extractor": x}}) for x in (0, 1)],
+        ("one_hot", {"normalize_advantage": False, "cg_max_steps": 3, "cg_damping": 1.0}),
+        ("one_hot", {"sub_sampling_factor": 3, "gae_lambda": 0.9}),
+        ("one_hot", {"target_kl": 0.5, "line_search_shrinking_factor": 0.5}),
+        ("one_hot", {"line_search_max_iter": 0}),
+        ("one_hot", {"policy_kwargs": {"optimizer_class": torch.optim.AdamW}}),
+        ("none", {"policy_kwargs": {"net_arch": []}}),
+        ("coordinates", {"policy_kwargs": {"net_arch": {"pi": [8], "vf": [16, 16]}}}),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("few_states", [1024, 0], ids=["all states", "distinct states"])
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size of")
+def test_trpo_updates_as_stock(
+    kind: str, arguments: dict[str, Any], few_states: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tabulated, "_FEW_STATES", few_states)
+    steps = STEPS if few_states else 1  # of fewer samples than states
+    arguments = {"n_steps": steps, "batch_size": 300, "n_critic_updates": 2, **arguments}
+    ours, theirs = twins(TabulatedTRPO, TRPO, kind, **arguments)
+    share_rollout(ours, theirs)
+    before = [parameter.detach().clone() for parameter in ours.policy.parameters()]
+    assert_same_update(ours, theirs)
+    moved = [not torch.equal(*pair) for pair in zip(before, ours.policy.parameters(), strict=True)]
+    told = ours.logger.output_formats[0].values["train/is_line_search_success"]
+    assert all(moved) == (told == 1) == ("line_search_max_iter" not in arguments)
+    kept = ours.policy.optimizer.state_dict()["state"].keys()
+    assert kept == theirs.policy.optimizer.state_dict()["state"].keys() != set(range(len(moved)))
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "arguments"),
+    [
+        # RMSprop's first steps are of full size, however small a gradient is: rounding would grow.
+        (TabulatedA2C, A2C, {"n_steps": 8, "policy_kwargs": {"optimizer_class": torch.optim.SGD}}),
+        (TabulatedTRPO, TRPO, {"n_steps": 16, "batch_size": 256, "target_kl": 0.05}),
+    ],
+)
+def test_updates_that_follow_each_other_stay_together(
+    ours: Any, theirs: Any, arguments: dict[str, Any]
+) -> None:
+    ours, theirs = twins(ours, theirs, "one_hot", learning_rate=0.05, **arguments)
+    for update in range(12):
+        share_rollout(ours, theirs, is_moved=False)
+        for model in (ours, theirs):
+            model._update_current_progress_remaining(update, 13)
+            np.random.seed(update)
+            torch.manual_seed(update)
+            model.train()
+    for mine, peer in zip(ours.policy.parameters(), theirs.policy.parameters(), strict=True):
+        assert torch.allclose(mine, peer, rtol=1e-3, atol=1e-4)
+
+
+def test_trpos_curvature_is_the_divergences_second_derivative() -> None:
+    """The table's Fisher product against finite differences of the slope of the divergence."""
+    rng = np.random.default_rng(0)
+    logits, move = rng.normal(size=(2, 5, 4)), rng.normal(size=(2, 5, 4))
+    shares, start = rng.random((2, 5)), log_softmax(logits)
+    half = 1e-4
+    ahead, behind, here = (
+        trpo_loss.divergence(log_softmax(logits + step * move), start, shares) for step in (half, -half, 0)
+    )
+    product = (move * trpo_loss.curved(np.exp(start), shares, move)).sum(axis=(-2, -1))
+    assert np.allclose((ahead - 2 * here + behind) / half**2, product, rtol=1e-4)
+
+
 def test_ppo_collects_what_stock_would_compute() -> None:
     ours, theirs = twins(TabulatedPPO, PPO, "one_hot", n_steps=STEPS, batch_size=64)
     ours.collect_rollouts(ours.env, no_callback(ours), ours.rollout_buffer, STEPS)
@@ -159,7 +269,7 @@ def test_advantages_are_sb3s_to_the_last_bit() -> None:
         assert np.array_equal(getattr(ours.rollout_buffer, name), getattr(theirs.rollout_buffer, name))
 
 
-def share_replay(ours: TabulatedDQN, theirs: DQN) -> None:
+def share_replay(ours: Any, theirs: Any) -> None:
     frequency = TrainFreq(STEPS, TrainFrequencyUnit.STEP)
     ours.collect_rollouts(ours.env, no_callback(ours), frequency, ours.replay_buffer)
     source, target = ours.replay_buffer, theirs.replay_buffer
@@ -174,7 +284,8 @@ def share_replay(ours: TabulatedDQN, theirs: DQN) -> None:
     assert source.timeouts.sum() > 0
     assert source.dones.sum() > source.timeouts.sum()
     with torch.no_grad():  # a target network of its own
-        for mine, peer in zip(ours.q_net_target.parameters(), theirs.q_net_target.parameters(), strict=True):
+        targets = (getattr(model, f"{ours.network}_target").parameters() for model in (ours, theirs))
+        for mine, peer in zip(*targets, strict=True):
             mine += 0.1 * torch.randn_like(mine)
             peer.copy_(mine)
     ours._target_values = None
@@ -202,17 +313,67 @@ def test_dqn_updates_as_stock(
     assert_same_update(ours, theirs, steps, size)
 
 
+@pytest.mark.parametrize(
+    ("kind", "arguments"),
+    [
+        *[(kind, {}) for kind in KINDS],
+        ("one_hot", {"max_grad_norm": 1e-3, "gamma": 0.5}),
+        ("one_hot", {"policy_kwargs": {"net_arch": [], "n_quantiles": 7}}),
+        ("none", {"policy_kwargs": {"n_quantiles": 1, "optimizer_class": torch.optim.SGD}}),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("few_states", [1024, 0], ids=["all states", "distinct states"])
+def test_qrdqn_updates_as_stock(
+    kind: str, arguments: dict[str, Any], few_states: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tabulated, "_FEW_STATES", few_states)
+    steps, size = (1, 64) if few_states else (3, 16)
+    policy_kwargs = {"n_quantiles": 20, **arguments.get("policy_kwargs", {})}
+    arguments = {"learning_rate": 1e-3, **arguments, "policy_kwargs": policy_kwargs}
+    ours, theirs = twins(TabulatedQRDQN, QRDQN, kind, buffer_size=800, exploration_fraction=1.0, **arguments)
+    share_replay(ours, theirs)
+    assert_same_update(ours, theirs, steps, size)
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [(TabulatedDQN, DQN), (TabulatedQRDQN, QRDQN)])
+def test_the_same_seed_walks_and_learns_the_same(ours: type, theirs: type) -> None:
+    """The same greedy actions, the same minibatches: the weights agree after as many updates."""
+    settings: dict[str, Any] = {"exploration_initial_eps": 0.0, "exploration_final_eps": 0.0}
+    settings |= {"learning_starts": 0, "batch_size": 32, "learning_rate": 0.05, "train_freq": 1}
+    settings |= {"buffer_size": 2000, "target_update_interval": 160}
+    settings["policy_kwargs"] = {"optimizer_class": torch.optim.SGD}  # Adam would blow rounding up
+    pair = [
+        cls("MlpPolicy", batch("one_hot"), seed=0, device="cpu", **settings).learn(640)
+        for cls in (ours, theirs)
+    ]
+    observations = pair[0].env.observation.rows(pair[0].replay_buffer.observations[:40])
+    assert np.array_equal(observations, pair[1].replay_buffer.observations[:40])
+    assert np.array_equal(pair[0].replay_buffer.actions[:40], pair[1].replay_buffer.actions[:40, :, 0])
+    for mine, peer in zip(pair[0].policy.parameters(), pair[1].policy.parameters(), strict=True):
+        assert torch.allclose(mine, peer, rtol=1e-4, atol=1e-5)
+
+
+def test_losses_of_several_minibatches_at_once_are_those_of_each() -> None:
+    """Arrays may have leading axes, of runs that are trained together."""
+    quantiles, targets = np.random.default_rng(0).normal(size=(2, 3, 7, 16)).astype(np.float32)
+    losses, slopes = qrdqn_loss.losses_and_slopes(quantiles, targets)
+    for one, its_targets, loss, its_slopes in zip(quantiles, targets, losses, slopes, strict=True):
+        alone, slopes_alone = qrdqn_loss.losses_and_slopes(one, its_targets)
+        assert (alone == loss, np.array_equal(slopes_alone, its_slopes)) == (True, True)
+
+
 def test_dqn_looks_up_a_table_only_while_its_network_stands_still() -> None:
     ours, _ = twins(TabulatedDQN, DQN, "one_hot", buffer_size=800, target_update_interval=10_000)
     ours.exploration_rate = 0.0
     states = np.arange(30)
     before = ours._act(states, 0)
-    assert ours._q is not None
+    assert ours._online is not None
     with torch.no_grad():
         expected = ours.q_net(torch.as_tensor(ours.env.observation.table())).argmax(dim=1).numpy()
     assert np.array_equal(before, expected)
     ours.descend(states, (expected + 1) % 4, np.full(30, 50, dtype=np.float32))
-    assert ours._q is None
+    assert ours._online is None
     with torch.no_grad():
         expected = ours.q_net(torch.as_tensor(ours.env.observation.table())).argmax(dim=1).numpy()
     assert np.array_equal(ours._act(states, 0), expected)
@@ -254,7 +415,10 @@ class Watch(BaseCallback):
     ("ours", "theirs", "arguments"),
     [
         (TabulatedPPO, PPO, {"n_steps": STEPS, "batch_size": 64}),
+        (TabulatedA2C, A2C, {"n_steps": 5}),
+        (TabulatedTRPO, TRPO, {"n_steps": STEPS, "batch_size": 64}),
         (TabulatedDQN, DQN, {"learning_starts": 100, "exploration_fraction": 1.0}),
+        (TabulatedQRDQN, QRDQN, {"learning_starts": 100, "policy_kwargs": {"n_quantiles": 5}}),
     ],
 )
 def test_callbacks_schedules_and_files_are_sb3s(
@@ -284,7 +448,7 @@ def test_callbacks_schedules_and_files_are_sb3s(
     loaded.learn(200, reset_num_timesteps=False)  # and it goes on training
 
 
-@pytest.mark.parametrize("agent", DEEP)
+@pytest.mark.parametrize("agent", [*DEEP, "a2c", "qrdqn", "trpo"])
 def test_both_engines_train_and_leave_the_same_kind_of_run(agent: str, tmp_path: Path) -> None:
     runs = [
         train_in(tmp_path / engine, *SHORT[agent], f"agent.engine={engine}")
@@ -371,6 +535,30 @@ def test_what_is_known_is_covered(agent: str, engine: type, settings: list[str])
     config = configure(f"agent={agent}", *settings).agent
     assert isinstance(config, SB3Config)
     assert algorithm_and_arguments(config)[0] is engine
+
+
+@pytest.mark.parametrize(
+    ("agent", "stock", "engine"),
+    [("a2c", A2C, TabulatedA2C), ("qrdqn", QRDQN, TabulatedQRDQN), ("trpo", TRPO, TabulatedTRPO)],
+)
+def test_a_class_with_its_arguments_is_covered_as_well(
+    agent: str, stock: type, engine: type, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def chosen(*settings: str) -> type:
+        config = configure(f"agent={agent}", *settings).agent
+        assert isinstance(config, SB3Config)
+        return algorithm_and_arguments(config)[0]
+
+    without = [f"~agent.arguments.{name}" for name in vars(configure(f"agent={agent}").agent)["arguments"]]
+    assert chosen() is engine
+    assert chosen("agent.engine=stock") is stock
+    assert chosen("agent.algorithm=sb3_contrib.MaskablePPO", *without) is MaskablePPO
+    assert capsys.readouterr().err == ""
+    assert chosen("+agent.arguments.policy_kwargs.activation_fn=torch.nn.RReLU") is stock
+    reason = "agent.arguments.policy_kwargs.activation_fn=torch.nn.RReLU is not known to give"
+    assert f"engine: stock, since {reason}" in capsys.readouterr().err
+    with pytest.raises(InputError, match=r"agent\.engine=fast: must be tabulated or stock"):
+        check(configure(f"agent={agent}", "agent.engine=fast"))
 
 
 def test_a_policy_of_sb3s_by_its_path_is_covered() -> None:

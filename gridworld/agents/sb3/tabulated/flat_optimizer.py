@@ -24,21 +24,29 @@ ELEMENTWISE: tuple[type[torch.optim.Optimizer], ...] = (
     *(torch.optim.NAdam, torch.optim.RAdam, torch.optim.RMSprop, torch.optim.SGD),
 )
 
-_ENGINE: Any = torch.autograd.Variable._execution_engine
+# What torch.autograd's functions call once they have imported sympy, for shapes that are symbols.
+ENGINE: Any = torch.autograd.Variable._execution_engine
 
 
 class FlatOptimizer:
     """Takes the steps of `optimizer` as SB3 does: gradients from zero, clipped by their common norm.
+
+    Args:
+        optimizer: the policy's.
+        parameters: those of its parameters that are to change; None: all.
 
     Attributes:
         weights: (N,), all parameters.
         gradient: (N,), theirs.
     """
 
-    def __init__(self, optimizer: torch.optim.Optimizer) -> None:
+    def __init__(
+        self, optimizer: torch.optim.Optimizer, parameters: Sequence[nn.Parameter] | None = None
+    ) -> None:
         (group,) = optimizer.param_groups
         self._optimizer = optimizer
-        self.parameters: list[Tensor] = group["params"]
+        self.parameters: Sequence[Tensor] = group["params"] if parameters is None else parameters
+        self._leaves = () if parameters is None else tuple(parameters)  # of backward passes; (): all
         self.weights = torch.cat([parameter.detach().ravel() for parameter in self.parameters])
         self._joined = nn.Parameter(self.weights)
         self.gradient = self._joined.grad = torch.zeros_like(self.weights)
@@ -76,7 +84,7 @@ class FlatOptimizer:
         """Set the gradient to that of a loss with these slopes in the network's outputs."""
         self.gradient.zero_()
         self._attach()
-        run_backward(outputs, slopes)
+        run_backward(outputs, slopes, self._leaves)
 
     def _attach(self) -> None:
         """Let each parameter's gradient be a view, should somebody have removed it."""
@@ -149,24 +157,28 @@ class FlatOptimizer:
     def cut(self, joined: Tensor) -> list[Tensor]:
         """Vectors (..., N) of all weights, cut into views of the parameters' shapes."""
         parts = torch.split(joined, [parameter.numel() for parameter in self.parameters], dim=-1)
-        return [part.unflatten(-1, of.shape) for part, of in zip(parts, self.parameters, strict=True)]
+        pairs = zip(parts, self.parameters, strict=True)
+        return [part.view(*part.shape[:-1], *of.shape) for part, of in pairs]
 
 
 def run_backward(
-    outputs: Sequence[Tensor], slopes: Sequence[NDArray[Any]], leaves: Sequence[Tensor] = ()
+    outputs: Sequence[Tensor],
+    slopes: Sequence[NDArray[Any]],
+    leaves: Sequence[Tensor] = (),
+    accumulates: bool = True,
 ) -> Sequence[Tensor]:
     """Take a loss's slopes in the outputs back to the weights.
 
     Args:
         outputs: of a network, with their graph, which is used up.
         slopes: an array for each output.
-        leaves: the weights whose gradients are asked for; without them, each weight's is added to its own.
+        leaves: the weights whose gradients are asked for; (): all.
+        accumulates: whether gradients are added to those that the weights have.
 
     Returns:
-        The gradients of `leaves`.
+        The gradients of `leaves`, if they were not added.
     """
-    # What torch.autograd.backward calls once it has imported sympy, for shapes that are symbols.
-    gradients: Sequence[Tensor] = _ENGINE.run_backward(
+    gradients: Sequence[Tensor] = ENGINE.run_backward(
         tuple(outputs),
         tuple(
             torch.as_tensor(slope, dtype=output.dtype, device=output.device).view_as(output)
@@ -174,7 +186,7 @@ def run_backward(
         ),
         *(False, False, tuple(leaves)),  # the graph is not kept, no graph of the gradients
         allow_unreachable=True,
-        accumulate_grad=not leaves,
+        accumulate_grad=accumulates,
     )
     return gradients
 

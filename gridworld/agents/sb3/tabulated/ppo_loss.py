@@ -25,6 +25,7 @@ J. Schulman et al., Proximal Policy Optimization Algorithms, 2017, has the losse
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -67,8 +68,8 @@ class Sums:
 
     def of(self, rows: IntArray) -> Sums:
         """Those of some of the runs; the deviation is theirs already."""
-        tables = (self.positive, self.negative, self.pairs, self.states, self.mean_return)
-        return Sums(*(table[rows] for table in tables), self.deviation)
+        of_pairs = self.positive[rows], self.negative[rows], self.pairs[rows]
+        return Sums(*of_pairs, self.states[rows], self.mean_return[rows], self.deviation)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -85,6 +86,11 @@ class Weights:
         vf = self.clip_range_vf
         clip_range_vf = None if vf is None else vf[rows]
         return Weights(self.clip_range[rows], clip_range_vf, self.ent_coef[rows], self.vf_coef[rows])
+
+
+def column(numbers: Sequence[float]) -> FloatArray:
+    """A setting of P runs as `Weights` has it."""
+    return np.array(numbers, dtype=np.float64).reshape(-1, 1, 1)
 
 
 class Losses(NamedTuple):

@@ -35,11 +35,11 @@ class Tabulated(Protocol):
     descent: FlatOptimizer
     inputs: Any  # `state_inputs.StateInputs`
 
-    def outputs(self) -> tuple[Tensor, ...]:
+    def outputs_alone(self) -> Sequence[Tensor]:
         """What its network says of all states, (S, ...) each, with the graph."""
 
-    def outputs_of_all(self, leaves: Leaves) -> tuple[Tensor, ...]:
-        """The same of P networks of this shape, (P, S, ...) each."""
+    def outputs_together(self, leaves: Leaves) -> Sequence[Tensor]:
+        """The same of P networks of this shape, (P, S, ...) each, by their weights of `SideBySide`."""
 
 
 class Member(Protocol):
@@ -88,11 +88,11 @@ def _try_out(models: Sequence[Tabulated]) -> bool:
     generator = np.random.default_rng(0)
     optimizers = [model.descent for model in models]
     with SideBySide(optimizers) as rows:
-        outputs = models[0].outputs_of_all(rows.leaves)
+        outputs = models[0].outputs_together(rows.leaves)
         slopes = [generator.normal(size=output.shape) for output in outputs]
         gradients = rows.backward(outputs, slopes)
         for row, model in enumerate(models):
-            alone = model.outputs()
+            alone = model.outputs_alone()
             if not all(torch.equal(mine, all_[row]) for mine, all_ in zip(alone, outputs, strict=True)):
                 return False
             model.descent.backward(alone, [slope[row] for slope in slopes])
@@ -178,7 +178,7 @@ class SideBySide:
 
     def backward(self, outputs: Sequence[Tensor], slopes: Sequence[NDArray[Any]]) -> Tensor:
         """Take a loss's slopes in the outputs back to the gradients (P, N) of several."""
-        gradients = run_backward(outputs, slopes, tuple(self.leaves.values()))
+        gradients = run_backward(outputs, slopes, tuple(self.leaves.values()), accumulates=False)
         torch.cat([each.flatten(1) for each in gradients], dim=1, out=self._gradients)
         self._gradients += 0  # as each is added to 0 where there is one network, and -0 becomes 0
         return self._gradients
@@ -217,7 +217,7 @@ def forward(network: Iterable[nn.Module], leaves: Leaves, features: Tensor | Non
             continue
         if hidden.dim() == 2:
             hidden = hidden.expand(len(weight), *hidden.shape)
-        hidden = _Linear.apply(hidden, weight, bias)
+        hidden = _linear(hidden, weight, bias)
     assert hidden is not None
     return hidden
 
@@ -241,6 +241,9 @@ class _Linear(torch.autograd.Function):
         elif ctx.needs_input_grad[0]:
             of_inputs = torch.bmm(slope, weight)
         return of_inputs, torch.bmm(slope.transpose(1, 2), inputs), slope.sum(1, keepdim=True)
+
+
+_linear: Any = _Linear.apply
 
 
 def can_stand(*networks: nn.Module) -> bool:

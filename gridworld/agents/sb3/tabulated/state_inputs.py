@@ -1,4 +1,4 @@
-"""Run the network once per state, not once per sample: the idea, and what both algorithms share.
+"""Run the network once per state, not once per sample: the idea, and what all algorithms share.
 
 A batch of B transitions in a world of S states holds at most S different observations. For a network f with
 parameters θ, whatever a loss makes of its outputs, it depends on θ only through the outputs at the states
@@ -22,10 +22,12 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from torch import Tensor, nn
 
-from gridworld.agents.sb3.schemas import DQNConfig, PPOConfig, SB3CheckedConfig
+from gridworld.agents.sb3.schemas import SB3ClassConfig, SB3Config
 from gridworld.agents.sb3.tabulated.flat_optimizer import ELEMENTWISE
 from gridworld.agents.sb3.tabulated.side_by_side import can_stand
 from gridworld.agents.sb3.vec_env import StateStep
@@ -38,10 +40,16 @@ ACTIVATIONS = (
     *(nn.LeakyReLU, nn.LogSigmoid, nn.Mish, nn.PReLU, nn.ReLU, nn.ReLU6, nn.SELU, nn.SiLU, nn.Sigmoid),
     *(nn.Softplus, nn.Softshrink, nn.Softsign, nn.Tanh, nn.Tanhshrink),
 )
+# Of a policy's classes: those that are known to fit, and why another one need not.
+_CLASSES: tuple[tuple[str, tuple[type, ...], str], ...] = (
+    ("activation_fn", ACTIVATIONS, "is not known to give the same for the same number always"),
+    ("features_extractor_class", (), "may keep more than a function of the state"),
+    ("optimizer_class", ELEMENTWISE, "may look at more than a weight at a time"),
+)
 _FEW_STATES = 1024  # up to here all states are cheaper than finding out which ones a batch holds
 
 
-def why_not(config: SB3CheckedConfig, classes: Mapping[str, type], is_own_policy: bool) -> str | None:
+def why_not(config: SB3Config, algorithm: type[BaseAlgorithm], arguments: Mapping[str, Any]) -> str | None:
     """Why these settings need SB3's own loop, or None where the tabulated one gives the same.
 
     It does where the network's outputs at a state follow from the parameters and that state alone: whatever
@@ -50,34 +58,28 @@ def why_not(config: SB3CheckedConfig, classes: Mapping[str, type], is_own_policy
 
     Args:
         config: the agent's settings.
-        classes: those of its `policy_kwargs`, imported.
-        is_own_policy: whether its policy is one of the algorithm's own.
+        algorithm: its class, one of SB3's that has a tabulated version.
+        arguments: of the class, with classes imported.
     """
-    if not is_own_policy:
+    where, given = "agent", vars(config)
+    if isinstance(config, SB3ClassConfig):
+        where, given = "agent.arguments", config.arguments
+    classes = arguments.get("policy_kwargs", {})
+    if arguments["policy"] not in (algorithm.policy_aliases[name] for name in ("MlpPolicy", "CnnPolicy")):
         return f"agent.policy={config.policy} may compute more than a function of the state"
-    if classes.get("activation_fn", nn.ReLU) not in ACTIVATIONS:
-        return (
-            f"agent.policy_kwargs.activation_fn={config.policy_kwargs.activation_fn} is not known to give "
-            "the same for the same number always"
-        )
-    if config.policy_kwargs.features_extractor_class is not None:
-        return "agent.policy_kwargs.features_extractor_class may keep more than a function of the state"
-    if classes.get("optimizer_class", torch.optim.Adam) not in ELEMENTWISE:
-        optimizer = config.policy_kwargs.optimizer_class
-        return f"agent.policy_kwargs.optimizer_class={optimizer} may look at more than a weight at a time"
-    if isinstance(config, DQNConfig):
-        if config.replay_buffer_class is not None or config.replay_buffer_kwargs:
-            return "agent.replay_buffer_class is not the plain replay buffer"
-        if config.optimize_memory_usage:
-            return "agent.optimize_memory_usage changes what the replay buffer samples"
-        if config.n_steps > 1:
-            return "agent.n_steps above 1 needs SB3's n-step replay buffer"
-        return None
-    if isinstance(config, PPOConfig):
-        if config.rollout_buffer_class is not None or config.rollout_buffer_kwargs:
-            return "agent.rollout_buffer_class is not the plain rollout buffer"
-        return None
-    return f"{config.algorithm} has no tabulated version"
+    for name, known, reason in _CLASSES:
+        if name in classes and classes[name] not in known:
+            kwargs = given["policy_kwargs"]
+            path = (kwargs if isinstance(kwargs, dict) else vars(kwargs))[name]
+            return f"{where}.policy_kwargs.{name}={path} {reason}"
+    for name in ("replay_buffer", "rollout_buffer"):
+        if arguments.get(f"{name}_class") is not None or arguments.get(f"{name}_kwargs"):
+            return f"{where}.{name}_class is not the plain {name.replace('_', ' ')}"
+    if arguments.get("optimize_memory_usage"):
+        return f"{where}.optimize_memory_usage changes what the replay buffer samples"
+    if issubclass(algorithm, OffPolicyAlgorithm) and arguments.get("n_steps", 1) > 1:
+        return f"{where}.n_steps above 1 needs SB3's n-step replay buffer"
+    return None
 
 
 class StateInputs:

@@ -1,0 +1,376 @@
+"""What the tabulated off-policy algorithms share: acting, storing and targets, by tables of the networks.
+
+Greedy actions and targets are look-ups in tables, refreshed only when a network has changed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import RolloutReturn, TrainFreq
+from stable_baselines3.common.utils import should_collect_more_steps
+from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
+
+from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer, not_finite
+from gridworld.agents.sb3.tabulated.side_by_side import Leaves, SideBySide, forward, update_together
+from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of, smallest_integer
+from gridworld.agents.sb3.vec_env import GridWorldVecEnv, StateStep
+from gridworld.process.together import chance, meet
+from gridworld.world.mdp import FloatArray, IntArray
+
+Float32Array = NDArray[np.float32]
+
+
+class StateReplayBuffer(ReplayBuffer):
+    """SB3's replay buffer with states in the smallest integer type in place of observations."""
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: Any,
+        *arguments: Any,
+        num_states: int,
+        **options: Any,
+    ) -> None:
+        super().__init__(buffer_size, spaces.Discrete(1), *arguments, **options)
+        shape = (self.buffer_size, self.n_envs)
+        self.observations = np.zeros(shape, dtype=smallest_integer(num_states - 1))
+        self.next_observations = np.zeros_like(self.observations)
+        self.actions = np.zeros(shape, dtype=np.uint8)
+
+    def store(self, states: IntArray, actions: IntArray, step: StateStep) -> None:
+        """Add one step of every environment, from `states` (num_envs,) with `actions` (num_envs,)."""
+        at = self.pos
+        self.observations[at], self.actions[at] = states, actions
+        self.next_observations[at] = step.last_states
+        self.rewards[at], self.dones[at], self.timeouts[at] = step.rewards, step.dones, step.truncated
+        self.pos = (at + 1) % self.buffer_size
+        self.full |= self.pos == 0
+
+    def draw(
+        self, batch_size: int, chance: np.random.RandomState
+    ) -> tuple[IntArray, IntArray, IntArray, Float32Array, Float32Array]:
+        """Draw a minibatch of B transitions; drawn from numpy's global generator, they are SB3's own.
+
+        Returns:
+            (B,) each: states (int64), actions (uint8), next states (int64), rewards and ends (float32);
+            time-outs are no ends.
+        """
+        steps = chance.randint(0, self.buffer_size if self.full else self.pos, size=batch_size)
+        which = steps * self.n_envs + chance.randint(0, high=self.n_envs, size=batch_size)
+        ends = self.dones.take(which) * (1 - self.timeouts.take(which))
+        states, following = self.observations.take(which), self.next_observations.take(which)
+        rewards = self.rewards.take(which)
+        return states.astype(np.int64), self.actions.take(which), following.astype(np.int64), rewards, ends
+
+
+class TabulatedOffPolicy(OffPolicyAlgorithm):
+    """An off-policy algorithm of SB3's kind on a `GridWorldVecEnv`; comes before SB3's class."""
+
+    env: GridWorldVecEnv
+    replay_buffer: StateReplayBuffer
+    # From the rest: no part of a checkpoint.
+    derived = (
+        "descent",
+        "inputs",
+        "_online",
+        "_greedy",
+        "_target_values",
+    )
+    # Of the online network here and, with "_target", of the target network; and of the layers in either.
+    network: str
+    exploration_rate: float
+    max_grad_norm: Any  # a number, or None where it is not clipped
+    target_update_interval: int
+    _n_calls: int
+
+    def _setup_model(self) -> None:
+        observation = self.env.observation
+        self.replay_buffer_class = self.replay_buffer_class or StateReplayBuffer
+        self.replay_buffer_kwargs = {"num_states": observation.num_states}
+        super()._setup_model()
+        self.policy.set_training_mode(False)  # SB3's networks know no difference; switching takes time
+        self.descent = FlatOptimizer(self.policy.optimizer)
+        self.inputs = StateInputs(self.policy, observation)
+        self._online: Tensor | None = None  # of all states, with its graph, until the network changes
+        self._greedy: IntArray | None = None  # (S,), likewise
+        self._target_values: Float32Array | None = None  # (..., S), until the target network changes
+
+    def _excluded_save_params(self) -> list[str]:
+        return [
+            *super()._excluded_save_params(),
+            *("replay_buffer_class", "replay_buffer_kwargs"),
+            *self.derived,
+        ]
+
+    def outputs(self, network: Any, states: IntArray | None = None) -> Tensor:
+        """Run one of the two networks.
+
+        Args:
+            network: the online or the target network.
+            states: (U,), integers; None: all.
+
+        Returns:
+            (U, ...), with its graph.
+        """
+        layers = getattr(network, self.network)
+        observations = self.inputs.observations(states, layers)
+        features = None
+        if observations is not None:
+            features = network.extract_features(observations, network.features_extractor)
+        return self.inputs.latent(layers, states, features)
+
+    def outputs_alone(self) -> tuple[Tensor]:
+        """See `side_by_side.Tabulated`."""
+        return (self.outputs(getattr(self, self.network)),)
+
+    def outputs_together(self, leaves: Leaves) -> tuple[Tensor]:
+        """See `side_by_side.Tabulated`."""
+        network = getattr(self, self.network)
+        layers, features = getattr(network, self.network), None
+        observations = self.inputs.observations(None, layers)
+        if observations is not None:
+            features = network.extract_features(observations, network.features_extractor)
+        return (forward(layers, leaves, features),)
+
+    def q_values(self, states: IntArray | None = None) -> Tensor:
+        """Q (U, A) of these states (U,), with its graph. None: of all states."""
+        return self.q_of(self.outputs(getattr(self, self.network), states))
+
+    @staticmethod
+    def q_of(outputs: Tensor) -> Tensor:
+        """Q (..., U, A) of a network's outputs (..., U, ...)."""
+        return outputs
+
+    def online(self, which: IntArray | None) -> Tensor:
+        """Run the online network on the states of `StateInputs.distinct`; on all, once until it changes."""
+        if which is not None:
+            return self.outputs(getattr(self, self.network), which)
+        if self._online is None:
+            self._online = self.outputs(getattr(self, self.network))
+        return self._online
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        train_freq: TrainFreq,
+        replay_buffer: ReplayBuffer,
+        action_noise: ActionNoise | None = None,
+        learning_starts: int = 0,
+        log_interval: int | None = None,
+    ) -> RolloutReturn:
+        """See SB3's `OffPolicyAlgorithm.collect_rollouts`."""
+        assert isinstance(env, GridWorldVecEnv)
+        assert isinstance(replay_buffer, StateReplayBuffer)
+        steps, episodes = 0, 0
+        callback.on_rollout_start()
+        states = env.states
+        while should_collect_more_steps(train_freq, steps, episodes):
+            actions = self._act(states, learning_starts)
+            done = env.step_states(actions)
+            rewards, dones, infos = done.rewards, done.dones, infos_of(done, env.num_envs)
+            self.num_timesteps += env.num_envs
+            steps += 1
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return RolloutReturn(steps * env.num_envs, episodes, continue_training=False)
+            cast(Any, self.ep_info_buffer).extend([info["episode"] for info in done.ended.values()])
+            replay_buffer.store(states, actions, done)
+            states = done.states
+            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+            self._on_step()
+            for _ in done.ended:
+                episodes += 1
+                self._episode_num += 1
+                if log_interval is not None and self._episode_num % log_interval == 0:
+                    self.dump_logs()
+        self._last_obs = env.observation.rows(states)
+        callback.on_rollout_end()
+        return RolloutReturn(steps * env.num_envs, episodes, continue_training=True)
+
+    def _act(self, states: IntArray, learning_starts: int) -> IntArray:
+        """Uniformly random at first; then one coin decides for the whole batch, as in SB3."""
+        if self.num_timesteps < learning_starts or np.random.rand() < self.exploration_rate:
+            return self.action_space.np_random.integers(self.env.envs.mdp.num_actions, size=len(states))
+        which, index = self.inputs.distinct(states)
+        if which is None:
+            if self._greedy is None:
+                self._greedy = self.greedy_of(self.online(None))
+            return self._greedy[index]
+        with torch.no_grad():
+            return self.greedy_of(self.online(which))[index]
+
+    def greedy_of(self, outputs: Tensor) -> IntArray:
+        """The greedy actions (..., U) by a network's outputs."""
+        greedy: IntArray = self.q_of(outputs.detach()).cpu().numpy().argmax(axis=-1)
+        return greedy
+
+    def was_updated(self, greedy: IntArray | None = None) -> None:
+        """Forget what the network said before it was changed; `greedy` (S,) are its actions now, if known."""
+        self._online, self._greedy = None, greedy
+
+    def _on_step(self) -> None:
+        super()._on_step()
+        if self._n_calls % max(self.target_update_interval // self.n_envs, 1) == 0:
+            self._target_values = None
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """See SB3's `DQN.train`."""
+        self._update_learning_rate(self.policy.optimizer)
+        member = _Member(self, chance(), gradient_steps, batch_size)
+        meet(_train_together, member, (self.inputs.kind, gradient_steps, batch_size))
+
+    @staticmethod
+    def losses_and_slopes(
+        outputs: Float32Array, index: IntArray, actions: IntArray, targets: Float32Array
+    ) -> tuple[list[float], FloatArray]:
+        """Compute the losses of P minibatches and their slopes at the networks' outputs.
+
+        Args:
+            outputs: (P, U, ...).
+            index: (P, B), which of the U states each transition begins in.
+            actions: (P, B), integers.
+            targets: (P, ..., B), float32.
+
+        Returns:
+            P, the losses; the slopes, as many as there are outputs, in their order.
+        """
+        raise NotImplementedError
+
+    def best_values(self) -> Float32Array:
+        """What the target network says of the best action in each state, (..., S)."""
+        if self._target_values is None:
+            with torch.no_grad():
+                outputs = self.outputs(getattr(self, f"{self.network}_target"))
+            self._target_values = np.ascontiguousarray(self.of_best_action(outputs.cpu()))
+        return self._target_values
+
+    @staticmethod
+    def of_best_action(outputs: Tensor) -> Tensor:
+        """What a target network's outputs (U, ...) say of each state's best action, (..., U)."""
+        return outputs.max(dim=1).values
+
+
+@dataclass
+class _Member:
+    """One of the models that are updated together."""
+
+    model: TabulatedOffPolicy
+    chance: np.random.RandomState  # that its minibatches are drawn with
+    gradient_steps: int
+    batch_size: int
+    losses: list[float] = field(default_factory=list)
+    error: Exception | None = None
+
+
+def _train_together(members: Sequence[_Member]) -> list[Exception | None]:
+    return update_together(_train, members)
+
+
+def _train(members: Sequence[_Member]) -> list[Exception | None]:
+    """Make an update of each of P models of one kind; returns what is to be raised in each."""
+    with SideBySide([member.model.descent for member in members]) as rows:
+        update = Update([member.model for member in members], rows)
+        for _ in range(members[0].gradient_steps):
+            drawn = [each.model.replay_buffer.draw(each.batch_size, each.chance) for each in members]
+            losses, finite = update.step(*(_stacked(arrays) for arrays in zip(*drawn, strict=True)))
+            for member, loss, is_finite in zip(members, losses, finite, strict=True):
+                member.losses.append(loss)
+                member.error = member.error or (None if is_finite else not_finite())
+            if not any(finite):
+                break
+        update.end()
+    for member in members:
+        if member.error is None:
+            model = member.model
+            model._n_updates += member.gradient_steps
+            model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
+            model.logger.record("train/loss", np.mean(member.losses))
+    return [member.error for member in members]
+
+
+class Update:
+    """Steps that P models make together, each on minibatches of its own.
+
+    Args:
+        models: of one kind.
+        rows: their optimisers.
+    """
+
+    def __init__(self, models: Sequence[TabulatedOffPolicy], rows: SideBySide) -> None:
+        self._models, self._rows = models, rows
+        self._best_values = [model.best_values() for model in models]
+        self._gammas = np.array([[model.gamma] for model in models], dtype=np.float32)
+        norms = [model.max_grad_norm for model in models]
+        self._norms = [math.inf if norm is None else norm for norm in norms]
+        self._finite = np.ones(len(models), dtype=np.bool_)
+
+    def step(
+        self,
+        states: IntArray,
+        actions: IntArray,
+        following: IntArray,
+        rewards: Float32Array,
+        ends: Float32Array,
+    ) -> tuple[list[float], list[bool]]:
+        """Make one step of each optimiser.
+
+        Args:
+            states: (P, B), and so all others; what `StateReplayBuffer.draw` returns.
+
+        Returns:
+            P, the losses before the step; P, which gradients have been finite so far.
+        """
+        pairs = zip(self._best_values, following, strict=True)
+        best = _stacked([values.take(where, axis=-1) for values, where in pairs])
+        runs, inner = len(states), (1,) * (best.ndim - 2)
+        rewards, discounts = (each.reshape(runs, *inner, -1) for each in (rewards, (1 - ends) * self._gammas))
+        return self.descend(states, actions, rewards + discounts * best)
+
+    def descend(
+        self, states: IntArray, actions: IntArray, targets: Float32Array
+    ) -> tuple[list[float], list[bool]]:
+        """The same towards targets (P, ..., B), float32, of the outputs for these actions (P, B)."""
+        index, outputs = self._outputs(states)
+        numbers = outputs.detach().cpu().numpy()
+        if len(self._models) == 1:
+            numbers = numbers[None]
+        losses, slopes = self._models[0].losses_and_slopes(numbers, index, actions, targets)
+        going = np.flatnonzero(self._finite)
+        self._finite[going] = self._rows.step([outputs], [slopes], self._norms, going.tolist())
+        for model in self._models:
+            model.was_updated()
+        return losses, self._finite.tolist()
+
+    def end(self) -> None:
+        """Let the models know what their networks say now."""
+        if len(self._models) > 1:
+            with torch.no_grad():
+                (outputs,) = self._models[0].outputs_together(self._rows.leaves)
+            for model, greedy in zip(self._models, self._models[0].greedy_of(outputs), strict=True):
+                model.was_updated(greedy)
+
+    def _outputs(self, states: IntArray) -> tuple[IntArray, Tensor]:
+        """The online networks' outputs for all or some states; where in them each of `states` (P, B) is."""
+        if len(self._models) > 1:
+            return states, self._models[0].outputs_together(self._rows.leaves)[0]
+        which, index = self._models[0].inputs.distinct(states[0])
+        return index[None], self._models[0].online(which)
+
+
+def _stacked(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Arrays (...) of P models as one (P, ...)."""
+    return arrays[0][None] if len(arrays) == 1 else np.stack(arrays)

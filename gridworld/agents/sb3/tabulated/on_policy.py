@@ -1,0 +1,231 @@
+"""What the tabulated on-policy algorithms share: the network's tables, and collecting a rollout by them.
+
+During a rollout the policy stands still: log-probabilities and values of all states are tables, and a step
+is a few look-ups.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import explained_variance
+from stable_baselines3.common.vec_env import VecEnv
+from torch import Tensor
+
+from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer
+from gridworld.agents.sb3.tabulated.ppo_loss import Outputs, log_softmax
+from gridworld.agents.sb3.tabulated.side_by_side import Leaves, SideBySide, forward
+from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of
+from gridworld.agents.sb3.vec_env import GridWorldVecEnv
+from gridworld.world.mdp import BoolArray, IntArray
+
+Float32Array = NDArray[np.float32]
+
+
+class StateRolloutBuffer(RolloutBuffer):
+    """SB3's rollout buffer with the state's number in place of an observation."""
+
+    def __init__(self, buffer_size: int, observation_space: Any, *arguments: Any, **options: Any) -> None:
+        super().__init__(buffer_size, spaces.Discrete(1), *arguments, **options)
+
+    def compute_returns_and_advantage(self, last_values: Tensor, dones: BoolArray) -> None:
+        """SB3's own recursion to the last bit, with everything that does not recur done at once."""
+        going_on = 1.0 - np.concatenate([self.episode_starts[1:], dones[None].astype(np.float32)])
+        following = np.concatenate([self.values[1:], last_values.numpy()[None]])
+        self.advantages = self.rewards + self.gamma * following * going_on - self.values
+        carry = self.gamma * self.gae_lambda * going_on
+        for step in range(self.buffer_size - 2, -1, -1):
+            self.advantages[step] += carry[step] * self.advantages[step + 1]
+        self.returns = self.advantages + self.values
+
+
+class TabulatedOnPolicy(OnPolicyAlgorithm):
+    """An on-policy algorithm of SB3's kind on a `GridWorldVecEnv`; comes before SB3's class."""
+
+    env: GridWorldVecEnv
+    policy: ActorCriticPolicy
+    derived: tuple[str, ...] = ("descent", "inputs", "old")  # from the rest: no part of a checkpoint
+
+    def _setup_model(self) -> None:
+        self.rollout_buffer_class = self.rollout_buffer_class or StateRolloutBuffer
+        super()._setup_model()
+        self.policy.set_training_mode(False)  # SB3's networks know no difference; switching takes time
+        self.inputs = StateInputs(self.policy, self.env.observation)
+        self.descent = self._make_descent()
+        self.old: Outputs  # of all states, from the policy that collected the rollout
+
+    def _make_descent(self) -> FlatOptimizer:
+        return FlatOptimizer(self.policy.optimizer)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "rollout_buffer_class", *self.derived]
+
+    def outputs(self, states: IntArray | None = None) -> tuple[Tensor, Tensor]:
+        """Logits (U, A) and values (U, 1) of these states (U,), with their graph. None: of all states."""
+        policy, extractor = self.policy, self.policy.mlp_extractor
+        nets = (extractor.policy_net, extractor.value_net)
+        observations = self.inputs.observations(states, *nets)
+        features: Any = None if observations is None else policy.extract_features(observations)
+        actor, critic = features if isinstance(features, tuple) else (features, features)
+        logits = policy.action_net(self.inputs.latent(nets[0], states, actor))
+        values = policy.value_net(self.inputs.latent(nets[1], states, critic))
+        return logits, values
+
+    def outputs_alone(self) -> tuple[Tensor, Tensor]:
+        """See `side_by_side.Tabulated`."""
+        return self.outputs()
+
+    def outputs_together(self, leaves: Leaves) -> tuple[Tensor, Tensor]:
+        """See `side_by_side.Tabulated`."""
+        policy, extractor = self.policy, self.policy.mlp_extractor
+        nets = (extractor.policy_net, extractor.value_net)
+        observations = self.inputs.observations(None, *nets)
+        features: Any = None if observations is None else policy.extract_features(observations)
+        actor, critic = features if isinstance(features, tuple) else (features, features)
+        logits = forward([*nets[0], policy.action_net], leaves, actor)
+        return logits, forward([*nets[1], policy.value_net], leaves, critic)
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
+    ) -> bool:
+        """See SB3's `OnPolicyAlgorithm.collect_rollouts`."""
+        assert isinstance(env, GridWorldVecEnv)
+        rollout_buffer.reset()
+        callback.on_rollout_start()
+        with torch.no_grad():
+            self.old = log_prob, values = tables(*self.outputs())
+        thresholds = np.exp(log_prob).cumsum(axis=1).T[:-1].copy()  # (A - 1, S)
+        draws = torch.rand(n_rollout_steps, env.num_envs).numpy()
+
+        visited = np.empty((n_rollout_steps, env.num_envs), dtype=np.int64)
+        taken = np.empty_like(visited)
+        states = env.states
+        for step in range(n_rollout_steps):
+            beyond = draws[step] >= thresholds.take(states, axis=1)
+            actions = np.add.reduce(beyond, axis=0, dtype=np.int64)
+            done = env.step_states(actions)
+            rewards, dones, infos = done.rewards, done.dones, infos_of(done, env.num_envs)
+            self.num_timesteps += env.num_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+            cast(Any, self.ep_info_buffer).extend([info["episode"] for info in done.ended.values()])
+            if done.ended and done.truncated.any():
+                rewards = rewards + self.gamma * done.truncated * values[done.last_states]
+            visited[step], taken[step] = states, actions
+            rollout_buffer.rewards[step] = rewards
+            rollout_buffer.episode_starts[step] = self._last_episode_starts
+            states, self._last_episode_starts = done.states, dones
+
+        rollout_buffer.observations, rollout_buffer.actions = visited, taken
+        rollout_buffer.values = values[visited]
+        rollout_buffer.log_probs = log_prob[visited, taken]
+        rollout_buffer.full = True
+        self._last_obs = env.observation.rows(states)
+        rollout_buffer.compute_returns_and_advantage(torch.as_tensor(values[states]), dones)
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def samples(self) -> tuple[IntArray, IntArray, Float32Array, Float32Array]:
+        """States, actions, advantages and returns of the rollout's n samples, (n,) each.
+
+        Environment by environment, as SB3 lines samples up: the same seed draws the same minibatches.
+        """
+        buffer = self.rollout_buffer
+        states, actions, advantages, returns = (
+            table.swapaxes(0, 1).ravel()
+            for table in (buffer.observations, buffer.actions, buffer.advantages, buffer.returns)
+        )
+        return states, actions, advantages, returns
+
+    def log_update(self) -> None:
+        """Log what SB3 logs of the rollout after an update."""
+        buffer = self.rollout_buffer
+        variance = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
+        self.logger.record("train/explained_variance", variance)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+
+class Rollouts:
+    """The rollouts of R models of one kind that are updated together, as one batch.
+
+    Args:
+        models: with rollouts of one size, of n samples.
+        rows: their optimisers.
+
+    Attributes:
+        num_states: S.
+        num_actions: A.
+        states: (R, n), run · S + state of each sample.
+        pairs: (R, n), states · A + action.
+        advantages: (R, n), float32.
+        returns: (R, n), float32.
+    """
+
+    def __init__(self, models: Sequence[TabulatedOnPolicy], rows: SideBySide) -> None:
+        self._models, self._rows = models, rows
+        states, actions, self.advantages, self.returns = (
+            np.stack(arrays) for arrays in zip(*(model.samples() for model in models), strict=True)
+        )
+        self.num_states, self.num_actions = models[0].old.log_prob.shape
+        self.states = states + self.num_states * np.arange(len(models))[:, None]
+        self.pairs = self.states * self.num_actions + actions
+
+    def outputs(self, which: IntArray | None) -> tuple[Tensor, Tensor]:
+        """Logits and values of all states, (R, S, ...); of a single model, (U, ...) of the states `which`."""
+        if len(self._models) == 1:
+            return self._models[0].outputs(which)
+        return self._models[0].outputs_together(self._rows.leaves)
+
+    def distinct(self, states: IntArray, pairs: IntArray) -> tuple[IntArray | None, IntArray, IntArray]:
+        """Find the states to run the network on.
+
+        Args:
+            states: (R, B), of some samples.
+            pairs: (R, B).
+
+        Returns:
+            (U,), those states of a single model, None for all; `states` and `pairs` numbered by them.
+        """
+        if len(self._models) > 1:
+            return None, states, pairs
+        which, index = self._models[0].inputs.distinct(states[0])
+        return which, index[None], pairs if which is None else (index - states) * self.num_actions + pairs
+
+
+def tables(logits: Tensor, values: Tensor) -> Outputs:
+    """The numbers alone of logits (..., U, A) and values (..., U, 1), where a loss works on them."""
+    return Outputs(log_softmax(logits.detach().cpu().numpy()), values.detach().cpu().numpy()[..., 0])
+
+
+def tables_of_runs(logits: Tensor, values: Tensor) -> Outputs:
+    """The same with an axis of runs, also where there is one run and no such axis."""
+    found = tables(logits, values)
+    return found if logits.dim() == 3 else Outputs(found.log_prob[None], found.values[None])
+
+
+def normalized(advantages: Float32Array) -> Float32Array:
+    """Advantages (..., B) with mean 0 and standard deviation 1, as SB3 scales them."""
+    mean = advantages.mean(axis=-1, keepdims=True)
+    scaled: Float32Array = (advantages - mean) / (advantages.std(axis=-1, ddof=1, keepdims=True) + 1e-8)
+    return scaled
+
+
+def minibatches(count: int, batch_size: int) -> list[IntArray]:
+    """All samples in random order, cut into batches; the draw is SB3's own."""
+    order = np.random.permutation(count)
+    return [order[start : start + batch_size] for start in range(0, count, batch_size)]
