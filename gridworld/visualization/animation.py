@@ -97,7 +97,7 @@ _boards: WeakKeyDictionary[Mdp, dict[int, _EmptyBoard]] = WeakKeyDictionary()
 
 
 def _empty_board(mdp: Mdp, size: int) -> _EmptyBoard:
-    """The board in cells of `size` pixels, drawn once per process; of a world the newest few sizes are kept."""
+    """The board in cells of `size` pixels, drawn once per process; of a world the newest sizes are kept."""
     boards = _boards.setdefault(mdp, {})
     board = boards.pop(size, None)
     if board is None:
@@ -210,7 +210,7 @@ def _image(picture: NDArray[np.uint8], palette: Palette) -> Image.Image:
 
 
 def _number(pictures: Iterable[Packed], first: Iterable[Sequence[int]] = ()) -> Numbered | None:
-    """The pictures as numbers into one palette, which begins with these colours; None for too many colours."""
+    """The pictures as numbers into one palette, which begins with these colours; None: too many colours."""
     numbers = _colour_numbers()
     palette = list(dict.fromkeys(red << 16 | green << 8 | blue for red, green, blue in first))
     numbers[palette] = range(1, 1 + len(palette))
