@@ -201,7 +201,7 @@ def _draw_disc(canvas: Canvas, middle: Point, name: str, size: float, ink: Colou
         canvas.number(name[:1].upper(), middle, letter, paper)
 
 
-@functools.lru_cache(maxsize=1 << 14)  # the same arrows are drawn in every picture of an animation
+@functools.lru_cache(maxsize=1 << 13)  # the same arrows are drawn in every picture of an animation
 def _arrow(x: float, y: float, down: int, right: int, size: float) -> list[Point]:
     length = math.hypot(down, right)
     to_down, to_right = down / length, right / length
