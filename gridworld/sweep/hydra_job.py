@@ -8,6 +8,8 @@ made once per process. Files, variables and callbacks are Hydra's, which tests/s
 from __future__ import annotations
 
 import contextlib
+import functools
+import gc
 import os
 import pickle
 from collections.abc import Iterator
@@ -86,10 +88,18 @@ def run_job(
         done.task_name = JobRuntime.instance().get("name")
         _flush_loggers()
         hydra_context.callbacks.on_job_end(config=config, job_return=done)
+        _spare_the_collector()
         return done
     finally:
         shared.cfg = before
         os.chdir(folder_before)
+
+
+@functools.cache
+def _spare_the_collector() -> None:
+    """Once, after the first job: a collection that walks through torch takes as long as a run's pictures."""
+    gc.collect()
+    gc.freeze()
 
 
 def _settings(config: DictConfig) -> DictConfig:
