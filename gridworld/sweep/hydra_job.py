@@ -7,6 +7,8 @@ made once per process. Files, variables and callbacks are Hydra's, which tests/s
 
 from __future__ import annotations
 
+import gc
+import itertools
 import os
 import pickle
 from pathlib import Path
@@ -20,6 +22,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf._utils import get_omega_conf_dumper
 
 _MOST_ENTRIES = 4096
+
+_jobs = itertools.count()  # that began in this process
 
 _entries: dict[tuple[object, ...], str] = {}  # YAML by what it is of
 
@@ -46,6 +50,7 @@ def run_job(
         What it came to; an `Exception` that it raised is in there. It has no configurations, which would fill
         the memory of a long sweep.
     """
+    _spare_the_collector()
     shared, folder_before = cast("Any", HydraConfig.instance()), Path.cwd()
     before, shared.cfg = shared.cfg, config  # what is composed refers to it
     try:
@@ -76,6 +81,13 @@ def run_job(
     finally:
         shared.cfg = before
         os.chdir(folder_before)
+
+
+def _spare_the_collector() -> None:
+    """Once, before the second job: a collection that walks through torch takes as long as a run's pictures."""
+    if next(_jobs) == 1:
+        gc.collect()
+        gc.freeze()
 
 
 def _settings(config: DictConfig) -> DictConfig:

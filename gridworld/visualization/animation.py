@@ -7,8 +7,11 @@ exact; what an environment of another library draws may have more than a palette
 from __future__ import annotations
 
 import functools
+import math
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -97,11 +100,11 @@ _boards: WeakKeyDictionary[Mdp, dict[int, _EmptyBoard]] = WeakKeyDictionary()
 
 
 def _empty_board(mdp: Mdp, size: int) -> _EmptyBoard:
-    """The board in cells of `size` pixels, drawn once per process; of a world the newest few sizes are kept."""
+    """The board in cells of `size` pixels, drawn once per process; of a world the newest sizes are kept."""
     boards = _boards.setdefault(mdp, {})
     board = boards.pop(size, None)
     if board is None:
-        empty = drawing.pack(drawing.draw_frame(mdp, None, size))
+        empty = drawing.draw_frame(mdp, None, size)
         numbered = _number([empty], first=[drawing.AGENT, drawing.BACKGROUND])
         assert numbered is not None  # colours of walls, cliffs, ends, lines and the greys of letters
         board = _EmptyBoard(numbered[0][0], numbered[1])
@@ -150,11 +153,11 @@ def _cards(mdp: Mdp, episode: Episode) -> Iterator[tuple[str, ...]]:
         yield mdp.state_name(state), f"step {step}: {what}", f"reward so far {earned[step]:.6g}"
 
 
-def animation_of_frames(frames: Iterable[Packed], likely: Iterable[Sequence[int]] = ()) -> Animation:
+def animation_of_frames(frames: Iterable[Frame | Packed], likely: Iterable[Sequence[int]] = ()) -> Animation:
     """Show frames one after the other.
 
     Args:
-        frames: (height, width) each, see `envs.rendering.Packed`.
+        frames: (height, width, 3) each, RGB, or (height, width), see `envs.rendering.Packed`.
         likely: colours that the palette begins with; to know those of most pixels before saves time.
 
     Returns:
@@ -184,7 +187,7 @@ def animation_of_rendered(
         A picture for each key; quantised where the frames have more colours than a palette.
     """
     pictures = [_scaled_down(frame, longest_side) for frame in frames]
-    if (numbered := _number(map(drawing.pack, pictures))) is not None:
+    if (numbered := _number(pictures)) is not None:
         numbers, palette = numbered
         return Animation(keys, lambda key: _image(numbers[key], palette))
     every = 1 + sum(picture.size for picture in pictures) // _SAMPLED
@@ -209,26 +212,46 @@ def _image(picture: NDArray[np.uint8], palette: Palette) -> Image.Image:
     return image
 
 
-def _number(pictures: Iterable[Packed], first: Iterable[Sequence[int]] = ()) -> Numbered | None:
-    """The pictures as numbers into one palette, which begins with these colours; None for too many colours."""
-    numbers = _colour_numbers()
+def _number(pictures: Iterable[Frame | Packed], first: Iterable[Sequence[int]] = ()) -> Numbered | None:
+    """The pictures as numbers into one palette, which begins with these colours; None: too many colours."""
     palette = list(dict.fromkeys(red << 16 | green << 8 | blue for red, green, blue in first))
-    numbers[palette] = range(1, 1 + len(palette))
     numbered = []
-    try:
-        for picture in pictures:
-            found = numbers[picture]
-            if not found.all():
-                new = np.unique(picture[found == 0])
-                if len(palette) + len(new) > _MOST_COLOURS:
-                    return None
-                numbers[new] = range(1 + len(palette), 1 + len(palette) + len(new))
-                palette += new.tolist()
-                found = numbers[picture]
-            numbered.append(np.subtract(found, 1, dtype=np.uint8, casting="unsafe"))
-    finally:
-        numbers[palette] = 0
+    with _one_at_a_time:
+        numbers = _colour_numbers()
+        try:
+            numbers[palette] = range(1, 1 + len(palette))
+            for picture in pictures:
+                # Bands of about a million pixels need little memory beside a large picture.
+                bands: list[NDArray[Any]] = np.array_split(
+                    picture, 1 + math.prod(picture.shape[:2]) // 1_000_000
+                )
+                numbered.append(np.concatenate([_look_up(band, numbers, palette) for band in bands]))
+        except _TooManyColoursError:
+            return None
+        finally:
+            numbers[palette] = 0
     return numbered, np.array(palette, dtype=">u4").view(np.uint8).reshape(-1, 4)[:, 1:]
+
+
+def _look_up(band: NDArray[Any], numbers: NDArray[np.uint16], palette: list[int]) -> NDArray[np.uint8]:
+    """The places of the band's colours in the palette, which gets those that are new."""
+    packed = drawing.pack(band) if band.ndim == 3 else band
+    found = numbers[packed]
+    if not found.all():
+        new = np.unique(packed[found == 0])
+        if len(palette) + len(new) > _MOST_COLOURS:
+            raise _TooManyColoursError
+        numbers[new] = range(1 + len(palette), 1 + len(palette) + len(new))
+        palette += new.tolist()
+        found = numbers[packed]
+    return np.subtract(found, 1, dtype=np.uint8, casting="unsafe")
+
+
+class _TooManyColoursError(Exception):
+    pass
+
+
+_one_at_a_time = threading.Lock()  # they use one table
 
 
 @functools.cache

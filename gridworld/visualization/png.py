@@ -74,7 +74,7 @@ def _deflated(rows: NDArray[np.uint8], strategy: int) -> bytes:
     """zlib's format of filtered rows."""
     packer = zlib.compressobj(_LEVEL, zlib.DEFLATED, _RAW, strategy=strategy)
     parts, done = [_HEADER], 0
-    is_full = rows[:, 1:].any(axis=1)
+    is_full = np.asarray(rows[:, 1:].any(axis=1))
     edges = [0, *(np.flatnonzero(np.diff(is_full)) + 1).tolist(), len(rows)]
     for start, stop in pairwise(edges):
         if not is_full[start] and stop - start >= _LEAST_EMPTY:

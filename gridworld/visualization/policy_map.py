@@ -129,19 +129,16 @@ def draw_policy_map(
     inks = np.where(known[:, None], np.where(dark[:, None], PAPER, INK), UNKNOWN_INK).tolist()
     middle = 0.5 if size is None else 0.4  # of the arrows, above the numbers
     paths = greedy_paths(mdp, greedy)
-    ways = directions(mdp)[np.arange(mdp.num_states), greedy]
+    ways = directions(mdp)[np.arange(mdp.num_states), greedy].tolist()
     _draw_paths(canvas, paths, ways, middle)
-    pointing = ways.tolist()
     length = canvas.cell if size is None else 0.85 * canvas.cell
-    if canvas.cell >= _SMALLEST_ARROW_CELL:
-        for state in states.tolist():
-            ink, point = inks[state], canvas.point(state, 0.5, middle)
-            if any(pointing[state]):
-                arrow = _arrow(*point, *pointing[state], length)
-                drawing.import_pygame().draw.polygon(canvas.world, ink, arrow)
-            else:
-                name, paper = mdp.action_names[greedy[state]], colours[state].tolist()
-                _draw_disc(canvas, point, name, length, ink, paper)
+    for state in states.tolist() if canvas.cell >= _SMALLEST_ARROW_CELL else []:
+        point = canvas.point(state, 0.5, middle)
+        if any(ways[state]):
+            _draw_arrow(canvas, point, ways[state], length, inks[state])
+        else:
+            name, paper = mdp.action_names[greedy[state]], colours[state].tolist()
+            _draw_disc(canvas, point, name, length, inks[state], paper)
     on_path = set().union(*paths)
     if size is not None:
         for state in np.flatnonzero(known).tolist():
@@ -167,21 +164,21 @@ def _swatches(cell: int, has_path: bool, all_known: bool) -> list[Swatch]:
     return [*([path] if has_path else []), wrong, *([] if all_known else [NEVER_VISITED])]
 
 
-def _draw_paths(canvas: Canvas, paths: list[list[int]], ways: IntArray, middle: float) -> None:
+def _draw_paths(canvas: Canvas, paths: list[list[int]], ways: list[list[int]], middle: float) -> None:
     """A ring around each start, and lines through the states where one is beside the next.
 
     Args:
         canvas: is drawn on.
         paths: the states of each path.
-        ways: (S, 2), where each state's arrow points.
+        ways: where each state's arrow points, down and right.
         middle: how far below a cell's upper edge, in cells.
     """
-    cell = canvas.board.cell
+    place = canvas.board.place
     for path in paths:
-        placed, lines = [state for state in path if cell[state, 0] >= 0], []
+        placed, lines = [state for state in path if place[state][0] >= 0], []
         for state, following in pairwise(placed):
-            step = cell[following] - cell[state]
-            if np.abs(step).sum() <= 1 or (step == ways[state]).all():  # an arrow may point along a diagonal
+            down, right = place[following][0] - place[state][0], place[following][1] - place[state][1]
+            if abs(down) + abs(right) <= 1 or [down, right] == ways[state]:  # which may be along a diagonal
                 lines.append((canvas.point(state, 0.5, middle), canvas.point(following, 0.5, middle)))
                 if canvas.mdp.terminal[following] and canvas.has_grid:  # what is drawn there stays whole
                     (x, y), (to_x, to_y) = lines[-1]
@@ -189,6 +186,11 @@ def _draw_paths(canvas: Canvas, paths: list[list[int]], ways: IntArray, middle: 
         canvas.line(lines, AGENT)
         if placed:
             canvas.ring(canvas.point(placed[0], 0.5, middle), AGENT)
+
+
+def _draw_arrow(canvas: Canvas, middle: Point, way: list[int], size: float, ink: Colour) -> None:
+    arrow = _arrow(*middle, *way, size)
+    drawing.import_pygame().draw.polygon(canvas.world, ink, arrow)
 
 
 def _draw_disc(canvas: Canvas, middle: Point, name: str, size: float, ink: Colour, paper: Colour) -> None:
@@ -199,7 +201,7 @@ def _draw_disc(canvas: Canvas, middle: Point, name: str, size: float, ink: Colou
         canvas.number(name[:1].upper(), middle, letter, paper)
 
 
-@functools.lru_cache(maxsize=1 << 14)  # the same arrows are drawn in every picture of an animation
+@functools.lru_cache(maxsize=1 << 13)  # the same arrows are drawn in every picture of an animation
 def _arrow(x: float, y: float, down: int, right: int, size: float) -> list[Point]:
     length = math.hypot(down, right)
     to_down, to_right = down / length, right / length

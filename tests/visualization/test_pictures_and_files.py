@@ -56,7 +56,9 @@ def test_a_gif_holds_any_film_exactly() -> None:
             chance.integers(200)
         ]
         frames.append(frame)
-    shown = frames_of(Image.open(io.BytesIO(record.encode_gif(animation_of_frames(map(pack, frames)), 20))))
+    gif = record.encode_gif(animation_of_frames(frames, [frames[0][0, 0], (0, 0, 0)]), 20)
+    assert record.encode_gif(animation_of_frames(map(pack, frames), [frames[0][0, 0], (0, 0, 0)]), 20) == gif
+    shown = frames_of(Image.open(io.BytesIO(gif)))
     assert len(shown) == len(frames)
     assert all(np.array_equal(got, frame) for (got, _), frame in zip(shown, frames, strict=True))
     assert sum(duration for _, duration in shown) == (len(frames) + 4) * 50
@@ -69,7 +71,7 @@ def test_a_gif_holds_any_film_exactly() -> None:
 def test_a_film_has_one_palette() -> None:
     noise = np.random.default_rng(0).integers(256, size=(40, 40, 3), dtype=np.uint8)
     with pytest.raises(InputError, match="more than 256 colours"):
-        animation_of_frames([pack(noise)])
+        animation_of_frames([noise])
 
 
 def test_png_is_exact() -> None:

@@ -6,7 +6,6 @@ The process gets Hydra's state once, in one piece; Hydra's own launchers send it
 from __future__ import annotations
 
 import functools
-import gc
 import os
 import pickle
 import signal
@@ -67,7 +66,7 @@ class JobRunner:
         with open_dict(config):
             config.hydra.job.id = f"{config.hydra.job.name}_{number}"
             config.hydra.job.num = number
-        result = run_job(
+        return run_job(
             hydra_context=self.context,
             task_function=self.task,
             config=config,
@@ -75,9 +74,6 @@ class JobRunner:
             job_subdir_key="hydra.sweep.subdir",
             configures_logging=configures_logging,
         )
-        result.cfg = result.hydra_cfg = None  # they are not used, and would fill the memory
-        _spare_the_collector()
-        return result
 
 
 @functools.lru_cache(maxsize=1)
@@ -120,10 +116,3 @@ def run_in_turn(state: bytes, sweep: Path, jobs: Sequence[Sequence[str]], first:
     except (SystemExit, KeyboardInterrupt):
         pass
     return errors
-
-
-@functools.cache
-def _spare_the_collector() -> None:
-    """Once, after the first job: loky collects garbage every second, which need not walk through torch."""
-    gc.collect()
-    gc.freeze()
