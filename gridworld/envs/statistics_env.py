@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from gridworld.envs.vector_env import Advance, GridWorldVectorEnv
+from gridworld.envs.vector_env import Advance, Ended, GridWorldVectorEnv
 from gridworld.storage.serialization import State, fill
 
 
@@ -54,14 +54,19 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
 
     def advance(self, actions: NDArray[Any]) -> Advance:
         """See `GridWorldVectorEnv.advance`."""
-        taken = self._state * self.mdp.num_actions
+        states = self._state
         step = super().advance(actions)
+        self.count(states, actions, step[4])
+        return step
+
+    def count(self, states: NDArray[Any], actions: NDArray[Any], ended: Ended | None) -> None:
+        """Count a step from these states (num_envs,) by these actions (num_envs,), and what it ended."""
+        taken = states * self.mdp.num_actions
         np.add(taken, actions, out=taken, casting="unsafe")  # unsigned ones too
         np.add.at(self._flat_visits, taken, 1)
-        if (ended := step[4]) is not None:
+        if ended is not None:
             total = float(np.add.reduce(ended.returns))
             self._ended = Returns(self._ended.episodes + len(ended.returns), self._ended.total + total)
-        return step
 
     def get_state(self) -> State:
         """See `GridWorldVectorEnv.get_state`."""

@@ -40,6 +40,21 @@ class Ended(NamedTuple):
     lengths: NDArray[np.int64]  # (n,), steps
 
 
+class Tables(NamedTuple):
+    """A world's tables, flat: by (state * A + action) * K + outcome."""
+
+    next_state: StateArray
+    reward: FloatArray
+    terminated: BoolArray
+    thresholds: FloatArray  # (K - 1,) where all states and actions have the same, else (K - 1, S * A)
+
+    def of_pairs(self) -> FloatArray:
+        """The thresholds as (K - 1, S * A)."""
+        pairs = len(self.reward) // (len(self.thresholds) + 1)
+        of_each = self.thresholds.reshape(len(self.thresholds), -1)
+        return np.broadcast_to(of_each, (len(self.thresholds), pairs))
+
+
 Advance = tuple[StateArray, FloatArray, BoolArray, BoolArray, Ended | None]
 
 
@@ -99,7 +114,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         self.max_episode_steps = (
             None if max_episode_steps is None else positive_int("max_episode_steps", max_episode_steps)
         )
-        self._step_limit = self.max_episode_steps or np.iinfo(np.int64).max
+        self.step_limit: int = self.max_episode_steps or np.iinfo(np.int64).max
         self.mdp = mdp_or_compiled(
             mdp, layout, num_rows, num_cols, slip, step_reward, goal_reward, trap_reward
         )
@@ -111,14 +126,15 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
-        # Flat tables, indexed by (state * A + action) * K + outcome. States are in numpy's own index type:
-        # smaller ones save nothing that counts and are converted at every look-up.
+        # States are in numpy's own index type: smaller ones save nothing that counts and are converted at
+        # every look-up.
         self._num_actions = self.mdp.num_actions
         self._num_outcomes = self.mdp.next_state.shape[2]
-        self._thresholds = _of_pairs(self.mdp.thresholds)
-        self._next_state = self.mdp.next_state.ravel().astype(np.int64)
-        self._reward = self.mdp.reward.ravel()
-        self._terminated = self.mdp.terminal[self._next_state]
+        next_state = self.mdp.next_state.ravel().astype(np.int64)
+        self.tables = Tables(
+            next_state, self.mdp.reward.ravel(), self.mdp.terminal[next_state], _of_pairs(self.mdp.thresholds)
+        )
+        self._next_state, self._reward, self._terminated, self._thresholds = self.tables
         self._state: StateArray = np.full(self.num_envs, self.mdp.start_states[0], dtype=np.int64)
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)  # steps of the episodes under way
         self._returns = np.zeros(self.num_envs)  # of these, undiscounted; counted where `ended` tells them
@@ -211,7 +227,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
             self._restart(starting)
             rewards[starting] = 0.0
             terminated[starting] = False
-        truncated = self._elapsed >= self._step_limit
+        truncated = self._elapsed >= self.step_limit
         over = terminated | truncated
         ended = None
         if self._autoreset is AutoresetMode.SAME_STEP:
@@ -263,12 +279,24 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         fill(self._returns, state["returns"], "returns")
         self._any_over = bool(self._over.any())
 
-    def _restart(self, which: NDArray[np.intp]) -> None:
+    @property
+    def under_way(self) -> tuple[StateArray, NDArray[np.int64], FloatArray]:
+        """(num_envs,) each: the states, and the steps and returns of the episodes under way so far."""
+        return self._state, self._elapsed, self._returns
+
+    def go_on_from(self, states: StateArray, elapsed: NDArray[np.int64], returns: FloatArray) -> None:
+        """Put back what `under_way` returned, or what has become of it."""
+        self._state, self._elapsed, self._returns = states.copy(), elapsed.copy(), returns.copy()
+
+    def draw_starts(self, count: int) -> StateArray | np.int64:
+        """The states in which so many new episodes begin, or the one in which all do."""
         starts = self.mdp.start_states
         if len(starts) == 1:
-            self._state[which] = starts[0]
-        else:
-            self._state[which] = starts[self.mdp.start_index(self.np_random.random(len(which)))]
+            return starts[0]
+        return starts[self.mdp.start_index(self.np_random.random(count))]
+
+    def _restart(self, which: NDArray[np.intp]) -> None:
+        self._state[which] = self.draw_starts(len(which))
         self._elapsed[which] = 0
 
     def _draw_outcomes(

@@ -14,7 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from gridworld.envs.observations import ObservationTable
-from gridworld.envs.vector_env import GridWorldVectorEnv, StateArray
+from gridworld.envs.vector_env import Advance, GridWorldVectorEnv, StateArray
 from gridworld.errors import InputError
 from gridworld.storage.rng_state import independent_generator
 from gridworld.storage.serialization import State
@@ -107,7 +107,11 @@ class GridWorldVecEnv(VecEnv):
         Raises:
             InputError: other actions.
         """
-        states, rewards, terminated, truncated, ended = self.envs.advance(actions)
+        return self.told(self.envs.advance(actions))
+
+    def told(self, step: Advance) -> StateStep:
+        """A step of the batch as SB3 is told of it."""
+        states, rewards, terminated, truncated, ended = step
         if ended is None:
             return StateStep(states, states, rewards, terminated, truncated, {})
         truncated &= ~terminated

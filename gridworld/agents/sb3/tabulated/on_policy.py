@@ -7,6 +7,7 @@ is a few look-ups.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
@@ -26,7 +27,10 @@ from gridworld.agents.sb3.tabulated.ppo_loss import Outputs, log_softmax
 from gridworld.agents.sb3.tabulated.side_by_side import Leaves, SideBySide, forward
 from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.world.mdp import BoolArray, IntArray
+from gridworld.envs.joint_rollout import Rollout, roll, shape_of
+from gridworld.envs.vector_env import GridWorldVectorEnv
+from gridworld.process.together import meet
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 Float32Array = NDArray[np.float32]
 
@@ -107,16 +111,18 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         callback.on_rollout_start()
         with torch.no_grad():
             self.old = log_prob, values = tables(*self.outputs())
-        thresholds = np.exp(log_prob).cumsum(axis=1).T[:-1].copy()  # (A - 1, S)
+        thresholds = np.exp(log_prob).cumsum(axis=1).T[:-1]  # (A - 1, S)
         draws = torch.rand(n_rollout_steps, env.num_envs).numpy()
+        request = _Request(env.envs, thresholds, draws)
+        meet(_roll_together, request, (shape_of(env.envs), n_rollout_steps))
+        rolled = request.rolled
 
-        visited = np.empty((n_rollout_steps, env.num_envs), dtype=np.int64)
-        taken = np.empty_like(visited)
-        states = env.states
+        last_starts = self._last_episode_starts
         for step in range(n_rollout_steps):
-            beyond = draws[step] >= thresholds.take(states, axis=1)
-            actions = np.add.reduce(beyond, axis=0, dtype=np.int64)
-            done = env.step_states(actions)
+            actions = rolled.actions[step]
+            found = rolled.step(step)
+            env.envs.count(rolled.states[step], actions, found[4])
+            done = env.told(found)
             rewards, dones, infos = done.rewards, done.dones, infos_of(done, env.num_envs)
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())
@@ -125,14 +131,14 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
             cast(Any, self.ep_info_buffer).extend([info["episode"] for info in done.ended.values()])
             if done.ended and done.truncated.any():
                 rewards = rewards + self.gamma * done.truncated * values[done.last_states]
-            visited[step], taken[step] = states, actions
             rollout_buffer.rewards[step] = rewards
-            rollout_buffer.episode_starts[step] = self._last_episode_starts
-            states, self._last_episode_starts = done.states, dones
+            rollout_buffer.episode_starts[step] = last_starts
+            last_starts = self._last_episode_starts = dones
 
-        rollout_buffer.observations, rollout_buffer.actions = visited, taken
-        rollout_buffer.values = values[visited]
-        rollout_buffer.log_probs = log_prob[visited, taken]
+        states = rolled.final_states
+        rollout_buffer.observations, rollout_buffer.actions = rolled.states, rolled.actions
+        rollout_buffer.values = values[rolled.states]
+        rollout_buffer.log_probs = log_prob[rolled.states, rolled.actions]
         rollout_buffer.full = True
         self._last_obs = env.observation.rows(states)
         rollout_buffer.compute_returns_and_advantage(torch.as_tensor(values[states]), dones)
@@ -158,6 +164,24 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         variance = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
         self.logger.record("train/explained_variance", variance)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+
+@dataclass
+class _Request:
+    """A rollout that a model asks for, see `envs.joint_rollout.roll`."""
+
+    envs: GridWorldVectorEnv
+    thresholds: FloatArray
+    draws: NDArray[np.float32]
+    rolled: Rollout = field(init=False)
+
+
+def _roll_together(requests: Sequence[_Request]) -> list[Exception | None]:
+    envs, thresholds = [each.envs for each in requests], [each.thresholds for each in requests]
+    draws = np.stack([each.draws for each in requests])
+    for request, rolled in zip(requests, roll(envs, thresholds, draws), strict=True):
+        request.rolled = rolled
+    return [None] * len(requests)
 
 
 class Rollouts:
