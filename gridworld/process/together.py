@@ -16,7 +16,7 @@ import contextvars
 import random
 import sys
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -66,7 +66,6 @@ class _Task(greenlet):  # type: ignore[misc]
     def resume(self, error: BaseException | None = None) -> None:
         """Let it run, with its random numbers, until it waits again or has ended; raise `error` in it."""
         torch = sys.modules.get("torch")
-        outside = _GLOBAL.get_bit_generator(), random.getstate(), _torch_numbers(torch)
         _GLOBAL.set_bit_generator(self._bits)
         random.setstate(self._python)
         if torch is not None and self._torch is not None:
@@ -84,13 +83,7 @@ class _Task(greenlet):  # type: ignore[misc]
                     self.throw()
         finally:
             self.seconds += time.perf_counter() - self.resumed
-            torch = sys.modules.get("torch")
-            self._python, self._torch = random.getstate(), _torch_numbers(torch)
-            bits, python, numbers = outside
-            _GLOBAL.set_bit_generator(bits)
-            random.setstate(python)
-            if torch is not None and numbers is not None:
-                torch.set_rng_state(numbers)
+            self._python, self._torch = random.getstate(), _torch_numbers()
 
 
 def run_together(tasks: Sequence[Callable[[], T]]) -> list[T | Exception]:
@@ -107,23 +100,41 @@ def run_together(tasks: Sequence[Callable[[], T]]) -> list[T | Exception]:
         BaseException: one of another kind, which is no `Exception`. It was raised in the others too.
     """
     running = [_Task(function) for function in tasks]
-    try:
-        for task in running:
-            task.resume(stopped())
-            _pass_on(task.error)
-        while waiting := [task for task in running if not task.dead]:
-            for task, error in _met(waiting):
-                task.resume(error or stopped())
-                _pass_on(task.error)
-    except BaseException as stop:
-        for task in running:
-            while not task.dead:  # it may wait once more on its way out
-                task.resume(stop)
-        raise
+    with _keeping_chance():
+        _run_all(running)
     ends = [task.error for task in running if isinstance(task.error, SystemExit)]
     if ends:
         raise ends[0]
     return [task.result if task.error is None else _exception(task.error) for task in running]
+
+
+def _run_all(tasks: Sequence[_Task]) -> None:
+    try:
+        for task in tasks:
+            task.resume(stopped())
+            _pass_on(task.error)
+        while waiting := [task for task in tasks if not task.dead]:
+            for task, error in _met(waiting):
+                task.resume(error or stopped())
+                _pass_on(task.error)
+    except BaseException as stop:
+        for task in tasks:
+            while not task.dead:  # it may wait once more on its way out
+                task.resume(stop)
+        raise
+
+
+@contextlib.contextmanager
+def _keeping_chance() -> Iterator[None]:
+    """Put the process's own generators back after the block."""
+    bits, python, numbers = _GLOBAL.get_bit_generator(), random.getstate(), _torch_numbers()
+    try:
+        yield
+    finally:
+        _GLOBAL.set_bit_generator(bits)
+        random.setstate(python)
+        if numbers is not None:
+            sys.modules["torch"].set_rng_state(numbers)
 
 
 def meet(work: Work[M], member: M, key: Hashable) -> None:
@@ -190,5 +201,6 @@ def _exception(error: BaseException) -> Exception:
     return error
 
 
-def _torch_numbers(torch: Any) -> Any:
+def _torch_numbers() -> Any:
+    torch = sys.modules.get("torch")
     return None if torch is None else torch.get_rng_state()

@@ -50,7 +50,8 @@ def run_job(
         What it came to; an `Exception` that it raised is in there. It has no configurations, which would fill
         the memory of a long sweep.
     """
-    _spare_the_collector()
+    if not config.hydra.sweeper.get("together"):  # which stands for several, and begins before them
+        _spare_the_collector()
     shared, folder_before = cast("Any", HydraConfig.instance()), Path.cwd()
     before, shared.cfg = shared.cfg, config  # what is composed refers to it
     try:
@@ -84,7 +85,7 @@ def run_job(
 
 
 def _spare_the_collector() -> None:
-    """Once, before the second job: a collection that walks through torch takes as long as a run's pictures."""
+    """Once, before the second job: a collection that walks through torch takes as long as pictures do."""
     if next(_jobs) == 1:
         gc.collect()
         gc.freeze()
