@@ -26,7 +26,7 @@ def comparisons(workload: Workload) -> Iterator[Comparison]:
         yield Comparison(
             "whole command, seconds",
             f"train.py agent={agent}",
-            partial(_seconds, _train(f"agent={agent}")),
+            partial(_seconds, train(f"agent={agent}")),
             'python -c "import stable_baselines3"',
             partial(_seconds, [sys.executable, "-c", "import stable_baselines3"]),
         )
@@ -34,28 +34,29 @@ def comparisons(workload: Workload) -> Iterator[Comparison]:
         yield Comparison(
             "whole command, seconds",
             f"train.py agent={agent}, {_STEPS:,} steps",
-            partial(_seconds, _train(f"agent={agent}", f"total_timesteps={_STEPS}")),
+            partial(_seconds, train(f"agent={agent}", f"total_timesteps={_STEPS}")),
             f"RL Zoo's {agent}, {_STEPS:,} steps, SB3's defaults, one env",
             None if peers.why_not("RL_ZOO") else partial(_rl_zoo, agent),
             peers.why_not("RL_ZOO"),
         )
     count = 2 * workload.sweep_seeds
-    sweep = _train("-m", "agent=dqn,ppo", f"seed=range({workload.sweep_seeds})")
-    yield Comparison("whole command, seconds", f"a sweep of {count}, per run", lambda: _run(sweep)[0] / count)
+    sweep = train("-m", "agent=dqn,ppo", f"seed=range({workload.sweep_seeds})")
+    yield Comparison("whole command, seconds", f"a sweep of {count}, per run", lambda: run(sweep)[0] / count)
     large = ["env.num_rows=200", "env.num_cols=200", "total_timesteps=8192"]
     for name, words in (("5x6", []), ("200x200", large)):
         for agent in ("dqn", "ppo"):
-            command = _train(f"agent={agent}", "evaluation.every=100000", *words)
+            command = train(f"agent={agent}", "evaluation.every=100000", *words)
             yield Comparison(
                 "peak memory of the whole command, MB",
                 f"train.py agent={agent}, {name}",
-                lambda command=command: _run(command)[1],  # type: ignore[misc]
+                lambda command=command: run(command)[1],  # type: ignore[misc]
                 'python -c "import stable_baselines3"',
-                lambda: _run([sys.executable, "-c", "import stable_baselines3"])[1],
+                lambda: run([sys.executable, "-c", "import stable_baselines3"])[1],
             )
 
 
-def _train(*words: str) -> list[str]:
+def train(*words: str) -> list[str]:
+    """The command line of a training run, or of a sweep, without progress lines."""
     return [sys.executable, "-m", "gridworld", "train", *words, "logging.progress=false"]
 
 
@@ -74,10 +75,10 @@ def _rl_zoo(agent: str) -> float:
 
 
 def _seconds(command: list[str], env: Mapping[str, str] | None = None) -> float:
-    return _run(command, env)[0]
+    return run(command, env)[0]
 
 
-def _run(command: list[str], env: Mapping[str, str] | None = None) -> tuple[float, float]:
+def run(command: list[str], env: Mapping[str, str] | None = None) -> tuple[float, float]:
     """Seconds, and peak memory in MB, of a process in a folder of its own."""
     measured = [sys.executable, "-S", "-c", _MEASURE, *command]
     with tempfile.TemporaryDirectory() as folder:

@@ -16,7 +16,7 @@ from gridworld.run.claim import check_inside, check_writable
 from gridworld.storage.atomic_write import write_json
 
 # By the table's name on the command line: its module, imported where it is asked for.
-_TABLES = {table: table for table in ("stepping", "training", "worlds")}
+_TABLES = {table: table for table in ("stepping", "training", "worlds", "population")}
 _TABLES |= {"whole": "end_to_end", "files": "file_system"}
 
 

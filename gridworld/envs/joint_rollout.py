@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.envs.vector_env import Advance, Ended, GridWorldVectorEnv
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray
+from gridworld.envs.vector_env import Advance, Ended, GridWorldVectorEnv, StateArray
+from gridworld.world.mdp import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -38,16 +38,16 @@ class Rollout:
         first_ended: n + 1, of each step, the first of the m that it ended.
     """
 
-    states: IntArray
-    actions: IntArray
+    states: StateArray
+    actions: StateArray
     rewards: FloatArray
-    last_states: IntArray
+    last_states: StateArray
     terminated: BoolArray
     truncated: BoolArray
-    final_states: IntArray
-    which: IntArray
+    final_states: StateArray
+    which: StateArray
     returns: FloatArray
-    lengths: IntArray
+    lengths: StateArray
     first_ended: Sequence[int]
 
     def step(self, number: int) -> Advance:
@@ -106,7 +106,8 @@ def roll(
     tables = zip(states, actions, rewards, last_states, terminated, truncated, strict=True)
     finals = joint.states.reshape(runs, count)
     of_runs = _of_runs(ended, runs, steps, count)
-    return [Rollout(*table, final, *over) for table, final, over in zip(tables, finals, of_runs, strict=True)]
+    pairs: Any = zip(tables, finals, of_runs, strict=True)
+    return [Rollout(*table, final, *over) for table, final, over in pairs]
 
 
 class _Joint:
@@ -135,7 +136,7 @@ class _Joint:
             np.concatenate(arrays) for arrays in zip(*(batch.under_way for batch in batches), strict=True)
         )
 
-    def advance(self, actions: IntArray) -> tuple[IntArray, FloatArray, BoolArray, BoolArray, Any]:
+    def advance(self, actions: StateArray) -> tuple[StateArray, FloatArray, BoolArray, BoolArray, Any]:
         """See `GridWorldVectorEnv.advance`; the last are where episodes ended, their returns and lengths."""
         index = self.states * self._num_actions
         index += actions
@@ -166,7 +167,7 @@ class _Joint:
             part = slice(run * size, (run + 1) * size)
             batch.go_on_from(self.states[part], self._elapsed[part], self._returns[part])
 
-    def _draw_outcomes(self, pairs: IntArray) -> IntArray:
+    def _draw_outcomes(self, pairs: StateArray) -> StateArray:
         moving = np.flatnonzero(~self._still.take(self.states + self._first_state))
         draws = self._draws(moving)
         thresholds = self._thresholds.take(pairs[moving], axis=1)
@@ -177,7 +178,7 @@ class _Joint:
         outcomes[moving] = drawn
         return outcomes
 
-    def _draw_starts(self, which: IntArray) -> IntArray:
+    def _draw_starts(self, which: StateArray) -> StateArray:
         cuts = self._cuts(which)
         starts = np.empty(len(which), dtype=np.int64)
         for batch, (start, end) in zip(self._batches, itertools.pairwise(cuts), strict=True):
@@ -185,14 +186,14 @@ class _Joint:
                 starts[start:end] = batch.draw_starts(end - start)
         return starts
 
-    def _draws(self, where: IntArray) -> FloatArray:
+    def _draws(self, where: StateArray) -> FloatArray:
         """A number for each of these places, from the generators of their batches."""
         cuts = self._cuts(where)
         counts = [end - start for start, end in itertools.pairwise(cuts)]
         pairs = zip(self._batches, counts, strict=True)
         return np.concatenate([batch.np_random.random(count) for batch, count in pairs])
 
-    def _cuts(self, where: IntArray) -> list[int]:
+    def _cuts(self, where: StateArray) -> list[int]:
         """Of ascending places, the first of each batch; and their number."""
         bounds = np.arange(len(self._batches) + 1) * self._count
         cuts: list[int] = np.searchsorted(where, bounds).tolist()
@@ -217,6 +218,6 @@ def _of_runs(ended: list[Any], runs: int, steps: int, count: int) -> list[tuple[
     return found
 
 
-def _starts(lengths: Sequence[int]) -> IntArray:
+def _starts(lengths: Sequence[int]) -> StateArray:
     """Where parts of these lengths begin, one behind the other."""
     return np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)

@@ -60,7 +60,7 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
         return step
 
     def count(self, states: NDArray[Any], actions: NDArray[Any], ended: Ended | None) -> None:
-        """Count a step from these states (num_envs,) by these actions (num_envs,), and what it ended."""
+        """See `GridWorldVectorEnv.count`."""
         taken = states * self.mdp.num_actions
         np.add(taken, actions, out=taken, casting="unsafe")  # unsigned ones too
         np.add.at(self._flat_visits, taken, 1)

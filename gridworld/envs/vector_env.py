@@ -288,6 +288,15 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         """Put back what `under_way` returned, or what has become of it."""
         self._state, self._elapsed, self._returns = states.copy(), elapsed.copy(), returns.copy()
 
+    def count(self, states: NDArray[Any], actions: NDArray[Any], ended: Ended | None) -> None:
+        """Count a step that was made elsewhere (`joint_rollout`), where a subclass counts steps.
+
+        Args:
+            states: (num_envs,), that it began in.
+            actions: (num_envs,), integers.
+            ended: the episodes that it ended.
+        """
+
     def draw_starts(self, count: int) -> StateArray | np.int64:
         """The states in which so many new episodes begin, or the one in which all do."""
         starts = self.mdp.start_states

@@ -1,0 +1,122 @@
+"""Populations: a sweep's runs that train together, beside one run alone."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import torch
+
+from gridworld.agents import family
+from gridworld.agents.sb3.interop.make_vec_env import make_vec_env
+from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
+from gridworld.benchmark import peers
+from gridworld.benchmark.end_to_end import run, train
+from gridworld.benchmark.measure import Comparison, Workload
+from gridworld.benchmark.training import PPO_LARGE
+from gridworld.config.composition.compose import compose
+from gridworld.config.composition.conf_folder import conf_folder
+from gridworld.envs.observations import make_observation
+from gridworld.process.together import run_together
+from gridworld.training.setup import make_context
+
+_LARGE_ENVS, _LARGE_ROLLOUTS = 1024, 16
+
+
+def comparisons(workload: Workload) -> Iterator[Comparison]:
+    """Whole commands, then training alone, at the shipped settings and with large batches."""
+    torch.set_num_threads(1)
+    seeds = workload.sweep_seeds
+    for agent, count in (("ppo", seeds), ("dqn", seeds), ("a2c", seeds), ("ppo", 5 * seeds)):
+        sweep = train("-m", f"agent={agent}", f"seed=range({count})")
+        yield Comparison(
+            "whole command with all pictures, seconds",
+            f"train.py -m agent={agent} 'seed=range({count})'",
+            partial(_seconds, sweep),
+            f"train.py agent={agent}",
+            partial(_seconds, train(f"agent={agent}")),
+        )
+        if count == seeds:
+            yield Comparison(
+                "whole command with all pictures, seconds",
+                "the same",
+                partial(_seconds, sweep),
+                "run by run, hydra.sweeper.population=1",
+                partial(_seconds, [*sweep, "hydra.sweeper.population=1"]),
+            )
+    for agent in ("ppo", "dqn", "a2c"):
+        yield Comparison(
+            "training alone, environment steps per second",
+            f"{agent}, {seeds} seeds as one population",
+            partial(_shipped, agent, seeds),
+            "one seed",
+            partial(_shipped, agent, 1),
+        )
+    cores = os.cpu_count() or 1
+    each = max(1, seeds // cores)
+    yield Comparison(
+        "training alone, environment steps per second",
+        f"ppo, {_LARGE_ENVS} envs x 32, {each * cores} seeds on {cores} cores",
+        partial(_on_all_cores, cores, each),
+        f"NAVIX's compiled PPO, {_LARGE_ENVS} x 32, vmap over as many seeds",
+        None if peers.why_not("NAVIX") else partial(peers.navix, each * cores),
+        peers.why_not("NAVIX"),
+    )
+
+
+def _seconds(command: list[str]) -> float:
+    return run(command)[0]
+
+
+def _shipped(agent: str, seeds: int) -> float:
+    """Environment steps a second of so many seeds of an agent as it is shipped."""
+    learners = [_learner(agent, seed) for seed in range(seeds)]
+    started = time.perf_counter()
+    steps = sum(_result(found) for found in run_together([partial(_learn, *each) for each in learners]))
+    return steps / (time.perf_counter() - started)
+
+
+def _learner(agent: str, seed: int) -> tuple[Any, int]:
+    config = compose(conf_folder(), [f"agent={agent}", f"seed={seed}"])
+    mdp = config.env.compile()
+    context = make_context(config, mdp, make_observation(mdp, config.observation.kind))
+    return family(config.agent).build(config.agent, context), config.total_timesteps
+
+
+def _learn(agent: Any, total_timesteps: int) -> int:
+    agent.learn(total_timesteps, lambda steps: True)
+    return int(agent.model.num_timesteps)
+
+
+def _on_all_cores(cores: int, seeds: int) -> float:
+    """Environment steps a second of as many populations as there are cores."""
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(cores) as pool:
+        return sum(pool.map(_large, [seeds] * cores, chunksize=1))
+
+
+def _large(seeds: int) -> float:
+    torch.set_num_threads(1)
+    models = []
+    for seed in range(seeds):
+        envs = make_vec_env(n_envs=_LARGE_ENVS)
+        models.append(TabulatedPPO("MlpPolicy", envs, seed=seed, device="cpu", **PPO_LARGE))
+    steps = _LARGE_ENVS * PPO_LARGE["n_steps"] * _LARGE_ROLLOUTS
+
+    def learn(model: TabulatedPPO) -> int:
+        model.learn(steps)
+        return int(model.num_timesteps)
+
+    started = time.perf_counter()
+    made = sum(_result(found) for found in run_together([partial(learn, model) for model in models]))
+    return made / (time.perf_counter() - started)
+
+
+def _result(found: int | Exception) -> int:
+    if isinstance(found, Exception):
+        raise found
+    return found
