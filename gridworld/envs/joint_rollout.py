@@ -106,8 +106,8 @@ def roll(
     tables = zip(states, actions, rewards, last_states, terminated, truncated, strict=True)
     finals = joint.states.reshape(runs, count)
     of_runs = _of_runs(ended, runs, steps, count)
-    pairs: Any = zip(tables, finals, of_runs, strict=True)
-    return [Rollout(*table, final, *over) for table, final, over in pairs]
+    runs_of: list[Any] = list(zip(tables, finals, of_runs, strict=True))
+    return [Rollout(*table, final, *over) for table, final, over in runs_of]
 
 
 class _Joint:

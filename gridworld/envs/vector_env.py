@@ -297,12 +297,10 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
             ended: the episodes that it ended.
         """
 
-    def draw_starts(self, count: int) -> StateArray | np.int64:
-        """The states in which so many new episodes begin, or the one in which all do."""
+    def draw_starts(self, count: int) -> Any:
+        """The states in which so many new episodes begin, (count,), or the one in which all do."""
         starts = self.mdp.start_states
-        if len(starts) == 1:
-            return starts[0]
-        return starts[self.mdp.start_index(self.np_random.random(count))]
+        return starts[0] if len(starts) == 1 else starts[self.mdp.start_index(self.np_random.random(count))]
 
     def _restart(self, which: NDArray[np.intp]) -> None:
         self._state[which] = self.draw_starts(len(which))
