@@ -107,7 +107,7 @@ def roll(
     finals = joint.states.reshape(runs, count)
     of_runs = _of_runs(ended, runs, steps, count)
     runs_of: list[Any] = list(zip(tables, finals, of_runs, strict=True))
-    return [Rollout(*table, final, *over) for table, final, over in runs_of]
+    return [Rollout(*[*table, final, *over]) for table, final, over in runs_of]
 
 
 class _Joint:
