@@ -12,6 +12,7 @@ from pathlib import Path
 
 import hydra
 from helpers import forks
+from helpers.composing import compose_quickly
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -71,6 +72,7 @@ def _composed(overrides: tuple[str, ...]) -> TrainConfig:
 
 @functools.cache
 def _loader() -> tuple[SweepLoader, DictConfig]:
+    compose_quickly()
     register_schemas()
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         loader = GlobalHydra.instance().config_loader()
