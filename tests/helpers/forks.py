@@ -49,13 +49,20 @@ class Watched(Ended):
         return self.stdout + self.stderr
 
 
-def run(name: str, *words: str, cwd: Path, environment: dict[str, str], timeout: float) -> Ended:
-    """Run one of the scripts in `cwd`.
+def run(
+    name: str,
+    *words: str,
+    cwd: Path,
+    environment: dict[str, str],
+    timeout: float,
+    stdout: Path | None = None,
+) -> Ended:
+    """Run one of the scripts in `cwd`, which prints to the file `stdout`, or to what comes back.
 
     Raises:
         subprocess.TimeoutExpired: It took longer than `timeout` seconds, and was killed.
     """
-    return _warm().run(name, words, cwd, {**os.environ, **environment}, timeout, None)[0]
+    return _warm().run(name, words, cwd, {**os.environ, **environment}, timeout, None, stdout)[0]
 
 
 def run_watched(
@@ -149,11 +156,12 @@ class _Warm:
         environment: dict[str, str],
         timeout: float,
         secret: str | None,
+        stdout: Path | None = None,
     ) -> tuple[Ended, dict[str, Any]]:
         out, err, report = (Path(self._folder.name) / name for name in ("out", "err", "report"))
         for path in (out, err, report):
             path.write_bytes(b"")
-        streams = (os.open(out, os.O_WRONLY), os.open(err, os.O_WRONLY))
+        streams = (os.open(stdout or out, os.O_WRONLY), os.open(err, os.O_WRONLY))
         watched = None if secret is None else {"secret": secret, "report": str(report)}
         process = self._fork(name, words, cwd, environment, streams, watched)
         for stream in streams:
