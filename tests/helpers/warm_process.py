@@ -7,7 +7,8 @@ answer goes back over it; `helpers.forks` asks. The process ends with the proces
 with what a process of its own would start with: command line, folder, environment, paths, random numbers.
 Four things differ: everything is imported already, Hydra has composed settings once and composes faster,
 garbage is collected less often, and what Python and the libraries read of the environment while they are
-loaded is that of the first request. And no line says that something takes long, as on a busy machine it may.
+loaded is that of the first request. And no line says that something takes long, as on a busy machine it may;
+the table of a search is written more often.
 """
 
 import atexit
@@ -46,6 +47,7 @@ import gridworld
 from gridworld.config.composition.compose import compose
 from gridworld.envs.rendering import import_pygame
 from gridworld.process import progress
+from gridworld.tune import progress as search_progress
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 
@@ -249,6 +251,7 @@ if __name__ == "__main__":
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     _import_everything()
     progress._SECONDS_BETWEEN_LINES = 600.0
+    search_progress._SECONDS_BETWEEN_TABLES = 0.3
     compose_quickly()
     compose(CONF, [])
     OverridesParser.create().parse_overrides(list(_WORDS))
