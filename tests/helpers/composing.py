@@ -1,4 +1,4 @@
-"""Composing in three quarters of the time: what Hydra and OmegaConf do again and again is done once in a process."""
+"""Composing in three quarters of the time: what Hydra and OmegaConf repeat is done once in a process."""
 
 import copy
 import functools
