@@ -76,8 +76,11 @@ def pytest_collection_finish() -> None:
     """What was imported stays, and need not be looked through each time that garbage is collected."""
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)  # networks this small take longer with more
+    if "gridworld.agents.sb3.factory" in sys.modules:
+        sys.modules["gridworld.agents.sb3.factory"].keep_compiler_out()
     gc.collect()
     gc.freeze()
+    gc.set_threshold(50_000)  # 700 is Python's own
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -10,7 +10,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from helpers.support import CONF, ROOT, SHORT
+from helpers.support import CONF, ROOT, SHORT, script
 
 from gridworld import __version__
 from gridworld.commands.shell.console import COMMANDS
@@ -72,7 +72,7 @@ def test_asking_imports_nothing_heavy(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_help_names_the_command_that_was_called(name: str, tmp_path: Path) -> None:
-    done = gridworld(name, "--help", cwd=tmp_path)
+    done = script(str(ROOT / "gridworld" / "__main__.py"), name, "--help", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert f"usage: gridworld {name} " in done.stdout
     assert not re.search(r"scripts/|\b(?:train|tune|record|report|evaluate|jobs|play)\.py", done.stdout)

@@ -1,4 +1,7 @@
-"""`recipe=FILE`: what tune.py found comes out as Hydra would compose it, a stranger's is only data."""
+"""`recipe=FILE`: what tune.py found comes out as Hydra would compose it, a stranger's is only data.
+
+That the shipped recipes are the same as data, test_experiments.py checks beside what else it asks of them.
+"""
 
 import dataclasses
 import os
@@ -18,8 +21,6 @@ from gridworld.storage.safe_read import read_object
 from gridworld.tune.recipe import write_recipe
 from gridworld.tune.study_spec import ConfFolders, compose_in, compose_study
 
-# Those named textbook have an interpolation.
-SHIPPED = sorted(path for path in (CONF / "experiment").glob("*.yaml") if "textbook" not in path.name)
 WINNERS = {
     "dqn": [
         *("agent.learning_rate=lin_3e-7", "agent.policy_kwargs.net_arch=[16,8]", "agent.train_freq=[2,step]"),
@@ -48,11 +49,6 @@ def test_a_winner_is_the_same_by_hydra_and_as_data(agent: str, tmp_path: Path) -
     by_hydra = compose_in(ConfFolders(CONF, (tmp_path,)), "train", ["experiment=winner"])
     assert of_words(f"recipe={path}") == without_hydra(by_hydra) == configure(*words)
     assert of_words(f"recipe={tmp_path}") == configure(*words)
-
-
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: str(path.stem))
-def test_the_shipped_recipes_are_the_same_as_data(path: Path) -> None:
-    assert of_words(f"recipe={path}") == configure(f"experiment={path.stem}")
 
 
 def test_the_command_line_goes_before_the_recipe() -> None:

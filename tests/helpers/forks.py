@@ -1,20 +1,23 @@
 """Scripts in forks of one process that has imported everything: a process each, at the cost of none.
 
-The process starts with the first script that is asked for, and serves all tests of this process.
+The process starts with the first script that any of pytest's processes asks for, serves them all, and ends
+with the process that started them.
 """
 
 import atexit
+import fcntl
 import functools
 import json
 import os
 import select
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
 import time
 from dataclasses import dataclass, field
-from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from multiprocessing.reduction import send_handle
 from pathlib import Path
 from typing import Any
@@ -46,13 +49,20 @@ class Watched(Ended):
         return self.stdout + self.stderr
 
 
-def run(name: str, *words: str, cwd: Path, environment: dict[str, str], timeout: float) -> Ended:
-    """Run one of the scripts in `cwd`.
+def run(
+    name: str,
+    *words: str,
+    cwd: Path,
+    environment: dict[str, str],
+    timeout: float,
+    stdout: Path | None = None,
+) -> Ended:
+    """Run one of the scripts in `cwd`, which prints to the file `stdout`, or to what comes back.
 
     Raises:
         subprocess.TimeoutExpired: It took longer than `timeout` seconds, and was killed.
     """
-    return _warm().run(name, words, cwd, {**os.environ, **environment}, timeout, None)[0]
+    return _warm().run(name, words, cwd, {**os.environ, **environment}, timeout, None, stdout)[0]
 
 
 def run_watched(
@@ -128,22 +138,14 @@ def _warm() -> "_Warm":
 
 
 class _Warm:
-    """The process and the connection to it. It ends when this one does."""
+    """A process of this one's own that forks, and the connection to it. It ends when this one does."""
 
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="forks-")
         self.scratch = Path(self._folder.name) / "scratch"
         self.scratch.mkdir()
-        self._connection, other = Pipe()
-        command = [sys.executable, str(Path(__file__).with_name("warm_process.py")), str(other.fileno())]
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            env=_FRESH,
-            pass_fds=[other.fileno()],
-        )
-        other.close()
+        self._connection: Connection[Any, Any] = Connection(_connected().detach())
+        self._process = int(self._connection.recv())
         atexit.register(self._end)
 
     def run(
@@ -154,11 +156,12 @@ class _Warm:
         environment: dict[str, str],
         timeout: float,
         secret: str | None,
+        stdout: Path | None = None,
     ) -> tuple[Ended, dict[str, Any]]:
         out, err, report = (Path(self._folder.name) / name for name in ("out", "err", "report"))
         for path in (out, err, report):
             path.write_bytes(b"")
-        streams = (os.open(out, os.O_WRONLY), os.open(err, os.O_WRONLY))
+        streams = (os.open(stdout or out, os.O_WRONLY), os.open(err, os.O_WRONLY))
         watched = None if secret is None else {"secret": secret, "report": str(report)}
         process = self._fork(name, words, cwd, environment, streams, watched)
         for stream in streams:
@@ -204,13 +207,47 @@ class _Warm:
             }
         )
         for stream in streams:
-            send_handle(self._connection, stream, self._process.pid)
+            send_handle(self._connection, stream, self._process)
         return int(self._connection.recv())
 
     def _end(self) -> None:
         self._connection.close()
-        self._process.wait()
         self._folder.cleanup()
+
+
+def _connected() -> socket.socket:
+    """A connection to the warm process, which is started where there is none."""
+    owner = os.getppid() if "PYTEST_XDIST_WORKER" in os.environ else os.getpid()
+    folder = Path(tempfile.gettempdir()) / f"forks-of-{owner}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        path = folder / "socket"
+        ours = socket.socket(socket.AF_UNIX)
+        try:
+            ours.connect(str(path))
+        except OSError:
+            path.unlink(missing_ok=True)
+            _start(owner, path)
+            ours.connect(str(path))
+    return ours
+
+
+def _start(owner: int, path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+        listener.set_inheritable(True)
+        program = str(Path(__file__).with_name("warm_process.py"))
+        os.posix_spawn(
+            sys.executable,
+            [sys.executable, program, str(listener.fileno()), str(owner)],
+            _FRESH,
+            file_actions=[
+                (os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0),
+                (os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0),
+            ],
+        )
 
 
 def _text(path: Path) -> str:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import hydra
 from helpers import forks
+from helpers.composing import compose_quickly
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -71,6 +72,7 @@ def _composed(overrides: tuple[str, ...]) -> TrainConfig:
 
 @functools.cache
 def _loader() -> tuple[SweepLoader, DictConfig]:
+    compose_quickly()
     register_schemas()
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         loader = GlobalHydra.instance().config_loader()
@@ -88,7 +90,13 @@ _READ_AT_START = re.compile(r"PYTHON(?!PATH$)|LC_|LANG|LD_|OMP_|MKL_|OPENBLAS_")
 
 
 def script(
-    name: str, *arguments: str, cwd: Path, real: bool = False, timeout: float = 120, **environment: str
+    name: str,
+    *arguments: str,
+    cwd: Path,
+    real: bool = False,
+    stdout: Path | None = None,
+    timeout: float = 120,
+    **environment: str,
 ) -> subprocess.CompletedProcess[str]:
     """Run one of the scripts as a user does, from another folder.
 
@@ -98,12 +106,13 @@ def script(
         cwd: The folder to run it in.
         real: Start Python for it. Otherwise it runs in a fork of a process that has imported everything,
             which takes seconds less; see `helpers.warm_process` for the difference.
+        stdout: A file that a fork prints to, instead of to what comes back.
         timeout: The seconds that it may take.
         environment: Variables beside those of this process. One that Python reads when it starts makes
             the process a real one.
     """
     if not real and not any(map(_READ_AT_START.match, environment)):
-        ended = forks.run(name, *arguments, cwd=cwd, environment=environment, timeout=timeout)
+        ended = forks.run(name, *arguments, cwd=cwd, environment=environment, timeout=timeout, stdout=stdout)
         return subprocess.CompletedProcess([name, *arguments], ended.code, ended.stdout, ended.stderr)
     return subprocess.run(
         [sys.executable, str(ROOT / "scripts" / name), *arguments],

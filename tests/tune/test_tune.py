@@ -272,7 +272,7 @@ def test_without_optuna_it_says_what_to_install(tmp_path: Path, monkeypatch: pyt
 
 
 LONG = (
-    "total_timesteps=60000",  # so that a trial outlasts the two seconds between two tables
+    "total_timesteps=20000",  # so that a trial outlasts the time between two tables in a fork, 0.3 seconds
     "tune.pruner=none",
     "tune.stop_after=null",
     "tune.trials=3",
