@@ -177,6 +177,8 @@ class _Listeners:
             self._before = {number: signal.getsignal(number) for number in handlers}
             for number, handler in handlers.items():
                 signal.signal(number, handler)
+        else:  # those that began before may have been asked already
+            request.number = self._requests[0].number
         self._requests.append(request)
 
     def remove(self, request: StopRequest) -> None:

@@ -6,7 +6,8 @@ and each goes on. A task that ends, or fails, is not waited for. Outside of `run
 work for the one that calls it. So no task can tell whether it runs alone.
 
 What a process has only once is changed over with the task: the generators of random numbers (Python's,
-numpy's and torch's) and the context variables.
+numpy's and torch's) and the context variables. Only the second normal number that numpy's old functions keep
+for the next call is not: to copy it takes longer than a step of training, none of which draws one.
 """
 
 from __future__ import annotations
@@ -97,14 +98,13 @@ def run_together(tasks: Sequence[Callable[[], T]]) -> list[T | Exception]:
 
     Raises:
         SystemExit: a task raised it. The others have gone on until they ended.
-        BaseException: one of another kind, which is no `Exception`. It was raised in the others too.
+        BaseException: one of another kind, which is no `Exception`. It was raised in the others too, and none
+            of them made a `SystemExit` of it.
     """
     running = [_Task(function) for function in tasks]
     with _keeping_chance():
         _run_all(running)
-    ends = [task.error for task in running if isinstance(task.error, SystemExit)]
-    if ends:
-        raise ends[0]
+    _exit_as_asked(running)
     return [task.result if task.error is None else _exception(task.error) for task in running]
 
 
@@ -121,6 +121,7 @@ def _run_all(tasks: Sequence[_Task]) -> None:
         for task in tasks:
             while not task.dead:  # it may wait once more on its way out
                 task.resume(stop)
+        _exit_as_asked(tasks)
         raise
 
 
@@ -194,6 +195,13 @@ def _pass_on(error: BaseException | None) -> None:
     """Raise what is to end all tasks."""
     if error is not None and not isinstance(error, Exception | SystemExit):
         raise error
+
+
+def _exit_as_asked(ended: Sequence[_Task]) -> None:
+    """Raise the first `SystemExit` that a task raised."""
+    for task in ended:
+        if isinstance(task.error, SystemExit):
+            raise task.error
 
 
 def _exception(error: BaseException) -> Exception:

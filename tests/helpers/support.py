@@ -139,7 +139,8 @@ def train_on_full_disk(most: int, *words: str, cwd: Path) -> subprocess.Complete
     return subprocess.run(
         [sys.executable, str(ROOT / "scripts" / "train.py"), *words],
         cwd=cwd,
-        env={**os.environ, "GIT_DIR": "none"},  # the changes of a tree at work would not fit
+        # The changes of a tree at work would not fit, and compiled modules would be half written.
+        env={**os.environ, "GIT_DIR": "none", "PYTHONDONTWRITEBYTECODE": "1"},
         preexec_fn=limit,
         capture_output=True,
         text=True,

@@ -14,7 +14,7 @@ from helpers.resuming import begin, differences, go_on, left_behind, stopped_aft
 from helpers.support import SHORT, script, train_on_full_disk
 
 from gridworld.agents.sb3 import rehearsal
-from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
+from gridworld.agents.sb3.tabulated.off_policy import Update
 from gridworld.errors import InputError
 from gridworld.run import checkpoints as checkpoint
 from gridworld.run import writer as run
@@ -50,13 +50,14 @@ def test_numbers_that_are_none_stop_a_run(
 def test_the_last_good_state_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     words = [*SHORT["dqn"], *LESS, "checkpoint.every=100"]
     begin(tmp_path / "calm", *words)
-    descend = TabulatedDQN.descend
+    descend = Update.descend
 
-    def spoilt(self: TabulatedDQN, states: Any, actions: Any, targets: Any) -> float:
-        return descend(self, states, actions, targets * (float("nan") if self.num_timesteps > 1500 else 1))
+    def spoilt(self: Update, states: Any, actions: Any, targets: Any) -> Any:
+        late = self._models[0].num_timesteps > 1500
+        return descend(self, states, actions, targets * (float("nan") if late else 1))
 
     with monkeypatch.context() as patched:
-        patched.setattr(TabulatedDQN, "descend", spoilt)
+        patched.setattr(Update, "descend", spoilt)
         with pytest.raises(
             InputError, match=r"training diverged at update 64, after 1,536 steps: the gradient"
         ):
@@ -71,15 +72,17 @@ def test_a_finished_run_that_fails_while_it_is_made_longer_stays_as_it_was(
     run = tmp_path / "run"
     begin(run, *SHORT["dqn"], *LESS, "checkpoint.every=100")
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    descend, errors = TabulatedDQN.descend, {"error.txt": RuntimeError("a bug"), "": InputError("diverged")}
+    descend, errors = Update.descend, {"error.txt": RuntimeError("a bug"), "": InputError("diverged")}
 
-    def spoilt(self: TabulatedDQN, *arguments: Any) -> float:
-        if self.num_timesteps > 4000:  # the finished run's checkpoint is kept beside the newest two
+    def spoilt(self: Update, *arguments: Any) -> Any:
+        if (
+            self._models[0].num_timesteps > 4000
+        ):  # the finished run's checkpoint is kept beside the newest two
             assert len(list(run.glob("checkpoints/*.state"))) == 3
             raise error
         return descend(self, *arguments)
 
-    monkeypatch.setattr(TabulatedDQN, "descend", spoilt)
+    monkeypatch.setattr(Update, "descend", spoilt)
     for trace, error in errors.items():
         with pytest.raises(type(error), match=str(error)):
             go_on(run, 5000)

@@ -19,13 +19,14 @@ from gridworld import GridWorldVectorEnv
 from gridworld.agents.sb3 import check
 from gridworld.agents.sb3.constructor_arguments import algorithm_and_arguments
 from gridworld.agents.sb3.schemas import SB3Config
-from gridworld.agents.sb3.tabulated import qrdqn_loss, trpo_loss
+from gridworld.agents.sb3.tabulated import off_policy, qrdqn_loss, trpo_loss
 from gridworld.agents.sb3.tabulated import state_inputs as tabulated
 from gridworld.agents.sb3.tabulated.a2c import TabulatedA2C
 from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
 from gridworld.agents.sb3.tabulated.ppo_loss import log_softmax
 from gridworld.agents.sb3.tabulated.qrdqn import TabulatedQRDQN
+from gridworld.agents.sb3.tabulated.side_by_side import SideBySide
 from gridworld.agents.sb3.tabulated.trpo import TabulatedTRPO
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.envs.observations import make_observation
@@ -372,7 +373,10 @@ def test_dqn_looks_up_a_table_only_while_its_network_stands_still() -> None:
     with torch.no_grad():
         expected = ours.q_net(torch.as_tensor(ours.env.observation.table())).argmax(dim=1).numpy()
     assert np.array_equal(before, expected)
-    ours.descend(states, (expected + 1) % 4, np.full(30, 50, dtype=np.float32))
+    with SideBySide([ours.descent]) as rows:
+        off_policy.Update([ours], rows).descend(
+            states[None], (expected[None] + 1) % 4, np.full((1, 30), 50, dtype=np.float32)
+        )
     assert ours._online is None
     with torch.no_grad():
         expected = ours.q_net(torch.as_tensor(ours.env.observation.table())).argmax(dim=1).numpy()

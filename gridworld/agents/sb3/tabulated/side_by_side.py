@@ -169,9 +169,10 @@ class SideBySide:
             return [True]
         self.backward(outputs, slopes)
         norms = torch.linalg.vector_norm(self._gradients, dim=1).tolist()
-        scales = [clipping(norm, most) for norm, most in zip(norms, max_grad_norms, strict=True)]
+        pairs = zip(norms, max_grad_norms, strict=True)
+        scales = [min(1.0, clipping(norm, most)) for norm, most in pairs]  # 1 where it is NaN
         if min(scales) < 1:
-            self._gradients *= torch.tensor([[min(scale, 1.0)] for scale in scales])
+            self._gradients *= torch.tensor(scales)[:, None]
         finite = [norms[row] < math.inf for row in rows]
         self._advance(tuple(row for row, goes in zip(rows, finite, strict=True) if goes))
         return finite

@@ -1,0 +1,313 @@
+"""Runs that train as one population: each is, bit for bit, the run that it would have been alone."""
+
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.support import configure
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gridworld.agents import family
+from gridworld.agents.sb3.tabulated import side_by_side, state_inputs
+from gridworld.envs.observations import make_observation
+from gridworld.process.together import run_together
+from gridworld.training.setup import check_settings, make_context
+
+Words = tuple[str, ...]
+Learned = dict[str, Any]  # all that learning leaves
+
+SMALL: dict[str, Words] = {
+    "dqn": (
+        *("agent=dqn", "n_envs=2", "total_timesteps=240", "agent.learning_starts=60", "agent.train_freq=4"),
+        *("agent.gradient_steps=3", "agent.batch_size=24", "agent.buffer_size=150", "agent.log_interval=2"),
+    ),
+    "qrdqn": (
+        *("agent=qrdqn", "total_timesteps=160", "n_envs=4", "+agent.arguments.learning_starts=40"),
+        *("agent.arguments.gradient_steps=2", "agent.arguments.batch_size=16"),
+        "agent.arguments.policy_kwargs.n_quantiles=5",
+    ),
+    "ppo": (
+        *("agent=ppo", "total_timesteps=128", "n_envs=4", "agent.n_steps=8", "agent.batch_size=8"),
+        "agent.n_epochs=3",
+    ),
+    "a2c": ("agent=a2c", "total_timesteps=100", "n_envs=4"),
+}
+
+
+def learned(words: Words, on_step: Callable[[int], bool] = lambda steps: True) -> Learned:
+    """Train; returns weights, the optimiser's state, the buffer, visits, what was logged, random numbers."""
+    config = configure(*words)
+    mdp = check_settings(config)
+    observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
+    logged: list[Any] = []
+
+    def log(values: dict[str, Any], step: int) -> None:
+        logged.append(
+            (step, sorted((key, repr(v)) for key, v in values.items() if not key.startswith("time/")))
+        )
+
+    context = make_context(config, mdp, observation, log)
+    agent: Any = family(config.agent).build(config.agent, context)
+    agent.learn(config.total_timesteps, on_step)
+    model, found = agent.model, {}
+    for name, tensor in model.policy.state_dict().items():
+        found[f"weights {name}"] = tensor.numpy().tobytes()
+    for number, state in model.policy.optimizer.state_dict()["state"].items():
+        found |= {f"optimiser {number} {key}": np.asarray(value).tobytes() for key, value in state.items()}
+    buffer = getattr(model, "replay_buffer", None) or model.rollout_buffer
+    for name, array in vars(buffer).items():
+        if isinstance(array, np.ndarray):
+            found[f"buffer {name}"] = array.tobytes()
+    found["visits"], found["logged"] = context.envs.visits.tobytes(), logged
+    found["steps"] = model.num_timesteps, model._n_updates
+    found["random numbers"] = np.random.rand(3).tobytes(), torch.rand(3).numpy().tobytes()
+    return found
+
+
+def alone(words: Words) -> Learned | Exception:
+    try:
+        return learned(words)
+    except Exception as error:
+        return error
+
+
+def together(runs: Sequence[Words]) -> list[Learned | Exception]:
+    return run_together([lambda words=words: learned(words) for words in runs])  # type: ignore[misc]
+
+
+def differences(one: Learned | Exception, other: Learned | Exception) -> list[str]:
+    if isinstance(one, Exception) or isinstance(other, Exception):
+        return [] if repr(one) == repr(other) else [f"{one!r:.200} and {other!r:.200}"]
+    return [key for key in sorted(one.keys() | other.keys()) if one.get(key) != other.get(key)]
+
+
+def assert_as_alone(runs: Sequence[Words]) -> None:
+    expected = [alone(words) for words in runs]
+    for words, mine, theirs in zip(runs, together(runs), expected, strict=True):
+        assert isinstance(theirs, dict), theirs
+        assert differences(mine, theirs) == [], words
+
+
+@pytest.fixture
+def meetings(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many networks were run at once, each time."""
+    sizes: list[int] = []
+    original = side_by_side.SideBySide
+
+    class Counted(original):  # type: ignore[misc, valid-type]
+        def __init__(self, optimizers: Sequence[Any]) -> None:
+            sizes.append(len(optimizers))
+            super().__init__(optimizers)
+
+    from gridworld.agents.sb3.tabulated import a2c, off_policy, ppo
+
+    for module in (a2c, off_policy, ppo):
+        monkeypatch.setattr(module, "SideBySide", Counted)
+    return sizes
+
+
+@pytest.mark.parametrize("agent", SMALL)
+def test_seeds_train_as_alone(agent: str, meetings: list[int]) -> None:
+    runs = [(*SMALL[agent], f"seed={seed}", "env.slip=0.1") for seed in range(4)]
+    expected = [alone(words) for words in runs]
+    assert set(meetings) == {1}
+    meetings.clear()
+    assert [differences(*pair) for pair in zip(together(runs), expected, strict=True)] == [[]] * 4
+    assert set(meetings) == {4}
+    assert len({repr(each) for each in expected}) == 4
+
+
+# Settings that may differ within a population, and those that are the same for all that train at once.
+OF_ALL: list[list[Words]] = [
+    [(), ("env.slip=0.3",), ("env.slip=0.1", "env.max_episode_steps=7"), ("env.step_reward=-0.5",)],
+    [(), ("total_timesteps=70",), ("total_timesteps=333",)],
+]
+DIFFERENT: dict[str, list[list[str]]] = {  # of each argument; the empty one is the agent's own
+    "dqn": [
+        ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
+        ["gamma=0.5", "gamma=1", ""],
+        ["exploration_fraction=0.3", "exploration_final_eps=0.5", "exploration_initial_eps=0.2"],
+        ["target_update_interval=1", "target_update_interval=37", ""],
+        ["tau=0.5", "", ""],
+        ["max_grad_norm=0.01", "max_grad_norm=1000", ""],
+        ["learning_starts=0", "learning_starts=100", ""],
+        ["buffer_size=40", "buffer_size=1000", ""],
+    ],
+    "qrdqn": [
+        ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
+        ["gamma=0.5", "gamma=1", ""],
+        ["exploration_fraction=0.3", "exploration_final_eps=0.5", ""],
+        ["target_update_interval=8", "tau=0.3", ""],
+        ["max_grad_norm=0.01", ""],
+    ],
+    "ppo": [
+        ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
+        ["gamma=0.5", "gae_lambda=0", ""],
+        ["ent_coef=0.1", "vf_coef=2", ""],
+        ["target_kl=0.0001", "target_kl=0.003", ""],
+        ["clip_range=0.01", "clip_range=lin_0.5", ""],
+        ["clip_range_vf=0.01", "clip_range_vf=lin_1", ""],
+        ["max_grad_norm=0.01", "max_grad_norm=1000", ""],
+    ],
+    "a2c": [
+        ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
+        ["gamma=0.5", "gae_lambda=0.5", ""],
+        ["ent_coef=0.3", "vf_coef=2", ""],
+        ["max_grad_norm=0.01", ""],
+    ],
+}
+OBSERVATIONS: list[Words] = [(), ("observation=coordinates",), ("observation=none",)]
+NETS = ["", "net_arch=[20]", "net_arch=[7,1]", "net_arch=[]", "net_arch=[33,5,16]"]
+SPLIT_NETS = ["net_arch={pi:[9],vf:[4,3]}", "net_arch={pi:[],vf:[20]}"]
+
+
+def word(agent: str, setting: str, inside: str = "") -> Words:
+    """A word of the command line that gives the agent an argument."""
+    if not setting:
+        return ()
+    of_class = agent in ("qrdqn", "a2c")
+    return (f"++agent.{'arguments.' if of_class else ''}{inside}{setting}",)
+
+
+@st.composite
+def populations(draw: Callable[..., Any]) -> list[Words]:
+    """Members of one or two shapes, with whatever settings of their own."""
+    shapes = []
+    for _ in range(draw(st.sampled_from([1, 1, 2]))):
+        agent = draw(st.sampled_from(sorted(SMALL)))
+        nets = NETS if agent in ("dqn", "qrdqn") else NETS + SPLIT_NETS
+        net = word(agent, draw(st.sampled_from(nets)), "policy_kwargs.")
+        shapes.append((agent, (*SMALL[agent], *draw(st.sampled_from(OBSERVATIONS)), *net)))
+    members = []
+    for seed in range(draw(st.integers(2, 5))):
+        agent, shape = draw(st.sampled_from(shapes))
+        of_agent = [word(agent, draw(st.sampled_from(values))) for values in DIFFERENT[agent]]
+        of_all = [draw(st.sampled_from(values)) for values in OF_ALL]
+        members.append((*shape, *(each for words in (*of_all, *of_agent) for each in words), f"seed={seed}"))
+    return members
+
+
+@settings(max_examples=14)
+@given(runs=populations())
+def test_whatever_their_settings_runs_train_as_alone(runs: list[Words]) -> None:
+    assert_as_alone(runs)
+
+
+@pytest.mark.parametrize("agent", SMALL)
+def test_runs_that_differ_in_all_that_may_differ(agent: str, meetings: list[int]) -> None:
+    """Each value occurs, and all are updated at once while they have the same to do."""
+    runs = [
+        tuple(
+            each
+            for place, values in enumerate(DIFFERENT[agent])
+            for each in word(agent, values[(member + place) % len(values)])
+        )
+        for member in range(3)
+    ]
+    runs = [(*SMALL[agent], *words, f"seed={seed}") for seed, words in enumerate(runs)]
+    if agent == "ppo":  # it has another loss where the value is clipped: two of one kind, and another
+        assert sum("clip_range_vf" in " ".join(words) for words in runs) == 2
+    assert_as_alone(runs)
+    assert max(meetings) == (2 if agent == "ppo" else 3)
+
+
+WRITTEN = {
+    "ppo one step": ("ppo", ("agent.n_steps=1", "agent.batch_size=4")),
+    "ppo one sample": ("ppo", ("agent.n_steps=2", "agent.batch_size=1", "total_timesteps=24")),
+    "ppo whole batch": ("ppo", ("agent.batch_size=32", "agent.normalize_advantage=false")),
+    "ppo one environment": ("ppo", ("n_envs=1", "agent.n_steps=15", "agent.batch_size=5")),
+    "a2c one step": ("a2c", ("agent.arguments.n_steps=1", "total_timesteps=24")),
+    "a2c scaled": ("a2c", ("++agent.arguments.normalize_advantage=true",)),
+    "a2c adam": ("a2c", ("++agent.arguments.use_rms_prop=false",)),
+    "dqn one sample": ("dqn", ("agent.batch_size=1", "agent.gradient_steps=1", "agent.train_freq=1")),
+    "dqn many steps": ("dqn", ("agent.gradient_steps=-1", "n_envs=3")),
+    "dqn episodes": ("dqn", ("agent.train_freq=[2,episode]", "n_envs=1")),
+    "dqn sgd": ("dqn", ("agent.policy_kwargs.optimizer_class=torch.optim.SGD",)),
+    "dqn amsgrad": ("dqn", ("agent.policy_kwargs.optimizer_kwargs={amsgrad: true}",)),
+    "dqn decay": ("dqn", ("agent.policy_kwargs.optimizer_kwargs={weight_decay: 0.1, betas: [0.5, 0.9]}",)),
+    "qrdqn one quantile": ("qrdqn", ("agent.arguments.policy_kwargs.n_quantiles=1",)),
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_buffers_batches_and_optimisers_of_other_kinds(name: str, meetings: list[int]) -> None:
+    agent, words = WRITTEN[name]
+    assert_as_alone([(*SMALL[agent], *words, f"seed={seed}") for seed in range(3)])
+    assert max(meetings) == 3
+
+
+@pytest.mark.parametrize("activation", [each.__name__ for each in state_inputs.ACTIVATIONS])
+def test_all_activations(activation: str, meetings: list[int]) -> None:
+    """PReLU learns something in no linear layer: such networks train one by one."""
+    given = word("ppo", f"activation_fn=torch.nn.{activation}", "policy_kwargs.")
+    shape = (*SMALL["ppo"], *given, "total_timesteps=64", "agent.policy_kwargs.net_arch=[13]")
+    assert_as_alone([(*shape, f"seed={seed}", "observation=coordinates") for seed in range(2)])
+    assert max(meetings) == (1 if activation == "PReLU" else 2)
+
+
+# What ends one of them
+
+
+RATE = {agent: word(agent, "learning_rate=1e38") for agent in SMALL}
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("place", [0, 1])
+@pytest.mark.parametrize("agent", SMALL)
+def test_one_that_diverges_leaves_the_others_alone(agent: str, place: int) -> None:
+    tight = word(agent, "max_grad_norm=0.01")  # so that gradients are clipped at the step, too
+    runs = [(*SMALL[agent], *tight, f"seed={seed}") for seed in range(3)]
+    runs[place] = (*runs[place], *RATE[agent])
+    found = together(runs)
+    assert isinstance(found[place], Exception)
+    assert "no finite number" in str(found[place])
+    expected = [alone(words) for words in runs]
+    assert [differences(*pair) for pair in zip(found, expected, strict=True)] == [[]] * 3
+
+
+@pytest.mark.parametrize("agent", SMALL)
+def test_one_that_fails_or_is_stopped_leaves_the_others_alone(agent: str) -> None:
+    runs = [(*SMALL[agent], f"seed={seed}") for seed in range(3)]
+    expected = [alone(words) for words in runs]
+
+    def fails() -> Learned:
+        return learned(runs[1], lambda steps: steps < 60 or 1 / 0)  # type: ignore[arg-type, return-value]
+
+    def stops() -> Learned:
+        return learned(runs[2], lambda steps: steps < 60)
+
+    first, failed, stopped, last = run_together(
+        [lambda: learned(runs[0]), fails, stops, lambda: learned(runs[1])]
+    )
+    assert isinstance(failed, ZeroDivisionError)
+    assert differences(first, expected[0]) == differences(last, expected[1]) == []
+    assert differences(stopped, stops()) == []
+    assert stopped["steps"][0] < 70  # type: ignore[index]
+
+
+# The self-test
+
+
+def test_where_products_add_up_otherwise_runs_train_one_by_one(
+    monkeypatch: pytest.MonkeyPatch, meetings: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [(*SMALL["dqn"], f"seed={seed}", "observation=coordinates") for seed in range(3)]
+    expected = [alone(words) for words in runs]
+    meetings.clear()
+    product = torch.bmm
+
+    def other(one: torch.Tensor, two: torch.Tensor) -> torch.Tensor:
+        found = product(one, two)
+        return torch.nextafter(found, torch.full_like(found, torch.inf))
+
+    monkeypatch.setattr(torch, "bmm", other)
+    monkeypatch.setattr(side_by_side, "_agreed", {})
+    assert [differences(*pair) for pair in zip(together(runs), expected, strict=True)] == [[]] * 3
+    assert set(meetings) == {1}
+    told = capsys.readouterr().err
+    assert len(re.findall(r"^population: .* train one by one$", told, re.MULTILINE)) == 1
+    monkeypatch.undo()
