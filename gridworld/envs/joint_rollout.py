@@ -27,6 +27,7 @@ class Rollout:
     Attributes:
         states: int64, that the steps began in.
         actions: int64.
+        pairs: int64, states * A + actions.
         rewards: float64.
         last_states: int64, where the steps led to, before the reset of episodes that ended.
         terminated: bool.
@@ -40,6 +41,7 @@ class Rollout:
 
     states: StateArray
     actions: StateArray
+    pairs: StateArray
     rewards: FloatArray
     last_states: StateArray
     terminated: BoolArray
@@ -49,6 +51,11 @@ class Rollout:
     returns: FloatArray
     lengths: StateArray
     first_ended: Sequence[int]
+
+    def ended(self, number: int) -> tuple[FloatArray, StateArray]:
+        """The returns and lengths of the episodes that a step ended."""
+        start, end = self.first_ended[number], self.first_ended[number + 1]
+        return self.returns[start:end], self.lengths[start:end]
 
     def step(self, number: int) -> Advance:
         """What `GridWorldVectorEnv.advance` returns for a step."""
@@ -103,7 +110,8 @@ def roll(
         if len(over[0]):
             ended.append((np.full(len(over[0]), step), *over))
     joint.put_back()
-    tables = zip(states, actions, rewards, last_states, terminated, truncated, strict=True)
+    pairs = states * batches[0].mdp.num_actions + actions
+    tables = zip(states, actions, pairs, rewards, last_states, terminated, truncated, strict=True)
     finals = joint.states.reshape(runs, count)
     of_runs = _of_runs(ended, runs, steps, count)
     runs_of: list[Any] = list(zip(tables, finals, of_runs, strict=True))

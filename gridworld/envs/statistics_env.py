@@ -12,8 +12,9 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
-from gridworld.envs.vector_env import Advance, Ended, GridWorldVectorEnv
+from gridworld.envs.vector_env import Advance, GridWorldVectorEnv
 from gridworld.storage.serialization import State, fill
+from gridworld.world.mdp import FloatArray
 
 
 class Returns(NamedTuple):
@@ -32,6 +33,7 @@ class Returns(NamedTuple):
         return Returns(self.episodes + others.episodes, self.total + others.total)
 
 
+_NONE = np.zeros(0)
 NO_EPISODES = Returns(0, 0.0)
 
 
@@ -54,19 +56,19 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
 
     def advance(self, actions: NDArray[Any]) -> Advance:
         """See `GridWorldVectorEnv.advance`."""
-        states = self._state
+        pairs = self._state * self.mdp.num_actions
         step = super().advance(actions)
-        self.count(states, actions, step[4])
+        np.add(pairs, actions, out=pairs, casting="unsafe")  # unsigned ones too
+        ended = step[4]
+        self.count(pairs, *((_NONE, _NONE) if ended is None else (ended.returns, ended.lengths)))
         return step
 
-    def count(self, states: NDArray[Any], actions: NDArray[Any], ended: Ended | None) -> None:
+    def count(self, pairs: NDArray[Any], returns: FloatArray, lengths: NDArray[Any]) -> None:
         """See `GridWorldVectorEnv.count`."""
-        taken = states * self.mdp.num_actions
-        np.add(taken, actions, out=taken, casting="unsafe")  # unsigned ones too
-        np.add.at(self._flat_visits, taken, 1)
-        if ended is not None:
-            total = float(np.add.reduce(ended.returns))
-            self._ended = Returns(self._ended.episodes + len(ended.returns), self._ended.total + total)
+        np.add.at(self._flat_visits, pairs, 1)
+        if len(returns):
+            total = float(np.add.reduce(returns))
+            self._ended = Returns(self._ended.episodes + len(returns), self._ended.total + total)
 
     def get_state(self) -> State:
         """See `GridWorldVectorEnv.get_state`."""

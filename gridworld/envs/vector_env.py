@@ -288,13 +288,13 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         """Put back what `under_way` returned, or what has become of it."""
         self._state, self._elapsed, self._returns = states.copy(), elapsed.copy(), returns.copy()
 
-    def count(self, states: NDArray[Any], actions: NDArray[Any], ended: Ended | None) -> None:
+    def count(self, pairs: NDArray[Any], returns: FloatArray, lengths: NDArray[np.int64]) -> None:
         """Count a step that was made elsewhere (`joint_rollout`), where a subclass counts steps.
 
         Args:
-            states: (num_envs,), that it began in.
-            actions: (num_envs,), integers.
-            ended: the episodes that it ended.
+            pairs: (num_envs,), state * A + action of each environment.
+            returns: (m,), undiscounted, of the episodes that it ended.
+            lengths: (m,), theirs, in steps.
         """
 
     def draw_starts(self, count: int) -> Any:

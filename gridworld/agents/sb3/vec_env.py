@@ -115,23 +115,27 @@ class GridWorldVecEnv(VecEnv):
         if ended is None:
             return StateStep(states, states, rewards, terminated, truncated, {})
         truncated &= ~terminated
-        elapsed = round(time.time() - self._started, 6)
         infos = {
             index: {
                 "terminal_observation": observation,
                 "TimeLimit.truncated": cut,
-                "episode": {"r": episode_return, "l": length, "t": elapsed},
+                "episode": episode,
             }
-            for index, observation, cut, episode_return, length in zip(
+            for index, observation, cut, episode in zip(
                 ended.which.tolist(),
                 self.observation.rows(ended.states[ended.which]),
                 truncated[ended.which].tolist(),
-                ended.returns.tolist(),
-                ended.lengths.tolist(),
+                self.episodes(ended.returns, ended.lengths),
                 strict=True,
             )
         }
         return StateStep(states, ended.states, rewards, ended.mask, truncated, infos)
+
+    def episodes(self, returns: FloatArray, lengths: NDArray[np.int64]) -> list[dict[str, Any]]:
+        """Episodes that ended now, by their returns and lengths (m,), as SB3's Monitor reports them."""
+        elapsed = round(time.time() - self._started, 6)
+        pairs = zip(returns.tolist(), lengths.tolist(), strict=True)
+        return [{"r": episode_return, "l": length, "t": elapsed} for episode_return, length in pairs]
 
     def get_state(self) -> State:
         """Where the batch stands, as a value. Seeds and options were used up by `reset`."""

@@ -68,6 +68,7 @@ class CheckpointCallback(BaseCallback):
         self._classes = ClassState()
         self.state: State | None = None
         self.goes_on = True
+        self.reads_locals = bool(others)  # whether anybody reads the variables of SB3's loop
 
     def _init_callback(self) -> None:
         for index, other in enumerate(self._others):

@@ -116,27 +116,23 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         request = _Request(env.envs, thresholds, draws)
         meet(_roll_together, request, (shape_of(env.envs), n_rollout_steps))
         rolled = request.rolled
-
-        last_starts = self._last_episode_starts
+        over = rolled.terminated | rolled.truncated
+        starts = np.concatenate([np.atleast_2d(cast(Any, self._last_episode_starts)), over])  # of episodes, step by step
         for step in range(n_rollout_steps):
-            actions = rolled.actions[step]
-            found = rolled.step(step)
-            env.envs.count(rolled.states[step], actions, found[4])
-            done = env.told(found)
-            rewards, dones, infos = done.rewards, done.dones, infos_of(done, env.num_envs)
+            env.envs.count(rolled.pairs[step], *(ended := rolled.ended(step)))
             self.num_timesteps += env.num_envs
-            callback.update_locals(locals())
+            if getattr(callback, "reads_locals", True):
+                callback.update_locals({**locals(), **_told(env, rolled, step)})
             if not callback.on_step():
+                self._last_episode_starts = starts[step]
                 return False
-            cast(Any, self.ep_info_buffer).extend([info["episode"] for info in done.ended.values()])
-            if done.ended and done.truncated.any():
-                rewards = rewards + self.gamma * done.truncated * values[done.last_states]
-            rollout_buffer.rewards[step] = rewards
-            rollout_buffer.episode_starts[step] = last_starts
-            last_starts = self._last_episode_starts = dones
+            cast(Any, self.ep_info_buffer).extend(env.episodes(*ended))
+        self._last_episode_starts = dones = starts[-1]
 
         states = rolled.final_states
         rollout_buffer.observations, rollout_buffer.actions = rolled.states, rolled.actions
+        rollout_buffer.rewards[:] = self._rewards(rolled, values)
+        rollout_buffer.episode_starts[:] = starts[:-1]
         rollout_buffer.values = values[rolled.states]
         rollout_buffer.log_probs = log_prob[rolled.states, rolled.actions]
         rollout_buffer.full = True
@@ -145,6 +141,14 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
+
+    def _rewards(self, rolled: Rollout, values: Float32Array) -> FloatArray:
+        """Rewards (n, E), with what the network expects after an episode that the step limit cut off."""
+        cut = rolled.truncated & ~rolled.terminated
+        (steps,) = np.nonzero(cut.any(axis=1))
+        rewards = rolled.rewards
+        rewards[steps] += self.gamma * cut[steps] * values[rolled.last_states[steps]]
+        return rewards
 
     def samples(self) -> tuple[IntArray, IntArray, Float32Array, Float32Array]:
         """States, actions, advantages and returns of the rollout's n samples, (n,) each.
@@ -182,6 +186,13 @@ def _roll_together(requests: Sequence[_Request]) -> list[Exception | None]:
     for request, rolled in zip(requests, roll(envs, thresholds, draws), strict=True):
         request.rolled = rolled
     return [None] * len(requests)
+
+
+def _told(env: GridWorldVecEnv, rolled: Rollout, step: int) -> dict[str, Any]:
+    """A step's variables of SB3's own loop, which callbacks read."""
+    done = env.told(rolled.step(step))
+    infos = infos_of(done, env.num_envs)
+    return {"actions": rolled.actions[step], "rewards": done.rewards, "dones": done.dones, "infos": infos}
 
 
 class Rollouts:
