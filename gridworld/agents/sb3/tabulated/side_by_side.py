@@ -75,11 +75,12 @@ def agree(models: Sequence[Tabulated]) -> bool:
     """
     key = models[0].inputs.kind, len(models)
     if key not in _agreed:
+        was_told = not all(_agreed.values())
         _agreed[key] = _try_out(models)
-        if not _agreed[key]:
+        if not (_agreed[key] or was_told):
             tell(
-                "population: this processor or torch adds up otherwise for several networks at once; these "
-                "runs train one by one"
+                "population: this processor or torch adds up otherwise for several networks like these at "
+                "once; such runs train one by one"
             )
     return _agreed[key]
 
