@@ -107,10 +107,11 @@ class GridWorldVecEnv(VecEnv):
         Raises:
             InputError: other actions.
         """
-        return self.told(self.envs.advance(actions))
+        step = self.envs.advance(actions)
+        return self.told(step, [] if step[4] is None else self.episodes(step[4].returns, step[4].lengths))
 
-    def told(self, step: Advance) -> StateStep:
-        """A step of the batch as SB3 is told of it."""
+    def told(self, step: Advance, episodes: list[dict[str, Any]]) -> StateStep:
+        """A step of the batch as SB3 is told of it; `episodes` are those that it ended."""
         states, rewards, terminated, truncated, ended = step
         if ended is None:
             return StateStep(states, states, rewards, terminated, truncated, {})
@@ -125,7 +126,7 @@ class GridWorldVecEnv(VecEnv):
                 ended.which.tolist(),
                 self.observation.rows(ended.states[ended.which]),
                 truncated[ended.which].tolist(),
-                self.episodes(ended.returns, ended.lengths),
+                episodes,
                 strict=True,
             )
         }

@@ -26,7 +26,7 @@ from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer
 from gridworld.agents.sb3.tabulated.ppo_loss import Outputs, log_softmax
 from gridworld.agents.sb3.tabulated.side_by_side import Leaves, SideBySide, forward
 from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of
-from gridworld.agents.sb3.vec_env import GridWorldVecEnv
+from gridworld.agents.sb3.vec_env import GridWorldVecEnv, StateStep
 from gridworld.envs.joint_rollout import Rollout, roll, shape_of
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.process.together import meet
@@ -117,16 +117,22 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         meet(_roll_together, request, (shape_of(env.envs), n_rollout_steps))
         rolled = request.rolled
         over = rolled.terminated | rolled.truncated
-        starts = np.concatenate([np.atleast_2d(cast(Any, self._last_episode_starts)), over])  # of episodes, step by step
+        starts = np.concatenate(
+            [np.atleast_2d(cast(Any, self._last_episode_starts)), over]
+        )  # of episodes, step by step
         for step in range(n_rollout_steps):
-            env.envs.count(rolled.pairs[step], *(ended := rolled.ended(step)))
+            actions, ended = rolled.actions[step], rolled.ended(step)
+            episodes = env.episodes(*ended)
+            env.envs.count(rolled.pairs[step], *ended)
             self.num_timesteps += env.num_envs
             if getattr(callback, "reads_locals", True):
-                callback.update_locals({**locals(), **_told(env, rolled, step)})
+                callback.update_locals(
+                    {**locals(), **_told(env.told(rolled.step(step), episodes), env.num_envs)}
+                )
             if not callback.on_step():
                 self._last_episode_starts = starts[step]
                 return False
-            cast(Any, self.ep_info_buffer).extend(env.episodes(*ended))
+            cast(Any, self.ep_info_buffer).extend(episodes)
         self._last_episode_starts = dones = starts[-1]
 
         states = rolled.final_states
@@ -188,11 +194,9 @@ def _roll_together(requests: Sequence[_Request]) -> list[Exception | None]:
     return [None] * len(requests)
 
 
-def _told(env: GridWorldVecEnv, rolled: Rollout, step: int) -> dict[str, Any]:
+def _told(done: StateStep, num_envs: int) -> dict[str, Any]:
     """A step's variables of SB3's own loop, which callbacks read."""
-    done = env.told(rolled.step(step))
-    infos = infos_of(done, env.num_envs)
-    return {"actions": rolled.actions[step], "rewards": done.rewards, "dones": done.dones, "infos": infos}
+    return {"rewards": done.rewards, "dones": done.dones, "infos": infos_of(done, num_envs)}
 
 
 class Rollouts:
