@@ -45,6 +45,10 @@ class AgentConfig:
         """What must be equal for runs of it to train as one population; None: each trains by itself."""
         return None
 
+    def memory(self, num_states: int, num_envs: int, total_timesteps: int) -> int:
+        """About the bytes that a run of it takes while it trains, the larger part at least."""
+        return 0
+
 
 @functools.cache
 def agent_schemas() -> dict[str, type[AgentConfig]]:

@@ -46,6 +46,7 @@ class Job:
     mistake: str | None  # what is wrong with the settings, as far as it is known before training
     progress: bool  # whether its settings ask for a progress line
     shape: str | None = None  # equal for jobs that can train as one population; None: it trains alone
+    memory: int = 0  # bytes, about, that it takes while it trains
 
 
 def expand(
@@ -161,16 +162,19 @@ def plan(
     planned: dict[str, Job] = {}
     for overrides, swept in jobs:
         config = configure(overrides)
-        mistake, layout = None, ""
+        mistake, layout, memory = None, "", 0
         try:
-            layout = check_settings(config, world).text()
+            mdp = check_settings(config, world)
+            layout, memory = (
+                mdp.text(),
+                config.agent.memory(mdp.num_states, config.n_envs, config.total_timesteps),
+            )
         except InputError as error:
             mistake = str(error)
         digest = settings_hash(dataclasses.asdict(config), layout)
-        planned.setdefault(
-            digest,
-            Job(tuple(overrides), tuple(swept), digest, mistake, config.logging.progress, _shape(config)),
-        )
+        progress = config.logging.progress
+        job = Job(tuple(overrides), tuple(swept), digest, mistake, progress, _shape(config), memory)
+        planned.setdefault(digest, job)
     return list(planned.values())
 
 

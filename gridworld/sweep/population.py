@@ -7,9 +7,11 @@ files and a folder of its own; `process.together` has them meet where the networ
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -25,11 +27,12 @@ from omegaconf import DictConfig
 from gridworld.config.sweep import SweepConfig
 from gridworld.errors import InputError
 from gridworld.sweep.folder import JobEntry, SweepFolder
+from gridworld.sweep.plan import Job
 
 AUTO = "auto"
 _MOST = 32  # runs of a population unless more are asked for; larger ones train no faster
 _SHARE_OF_MEMORY = 4  # a population takes a fourth of what is free, shared by the workers
-_RUNS_BYTES = 16 * 2**20  # of a run, with its pictures
+_RUNS_BYTES = 16 * 2**20  # of a run beside its agent, with its pictures
 _KEY = "hydra.sweeper.together"
 
 
@@ -117,12 +120,12 @@ def count_jobs(overrides: Sequence[str]) -> int:
 
 
 def populations(
-    jobs: Sequence[tuple[JobEntry, str | None]], settings: SweepConfig, hydra: DictConfig
+    jobs: Sequence[tuple[JobEntry, Job]], settings: SweepConfig, hydra: DictConfig
 ) -> list[list[JobEntry]]:
     """Divide jobs into populations.
 
     Args:
-        jobs: each with its shape (`plan.Job.shape`).
+        jobs: each as sweep.json has it, and as it was planned.
         settings: of the sweep.
         hydra: Hydra's own, with the launcher's.
 
@@ -132,39 +135,43 @@ def populations(
     Raises:
         InputError: `hydra.sweeper.population` is no number of runs.
     """
-    most = _most(settings.population, hydra.launcher)
+    workers = _workers(hydra.launcher)
+    memory = _free_memory() / _SHARE_OF_MEMORY / workers
+    shapes: dict[str, list[tuple[JobEntry, Job]]] = {}
+    for entry, job in jobs:
+        key = entry.job if job.shape is None else f"shape {job.shape}"
+        shapes.setdefault(key, []).append((entry, job))
+    most = _most(settings)
     if settings.stop_at_first_failure or hydra.job.chdir or hydra.job.env_set:
         most = 1  # which one failed first would be chance, and a process has one folder and one environment
-    shapes: dict[str, list[JobEntry]] = {}
-    for entry, shape in jobs:
-        shapes.setdefault(entry.job if shape is None or most == 1 else f"shape {shape}", []).append(entry)
-    workers = _workers(hydra.launcher)
     found = []
-    for entries in shapes.values():
-        size = max(1, min(most, math.ceil(len(entries) / workers)))
-        count = math.ceil(len(entries) / size)
-        found += [list(part) for part in _even(entries, count)]
+    for members in shapes.values():
+        bounds = [most or _MOST, math.ceil(len(members) / workers)]
+        if most is None:
+            bounds.append(int(memory / (_RUNS_BYTES + max(job.memory for _, job in members))))
+        if (own := hydra.launcher.get("jobs_per_task")) is not None:  # a task of Slurm's has its own number
+            bounds.append(own)
+        count = math.ceil(len(members) / max(1, min(bounds)))
+        found += _even([entry for entry, _ in members], count)
     return found
 
 
-def _even(entries: Sequence[JobEntry], count: int) -> list[Sequence[JobEntry]]:
+def _even(entries: Sequence[JobEntry], count: int) -> list[list[JobEntry]]:
     bounds = [len(entries) * part // count for part in range(count + 1)]
-    return [entries[start:end] for start, end in itertools.pairwise(bounds)]
+    return [list(entries[start:end]) for start, end in itertools.pairwise(bounds)]
 
 
-def _most(population: int | str | None, launcher: DictConfig) -> int:
-    """The largest population that is asked for, or that memory allows."""
-    if population == AUTO:
-        free = _free_memory() / _SHARE_OF_MEMORY / _workers(launcher)
-        most = max(1, min(_MOST, int(free / _RUNS_BYTES)))
-    elif type(population) is int and population >= 1:
-        most = population
-    else:
-        raise InputError(
-            f"hydra.sweeper.population={population}: must be the number of runs that train together at most, "
-            f"1 for each by itself, or {AUTO}"
-        )
-    return min(most, launcher.get("jobs_per_task") or most)  # a task of Slurm's has its own number
+def _most(settings: SweepConfig) -> int | None:
+    """The largest population that is asked for; None: as many as train faster, and memory holds."""
+    asked = settings.population
+    if asked == AUTO:
+        return None
+    if type(asked) is int and asked >= 1:
+        return asked
+    raise InputError(
+        f"hydra.sweeper.population={asked}: must be the number of runs that train together at most, 1 for "
+        f"each by itself, or {AUTO}"
+    )
 
 
 def _workers(launcher: DictConfig) -> int:
@@ -177,11 +184,14 @@ def _workers(launcher: DictConfig) -> int:
 
 
 def _free_memory() -> int:
-    """Bytes."""
-    try:
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (ValueError, OSError, AttributeError):  # not known here
-        return 4 * 2**30
+    """Bytes that programs can still have; half of all where the system does not tell."""
+    with contextlib.suppress(OSError):
+        known = re.search(r"^MemAvailable:\s*(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE)
+        if known is not None:
+            return 1024 * int(known[1])
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+    return 4 * 2**30
 
 
 def _quoted(text: str) -> str:

@@ -70,8 +70,8 @@ def run_sweep(
     """
     folder = SweepFolder(Path(master.hydra.sweep.dir))
 
-    def divided(shapes: dict[str, str | None], to_do: list[JobEntry]) -> list[list[JobEntry]]:
-        return populations([(entry, shapes[entry.job]) for entry in to_do], settings, master.hydra)
+    def divided(by_name: dict[str, Job], to_do: list[JobEntry]) -> list[list[JobEntry]]:
+        return populations([(entry, by_name[entry.job]) for entry in to_do], settings, master.hydra)
 
     def configure(overrides: Sequence[str]) -> TrainConfig:
         return to_config(loader.load_settings(master, list(overrides)))
@@ -85,8 +85,8 @@ def run_sweep(
         with folder.at_work():
             entries = folder.add(jobs, words)
             mistakes = {e.job: job.mistake for e, job in zip(entries, jobs, strict=True) if job.mistake}
-            shapes = {e.job: job.shape for e, job in zip(entries, jobs, strict=True)}
-            sweep = _Sweep(folder, entries, launcher, partial(divided, shapes))
+            by_name = {entry.job: job for entry, job in zip(entries, jobs, strict=True)}
+            sweep = _Sweep(folder, entries, launcher, partial(divided, by_name))
             code = sweep.run(mistakes, settings.retry_failed, any(job.progress for job in jobs))
     except ConnectionError:
         raise  # from a cluster, not from a disk

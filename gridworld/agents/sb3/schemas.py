@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import asdict, dataclass, field
 from typing import Any, Optional
 
@@ -35,6 +36,10 @@ _NUMBERS = frozenset(
         "name",
     ]
 )
+
+
+_COPIES, _NUMBER = 6, 4  # of each weight: its gradient, the optimiser's, a model file; bytes
+_BYTES_OF_A_STEP = 64  # in a buffer, and while it is summed up
 
 
 @dataclass
@@ -87,6 +92,16 @@ class SB3Config(AgentConfig):
         if settings.get("engine") != "tabulated":
             return None
         return repr({key: value for key, value in settings.items() if key not in _NUMBERS})
+
+    def memory(self, num_states: int, num_envs: int, total_timesteps: int) -> int:
+        """See `AgentConfig.memory`: its networks with their copies, and what it keeps of its steps."""
+        settings = vars(self) | vars(self).get("arguments", {})
+        kwargs = settings.get("policy_kwargs") or {}
+        nets = (kwargs if isinstance(kwargs, dict) else vars(kwargs)).get("net_arch") or [64, 64]
+        widths = [num_states, *(nets if isinstance(nets, list) else max(nets.values(), key=sum)), 1]
+        weights = 2 * sum(above * below for above, below in itertools.pairwise(widths))
+        kept = min(settings.get("buffer_size", settings.get("n_steps", 2048) * num_envs), total_timesteps)
+        return _COPIES * _NUMBER * weights + _BYTES_OF_A_STEP * kept
 
 
 @dataclass
