@@ -101,7 +101,7 @@ class SB3Config(AgentConfig):
         widths = [num_states, *(nets if isinstance(nets, list) else max(nets.values(), key=sum)), 1]
         weights = 2 * sum(above * below for above, below in itertools.pairwise(widths))
         kept = min(settings.get("buffer_size", settings.get("n_steps", 2048) * num_envs), total_timesteps)
-        return _COPIES * _NUMBER * weights + _BYTES_OF_A_STEP * kept
+        return int(_COPIES * _NUMBER * weights + _BYTES_OF_A_STEP * kept)
 
 
 @dataclass
