@@ -7,9 +7,11 @@ files and a folder of its own; `process.together` has them meet where the networ
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -177,11 +179,11 @@ def _workers(launcher: DictConfig) -> int:
 
 
 def _free_memory() -> int:
-    """Bytes."""
-    try:
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (ValueError, OSError, AttributeError):  # not known here
-        return 4 * 2**30
+    """Bytes that processes can have, with what the disk's cache would give up."""
+    with contextlib.suppress(OSError):
+        if found := re.search(r"^MemAvailable:\s*(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE):
+            return int(found[1]) * 1024
+    return 4 * 2**30  # not known here
 
 
 def _quoted(text: str) -> str:

@@ -8,7 +8,9 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ from helpers.support import script, start
 from helpers.sweeps import differing, logged, rows
 
 from gridworld.errors import InputError
+from gridworld.process.terminal import TOLD
 from gridworld.process.together import run_together
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.storage.append_log import AppendLog
@@ -162,6 +165,17 @@ def test_a_run_that_cannot_write_ends_alone_and_goes_on(
         assert differences(left_behind(tmp_path / str(seed)), calm[seed]) == []
     go_on(tmp_path / "1")
     assert differences(left_behind(tmp_path / "1"), calm[1]) == []
+
+
+def test_what_a_process_has_once_is_as_before(tmp_path: Path) -> None:
+    """A rehearsal silences the process, for its own run."""
+    words = ["agent=a2c", "n_envs=4", "total_timesteps=128", "evaluation.every=64"]
+    words += ["recording.gif=false", "recording.frames=false"]
+    before = sys.stdout, sys.stderr, TOLD.disabled, warnings.showwarning
+    tasks = [lambda seed=seed: begin(tmp_path / str(seed), *words) for seed in range(3)]
+    assert run_together(tasks) == [None] * 3  # type: ignore[arg-type]
+    assert (sys.stdout, sys.stderr, TOLD.disabled, warnings.showwarning) == before
+    assert ("ignore", None, Warning, None, 0) not in warnings.filters
 
 
 def test_runs_that_are_certified_end_when_they_would_alone(tmp_path: Path) -> None:
