@@ -30,6 +30,7 @@ T = TypeVar("T")
 M = TypeVar("M")
 _GLOBAL: Any = np.random  # numpy's stubs do not know all of its functions
 Work = Callable[[Sequence[M]], Sequence[Exception | None]]
+_is_by_itself: contextvars.ContextVar[bool] = contextvars.ContextVar("is_by_itself", default=False)
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,7 @@ def meet(work: Work[M], member: M, key: Hashable) -> None:
         Exception: what `work` returned for this task.
     """
     task = getcurrent()
-    if not isinstance(task, _Task):
+    if not isinstance(task, _Task) or _is_by_itself.get():
         (error,) = work([member])
         if error is not None:
             raise error
@@ -159,6 +160,16 @@ def meet(work: Work[M], member: M, key: Hashable) -> None:
     task.waiting = _Waiting(work, member, key)
     assert task.parent is not None
     task.parent.switch()
+
+
+@contextlib.contextmanager
+def by_itself() -> Iterator[None]:
+    """Let no other task run in the block, which changes what all share: in there, `meet` waits for none."""
+    token = _is_by_itself.set(True)
+    try:
+        yield
+    finally:
+        _is_by_itself.reset(token)
 
 
 def chance() -> np.random.RandomState:

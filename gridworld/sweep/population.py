@@ -103,9 +103,9 @@ def lines(folder: Path, groups: Sequence[Sequence[JobEntry]], first: int) -> lis
         first: the number of their first job, `hydra.job.num`.
     """
     found = []
-    for group in groups:
+    for number_given, group in enumerate(groups, first):  # by the launcher, to each population
         words = line(folder, group[0])
-        if len(group) > 1:
+        if len(group) > 1 or number_given != first:
             names = ",".join(_quoted(f"{number}:{each.job}") for number, each in enumerate(group, first))
             words += [f"{_KEY}=[{names}]", "hydra.output_subdir=null"]
         found.append(words)

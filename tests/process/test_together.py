@@ -16,7 +16,7 @@ import torch
 
 from gridworld.process import signals, together
 from gridworld.process.signals import Interrupted, StopRequest
-from gridworld.process.together import chance, clock, meet, run_together
+from gridworld.process.together import by_itself, chance, clock, meet, run_together
 
 NAME: ContextVar[str] = ContextVar("name", default="outside")
 met: list[list[Any]] = []
@@ -130,6 +130,24 @@ def test_context_variables_are_a_tasks_own() -> None:
     assert run_together([task("a"), task("b")]) == ["a", "b"]
     assert NAME.get() == "outside"
     assert met == [["outside"]] * 2  # two works, as a lambda each
+
+
+def test_a_task_by_itself_waits_for_none() -> None:
+    order: list[str] = []
+
+    def task(name: str) -> Callable[[], None]:
+        def run() -> None:
+            with by_itself():
+                order.append(f"{name} begins")
+                meet(note, name, None)
+                order.append(f"{name} ends")
+            meet(note, name, None)
+
+        return run
+
+    run_together([task("a"), task("b")])
+    assert order == ["a begins", "a ends", "b begins", "b ends"]
+    assert met == [["a"], ["b"], ["a", "b"]]
 
 
 def test_a_task_that_fails_leaves_the_others() -> None:

@@ -22,6 +22,7 @@ from typing import Any
 from gridworld.agents.sb3.snapshot.callback import set_torch_state, torch_state
 from gridworld.agents.sb3.snapshot.class_state import is_known
 from gridworld.process.terminal import TOLD
+from gridworld.process.together import by_itself
 from gridworld.storage.rng_state import global_state, set_global_state
 
 
@@ -38,7 +39,7 @@ def rolled_back(*classes: type) -> Iterator[None]:
                 with contextlib.suppress(Exception):  # each kind of object has its own
                     setattr(holder, name, copy.deepcopy(value, copied))
     try:
-        with _silence():
+        with _silence(), by_itself():
             yield
     finally:
         for holder, content in zip(holders, before, strict=True):

@@ -1,0 +1,296 @@
+"""Sweeps whose runs train as populations: each run is what it would be alone, whatever others do."""
+
+import errno
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.resuming import begin, differences, go_on, left_behind
+from helpers.support import script, start
+from helpers.sweeps import differing, logged, rows
+
+from gridworld.errors import InputError
+from gridworld.process.terminal import TOLD
+from gridworld.process.together import run_together
+from gridworld.run.checkpoints import Checkpoints
+from gridworld.storage.append_log import AppendLog
+
+KILLS = int(os.environ.get("GRIDWORLD_POPULATION_KILLS", "20"))
+SMALL = (
+    *("n_envs=16", "total_timesteps=1536", "evaluation.every=512", "agent.batch_size=64"),
+    *("agent.log_interval=1", "recording.gif=false", "recording.frames=false", "logging.progress=false"),
+)
+JOBS = ("agent=ppo,dqn", "seed=range(3)", *SMALL)
+ALONE = "hydra.sweeper.population=1"
+WORKERS = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
+
+
+def sweep(name: str, *words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return script("train.py", "-m", *words, f"hydra.sweep.dir={name}", cwd=cwd)
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep whose runs trained one by one."""
+    cwd = tmp_path_factory.mktemp("alone")
+    done = sweep("calm", *JOBS, ALONE, cwd=cwd)
+    assert done.returncode == 0, done.stderr
+    return cwd / "calm"
+
+
+@pytest.mark.parametrize("words", [(), ("hydra.sweeper.population=2",), WORKERS])
+def test_each_run_is_the_run_alone(words: tuple[str, ...], alone: Path, tmp_path: Path) -> None:
+    done = sweep("together", *JOBS, *words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "sweep together: 6 jobs: 6 pending; 6 to run\n"
+    together = tmp_path / "together"
+    assert differing(together, alone) == {}
+    assert rows(together) == rows(alone)
+    assert len(rows(together)) == 6
+    assert {path.name for path in together.iterdir()} == {path.name for path in alone.iterdir()}
+    numbers = {
+        re.findall(r"num: (\d+)", (run / ".hydra" / "hydra.yaml").read_text())[0]
+        for run in (together / job for job in rows(together))
+    }
+    assert numbers == set("012345")
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "foo", "1.5", "true", "null", "'2'"])
+def test_a_mistaken_size_is_refused_before_anything_is_written(value: str, tmp_path: Path) -> None:
+    done = sweep("new", *JOBS, f"hydra.sweeper.population={value}", cwd=tmp_path)
+    assert done.returncode == 2
+    shown = {"true": "(true|True)", "null": "None", "'2'": "2"}.get(value, re.escape(value))
+    assert re.fullmatch(
+        rf"error: hydra\.sweeper\.population={shown}: (must be the number of runs that train together at "
+        r"most, 1 for each by itself, or auto|Value .* is incompatible with type hint .*)\n",
+        done.stderr,
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
+# One member goes wrong
+
+
+def test_members_that_are_refused_or_diverge_leave_the_others_alone(tmp_path: Path) -> None:
+    """A mistake is found before; a learning rate is refused at the rehearsal, or makes no finite numbers."""
+    words = ("agent=dqn", *SMALL, "agent.gradient_steps=1", "agent.learning_rate=1e20,0.001,1e38,-1,0.002")
+    for name, more in (("together", ()), ("calm", (ALONE,))):
+        done = sweep(name, *words, *more, cwd=tmp_path)
+        assert done.returncode == 1, done.stderr
+        assert "Traceback" not in done.stderr
+    together, calm = rows(tmp_path / "together"), rows(tmp_path / "calm")
+    assert [(row["status"], row["error"]) for row in together.values()] == [
+        (row["status"], row["error"].replace("calm", "together")) for row in calm.values()
+    ]
+    assert [row["status"] for row in together.values()] == ["failed", "done", "failed", "failed", "done"]
+    assert "training diverged at update" in together["agent.learning_rate=1e+20"]["error"]
+    assert differing(tmp_path / "together", tmp_path / "calm") == {}
+    for job in ("agent.learning_rate=1e+20", "agent.learning_rate=0.001"):
+        lines = logged(tmp_path / "together" / job)
+        assert [line for line in lines if "RuntimeWarning" not in line] == [
+            line for line in logged(tmp_path / "calm" / job) if "RuntimeWarning" not in line
+        ]
+    assert logged(tmp_path / "together" / "agent.learning_rate=0.001") == [
+        "INFO begins: ",
+        "INFO finished after 1,536 steps",
+    ]
+
+
+def words_of(seed: int) -> list[str]:
+    return ["agent=ppo", *SMALL, "checkpoint.every=512", f"seed={seed}"]
+
+
+@pytest.fixture(scope="module")
+def calm(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+    """What three runs leave that trained one by one."""
+    folder = tmp_path_factory.mktemp("calm")
+    for seed in range(3):
+        begin(folder / str(seed), *words_of(seed))
+    return [left_behind(folder / str(seed)) for seed in range(3)]
+
+
+def begin_together(folder: Path) -> list[Any]:
+    tasks = [lambda seed=seed: begin(folder / str(seed), *words_of(seed)) for seed in range(3)]
+    return run_together(tasks)  # type: ignore[arg-type]
+
+
+def test_a_folder_that_is_taken_away_is_missed_by_its_run_alone(
+    calm: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save = Checkpoints.save
+
+    def taking(self: Checkpoints, *arguments: Any, **options: Any) -> None:
+        save(self, *arguments, **options)
+        shutil.rmtree(tmp_path / "1", ignore_errors=True)
+
+    monkeypatch.setattr(Checkpoints, "save", taking)
+    first, lost, last = begin_together(tmp_path)
+    assert (first, last) == (None, None)
+    assert isinstance(lost, InputError)
+    assert "run's folder was taken away while it ran" in str(lost)
+    for seed in (0, 2):
+        assert differences(left_behind(tmp_path / str(seed)), calm[seed]) == []
+    assert not (tmp_path / "1").exists()
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
+def test_a_run_that_cannot_write_ends_alone_and_goes_on(
+    code: int, calm: list[dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    append = AppendLog.append
+
+    def fails(self: AppendLog, *arguments: Any) -> None:
+        if (tmp_path / "1") in self.path.parents and list((tmp_path / "1").glob("checkpoints/*.state")):
+            raise OSError(code, os.strerror(code))
+        append(self, *arguments)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(AppendLog, "append", fails)
+        first, failed, last = begin_together(tmp_path)
+    assert (first, last) == (None, None)
+    assert isinstance(failed, InputError)
+    assert os.strerror(code) in str(failed)
+    for seed in (0, 2):
+        assert differences(left_behind(tmp_path / str(seed)), calm[seed]) == []
+    go_on(tmp_path / "1")
+    assert differences(left_behind(tmp_path / "1"), calm[1]) == []
+
+
+def test_what_a_process_has_once_is_as_before(tmp_path: Path) -> None:
+    """A rehearsal silences the process, for its own run."""
+    words = ["agent=a2c", "n_envs=4", "total_timesteps=128", "evaluation.every=64"]
+    words += ["recording.gif=false", "recording.frames=false"]
+    before = sys.stdout, sys.stderr, TOLD.disabled, warnings.showwarning
+    tasks = [lambda seed=seed: begin(tmp_path / str(seed), *words) for seed in range(3)]
+    assert run_together(tasks) == [None] * 3  # type: ignore[arg-type]
+    assert (sys.stdout, sys.stderr, TOLD.disabled, warnings.showwarning) == before
+    assert ("ignore", None, Warning, None, 0) not in warnings.filters
+
+
+def test_runs_that_are_certified_end_when_they_would_alone(tmp_path: Path) -> None:
+    """With `evaluation.stop_after`; the first to be done is not waited for."""
+    words = (
+        *("agent=ppo", "env.layout=aima_4x3", *SMALL, "total_timesteps=16384", "evaluation.stop_after=1"),
+        *("agent.ent_coef=0.01", "seed=range(4)"),
+    )
+    for name, more in (("together", ()), ("calm", (ALONE,))):
+        done = sweep(name, *words, *more, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    assert differing(tmp_path / "together", tmp_path / "calm") == {}
+    reached = {
+        json.loads(path.read_text())["reached"] for path in (tmp_path / "together").glob("*/manifest.json")
+    }
+    assert len(reached) > 1
+
+
+# Signals and kills
+
+
+def wait_for(condition: Callable[[], object], seconds: float = 60) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+LONG = ("agent=ppo", "seed=range(3)", *SMALL, "total_timesteps=15360", "evaluation.every=5120")
+
+
+@pytest.fixture(scope="module")
+def long_alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    cwd = tmp_path_factory.mktemp("long")
+    assert sweep("calm", *LONG, ALONE, cwd=cwd).returncode == 0
+    return cwd / "calm"
+
+
+@pytest.mark.parametrize(
+    ("number", "times", "launcher"),
+    [(signal.SIGTERM, 1, ()), (signal.SIGINT, 1, ()), (signal.SIGTERM, 2, ()), (signal.SIGINT, 1, WORKERS)],
+)
+def test_a_signal_interrupts_all_and_nothing_is_lost(
+    number: signal.Signals, times: int, launcher: tuple[str, ...], long_alone: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "sweep"
+    words = ("-m", *LONG, *launcher, "checkpoint.every=1024", "hydra.sweep.dir=sweep")
+    with start("train.py", *words, cwd=tmp_path) as process:
+        wait_for(lambda: len(list(folder.glob("*/checkpoints/*.state"))) >= 3)
+        for _ in range(times):
+            os.killpg(process.pid, number)
+        _, errors = process.communicate(timeout=20)
+    assert process.returncode == 128 + number, errors
+    assert f"stopped by {number.name}; go on with: python " in errors
+    assert "Traceback" not in errors
+    assert {row["status"] for row in rows(folder).values()} == {"interrupted"}
+    ends = [logged(run)[-1] for run in map(folder.joinpath, rows(folder))]
+    if not launcher:  # workers are ended, and go on from their last checkpoint
+        assert all(end.startswith(f"INFO stopped by {number.name}: ") for end in ends), ends
+    if not launcher and times == 1:
+        assert all(" steps are saved; go on with " in end for end in ends), ends
+    done = script("train.py", *words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for run in map(folder.joinpath, rows(folder)):
+        assert differences(left_behind(run), left_behind(long_alone / run.name)) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", ["ppo", "dqn"])
+def test_a_population_that_is_killed_comes_to_the_same(agent: str, tmp_path: Path) -> None:
+    words = (f"agent={agent}", "seed=range(10)", *SMALL, "checkpoint.every=256", "evaluation.every=256")
+    started = time.monotonic()
+    assert sweep("calm", *words, ALONE, cwd=tmp_path).returncode == 0
+    longest = time.monotonic() - started
+    calm = {run.parent.name: left_behind(run.parent) for run in tmp_path.glob("calm/*/summary.json")}
+    assert len(calm) == 10
+    chance, kills, folder = random.Random(agent), 0, tmp_path / "killed"
+    most = -(-KILLS // 2)
+
+    def check() -> None:
+        assert {run: row["status"] for run, row in rows(folder).items()} == dict.fromkeys(calm, "done")
+        for run, expected in calm.items():
+            assert differences(left_behind(folder / run), expected) == []
+        assert list(folder.rglob(".*.part")) == []
+        shutil.rmtree(folder)
+
+    while kills < most:
+        with start("train.py", "-m", *words, "hydra.sweep.dir=killed", cwd=tmp_path) as process:
+            end = time.monotonic() + chance.uniform(0.1, 1.0) * longest
+            while process.poll() is None and time.monotonic() < end:
+                time.sleep(0.01)
+            kills += process.poll() is None
+            process.kill()
+        if process.returncode == 0:
+            check()
+    assert sweep("killed", *words, cwd=tmp_path).returncode == 0
+    check()
+
+
+@pytest.mark.slow
+def test_the_memory_of_a_long_sweep_stays_flat(tmp_path: Path) -> None:
+    words = ("-m", "agent=ppo", "seed=range(60)", *SMALL, "total_timesteps=512", "hydra.sweeper.population=4")
+    sizes: dict[int, int] = {}  # bytes, by the number of runs that are done
+    with start("train.py", *words, "hydra.sweep.dir=long", cwd=tmp_path) as process:
+        while process.poll() is None:
+            done = len(list(tmp_path.glob("long/*/summary.json")))
+            try:
+                pages = int(Path(f"/proc/{process.pid}/statm").read_text().split()[1])
+            except (OSError, IndexError):
+                break
+            if pages:
+                sizes[done] = max(sizes.get(done, 0), pages * os.sysconf("SC_PAGE_SIZE"))
+            time.sleep(0.02)
+        assert process.wait(60) == 0
+    early = max(size for done, size in sizes.items() if done <= 20)
+    late = max(size for done, size in sizes.items() if 20 < done < 60)  # then come means over seeds
+    assert max(sizes) == 60
+    assert late - early < 8 * 2**20, sizes
