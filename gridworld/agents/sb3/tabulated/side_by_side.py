@@ -225,24 +225,44 @@ def forward(network: Iterable[nn.Module], leaves: Leaves, features: Tensor | Non
 
 
 class _Linear(torch.autograd.Function):
-    """P linear layers, with the products that torch makes for a single one, in both directions."""
+    """P linear layers, with the products that torch makes for a single one, in both directions.
+
+    A layer with one output is a product with a vector, which adds up in an order that depends on where its
+    numbers lie. Where they do not lie as those of a single layer do, it is made run by run, of copies.
+    """
 
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         ctx.save_for_backward(inputs, weight)
-        if weight.shape[1] == 1:  # a product with a vector
+        if weight.shape[1] > 1:
+            return torch.baddbmm(bias, inputs, weight.transpose(1, 2))
+        if _lies_as_alone(inputs):
             return torch.bmm(weight, inputs.transpose(1, 2)).transpose(1, 2) + bias
-        return torch.baddbmm(bias, inputs, weight.transpose(1, 2))
+        rows = zip(bias, inputs, weight, strict=True)
+        return torch.stack([torch.addmm(own, x.clone(), w.t()) for own, x, w in rows])
 
     @staticmethod
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
         inputs, weight = ctx.saved_tensors
         of_inputs = None
-        if ctx.needs_input_grad[0] and inputs.stride()[1:] == (1, inputs.shape[1]):
+        if ctx.needs_input_grad[0] and _is_transposed(inputs):
             of_inputs = torch.bmm(weight.transpose(1, 2), slope.transpose(1, 2)).transpose(1, 2)
         elif ctx.needs_input_grad[0]:
             of_inputs = torch.bmm(slope, weight)
-        return of_inputs, torch.bmm(slope.transpose(1, 2), inputs), slope.sum(1, keepdim=True)
+        if weight.shape[1] > 1 or _lies_as_alone(inputs):
+            of_weight = torch.bmm(slope.transpose(1, 2), inputs)
+        else:
+            rows = zip(slope, inputs, strict=True)
+            of_weight = torch.stack([torch.mm(g.clone().t(), x.clone()) for g, x in rows])
+        return of_inputs, of_weight, slope.sum(1, keepdim=True)
+
+
+def _is_transposed(inputs: Tensor) -> bool:
+    return inputs.stride()[1:] == (1, inputs.shape[1])
+
+
+def _lies_as_alone(inputs: Tensor) -> bool:
+    return not _is_transposed(inputs) and inputs.stride(0) % _ALIGNMENT == 0
 
 
 _linear: Any = _Linear.apply
