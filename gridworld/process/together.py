@@ -105,15 +105,19 @@ def run_together(tasks: Sequence[Callable[[], T]]) -> list[T | Exception]:
         What each returned, or the exception that it raised.
 
     Raises:
-        SystemExit: a task raised it. The others have gone on until they ended.
+        SystemExit: a task raised it. The others have gone on until they ended; those that had not begun
+            were left out.
         BaseException: one of another kind, which is no `Exception`. It was raised in the others too, and none
             of them made a `SystemExit` of it.
     """
-    running = [_Task(function) for function in tasks]
+    running: list[_Task] = []
     try:
-        for task in running:
+        for function in tasks:
+            running.append(task := _Task(function))
             task.resume(stopped())
             _pass_on(task.error)
+            if isinstance(task.error, SystemExit):
+                break
         while waiting := [task for task in running if not task.dead]:
             for task, error in _met(waiting):
                 task.resume(error or stopped())

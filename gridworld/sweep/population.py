@@ -132,8 +132,12 @@ def populations(
         The populations, in the order of their first jobs; of one job each where they cannot train together.
 
     Raises:
-        InputError: `hydra.sweeper.population` is no number of runs.
+        InputError: `hydra.sweeper.population` is no number of runs, or `hydra.sweeper.together` is given.
     """
+    if settings.together:
+        raise InputError(
+            f"{_KEY}: tells a launcher's process its runs; leave it out, and set hydra.sweeper.population"
+        )
     most = _most(settings.population, hydra.launcher)
     if settings.stop_at_first_failure or hydra.job.chdir or hydra.job.env_set:
         most = 1  # which one failed first would be chance, and a process has one folder and one environment

@@ -79,6 +79,13 @@ def test_a_mistaken_size_is_refused_before_anything_is_written(value: str, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_sweepers_own_key_is_refused(tmp_path: Path) -> None:
+    done = sweep("new", *JOBS, "hydra.sweeper.together=[x]", cwd=tmp_path)
+    assert done.returncode == 2
+    assert re.fullmatch(r"error: hydra\.sweeper\.together: .*; leave it out, and set .*\n", done.stderr)
+    assert list(tmp_path.iterdir()) == []
+
+
 # One member goes wrong
 
 
