@@ -34,13 +34,19 @@ def _environment() -> Iterator[None]:
 
 # One after the other: clusters, browsers and kills at random moments, which want a machine for themselves.
 IN_TURN = (
-    *("sweep/test_sweep_cluster.py", "sweep/test_sweep_kills.py"),
+    *("sweep/test_sweep_cluster.py", "sweep/test_sweep_kills.py", "sweep/test_population_kills.py"),
     *("training/test_tensorboard.py", "report/test_report_page.py"),
 )
 # What takes longest, in this order; most have few tests that start processes.
 LONG = (
     *("in turn", "tests/test_docs.py", "commands/test_commands.py", "commands/test_hostile_runs.py"),
-    *("api/test_scores.py", "sweep/test_sweep.py", "tune/test_tune.py", "restore/test_reproduce.py"),
+    *(
+        "api/test_scores.py",
+        "sweep/test_sweep.py",
+        "sweep/test_sweep_population.py",
+        "tune/test_tune.py",
+        "restore/test_reproduce.py",
+    ),
     *("restore/test_resume_kills.py", "process/test_output.py", "tune/test_tune_parts.py"),
     *("commands/test_bad_input.py", "agents/tabular/test_tabular.py", "api/test_runs.py"),
     *("report/test_report.py", "config/test_experiments.py", "restore/test_resume.py"),

@@ -98,31 +98,36 @@ def run_together(tasks: Sequence[Callable[[], T]]) -> list[T | Exception]:
         What each returned, or the exception that it raised.
 
     Raises:
-        SystemExit: a task raised it. The others have gone on until they ended.
+        SystemExit: a task raised it. The others have gone on until they ended; those that had not begun
+            were left out.
         BaseException: one of another kind, which is no `Exception`. It was raised in the others too, and none
             of them made a `SystemExit` of it.
     """
-    running = [_Task(function) for function in tasks]
+    running: list[_Task] = []
     with _keeping_chance():
-        _run_all(running)
+        _run_all(tasks, running)
     _exit_as_asked(running)
     return [task.result if task.error is None else _exception(task.error) for task in running]
 
 
-def _run_all(tasks: Sequence[_Task]) -> None:
+def _run_all(functions: Sequence[Callable[[], Any]], running: list[_Task]) -> None:
+    """Begin tasks, which are put into `running`, and run them until all have ended."""
     try:
-        for task in tasks:
+        for function in functions:
+            running.append(task := _Task(function))
             task.resume(stopped())
             _pass_on(task.error)
-        while waiting := [task for task in tasks if not task.dead]:
+            if isinstance(task.error, SystemExit):
+                break
+        while waiting := [task for task in running if not task.dead]:
             for task, error in _met(waiting):
                 task.resume(error or stopped())
                 _pass_on(task.error)
     except BaseException as stop:
-        for task in tasks:
+        for task in running:
             while not task.dead:  # it may wait once more on its way out
                 task.resume(stop)
-        _exit_as_asked(tasks)
+        _exit_as_asked(running)
         raise
 
 

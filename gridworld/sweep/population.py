@@ -133,8 +133,12 @@ def populations(
         The populations, in the order of their first jobs; of one job each where they cannot train together.
 
     Raises:
-        InputError: `hydra.sweeper.population` is no number of runs.
+        InputError: `hydra.sweeper.population` is no number of runs, or `hydra.sweeper.together` is given.
     """
+    if settings.together:
+        raise InputError(
+            f"{_KEY}: tells a launcher's process its runs; leave it out, and set hydra.sweeper.population"
+        )
     workers = _workers(hydra.launcher)
     memory = _free_memory() / _SHARE_OF_MEMORY / workers
     shapes: dict[str, list[tuple[JobEntry, Job]]] = {}

@@ -71,9 +71,9 @@ _agreed: dict[Hashable, bool] = {}
 def agree(models: Sequence[Tabulated]) -> bool:
     """Whether these models side by side give the numbers of each alone, to the last bit.
 
-    It is tried out once in a process for each kind and number of them, forwards and backwards.
+    It is tried out once in a process for each kind and number of them and of threads, forwards and backwards.
     """
-    key = models[0].inputs.kind, len(models)
+    key = models[0].inputs.kind, len(models), torch.get_num_threads()
     if key not in _agreed:
         was_told = not all(_agreed.values())
         _agreed[key] = _try_out(models)
