@@ -3,7 +3,8 @@
 Each task is an ordinary function, such as a whole training run, in a greenlet of its own. It runs undisturbed
 until it calls `meet`; there it waits for the others, the work is done for all that wait with the same key,
 and each goes on. A task that ends, or fails, is not waited for. Outside of `run_together`, `meet` does the
-work for the one that calls it. So no task can tell whether it runs alone.
+work for the one that calls it. So no task can tell whether it runs alone. A task may begin others, and wait
+for them, by `run_together` itself: they meet all that run together with it.
 
 What a process has only once is changed over with the task: the generators of random numbers (Python's,
 numpy's and torch's) and the context variables.
@@ -27,6 +28,7 @@ from gridworld.process.signals import stopped
 
 T = TypeVar("T")
 M = TypeVar("M")
+LARGEST = 32  # runs that train together unless more are asked for; larger populations train no faster
 _GLOBAL: Any = np.random  # numpy's stubs do not know all of its functions
 Work = Callable[[Sequence[M]], Sequence[Exception | None]]
 
@@ -43,11 +45,13 @@ class _Waiting(Generic[M]):
 class _Task(greenlet):  # type: ignore[misc]
     """A task, its outcome, and its own random numbers while it does not run."""
 
-    def __init__(self, function: Callable[[], Any]) -> None:
-        super().__init__(self._run)
+    def __init__(self, function: Callable[[], Any], beside: list[_Task], parent: greenlet) -> None:
+        super().__init__(self._run, parent)
         self.gr_context = contextvars.copy_context()
         self._function = function
+        self.beside = beside  # all that run together
         self.waiting: _Waiting[Any] | None = None
+        self.begun: list[_Task] = []  # the tasks that it waits for
         self.result: Any = None
         self.error: BaseException | None = None
         self._bits = np.random.MT19937(0)
@@ -106,24 +110,44 @@ def run_together(tasks: Sequence[Callable[[], T]]) -> list[T | Exception]:
         SystemExit: a task raised it. The others have gone on until they ended.
         BaseException: one of another kind, which is no `Exception`. It was raised in the others too.
     """
-    running = [_Task(function) for function in tasks]
+    here = getcurrent()
+    if isinstance(here, _Task):
+        assert here.parent is not None
+        here.begun = own = [_Task(function, here.beside, here.parent) for function in tasks]
+        here.beside += own
+        here.parent.switch()
+    else:
+        running: list[_Task] = []
+        own = [_Task(function, running, here) for function in tasks]
+        running += own
+        _run_all(running)
+    ends = [task.error for task in own if isinstance(task.error, SystemExit)]
+    if ends:
+        raise ends[0]
+    return [task.result if task.error is None else _exception(task.error) for task in own]
+
+
+def _run_all(running: list[_Task]) -> None:
+    """Run tasks, and those that they begin, until all have ended and left the list."""
+
+    def resume(task: _Task, error: BaseException | None = None) -> None:
+        task.resume(error or stopped())
+        if task.error is not None and not isinstance(task.error, Exception | SystemExit):
+            raise task.error  # it is to end all tasks
+
     try:
-        for task in running:
-            task.resume(stopped())
-            _pass_on(task.error)
-        while waiting := [task for task in running if not task.dead]:
-            for task, error in _met(waiting):
-                task.resume(error or stopped())
-                _pass_on(task.error)
+        while running:
+            for task in running:  # also those that are begun meanwhile
+                if task.waiting is None and all(each.dead for each in task.begun):
+                    resume(task)
+            for task, error in _met([task for task in running if task.waiting is not None]):
+                resume(task, error)
+            running[:] = [task for task in running if not task.dead]
     except BaseException as stop:
         for task in running:
             while not task.dead:  # it may wait once more on its way out
                 task.resume(stop)
         raise
-    ends = [task.error for task in running if isinstance(task.error, SystemExit)]
-    if ends:
-        raise ends[0]
-    return [task.result if task.error is None else _exception(task.error) for task in running]
 
 
 def meet(work: Work[M], member: M, key: Hashable) -> None:
@@ -177,12 +201,6 @@ def _met(waiting: Sequence[_Task]) -> list[tuple[_Task, Exception | None]]:
             task.seconds += (time.perf_counter() - started) / len(tasks)
         errors.update(zip(tasks, found, strict=True))
     return [(task, errors[task]) for task in waiting]
-
-
-def _pass_on(error: BaseException | None) -> None:
-    """Raise what is to end all tasks."""
-    if error is not None and not isinstance(error, Exception | SystemExit):
-        raise error
 
 
 def _exception(error: BaseException) -> Exception:

@@ -169,13 +169,13 @@ def plan(
         digest = settings_hash(dataclasses.asdict(config), layout)
         planned.setdefault(
             digest,
-            Job(tuple(overrides), tuple(swept), digest, mistake, config.logging.progress, _shape(config)),
+            Job(tuple(overrides), tuple(swept), digest, mistake, config.logging.progress, shape(config)),
         )
     return list(planned.values())
 
 
-def _shape(config: TrainConfig) -> str | None:
-    """What must be equal for jobs to train as one population, as far as settings tell."""
+def shape(config: TrainConfig) -> str | None:
+    """What must be equal for runs to train as one population; None: it trains alone."""
     if config.agent.shape is None or any(foreign_imports(config.callbacks)):
         return None
     return repr(

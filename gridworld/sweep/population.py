@@ -24,10 +24,10 @@ from omegaconf import DictConfig
 
 from gridworld.config.sweep import SweepConfig
 from gridworld.errors import InputError
+from gridworld.process.together import LARGEST, run_together
 from gridworld.sweep.folder import JobEntry, SweepFolder
 
 AUTO = "auto"
-_MOST = 32  # runs of a population unless more are asked for; larger ones train no faster
 _SHARE_OF_MEMORY = 4  # a population takes a fourth of what is free, shared by the workers
 _RUNS_BYTES = 16 * 2**20  # of a run, with its pictures
 _KEY = "hydra.sweeper.together"
@@ -72,7 +72,6 @@ class PopulationTask:
 
     def _run_all(self, folder: Path, numbers: Mapping[str, int]) -> list[JobReturn | Exception]:
         # Here, since most jobs are planned without it.
-        from gridworld.process.together import run_together
         from gridworld.sweep.launchers.worker import JobRunner
 
         entries = {entry.job: entry for entry in SweepFolder(folder).entries.values()}
@@ -156,7 +155,7 @@ def _most(population: int | str | None, launcher: DictConfig) -> int:
     """The largest population that is asked for, or that memory allows."""
     if population == AUTO:
         free = _free_memory() / _SHARE_OF_MEMORY / _workers(launcher)
-        most = max(1, min(_MOST, int(free / _RUNS_BYTES)))
+        most = max(1, min(LARGEST, int(free / _RUNS_BYTES)))
     elif type(population) is int and population >= 1:
         most = population
     else:

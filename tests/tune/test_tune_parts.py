@@ -191,7 +191,7 @@ def test_what_fails_is_a_trial_with_its_reason_and_the_study_goes_on(tmp_path: P
         return answer
 
     study, context = study_of(tmp_path, objective, 5)
-    while _run_next(study, context):
+    while _run_next(study, context, set()):
         pass
     now = count_trials(study)
     assert (now.complete, now.failed, now.ended) == (2, 3, 5)
@@ -212,7 +212,7 @@ def test_a_study_gone_on_with_chooses_as_an_undisturbed_one(tmp_path: Path, samp
         (tmp_path / name).mkdir()
         for trials in parts:
             study, context = study_of(tmp_path / name, objective, trials, sampler)
-            while _run_next(study, context):
+            while _run_next(study, context, set()):
                 pass
         chosen.append([trial.params["x"] for trial in study.trials])
     assert len(set(chosen[0])) == 14
@@ -238,7 +238,7 @@ def test_trials_that_are_cut_short_do_not_change_what_is_chosen(tmp_path: Path, 
         more = True
         while more:
             try:
-                more = _run_next(study, context)
+                more = _run_next(study, context, set())
             except Stopped:
                 study, context = study_of(tmp_path / name, objective, 14, sampler)
         assert len(study.trials) == 14 + len(stops)
@@ -267,7 +267,7 @@ def test_training_that_diverges_is_such_a_failure(tmp_path: Path) -> None:
     )
     space = SearchSpace({"agent.clip_range": DimensionConfig("float", low=0.1, high=0.3)}, "own")
     study, context = study_of(tmp_path, Objective(asked.measured, space, asked.seeds, 10, 2), 1)
-    while _run_next(study, context):
+    while _run_next(study, context, set()):
         pass
     assert "diverged" in study.trials[0].user_attrs["error"]
 

@@ -10,22 +10,27 @@ and the score is (m + mean c) / (n + 1). One certified seed more always counts f
 together, since the mean is at most 1. Where the share is the same, fewer steps win; where no seed is
 certified yet, less regret, so that a search has something to follow.
 
-Seeds are trained one after the other, in memory. After every tenth or so of a seed's budget Optuna is told
-the score as it would be if each seed, the present one included, stayed as it is. So its pruners compare
-trials at the same point of the same seed; a trial that is behind ends within a curve or between two seeds.
+Seeds are trained in memory, together where they can. Optuna is told of them one after the other: after every
+tenth or so of a seed's budget, the score as it would be if each seed, the present one included, stayed as it
+is. So its pruners compare trials at the same point of the same seed; a trial that is behind ends within a
+curve or between two seeds, as it does where the seeds train one after the other.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from gridworld.agents import family
 from gridworld.config.train import TrainConfig
 from gridworld.envs.observations import make_observation
+from gridworld.process.together import run_together
+from gridworld.sweep.plan import shape
 from gridworld.training.learning_curve import LearningCurve
 from gridworld.training.setup import check_settings, make_context
 from gridworld.tune.search.search_space import SearchSpace, Values, with_values
@@ -119,13 +124,18 @@ class Objective:
             Exception: what training raises.
         """
         values = self.space.suggest(trial)
-        ended: list[SeedScore] = []
-        for seed in self.seeds:
-            reporter = _Reporter(trial, self, ended)
-            ended.append(self.learn(values, seed, is_stopped, reporter.at))
-            reporter.at(1.0, ended[-1])
-            trial.set_user_attr(SEEDS, [dataclasses.asdict(each) for each in ended])
-        return score(ended, self.base.total_timesteps, len(self.seeds))
+        seeds = _Seeds(trial, self)
+        tasks = [partial(seeds.train, place, values, is_stopped) for place in range(len(self.seeds))]
+        if shape(self._config(values, self.seeds[0])) is None:
+            for task in tasks:
+                task()
+        else:
+            run_together(tasks)
+        return seeds.score()
+
+    def can_join(self) -> bool:
+        """Whether trials can train together, as far as the settings that the search begins from tell."""
+        return shape(self.base) is not None
 
     def learn(
         self,
@@ -141,6 +151,73 @@ class Objective:
             Exception: what training raises.
         """
         return _learn(self._config(values, seed), on_evaluation, is_stopped)
+
+
+class _LeftError(Exception):
+    """The trial has ended without this seed."""
+
+
+class _Seeds:
+    """A trial's seeds while they train. Optuna is told of each when those before it have ended."""
+
+    def __init__(self, trial: Trial, objective: Objective) -> None:
+        self._trial = trial
+        self._objective = objective
+        self._ended: list[SeedScore] = []  # those that Optuna has been told of
+        self._untold: list[deque[tuple[float, SeedScore]]] = [deque() for _ in objective.seeds]
+        self._results: list[SeedScore | Exception | None] = [None] * len(objective.seeds)
+        self._error: Exception | None = None  # that the trial ends with
+        self._reporter = _Reporter(trial, objective, [])
+
+    def train(self, place: int, values: Values, is_stopped: IsStopped) -> None:
+        """Train the seed at this place, unless the trial ends without it; raises nothing but `Stopped`."""
+
+        def is_over() -> bool:
+            if self._error is not None:
+                raise _LeftError
+            return is_stopped()
+
+        def on_evaluation(share: float, standing: SeedScore) -> None:
+            self._untold[place].append((share, standing))
+            self._tell()
+
+        try:
+            is_over()
+            self._results[place] = self._objective.learn(
+                values, self._objective.seeds[place], is_over, on_evaluation
+            )
+        except _LeftError:
+            return
+        except Exception as error:
+            self._results[place] = error
+        self._tell()
+
+    def score(self) -> float:
+        """The trial's score. Raises what it ended with instead."""
+        if self._error is not None:
+            raise self._error
+        return score(self._ended, self._objective.base.total_timesteps, len(self._objective.seeds))
+
+    def _tell(self) -> None:
+        try:
+            while self._error is None and len(self._ended) < len(self._results):
+                place = len(self._ended)
+                while self._untold[place]:
+                    self._reporter.at(*self._untold[place].popleft())
+                result = self._results[place]
+                if result is None:
+                    return
+                self._end(result)
+        except Exception as error:
+            self._error = error
+
+    def _end(self, result: SeedScore | Exception) -> None:
+        if isinstance(result, Exception):
+            raise result
+        self._reporter.at(1.0, result)
+        self._ended.append(result)
+        self._trial.set_user_attr(SEEDS, [dataclasses.asdict(each) for each in self._ended])
+        self._reporter = _Reporter(self._trial, self._objective, self._ended)
 
 
 class _Reporter:

@@ -137,11 +137,17 @@ class StudyStorage:
 
     def load(self) -> optuna.Study:
         """The study that `begin` has made. Raises `StorageLostError` where it is gone since."""
-        storage = self.connect()
+        return self.load_several(1)[0]
+
+    def load_several(self, count: int) -> list[optuna.Study]:
+        """The same, so many times over one connection: each can be in a trial of its own."""
+        storage = optuna.storages.get_storage(self.connect())
         try:
             with _quiet():
-                pruner = _pruner(self.settings)
-                return optuna.load_study(storage=storage, study_name=self.name, pruner=pruner)
+                return [
+                    optuna.load_study(storage=storage, study_name=self.name, pruner=_pruner(self.settings))
+                    for _ in range(count)
+                ]
         except KeyError:
             raise StorageLostError(f"it has no study {self.name}") from None
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.context import SpawnProcess
-from typing import Any
+from typing import Any, TypeVar
 
 from gridworld.errors import FolderLostError
 from gridworld.process.signals import StopRequest, blocking, signal_name
@@ -20,8 +21,11 @@ from gridworld.storage.file_lock import Held, held, work_for
 # with the parent, however that ends.
 WorkerMain = Callable[[Any, int, int], None]
 
+T = TypeVar("T")
+
 UNREACHABLE = 3  # exit code of a worker that lost the study, and printed nothing
 
+_BLAS = "OPENBLAS_NUM_THREADS"  # numpy's, read when a process loads it
 _POLL_SECONDS = 0.1
 _STOP_WITHIN = 3.0  # seconds
 _MOST_LOST = 20  # a machine on which more are killed has no room for them
@@ -56,7 +60,7 @@ def run_workers(
     with StopRequest().listening():
         try:
             for number in range(workers):
-                processes[number] = _start(main, context, number)
+                processes[number] = _start(main, context, number, workers)
             while processes:
                 for number, process in list(processes.items()):
                     if process.exitcode is None:
@@ -71,20 +75,43 @@ def run_workers(
                         _tell(-process.exitcode)
                         if lost > _MOST_LOST:
                             raise SearchError(f"{lost} workers were killed; is there memory for so many?")
-                        processes[workers + lost] = _start(main, context, workers + lost)
+                        processes[workers + lost] = _start(main, context, workers + lost, workers)
                 on_tick()
                 time.sleep(_POLL_SECONDS)
         finally:
             _stop(processes.values())
 
 
-def _start(main: WorkerMain, context: Any, number: int) -> SpawnProcess:
+def share(work: Sequence[T], worker: int, workers: int) -> Sequence[T]:
+    """A worker's part of the work that `workers` have at first; all of it for one that replaces another."""
+    if worker >= workers:
+        return work
+    return work[len(work) * worker // workers : len(work) * (worker + 1) // workers]
+
+
+def _start(main: WorkerMain, context: Any, number: int, workers: int) -> SpawnProcess:
     process = multiprocessing.get_context("spawn").Process(
         target=_run, args=(main, held(), context, number, os.getpid()), daemon=True
     )
-    with blocking(signal.SIGINT):  # Ctrl-C is for this process
+    with blocking(signal.SIGINT), _sharing_cores(workers):  # Ctrl-C is for this process
         process.start()
     return process
+
+
+@contextlib.contextmanager
+def _sharing_cores(workers: int) -> Iterator[None]:
+    """Let a process that starts here among others solve linear systems in one thread, as joblib does.
+
+    With a thread on each core in each of them, they would wait for one another for most of the time.
+    """
+    if workers == 1 or _BLAS in os.environ:
+        yield
+        return
+    os.environ[_BLAS] = "1"
+    try:
+        yield
+    finally:
+        del os.environ[_BLAS]
 
 
 def _run(main: WorkerMain, holder: Held, context: Any, number: int, parent: int) -> None:
