@@ -16,7 +16,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from gridworld.process.together import LARGEST
-from gridworld.tune.search.objective import SEEDS, Objective, SeedScore, Stopped, read_score, score
+from gridworld.tune.search.objective import SEEDS, Objective, SeedScore, Stopped, learn, read_score, score
 from gridworld.tune.search.worker import StudyContext, become_worker, is_stopped, run_all, study_of
 from gridworld.tune.search.worker_pool import share
 
@@ -91,7 +91,7 @@ def _run_missing(runs: FinalRuns, study: Study, worker: int) -> None:
 
 def _run(objective: Objective, study: Study, number: int, values: Mapping[str, Any], seed: int) -> None:
     try:
-        result = objective.learn(values, seed, is_stopped)
+        result = learn(objective.config(values), seed, is_stopped)
     except Exception:  # the run failed, though its trial did not
         result = SeedScore(seed, None, sys.float_info.max)
     study.set_user_attr(_name(number, seed), dataclasses.asdict(result))

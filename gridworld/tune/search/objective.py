@@ -99,14 +99,14 @@ class Objective:
     reports: int  # to the pruner, per seed
     stop_after: int | None
 
-    def _config(self, values: Values, seed: int) -> TrainConfig:
+    def config(self, values: Values) -> TrainConfig:
+        """The configuration of a run with these values, on the first seed."""
         base = self.base
         evaluation = base.evaluation
         if evaluation.stop_after is None:
             evaluation = dataclasses.replace(evaluation, stop_after=self.stop_after)
         quiet = dataclasses.replace(base.logging, progress=False, tensorboard=False)
-        config = dataclasses.replace(base, seed=seed, evaluation=evaluation, logging=quiet)
-        return with_values(config, values)
+        return with_values(dataclasses.replace(base, evaluation=evaluation, logging=quiet), values)
 
     def __call__(self, trial: Trial, is_stopped: IsStopped) -> float:
         """Train a trial's settings on every seed.
@@ -123,10 +123,10 @@ class Objective:
             Stopped: this process was asked to end.
             Exception: what training raises.
         """
-        values = self.space.suggest(trial)
+        config = self.config(self.space.suggest(trial))
         seeds = _Seeds(trial, self)
-        tasks = [partial(seeds.train, place, values, is_stopped) for place in range(len(self.seeds))]
-        if shape(self._config(values, self.seeds[0])) is None:
+        tasks = [partial(seeds.train, place, config, is_stopped) for place in range(len(self.seeds))]
+        if shape(config) is None:
             for task in tasks:
                 task()
         else:
@@ -136,21 +136,6 @@ class Objective:
     def can_join(self) -> bool:
         """Whether trials can train together, as far as the settings that the search begins from tell."""
         return shape(self.base) is not None
-
-    def learn(
-        self,
-        values: Values,
-        seed: int,
-        is_stopped: IsStopped,
-        on_evaluation: OnEvaluation = lambda share, standing: None,
-    ) -> SeedScore:
-        """Train on one seed; `on_evaluation` is called at every evaluation but the last.
-
-        Raises:
-            Stopped: this process was asked to end.
-            Exception: what training raises.
-        """
-        return _learn(self._config(values, seed), on_evaluation, is_stopped)
 
 
 class _LeftError(Exception):
@@ -169,7 +154,7 @@ class _Seeds:
         self._error: Exception | None = None  # that the trial ends with
         self._reporter = _Reporter(trial, objective, [])
 
-    def train(self, place: int, values: Values, is_stopped: IsStopped) -> None:
+    def train(self, place: int, config: TrainConfig, is_stopped: IsStopped) -> None:
         """Train the seed at this place, unless the trial ends without it; raises nothing but `Stopped`."""
 
         def is_over() -> bool:
@@ -183,9 +168,7 @@ class _Seeds:
 
         try:
             is_over()
-            self._results[place] = self._objective.learn(
-                values, self._objective.seeds[place], is_over, on_evaluation
-            )
+            self._results[place] = learn(config, self._objective.seeds[place], is_over, on_evaluation)
         except _LeftError:
             return
         except Exception as error:
@@ -247,8 +230,25 @@ class _Reporter:
             raise optuna.TrialPruned(f"at {share:.0%} of seed {standing.seed}")
 
 
-def _learn(config: TrainConfig, on_evaluation: OnEvaluation, is_stopped: IsStopped) -> SeedScore:
-    """Train and evaluate as a run would, and keep nothing but the end."""
+def learn(
+    config: TrainConfig,
+    seed: int,
+    is_stopped: IsStopped,
+    on_evaluation: OnEvaluation = lambda share, standing: None,
+) -> SeedScore:
+    """Train and evaluate as a run would, and keep nothing but the end.
+
+    Args:
+        config: the run's, whose own seed does not matter.
+        seed: the run's.
+        is_stopped: whether this process was asked to end.
+        on_evaluation: is called at every evaluation but the last.
+
+    Raises:
+        Stopped: this process was asked to end.
+        Exception: what training raises.
+    """
+    config = dataclasses.replace(config, seed=seed)
     mdp = check_settings(config)
     observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
     evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
