@@ -202,6 +202,24 @@ def test_what_fails_is_a_trial_with_its_reason_and_the_study_goes_on(tmp_path: P
         assert reason in table
 
 
+def test_the_pruner_sees_at_once_what_its_process_has_ended(tmp_path: Path) -> None:
+    values = iter([0.5, 0.4, 0.6, 0.3, 0.7, 0.45, 0.55, 0.2, 0.46, 0.44])
+
+    def objective(trial: optuna.Trial, is_stopped: object) -> float:
+        value = next(values)
+        for step in range(10):
+            trial.report(value, step)
+            if trial.should_prune():
+                raise optuna.TrialPruned
+        return value
+
+    study, context = study_of(tmp_path, objective, 10)
+    while _run_next(study, context, set()):
+        pass
+    pruned = [trial.number for trial in study.trials if trial.state == optuna.trial.TrialState.PRUNED]
+    assert pruned == [6, 8]  # the medians before them are 0.475 and 0.45
+
+
 @pytest.mark.parametrize("sampler", ["tpe", "random"])
 def test_a_study_gone_on_with_chooses_as_an_undisturbed_one(tmp_path: Path, sampler: str) -> None:
     def objective(trial: optuna.Trial, is_stopped: object) -> float:

@@ -117,7 +117,7 @@ def _run_next(study: Study, context: StudyContext, own: set[int]) -> bool:
         context: what is run.
         own: the numbers of the trials that this process runs, which are not waited for.
     """
-    from gridworld.tune.search.storage import count_trials, give_up_stale, put_back, seed_sampler
+    from gridworld.tune.search.storage import count_trials, give_up_stale, put_back, seed_sampler, show_ended
 
     settings = context.storage.settings
     with ExitStack() as turn:
@@ -138,6 +138,7 @@ def _run_next(study: Study, context: StudyContext, own: set[int]) -> bool:
                 raise
             finally:
                 own.difference_update(begun)
+                show_ended(study)
             return True
     if own:
         return False

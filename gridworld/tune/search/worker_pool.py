@@ -40,7 +40,11 @@ class StorageLostError(SearchError):
 
 
 def run_workers(
-    main: WorkerMain, context: Any, workers: int, on_tick: Callable[[], None] = lambda: None
+    main: WorkerMain,
+    context: Any,
+    workers: int,
+    on_tick: Callable[[], None] = lambda: None,
+    as_alone: bool = False,
 ) -> None:
     """Run `main` in worker processes until all have ended.
 
@@ -49,6 +53,9 @@ def run_workers(
         context: what `main` needs to know, to be pickled.
         workers: how many processes.
         on_tick: called ten times a second meanwhile.
+        as_alone: whether each solves linear systems in as many threads as a process that runs alone, which
+            the last bits of a policy's value depend on. Several then wait for one another for much of the
+            time.
 
     Raises:
         Interrupted: at Ctrl-C and SIGTERM.
@@ -59,8 +66,9 @@ def run_workers(
     lost = 0
     with StopRequest().listening():
         try:
+            shares = workers > 1 and not as_alone
             for number in range(workers):
-                processes[number] = _start(main, context, number, workers)
+                processes[number] = _start(main, context, number, shares)
             while processes:
                 for number, process in list(processes.items()):
                     if process.exitcode is None:
@@ -75,7 +83,7 @@ def run_workers(
                         _tell(-process.exitcode)
                         if lost > _MOST_LOST:
                             raise SearchError(f"{lost} workers were killed; is there memory for so many?")
-                        processes[workers + lost] = _start(main, context, workers + lost, workers)
+                        processes[workers + lost] = _start(main, context, workers + lost, shares)
                 on_tick()
                 time.sleep(_POLL_SECONDS)
         finally:
@@ -89,22 +97,19 @@ def share(work: Sequence[T], worker: int, workers: int) -> Sequence[T]:
     return work[len(work) * worker // workers : len(work) * (worker + 1) // workers]
 
 
-def _start(main: WorkerMain, context: Any, number: int, workers: int) -> SpawnProcess:
+def _start(main: WorkerMain, context: Any, number: int, shares: bool) -> SpawnProcess:
     process = multiprocessing.get_context("spawn").Process(
         target=_run, args=(main, held(), context, number, os.getpid()), daemon=True
     )
-    with blocking(signal.SIGINT), _sharing_cores(workers):  # Ctrl-C is for this process
+    with blocking(signal.SIGINT), _one_thread(shares):  # Ctrl-C is for this process
         process.start()
     return process
 
 
 @contextlib.contextmanager
-def _sharing_cores(workers: int) -> Iterator[None]:
-    """Let a process that starts here among others solve linear systems in one thread, as joblib does.
-
-    With a thread on each core in each of them, they would wait for one another for most of the time.
-    """
-    if workers == 1 or _BLAS in os.environ:
+def _one_thread(is_asked: bool) -> Iterator[None]:
+    """Let processes that start in the block solve linear systems in one thread, unless the user says."""
+    if not is_asked or _BLAS in os.environ:
         yield
         return
     os.environ[_BLAS] = "1"
