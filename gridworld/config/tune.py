@@ -35,6 +35,7 @@ class TuneConfig:
     folder: Optional[str] = None  # noqa: UP045  # null: runs/STUDY
     storage: Optional[str] = None  # noqa: UP045  # any URL that Optuna takes; null: study.db in the folder
     workers: int = -1  # processes; -1 for one on each core
+    together: Optional[int] = None  # noqa: UP045  # trials of a worker at once; null: 8 of all, 1 of one
     timeout: Optional[float] = None  # noqa: UP045  # seconds; no trial begins after that
     sampler: str = "tpe"  # or random
     sampler_seed: int = 0  # of the search itself

@@ -3,7 +3,8 @@
 Each task is an ordinary function, such as a whole training run, in a greenlet of its own. It runs undisturbed
 until it calls `meet`; there it waits for the others, the work is done for all that wait with the same key,
 and each goes on. A task that ends, or fails, is not waited for. Outside of `run_together`, `meet` does the
-work for the one that calls it. So no task can tell whether it runs alone.
+work for the one that calls it. So no task can tell whether it runs alone. A task may begin others, and wait
+for them, by `run_together` itself: they meet all that run together with it.
 
 What a process has only once is changed over with the task: the generators of random numbers (Python's,
 numpy's and torch's) and the context variables. Only the second normal number that numpy's old functions keep
@@ -28,6 +29,7 @@ from gridworld.process.signals import stopped
 
 T = TypeVar("T")
 M = TypeVar("M")
+LARGEST = 32  # runs that train together unless more are asked for; larger populations train no faster
 _GLOBAL: Any = np.random  # numpy's stubs do not know all of its functions
 Work = Callable[[Sequence[M]], Sequence[Exception | None]]
 _is_by_itself: contextvars.ContextVar[bool] = contextvars.ContextVar("is_by_itself", default=False)
@@ -45,11 +47,13 @@ class _Waiting(Generic[M]):
 class _Task(greenlet):  # type: ignore[misc]
     """A task, its outcome, and its own random numbers while it does not run."""
 
-    def __init__(self, function: Callable[[], Any]) -> None:
-        super().__init__(self._run)
+    def __init__(self, function: Callable[[], Any], beside: list[_Task], parent: greenlet) -> None:
+        super().__init__(self._run, parent)
         self.gr_context = contextvars.copy_context()
         self._function = function
+        self.beside = beside  # all that run together
         self.waiting: _Waiting[Any] | None = None
+        self.begun: list[_Task] = []  # the tasks that it waits for
         self.result: Any = None
         self.error: BaseException | None = None
         self._bits = np.random.MT19937(0)
@@ -64,6 +68,11 @@ class _Task(greenlet):  # type: ignore[misc]
             self.result = self._function()
         except BaseException as error:
             self.error = error
+
+    @property
+    def can_go_on(self) -> bool:
+        """Whether it waits for no work and no task that it began."""
+        return self.waiting is None and not self.dead and all(task.dead for task in self.begun)
 
     def resume(self, error: BaseException | None = None) -> None:
         """Let it run, with its random numbers, until it waits again or has ended; raise `error` in it."""
@@ -103,32 +112,54 @@ def run_together(tasks: Sequence[Callable[[], T]]) -> list[T | Exception]:
         BaseException: one of another kind, which is no `Exception`. It was raised in the others too, and none
             of them made a `SystemExit` of it.
     """
-    running: list[_Task] = []
-    with _keeping_chance():
-        _run_all(tasks, running)
-    _exit_as_asked(running)
-    return [task.result if task.error is None else _exception(task.error) for task in running]
+    here = getcurrent()
+    if isinstance(here, _Task):
+        assert here.parent is not None
+        here.begun = own = [_Task(function, here.beside, here.parent) for function in tasks]
+        here.beside += own
+        here.parent.switch()
+    else:
+        running: list[_Task] = []
+        own = [_Task(function, running, here) for function in tasks]
+        running += own
+        with _keeping_chance():
+            _run_all(running)
+    _exit_as_asked(own)
+    return [task.result if task.error is None else _exception(task.error) for task in own]
 
 
-def _run_all(functions: Sequence[Callable[[], Any]], running: list[_Task]) -> None:
-    """Begin tasks, which are put into `running`, and run them until all have ended."""
+def _run_all(running: list[_Task]) -> None:
+    """Run tasks, and those that they begin, until all have ended and left the list."""
+    exits: list[SystemExit] = []  # after the first, no other task begins
+
+    def resume(task: _Task, error: BaseException | None = None) -> None:
+        task.resume(error or stopped() or (exits[0] if exits and not task else None))
+        if isinstance(task.error, SystemExit):
+            exits.append(task.error)
+
     try:
-        for function in functions:
-            running.append(task := _Task(function))
-            task.resume(stopped())
-            _pass_on(task.error)
-            if isinstance(task.error, SystemExit):
-                break
-        while waiting := [task for task in running if not task.dead]:
-            for task, error in _met(waiting):
-                task.resume(error or stopped())
+        while running:
+            for task in running:  # also those that are begun meanwhile
+                if task.can_go_on:
+                    resume(task)
+                    _pass_on(task.error)
+            for task, error in _met([task for task in running if task.waiting is not None]):
+                resume(task, error)
                 _pass_on(task.error)
+            running[:] = [task for task in running if not task.dead]
     except BaseException as stop:
         for task in running:
             while not task.dead:  # it may wait once more on its way out
-                task.resume(stop)
-        _exit_as_asked(running)
+                resume(task, stop)
+        if exits:
+            raise exits[0] from None
         raise
+
+
+def _pass_on(error: BaseException | None) -> None:
+    """Raise what is to end all tasks."""
+    if error is not None and not isinstance(error, Exception | SystemExit):
+        raise error
 
 
 @contextlib.contextmanager
@@ -205,12 +236,6 @@ def _met(waiting: Sequence[_Task]) -> list[tuple[_Task, Exception | None]]:
             task.seconds += (time.perf_counter() - started) / len(tasks)
         errors.update(zip(tasks, found, strict=True))
     return [(task, errors[task]) for task in waiting]
-
-
-def _pass_on(error: BaseException | None) -> None:
-    """Raise what is to end all tasks."""
-    if error is not None and not isinstance(error, Exception | SystemExit):
-        raise error
 
 
 def _exit_as_asked(ended: Sequence[_Task]) -> None:

@@ -173,13 +173,13 @@ def plan(
             mistake = str(error)
         digest = settings_hash(dataclasses.asdict(config), layout)
         progress = config.logging.progress
-        job = Job(tuple(overrides), tuple(swept), digest, mistake, progress, _shape(config), memory)
+        job = Job(tuple(overrides), tuple(swept), digest, mistake, progress, shape(config), memory)
         planned.setdefault(digest, job)
     return list(planned.values())
 
 
-def _shape(config: TrainConfig) -> str | None:
-    """What must be equal for jobs to train as one population, as far as settings tell."""
+def shape(config: TrainConfig) -> str | None:
+    """What must be equal for runs to train as one population; None: it trains alone."""
     if config.agent.shape is None or any(foreign_imports(config.callbacks)):
         return None
     return repr(

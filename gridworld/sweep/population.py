@@ -26,11 +26,11 @@ from omegaconf import DictConfig
 
 from gridworld.config.sweep import SweepConfig
 from gridworld.errors import InputError
+from gridworld.process.together import LARGEST, run_together
 from gridworld.sweep.folder import JobEntry, SweepFolder
 from gridworld.sweep.plan import Job
 
 AUTO = "auto"
-_MOST = 32  # runs of a population unless more are asked for; larger ones train no faster
 _SHARE_OF_MEMORY = 4  # a population takes a fourth of what is free, shared by the workers
 _RUNS_BYTES = 16 * 2**20  # of a run beside its agent, with its pictures
 _KEY = "hydra.sweeper.together"
@@ -75,7 +75,6 @@ class PopulationTask:
 
     def _run_all(self, folder: Path, numbers: Mapping[str, int]) -> list[JobReturn | Exception]:
         # Here, since most jobs are planned without it.
-        from gridworld.process.together import run_together
         from gridworld.sweep.launchers.worker import JobRunner
 
         entries = {entry.job: entry for entry in SweepFolder(folder).entries.values()}
@@ -150,7 +149,7 @@ def populations(
         most = 1  # which one failed first would be chance, and a process has one folder and one environment
     found = []
     for members in shapes.values():
-        bounds = [most or _MOST, math.ceil(len(members) / workers)]
+        bounds = [most or LARGEST, math.ceil(len(members) / workers)]
         if most is None:
             bounds.append(int(memory / (_RUNS_BYTES + max(job.memory for _, job in members))))
         if (own := hydra.launcher.get("jobs_per_task")) is not None:  # a task of Slurm's has its own number

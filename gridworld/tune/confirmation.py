@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +21,16 @@ import numpy as np
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.terminal import printable
+from gridworld.process.together import LARGEST
 from gridworld.report.analysis import statistics
 from gridworld.report.table import number, steps_up_to
 from gridworld.run.recovery import find_run
 from gridworld.storage.symlinks import check_no_links, make_inside, names_inside, remove_inside
 from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.job_table import run_status
-from gridworld.sweep.plan import plan
-from gridworld.tune.search.worker import become_worker, is_stopped
+from gridworld.sweep.plan import plan, shape
+from gridworld.tune.search.worker import become_worker, is_stopped, run_all
+from gridworld.tune.search.worker_pool import share
 from gridworld.world.mdp import FloatArray
 
 CONFIRM = "confirm"  # the runs' folder, in the study's
@@ -41,6 +44,14 @@ class HeldOutRun:
 
     folder: Path
     config: TrainConfig
+
+
+@dataclass(frozen=True)
+class HeldOutRuns:
+    """Such runs, and how many workers share them."""
+
+    runs: tuple[HeldOutRun, ...]
+    workers: int
 
 
 def held_out_runs(folder: Path, name: str, config: TrainConfig, seeds: Sequence[int]) -> list[HeldOutRun]:
@@ -78,14 +89,23 @@ def prepare(folder: Path, runs: Sequence[HeldOutRun]) -> None:
             remove_inside(folder, CONFIRM, name)
 
 
-def run_held_out(runs: Sequence[HeldOutRun], worker: int, parent: int) -> None:
-    """A worker's process: run what nobody has run yet, until all have ended. See `worker_pool.WorkerMain`."""
+def run_held_out(all_runs: HeldOutRuns, worker: int, parent: int) -> None:
+    """A worker's process: run its part, then what nobody has run yet, until all have ended.
+
+    See `worker_pool.WorkerMain`.
+    """
     become_worker(parent)
-    left = list(runs)
+    part = share(all_runs.runs, worker, all_runs.workers)
+    together = LARGEST if shape(part[0].config) is not None else 1
+    left = [run for run in all_runs.runs if run not in part]
+    for start in range(0, len(part), together):
+        some = [] if is_stopped() else part[start : start + together]
+        ran = run_all([partial(_run, run) for run in some])
+        left += [run for run, is_well in zip(some, ran, strict=True) if is_well]
     while left and not is_stopped():
-        left = [run for run in left if is_stopped() or _run(run)]
         # Some may be running elsewhere, in this study's other workers or in another command's.
         left = [run for run in left if run_status(run.folder) not in _ENDED]
+        left = [run for run in left if is_stopped() or _run(run)]
     sys.exit(0)
 
 

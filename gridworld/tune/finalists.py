@@ -7,14 +7,18 @@ Results are attributes of the study, so that machines share them.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from gridworld.tune.search.objective import SEEDS, SeedScore, read_score, score
-from gridworld.tune.search.worker import StudyContext, become_worker, is_stopped, study_of
+from gridworld.process.together import LARGEST
+from gridworld.tune.search.objective import SEEDS, Objective, SeedScore, Stopped, learn, read_score, score
+from gridworld.tune.search.worker import StudyContext, become_worker, is_stopped, run_all, study_of
+from gridworld.tune.search.worker_pool import share
 
 if TYPE_CHECKING:
     from optuna import Study
@@ -25,11 +29,11 @@ FINAL = "final "  # what the names of these attributes begin with
 
 @dataclass(frozen=True)
 class FinalRuns:
-    """The runs of all finalists on all final seeds."""
+    """Runs of finalists on final seeds, and how many workers share them."""
 
     context: StudyContext
-    finalists: tuple[tuple[int, Mapping[str, Any]], ...]  # (number of the trial, its values)
-    seeds: tuple[int, ...]
+    runs: tuple[tuple[int, Mapping[str, Any], int], ...]  # (number of the trial, its values, seed)
+    workers: int
 
 
 @dataclass(frozen=True)
@@ -62,28 +66,35 @@ def choose_finalists(study: Study, count: int, began_from: Mapping[str, Any] | N
 
 
 def run_finals(runs: FinalRuns, worker: int, parent: int) -> None:
-    """A worker's process: run what nobody has run yet. See `worker_pool.WorkerMain`."""
+    """A worker's process: run a part, or for a worker that was lost whatever nobody has run yet.
+
+    See `worker_pool.WorkerMain`.
+    """
     become_worker(parent)
-    with study_of(runs.context) as study:
-        _run_missing(runs, study, worker)
+    with study_of(runs.context) as storage, contextlib.suppress(Stopped):
+        _run_missing(runs, storage.load(), worker)
     sys.exit(0)
 
 
 def _run_missing(runs: FinalRuns, study: Study, worker: int) -> None:
-    context = runs.context
-    todo = [(*finalist, seed) for seed in runs.seeds for finalist in runs.finalists]
-    start = worker * len(todo) // max(1, context.storage.settings.workers)  # so that workers seldom meet
-    for number, values, seed in [*todo[start % len(todo) :], *todo[: start % len(todo)]]:
-        if is_stopped():
-            break
-        if _name(number, seed) not in study.user_attrs:
-            try:
-                result = context.objective.learn(values, seed, is_stopped)
-            except KeyboardInterrupt:
-                break
-            except Exception:  # the run failed, though its trial did not
-                result = SeedScore(seed, None, sys.float_info.max)
-            study.set_user_attr(_name(number, seed), dataclasses.asdict(result))
+    part = share(runs.runs, worker, runs.workers)
+    attributes = study.user_attrs
+    tasks = [
+        partial(_run, runs.context.objective, study, *run)
+        for run in part
+        if _name(run[0], run[2]) not in attributes
+    ]
+    together = LARGEST if runs.context.objective.can_join() else 1
+    for start in range(0, len(tasks), together):
+        run_all(tasks[start : start + together])
+
+
+def _run(objective: Objective, study: Study, number: int, values: Mapping[str, Any], seed: int) -> None:
+    try:
+        result = learn(objective.config(values), seed, is_stopped)
+    except Exception:  # the run failed, though its trial did not
+        result = SeedScore(seed, None, sys.float_info.max)
+    study.set_user_attr(_name(number, seed), dataclasses.asdict(result))
 
 
 def ranking(study: Study, trials: Sequence[FrozenTrial], seeds: Sequence[int], total: int) -> list[Finalist]:
@@ -109,10 +120,19 @@ def ranking(study: Study, trials: Sequence[FrozenTrial], seeds: Sequence[int], t
     return sorted(found, key=lambda finalist: (finalist.score, finalist.trial))
 
 
-def count_missing(study: Study, trials: Sequence[FrozenTrial], seeds: Sequence[int]) -> int:
-    """How many final runs have no result yet."""
+def missing(
+    study: Study, finalists: Sequence[tuple[int, Mapping[str, Any]]], seeds: Sequence[int]
+) -> tuple[tuple[int, Mapping[str, Any], int], ...]:
+    """The final runs, as in `FinalRuns`, that have no result yet.
+
+    Args:
+        study: the study.
+        finalists: the number of each one's trial, and its values.
+        seeds: the final seeds.
+    """
     attributes = study.user_attrs
-    return sum(_name(trial.number, seed) not in attributes for trial in trials for seed in seeds)
+    runs = ((number, values, seed) for seed in seeds for number, values in finalists)
+    return tuple(run for run in runs if _name(run[0], run[2]) not in attributes)
 
 
 def _name(number: int, seed: int) -> str:

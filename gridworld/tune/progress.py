@@ -28,11 +28,11 @@ class SearchProgress:
 
     def begin(self) -> None:
         """Print what is searched."""
-        trials = self._asked.settings.trials
+        settings, trials = self._asked.settings, self._asked.settings.trials
         more = f", {self._ended_before} of them there already" if self._ended_before else ""
         print(
             f"study {self._asked.name} in {shell_path(self._asked.folder)}: {trials} trials of "
-            f"{len(self._asked.seeds)} seeds{more}, {self._asked.settings.workers} at once",
+            f"{len(self._asked.seeds)} seeds{more}, {settings.workers * (settings.together or 1)} at once",
             file=sys.stderr,
             flush=True,
         )

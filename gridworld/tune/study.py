@@ -25,6 +25,7 @@ from gridworld.training.tensorboard import hparams
 from gridworld.tune.confirmation import (
     CONFIRM,
     HeldOutRun,
+    HeldOutRuns,
     held_out_runs,
     prepare,
     read_results,
@@ -32,7 +33,7 @@ from gridworld.tune.confirmation import (
     verdict_on,
 )
 from gridworld.tune.existing_study import check_study, legible
-from gridworld.tune.finalists import Finalist, FinalRuns, choose_finalists, count_missing, ranking, run_finals
+from gridworld.tune.finalists import Finalist, FinalRuns, choose_finalists, missing, ranking, run_finals
 from gridworld.tune.progress import SearchProgress
 from gridworld.tune.recipe import write_recipe
 from gridworld.tune.search.objective import ERROR, Objective
@@ -116,14 +117,16 @@ def _rank_finalists(spec: StudySpec, study: optuna.Study, context: StudyContext)
         why = f"all {len(reasons)} failed, the first: {reasons[0]}" if reasons else "there was no time"
         raise SearchError(f"{shell_path(spec.folder)}: no trial came to a score; {why}")
     seeds = tuple(spec.final_seeds)
-    if runs := count_missing(study, trials, seeds):
+    named = [(trial.number, spec.space.values(trial.params)) for trial in trials]
+    if runs := missing(study, named, seeds):
         print(
-            f"the {len(trials)} finalists on {len(seeds)} seeds more: {runs} runs",
+            f"the {len(trials)} finalists on {len(seeds)} seeds more: {len(runs)} runs",
             file=sys.stderr,
             flush=True,
         )
-        named = tuple((trial.number, spec.space.values(trial.params)) for trial in trials)
-        run_workers(run_finals, FinalRuns(context, named, seeds), min(spec.settings.workers, runs))
+    while runs := missing(study, named, seeds):
+        workers = min(spec.settings.workers, len(runs))
+        run_workers(run_finals, FinalRuns(context, runs, workers), workers)
     return ranking(study, trials, seeds, spec.base.total_timesteps)
 
 
@@ -179,7 +182,8 @@ def _confirm(spec: StudySpec, winner: list[HeldOutRun], began_from: list[HeldOut
     count = len(began_from)
     print(f"{len(runs)} runs on {count} held-out seeds confirm the winner", file=sys.stderr, flush=True)
     prepare(spec.folder, runs)
-    run_workers(run_held_out, runs, min(spec.settings.workers, len(runs)))
+    workers = min(spec.settings.workers, len(runs))
+    run_workers(run_held_out, HeldOutRuns(tuple(runs), workers), workers, as_alone=True)
     before = read_results(began_from)
     if winner:
         return verdict_on(read_results(winner), before, "the winner")

@@ -33,12 +33,14 @@ from gridworld.config.train import TrainConfig
 from gridworld.config.tune import TuneConfig
 from gridworld.errors import InputError
 from gridworld.process.command_line import program
+from gridworld.sweep.plan import shape
 from gridworld.training.setup import check_settings
 from gridworld.tune.search.search_space import SearchSpace
 
 _SAMPLERS = ("tpe", "random")
 _PRUNERS = ("median", "hyperband", "none")
 _LARGEST_SEED = 2**32
+_TRIALS_AT_ONCE = 8  # over all workers; the sampler knows nothing of those that have not ended
 _PLAIN = re.compile(r"[\w./:-]+")  # what Hydra takes without quotes
 
 
@@ -178,6 +180,8 @@ def _check(settings: TuneConfig) -> None:
         at_least("tune.stop_after", settings.stop_after, 1)
     if settings.timeout is not None:
         above_zero("tune.timeout", settings.timeout)
+    if settings.together is not None:
+        at_least("tune.together", settings.together, 1)
     if settings.workers != -1:
         at_least("tune.workers", settings.workers, 1)
     for key, value, known in (
@@ -198,8 +202,10 @@ def _completed(settings: TuneConfig, agent: str, base: TrainConfig) -> TuneConfi
     if slug(study) != study:
         raise InputError(f"tune.study={study}: must be of letters, digits and _.,=+-, e.g. {slug(study)}")
     workers = _core_count() if settings.workers == -1 else settings.workers
+    together = settings.together or (1 if workers == 1 else math.ceil(_TRIALS_AT_ONCE / workers))
+    together = together if shape(base) is not None else 1
     folder = settings.folder or f"runs/{study}"
-    return dataclasses.replace(settings, study=study, folder=folder, workers=workers)
+    return dataclasses.replace(settings, study=study, folder=folder, workers=workers, together=together)
 
 
 def _sentence(error: Exception) -> str:

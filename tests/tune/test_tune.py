@@ -241,6 +241,7 @@ def test_a_search_space_that_makes_no_sense(
         (["agent=dqn,ppo"], "agent=dqn,ppo: a study searches from one configuration"),
         (["tune.trails=3"], "Key 'trails' not in 'TuneConfig'; did you mean trials"),
         (["tune.trials=0"], "tune.trials=0: must be at least 1"),
+        (["tune.together=0"], "tune.together=0: must be at least 1"),
         (["tune.pruner=axe"], "tune.pruner=axe: must be median, hyperband or none"),
         (["tune.storage=nonsense"], "tune.storage=nonsense: is no URL of a database"),
         (["tune.storage=sqlite://"], "tune.storage=sqlite://: is a database in the memory of one process"),

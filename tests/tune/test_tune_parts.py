@@ -191,7 +191,7 @@ def test_what_fails_is_a_trial_with_its_reason_and_the_study_goes_on(tmp_path: P
         return answer
 
     study, context = study_of(tmp_path, objective, 5)
-    while _run_next(study, context):
+    while _run_next(study, context, set()):
         pass
     now = count_trials(study)
     assert (now.complete, now.failed, now.ended) == (2, 3, 5)
@@ -200,6 +200,24 @@ def test_what_fails_is_a_trial_with_its_reason_and_the_study_goes_on(tmp_path: P
     table = (tmp_path / "trials.csv").read_text()
     for reason in ("the objective is NaN", "agent.gamma=2: must be from 0 to 1", "ZeroDivisionError: x"):
         assert reason in table
+
+
+def test_the_pruner_sees_at_once_what_its_process_has_ended(tmp_path: Path) -> None:
+    values = iter([0.5, 0.4, 0.6, 0.3, 0.7, 0.45, 0.55, 0.2, 0.46, 0.44])
+
+    def objective(trial: optuna.Trial, is_stopped: object) -> float:
+        value = next(values)
+        for step in range(10):
+            trial.report(value, step)
+            if trial.should_prune():
+                raise optuna.TrialPruned
+        return value
+
+    study, context = study_of(tmp_path, objective, 10)
+    while _run_next(study, context, set()):
+        pass
+    pruned = [trial.number for trial in study.trials if trial.state == optuna.trial.TrialState.PRUNED]
+    assert pruned == [6, 8]  # the medians before them are 0.475 and 0.45
 
 
 @pytest.mark.parametrize("sampler", ["tpe", "random"])
@@ -212,7 +230,7 @@ def test_a_study_gone_on_with_chooses_as_an_undisturbed_one(tmp_path: Path, samp
         (tmp_path / name).mkdir()
         for trials in parts:
             study, context = study_of(tmp_path / name, objective, trials, sampler)
-            while _run_next(study, context):
+            while _run_next(study, context, set()):
                 pass
         chosen.append([trial.params["x"] for trial in study.trials])
     assert len(set(chosen[0])) == 14
@@ -238,7 +256,7 @@ def test_trials_that_are_cut_short_do_not_change_what_is_chosen(tmp_path: Path, 
         more = True
         while more:
             try:
-                more = _run_next(study, context)
+                more = _run_next(study, context, set())
             except Stopped:
                 study, context = study_of(tmp_path / name, objective, 14, sampler)
         assert len(study.trials) == 14 + len(stops)
@@ -267,7 +285,7 @@ def test_training_that_diverges_is_such_a_failure(tmp_path: Path) -> None:
     )
     space = SearchSpace({"agent.clip_range": DimensionConfig("float", low=0.1, high=0.3)}, "own")
     study, context = study_of(tmp_path, Objective(asked.measured, space, asked.seeds, 10, 2), 1)
-    while _run_next(study, context):
+    while _run_next(study, context, set()):
         pass
     assert "diverged" in study.trials[0].user_attrs["error"]
 

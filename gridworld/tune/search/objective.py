@@ -10,22 +10,27 @@ and the score is (m + mean c) / (n + 1). One certified seed more always counts f
 together, since the mean is at most 1. Where the share is the same, fewer steps win; where no seed is
 certified yet, less regret, so that a search has something to follow.
 
-Seeds are trained one after the other, in memory. After every tenth or so of a seed's budget Optuna is told
-the score as it would be if each seed, the present one included, stayed as it is. So its pruners compare
-trials at the same point of the same seed; a trial that is behind ends within a curve or between two seeds.
+Seeds are trained in memory, together where they can. Optuna is told of them one after the other: after every
+tenth or so of a seed's budget, the score as it would be if each seed, the present one included, stayed as it
+is. So its pruners compare trials at the same point of the same seed; a trial that is behind ends within a
+curve or between two seeds, as it does where the seeds train one after the other.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from gridworld.agents import family
 from gridworld.config.train import TrainConfig
 from gridworld.envs.observations import make_observation
+from gridworld.process.together import run_together
+from gridworld.sweep.plan import shape
 from gridworld.training.learning_curve import LearningCurve
 from gridworld.training.setup import check_settings, make_context
 from gridworld.tune.search.search_space import SearchSpace, Values, with_values
@@ -94,14 +99,14 @@ class Objective:
     reports: int  # to the pruner, per seed
     stop_after: int | None
 
-    def _config(self, values: Values, seed: int) -> TrainConfig:
+    def config(self, values: Values) -> TrainConfig:
+        """The configuration of a run with these values, on the first seed."""
         base = self.base
         evaluation = base.evaluation
         if evaluation.stop_after is None:
             evaluation = dataclasses.replace(evaluation, stop_after=self.stop_after)
         quiet = dataclasses.replace(base.logging, progress=False, tensorboard=False)
-        config = dataclasses.replace(base, seed=seed, evaluation=evaluation, logging=quiet)
-        return with_values(config, values)
+        return with_values(dataclasses.replace(base, evaluation=evaluation, logging=quiet), values)
 
     def __call__(self, trial: Trial, is_stopped: IsStopped) -> float:
         """Train a trial's settings on every seed.
@@ -118,29 +123,84 @@ class Objective:
             Stopped: this process was asked to end.
             Exception: what training raises.
         """
-        values = self.space.suggest(trial)
-        ended: list[SeedScore] = []
-        for seed in self.seeds:
-            reporter = _Reporter(trial, self, ended)
-            ended.append(self.learn(values, seed, is_stopped, reporter.at))
-            reporter.at(1.0, ended[-1])
-            trial.set_user_attr(SEEDS, [dataclasses.asdict(each) for each in ended])
-        return score(ended, self.base.total_timesteps, len(self.seeds))
+        config = self.config(self.space.suggest(trial))
+        seeds = _Seeds(trial, self)
+        tasks = [partial(seeds.train, place, config, is_stopped) for place in range(len(self.seeds))]
+        if shape(config) is None:
+            for task in tasks:
+                task()
+        else:
+            run_together(tasks)
+        return seeds.score()
 
-    def learn(
-        self,
-        values: Values,
-        seed: int,
-        is_stopped: IsStopped,
-        on_evaluation: OnEvaluation = lambda share, standing: None,
-    ) -> SeedScore:
-        """Train on one seed; `on_evaluation` is called at every evaluation but the last.
+    def can_join(self) -> bool:
+        """Whether trials can train together, as far as the settings that the search begins from tell."""
+        return shape(self.base) is not None
 
-        Raises:
-            Stopped: this process was asked to end.
-            Exception: what training raises.
-        """
-        return _learn(self._config(values, seed), on_evaluation, is_stopped)
+
+class _LeftError(Exception):
+    """The trial has ended without this seed."""
+
+
+class _Seeds:
+    """A trial's seeds while they train. Optuna is told of each when those before it have ended."""
+
+    def __init__(self, trial: Trial, objective: Objective) -> None:
+        self._trial = trial
+        self._objective = objective
+        self._ended: list[SeedScore] = []  # those that Optuna has been told of
+        self._untold: list[deque[tuple[float, SeedScore]]] = [deque() for _ in objective.seeds]
+        self._results: list[SeedScore | Exception | None] = [None] * len(objective.seeds)
+        self._error: Exception | None = None  # that the trial ends with
+        self._reporter = _Reporter(trial, objective, [])
+
+    def train(self, place: int, config: TrainConfig, is_stopped: IsStopped) -> None:
+        """Train the seed at this place, unless the trial ends without it; raises nothing but `Stopped`."""
+
+        def is_over() -> bool:
+            if self._error is not None:
+                raise _LeftError
+            return is_stopped()
+
+        def on_evaluation(share: float, standing: SeedScore) -> None:
+            self._untold[place].append((share, standing))
+            self._tell()
+
+        try:
+            is_over()
+            self._results[place] = learn(config, self._objective.seeds[place], is_over, on_evaluation)
+        except _LeftError:
+            return
+        except Exception as error:
+            self._results[place] = error
+        self._tell()
+
+    def score(self) -> float:
+        """The trial's score. Raises what it ended with instead."""
+        if self._error is not None:
+            raise self._error
+        return score(self._ended, self._objective.base.total_timesteps, len(self._objective.seeds))
+
+    def _tell(self) -> None:
+        try:
+            while self._error is None and len(self._ended) < len(self._results):
+                place = len(self._ended)
+                while self._untold[place]:
+                    self._reporter.at(*self._untold[place].popleft())
+                result = self._results[place]
+                if result is None:
+                    return
+                self._end(result)
+        except Exception as error:
+            self._error = error
+
+    def _end(self, result: SeedScore | Exception) -> None:
+        if isinstance(result, Exception):
+            raise result
+        self._reporter.at(1.0, result)
+        self._ended.append(result)
+        self._trial.set_user_attr(SEEDS, [dataclasses.asdict(each) for each in self._ended])
+        self._reporter = _Reporter(self._trial, self._objective, self._ended)
 
 
 class _Reporter:
@@ -170,8 +230,25 @@ class _Reporter:
             raise optuna.TrialPruned(f"at {share:.0%} of seed {standing.seed}")
 
 
-def _learn(config: TrainConfig, on_evaluation: OnEvaluation, is_stopped: IsStopped) -> SeedScore:
-    """Train and evaluate as a run would, and keep nothing but the end."""
+def learn(
+    config: TrainConfig,
+    seed: int,
+    is_stopped: IsStopped,
+    on_evaluation: OnEvaluation = lambda share, standing: None,
+) -> SeedScore:
+    """Train and evaluate as a run would, and keep nothing but the end.
+
+    Args:
+        config: the run's, whose own seed does not matter.
+        seed: the run's.
+        is_stopped: whether this process was asked to end.
+        on_evaluation: is called at every evaluation but the last.
+
+    Raises:
+        Stopped: this process was asked to end.
+        Exception: what training raises.
+    """
+    config = dataclasses.replace(config, seed=seed)
     mdp = check_settings(config)
     observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
     evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))

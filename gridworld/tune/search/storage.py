@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
+import time
 import warnings
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import optuna
 from optuna.exceptions import DuplicatedStudyError, ExperimentalWarning, OptunaError, StorageInternalError
@@ -34,6 +37,7 @@ _MOST_RETRIES = 3  # of a trial whose worker is lost each time
 _SILENT_BEATS = 3
 _CONNECT_SECONDS = 10
 _EXAMPLES = "sqlite:////shared/study.db or postgresql://user@host/name"
+_SECONDS_BETWEEN_READINGS = 1.0
 _LOCKED_SECONDS = 60  # that a worker waits for others at an SQLite file
 
 
@@ -137,11 +141,18 @@ class StudyStorage:
 
     def load(self) -> optuna.Study:
         """The study that `begin` has made. Raises `StorageLostError` where it is gone since."""
-        storage = self.connect()
+        return self.load_several(1)[0]
+
+    def load_several(self, count: int) -> list[optuna.Study]:
+        """The same, so many times over one connection: each can be in a trial of its own."""
+        storage = optuna.storages.get_storage(self.connect())
         try:
             with _quiet():
                 pruner = _pruner(self.settings)
-                return optuna.load_study(storage=storage, study_name=self.name, pruner=pruner)
+                return [
+                    optuna.load_study(storage=storage, study_name=self.name, pruner=pruner)
+                    for _ in range(count)
+                ]
         except KeyError:
             raise StorageLostError(f"it has no study {self.name}") from None
 
@@ -234,7 +245,32 @@ def _pruner(settings: TuneConfig) -> optuna.pruners.BasePruner:
             min_resource=settings.reports, max_resource=settings.reports * settings.seeds
         )
     # Half a seed's budget is given to everybody: until then most have learnt nothing yet.
-    return optuna.pruners.MedianPruner(n_warmup_steps=settings.reports // 2)
+    return _RarelyReading(n_warmup_steps=settings.reports // 2)
+
+
+class _RarelyReading(optuna.pruners.MedianPruner):
+    """Optuna's median pruner, which reads once a second what other processes have ended.
+
+    At each report it would read all trials that run, which costs more than the steps between two reports.
+    """
+
+    _complete: Sequence[FrozenTrial] = ()
+    read = -math.inf  # when it did
+
+    def prune(self, study: optuna.Study, trial: FrozenTrial) -> bool:
+        if time.monotonic() - self.read > _SECONDS_BETWEEN_READINGS:
+            self._complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+            self.read = time.monotonic()
+        seen = SimpleNamespace(
+            direction=optuna.study.StudyDirection.MINIMIZE, get_trials=lambda **how: self._complete
+        )
+        return super().prune(cast(optuna.Study, seen), trial)
+
+
+def show_ended(study: optuna.Study) -> None:
+    """Let the pruner see at once what has ended in this process."""
+    if isinstance(study.pruner, _RarelyReading):
+        study.pruner.read = -math.inf
 
 
 def check_same_search(name: str, before: Any, about: Mapping[str, Any]) -> None:

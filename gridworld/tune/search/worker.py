@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import math
 import os
 import signal
@@ -11,15 +10,17 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from gridworld.errors import reason
 from gridworld.process.parent_watch import end_with
 from gridworld.process.signals import set_on
+from gridworld.process.together import run_together
 from gridworld.storage.file_lock import locked
 from gridworld.sweep.job_table import one_line
 from gridworld.tune.search.objective import ERROR, Objective, Stopped
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from optuna.trial import Trial
 
     from gridworld.tune.search.storage import StudyStorage
+
+T = TypeVar("T")
 
 TURN = ".turn.lock"  # in the study's folder: held while a worker counts the trials and begins one
 _POLL_SECONDS = 0.5
@@ -50,15 +53,37 @@ class StudyContext:
 def run_trials(context: StudyContext, worker: int, parent: int) -> None:
     """A worker's process: run trials until there are enough. See `worker_pool.WorkerMain`."""
     become_worker(parent)
-    with study_of(context) as study, contextlib.suppress(Stopped):
-        while not is_stopped() and time.time() < context.deadline and _run_next(study, context):
-            pass
+    count = context.storage.settings.together or 1
+    own: set[int] = set()
+    with study_of(context) as storage, contextlib.suppress(Stopped):
+        run_all([partial(_run_trials, study, context, own) for study in storage.load_several(count)])
     sys.exit(0)
 
 
+def run_all(tasks: Sequence[Callable[[], T]]) -> list[T]:
+    """Run tasks, together where they are several; returns what each returned.
+
+    Raises:
+        Exception: what the first of them raised that failed, after the others have ended.
+    """
+    if len(tasks) == 1:
+        return [tasks[0]()]
+    found = []
+    for result in run_together(tasks):
+        if isinstance(result, Exception):
+            raise result
+        found.append(result)
+    return found
+
+
+def _run_trials(study: Study, context: StudyContext, own: set[int]) -> None:
+    while not is_stopped() and time.time() < context.deadline and _run_next(study, context, own):
+        pass
+
+
 @contextlib.contextmanager
-def study_of(context: StudyContext) -> Iterator[Study]:
-    """The study for a worker, whose process exits with `UNREACHABLE`, and no message, when it is lost."""
+def study_of(context: StudyContext) -> Iterator[StudyStorage]:
+    """The study's storage for a worker, which exits with `UNREACHABLE`, and no message, when it is lost."""
     from gridworld.tune.search.storage import storage_error
 
     def heartbeat_failed(thread: threading.ExceptHookArgs) -> None:
@@ -68,7 +93,7 @@ def study_of(context: StudyContext) -> Iterator[Study]:
     threading.excepthook = heartbeat_failed  # the trial itself meets the error too
     try:
         with context.storage.in_reach():
-            yield context.storage.load()
+            yield context.storage
     except StorageLostError:
         sys.exit(UNREACHABLE)
 
@@ -84,9 +109,15 @@ def is_stopped() -> bool:
     return _stopped.is_set()
 
 
-def _run_next(study: Study, context: StudyContext) -> bool:
-    """Run a trial, or wait for those that others run; False once there are enough."""
-    from gridworld.tune.search.storage import count_trials, give_up_stale, put_back, seed_sampler
+def _run_next(study: Study, context: StudyContext, own: set[int]) -> bool:
+    """Run a trial, or wait for those that others run; False once there are enough.
+
+    Args:
+        study: the study, loaded for this trial and those after it.
+        context: what is run.
+        own: the numbers of the trials that this process runs, which are not waited for.
+    """
+    from gridworld.tune.search.storage import count_trials, give_up_stale, put_back, seed_sampler, show_ended
 
     settings = context.storage.settings
     with ExitStack() as turn:
@@ -99,22 +130,28 @@ def _run_next(study: Study, context: StudyContext) -> bool:
             begun: list[int] = []
             place = f"{socket.gethostname()}:{context.folder.absolute()}" if settings.storage else ""
             seed_sampler(study, settings, place)
-            run = functools.partial(_run, objective=context.objective, turn=turn, begun=begun)
+            run = partial(_run, objective=context.objective, turn=turn, begun=begun, own=own)
             try:
                 study.optimize(run, n_trials=1, catch=(Exception,))
             except Stopped:
                 put_back(study, begun[0])
                 raise
+            finally:
+                own.difference_update(begun)
+                show_ended(study)
             return True
+    if own:
+        return False
     _stopped.wait(_POLL_SECONDS)
     return True
 
 
-def _run(trial: Trial, objective: Objective, turn: ExitStack, begun: list[int]) -> float:
+def _run(trial: Trial, objective: Objective, turn: ExitStack, begun: list[int], own: set[int]) -> float:
     """Evaluate the objective; note the reason where it fails."""
     import optuna
 
     begun.append(trial.number)
+    own.add(trial.number)
     turn.close()
     trial.set_user_attr("worker", f"{socket.gethostname()}:{os.getpid()}")
     try:

@@ -36,7 +36,7 @@ class TabulatedPPO(TabulatedOnPolicy, PPO):
         """See SB3's `PPO.train`."""
         self._update_learning_rate(self.policy.optimizer)
         buffer = self.rollout_buffer
-        shape = (buffer.buffer_size, buffer.n_envs, self.batch_size, self.n_epochs, self.normalize_advantage)
+        shape = (buffer.buffer_size, buffer.n_envs, self.batch_size, self.normalize_advantage)
         meet(_train_together, _Run(self, chance()), (self.inputs.kind, shape, self.clip_range_vf is None))
 
     def clip_ranges(self) -> tuple[float, float | None]:
@@ -68,8 +68,8 @@ def _train(runs: Sequence[_Run]) -> list[Exception | None]:
     """Make the updates of a rollout of each of P models; returns what is to be raised in each."""
     with SideBySide([run.model.descent for run in runs]) as rows:
         update = _Update(runs, rows)
-        for _ in range(runs[0].model.n_epochs):
-            update.make_epoch()
+        for epoch in range(max(run.model.n_epochs for run in runs)):
+            update.make_epoch(epoch)
     for run in runs:
         if run.error is None:
             run.model.log_epochs(run.epochs, run.logged, run.logged[run.last_epoch :])
@@ -106,8 +106,9 @@ class _Update:
         self._weights = _weights(self._models)
         self._norms = [model.max_grad_norm for model in self._models]
 
-    def make_epoch(self) -> None:
+    def make_epoch(self, epoch: int) -> None:
         """Make the steps of an epoch; the order of samples is SB3's own draw."""
+        self._end([self._models[run].n_epochs > epoch for run in self._going])
         going: list[int] = self._going.tolist()
         for run in going:
             self._runs[run].last_epoch = len(self._runs[run].logged)
