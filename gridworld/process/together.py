@@ -18,6 +18,7 @@ import contextvars
 import random
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -223,19 +224,26 @@ def clock() -> float:
 
 
 def _met(waiting: Sequence[_Task]) -> list[tuple[_Task, Exception | None]]:
-    """Do the work that tasks wait for; returns what to raise in each, in their order."""
-    groups: dict[Any, list[_Task]] = {}
-    for task in waiting:
-        assert task.waiting is not None
-        groups.setdefault((task.waiting.work, task.waiting.key), []).append(task)
+    """Do the work that most tasks wait for; returns what to raise in each of these, in their order.
+
+    The others wait on. So tasks that are at different points of one loop come to do the same at once.
+    """
+    requests = [(task, task.waiting) for task in waiting if task.waiting is not None]
+    if not requests:
+        return []
+    [(work, _)] = Counter(request.work for _, request in requests).most_common(1)
+    groups: dict[Hashable, list[tuple[_Task, _Waiting[Any]]]] = {}
+    for task, request in requests:
+        if request.work == work:
+            groups.setdefault(request.key, []).append((task, request))
     errors: dict[_Task, Exception | None] = {}
-    for (work, _), tasks in groups.items():
+    for group in groups.values():
         started = time.perf_counter()
-        found = work([task.waiting.member for task in tasks if task.waiting is not None])
-        for task in tasks:
-            task.seconds += (time.perf_counter() - started) / len(tasks)
-        errors.update(zip(tasks, found, strict=True))
-    return [(task, errors[task]) for task in waiting]
+        found = work([request.member for _, request in group])
+        for (task, _), error in zip(group, found, strict=True):
+            task.seconds += (time.perf_counter() - started) / len(group)
+            errors[task] = error
+    return [(task, errors[task]) for task in waiting if task in errors]
 
 
 def _exit_as_asked(ended: Sequence[_Task]) -> None:

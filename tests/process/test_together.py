@@ -369,7 +369,7 @@ def test_the_one_at_work_stops_at_once_where_it_cannot_be_saved(at: dict[tuple[s
     def last() -> str:
         request = StopRequest()
         with request.listening():
-            meet(note, "last", None)
+            meet(send, ("last", 0), None)
             os.kill(os.getpid(), signal.SIGTERM)  # not patient
             raise AssertionError("it goes on")
 
@@ -446,6 +446,20 @@ class Meetings:
         for _ in range(times):
             meet(self.work, name, "key")
         return name
+
+
+def test_what_most_wait_for_is_done_first() -> None:
+    """So tasks at different points of one loop come to do the same at once."""
+
+    def first(members: Sequence[str]) -> list[Exception | None]:
+        return note(members)
+
+    def loop(name: str, begins_with: int) -> None:
+        for turn in range(begins_with, 4):
+            meet((first, note)[turn % 2], name, None)
+
+    run_together([partial(loop, "a", 0), partial(loop, "b", 1), partial(loop, "c", 0)])
+    assert met == [["a", "c"], ["a", "b", "c"], ["a", "b", "c"], ["a", "b", "c"]]
 
 
 def test_tasks_that_a_task_begins_meet_all_others() -> None:
