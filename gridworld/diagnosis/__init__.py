@@ -1,5 +1,5 @@
-"""Why a run is not optimal: its regret, split exactly over states, and the cause at each of them.
+"""Why a run is not optimal: its regret split over states, and the cause at each of them.
 
-`split` divides the regret, `evidence` has what is known of a run, a module of `causes` tests one kind of cause
-against it, and `verdict` puts them in order.
+`split` divides the regret and `evidence` has what is known of a run. A cause is a function of the evidence;
+`causes` has them in order, and `verdict` puts together what they find.
 """

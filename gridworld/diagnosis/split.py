@@ -4,9 +4,9 @@ The performance-difference lemma says
 
     V*(start) - V_π(start) = Σ_s d_π(s) [ V*(s) - Σ_a π(a|s) Q*(s, a) ],    d_π(s) = Σ_t γ^t P(s_t = s),
 
-a sum over states of the discounted visits under π times what its action there loses at best play afterwards.
-With γ = 1 a policy that never ends has no such sum. The walk is then stopped where it cannot end any more, and
-a state where it stops costs its visits times V* - V_π, all that is lost from there on.
+a sum over states of the discounted visits under π times what its action there loses.
+With γ = 1 a policy that never ends has no such sum. The walk then stops where it cannot end any more, and
+such a state costs its visits times V* - V_π, all that is lost from there on.
 
 As `world.evaluation` has it, value and regret are without a step limit. What an episode of training loses by
 being cut off is therefore no part of the split.

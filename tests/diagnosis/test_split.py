@@ -1,4 +1,4 @@
-"""The regret's shares of the states: against a second computation by loops over cells, and what they add up to."""
+"""The regret's shares of the states: against a second computation by loops, and what they add up to."""
 
 import numpy as np
 import pytest
@@ -66,7 +66,9 @@ def test_the_shares_add_up_to_the_regret(rows, settings, seed, greedy, gamma) ->
 
 
 def test_a_large_world_adds_up_too() -> None:
-    rows = "\n".join("S" + "." * 29 if row == 0 else "." * 29 + ("G" if row == 29 else ".") for row in range(30))
+    rows = "\n".join(
+        "S" + "." * 29 if row == 0 else "." * 29 + ("G" if row == 29 else ".") for row in range(30)
+    )
     evaluator = Evaluator(compile_mdp(parse(rows, "map"), slip=0.2, step_reward=-0.01), 0.99, 200)
     policy = _policy(900, 1, greedy=False)
     split = split_regret(evaluator, policy)
