@@ -28,7 +28,7 @@ def diagnose(run: RunResult | str | PathLike[str]) -> Diagnosis:
         >>> import gridworld
         >>> run = gridworld.train("agent=q_learning", "agent.learning_rate=0.001", progress=False)
         >>> found = gridworld.diagnose(run)
-        >>> found.cause, abs(found.split.cost.sum() - found.split.score.regret) < 1e-9
+        >>> found.cause, bool(abs(found.split.cost.sum() - found.split.score.regret) < 1e-9)
         ('slow', True)
     """
     if not isinstance(run, RunResult):
