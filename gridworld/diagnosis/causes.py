@@ -16,7 +16,7 @@ from gridworld.diagnosis.learning import (
     overshot,
     unsettled,
 )
-from gridworld.diagnosis.network import cannot_represent, spoilt
+from gridworld.diagnosis.network import cannot_represent, spoilt, spoilt_policy
 from gridworld.diagnosis.objective import (
     faint_gamma,
     hopeless_gamma,
@@ -27,6 +27,6 @@ from gridworld.diagnosis.objective import (
 
 CAUSES: tuple[Cause, ...] = (
     *(hopeless_gamma, lost_again, diverged, other_optimum, too_much_epsilon),
-    *(cannot_represent, hardly_moved, too_much_entropy, overshot, spoilt, not_tried, collapsed),
-    *(faint_gamma, not_there_yet, ended_early, unsettled),
+    *(cannot_represent, hardly_moved, too_much_entropy, overshot, spoilt_policy, not_tried, collapsed),
+    *(faint_gamma, spoilt, not_there_yet, ended_early, unsettled),
 )

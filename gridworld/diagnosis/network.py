@@ -23,6 +23,11 @@ def cannot_represent(run: Evidence) -> Finding | None:
     return Finding("network", run.split.wrong, why, (wide, *kinds))
 
 
+def spoilt_policy(run: Evidence) -> Finding | None:
+    """As `spoilt`, of a policy that explores by itself: what it did not try follows from its weights."""
+    return spoilt(run) if run.is_actor_critic else None
+
+
 def spoilt(run: Evidence) -> Finding | None:
     """Its own weights cannot be fitted any more, where new ones can."""
     if _fits(run, fresh=False) is not False:
