@@ -15,6 +15,7 @@ TYPE_CHECKING = False  # what type checkers take for True; `typing` itself would
 if TYPE_CHECKING:
     from gridworld.agents.sb3.interop.exact_eval_callback import ExactEvalCallback
     from gridworld.agents.sb3.interop.make_vec_env import make_vec_env
+    from gridworld.api.diagnosis import diagnose
     from gridworld.api.runs import RunResult, open_run, train
     from gridworld.api.scores import evaluate
     from gridworld.api.settings import compose
@@ -57,6 +58,7 @@ _HOME = {
     "compile_env": "api.worlds",
     "compile_mdp": "world.grid",
     "compose": "api.settings",
+    "diagnose": "api.diagnosis",
     "evaluate": "api.scores",
     "load": "world.layout",
     "load_world": "world.sources.arrays",
@@ -87,6 +89,7 @@ __all__ = [
     "compile_env",
     "compile_mdp",
     "compose",
+    "diagnose",
     "evaluate",
     "load",
     "load_world",

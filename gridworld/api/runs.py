@@ -79,7 +79,7 @@ class RunResult:
     @cached_property
     def policy(self) -> PolicySnapshot:
         """What was learnt, as tables `greedy` (S,), `sampled` (S, A), `values` (S,), `q` (S, A) or None."""
-        return self._agent.snapshot()
+        return self.agent.snapshot()
 
     @property
     def model(self) -> Any:
@@ -87,10 +87,16 @@ class RunResult:
 
         After `open_run` it has the trained weights, and neither a replay buffer nor the optimiser's state.
         """
-        return self._agent.model
+        return self.agent.model
+
+    @property
+    def overrides(self) -> list[str]:
+        """The settings that its command line or call changed, as words."""
+        return list(self._saved.run.manifest.get("overrides") or [])
 
     @cached_property
-    def _agent(self) -> Agent:
+    def agent(self) -> Agent:
+        """The trained agent, which has the model."""
         return self._make_agent()
 
     def __repr__(self) -> str:

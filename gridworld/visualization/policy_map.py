@@ -130,7 +130,7 @@ def draw_policy_map(
     middle = 0.5 if size is None else 0.4  # of the arrows, above the numbers
     paths = greedy_paths(mdp, greedy)
     ways = directions(mdp)[np.arange(mdp.num_states), greedy].tolist()
-    _draw_paths(canvas, paths, ways, middle)
+    draw_paths(canvas, paths, ways, middle)
     length = canvas.cell if size is None else 0.85 * canvas.cell
     for state in states.tolist() if canvas.cell >= _SMALLEST_ARROW_CELL else []:
         point = canvas.point(state, 0.5, middle)
@@ -164,7 +164,7 @@ def _swatches(cell: int, has_path: bool, all_known: bool) -> list[Swatch]:
     return [*([path] if has_path else []), wrong, *([] if all_known else [NEVER_VISITED])]
 
 
-def _draw_paths(canvas: Canvas, paths: list[list[int]], ways: list[list[int]], middle: float) -> None:
+def draw_paths(canvas: Canvas, paths: list[list[int]], ways: list[list[int]], middle: float) -> None:
     """A ring around each start, and lines through the states where one is beside the next.
 
     Args:

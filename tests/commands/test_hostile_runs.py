@@ -21,6 +21,7 @@ WORDS = {
     "record": ["run", "--format", "png", "gif", "policy", "visits", "--cell-size", "20"],
     "report": ["run", "--formats", "--readme", "table.md"],
     "export": ["run", "--to", "hub", "--out", "hub"],
+    "diagnose": ["run"],
     "reproduce": ["run"],
     "play": ["--agent", "run"],
     "resume": ["resume=run", "total_timesteps=2500"],  # last, since it writes there

@@ -16,6 +16,7 @@ COMMANDS = {
     "train": "train an agent, resume a run, or run a sweep",
     "jobs": "show how the jobs of a sweep stand",
     "evaluate": "score a finished run again, exactly and by sampling",
+    "diagnose": "say why a finished run is not optimal, and what to try",
     "record": "export a finished run's episodes and pictures",
     "report": "put many runs side by side, as one page",
     "export": "hand finished runs to W&B, MLflow or the Hugging Face Hub",

@@ -1,0 +1,82 @@
+"""Say why a finished run is not optimal: where its regret comes from, what causes it, and what to try."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from gridworld.diagnosis.evidence import Evidence
+from gridworld.diagnosis.picture import draw_diagnosis
+from gridworld.diagnosis.verdict import Diagnosis, diagnose
+from gridworld.errors import InputError
+from gridworld.process.columns import aligned
+from gridworld.process.command_line import program
+from gridworld.process.memory_budget import limited
+from gridworld.process.progress import telling_if_slow
+from gridworld.process.terminal import printable, tell
+from gridworld.restore.saved_run import SavedRun
+from gridworld.run.folder import shown
+from gridworld.storage.safe_read import check_no_link
+from gridworld.visualization.video import save_png
+
+PICTURE = "diagnosis.png"
+_MOST_ROWS = 8
+
+
+@limited()
+def main(arguments: Sequence[str]) -> None:
+    """Print the diagnosis, and draw it in the run's folder.
+
+    Raises:
+        InputError: The run cannot be read.
+    """
+    options = _parser().parse_args(arguments)
+    with telling_if_slow(f"diagnosing {options.run}"):
+        saved = SavedRun(options.run, options.trust)
+        found = diagnose(Evidence.of(saved))
+    print(printable(f"greedy policy of {options.run} on {saved.mdp.name}"))
+    if found.findings:
+        print(_table(found))
+    print(printable(found.sentence()))
+    if found.commands:
+        print("Try, one at a time:")
+        for line in found.commands:
+            print(printable(f"  {line}"))
+        _draw(found, options.run)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog=program("diagnose"), description=__doc__)
+    parser.add_argument("run", type=Path, help="the run's folder, e.g. runs/2026-...")
+    parser.add_argument(
+        "--trust", action="store_true", help="import the classes that the run names, wherever they are from"
+    )
+    return parser
+
+
+def _table(found: Diagnosis) -> str:
+    """The states that cost most, with their cause."""
+    split = found.split
+    rows = [["state", "takes", "visits", "lost", "regret", "cause"]]
+    costly = [state for state in (-split.cost).argsort(kind="stable").tolist() if found.cause_of[state] >= 0]
+    for state in costly[:_MOST_ROWS]:
+        action = found.mdp.action_names[found.greedy[state]]
+        numbers = [f"{each[state]:.3g}" for each in (split.visits, split.lost, split.cost)]
+        cause = found.findings[found.cause_of[state]].cause
+        rows.append([found.mdp.state_name(state), action, *numbers, f" {cause}"])
+    if len(costly) > _MOST_ROWS:
+        rest = float(split.cost[costly[_MOST_ROWS:]].sum())
+        rows.append([f"and {len(costly) - _MOST_ROWS:,} more", "", "", "", f"{rest:.3g}", ""])
+    return "\n".join(printable(f"  {line}") for line in aligned(rows, ("<14", "<8", ">9", ">9", ">9", "<14")))
+
+
+def _draw(found: Diagnosis, folder: Path) -> None:
+    path = folder / PICTURE
+    try:
+        check_no_link(path)
+        save_png(draw_diagnosis(found), path)
+    except (InputError, OSError) as error:  # the diagnosis stands without it
+        tell(f"{path}: not drawn ({error})")
+        return
+    print(f"{shown(path)} shows where the regret comes from")

@@ -1,0 +1,32 @@
+"""The causes in the order in which they are believed: a state belongs to the first that claims it.
+
+First what would be wrong for a perfect learner too, then what it could not know, then how it learns, and last
+what remains.
+"""
+
+from __future__ import annotations
+
+from gridworld.diagnosis.exploration import collapsed, ended_early, not_tried
+from gridworld.diagnosis.finding import Cause
+from gridworld.diagnosis.learning import (
+    diverged,
+    hardly_moved,
+    lost_again,
+    not_there_yet,
+    overshot,
+    unsettled,
+)
+from gridworld.diagnosis.network import cannot_represent, spoilt, spoilt_policy
+from gridworld.diagnosis.objective import (
+    faint_gamma,
+    hopeless_gamma,
+    other_optimum,
+    too_much_entropy,
+    too_much_epsilon,
+)
+
+CAUSES: tuple[Cause, ...] = (
+    *(hopeless_gamma, lost_again, diverged, other_optimum, too_much_epsilon),
+    *(cannot_represent, hardly_moved, too_much_entropy, overshot, spoilt_policy, not_tried, collapsed),
+    *(faint_gamma, spoilt, not_there_yet, ended_early, unsettled),
+)

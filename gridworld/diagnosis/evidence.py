@@ -1,0 +1,191 @@
+"""What is known of a finished run: all that a cause is told by."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gridworld.agents import Agent, PolicySnapshot
+from gridworld.config.agents import parse_schedule
+from gridworld.config.train import TrainConfig
+from gridworld.diagnosis.split import RegretSplit, split_regret
+from gridworld.errors import InputError
+from gridworld.report.evidence.curve_reader import read_columns
+from gridworld.restore.saved_run import SavedRun, read_visits
+from gridworld.world.bellman import backup, pick
+from gridworld.world.evaluation import Evaluator
+from gridworld.world.markov_chain import Chain
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+from gridworld.world.solver import Solution, solved
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """A run, as its files and its agent have it.
+
+    Attributes:
+        config: its settings.
+        overrides: those that its command line changed.
+        curve: (evaluations,) each, the columns of `curve.csv`.
+        visits: (S, A), how often training took each action in each state.
+        evaluator: of its world.
+        agent: what it trained.
+        snapshot: what the agent holds of every state.
+    """
+
+    config: TrainConfig
+    overrides: Sequence[str]
+    curve: Mapping[str, NDArray[Any]]
+    visits: NDArray[np.int64]
+    evaluator: Evaluator
+    agent: Agent
+    snapshot: PolicySnapshot
+
+    @classmethod
+    def of(cls, saved: SavedRun) -> Evidence:
+        """Read a run's files.
+
+        Raises:
+            InputError: a file was changed since, or is missing.
+        """
+        agent, shape = saved.agent(), saved.mdp.next_state.shape[:2]
+        return cls(
+            saved.config,
+            saved.run.manifest.get("overrides") or [],
+            read_columns(saved.run),
+            read_visits(saved.run, shape),
+            saved.evaluator(),
+            agent,
+            agent.snapshot(),
+        )
+
+    @property
+    def mdp(self) -> Mdp:
+        """The world."""
+        return self.evaluator.mdp
+
+    @cached_property
+    def split(self) -> RegretSplit:
+        """The regret of the greedy policy."""
+        return split_regret(self.evaluator, self.snapshot.greedy_policy())
+
+    @property
+    def greedy(self) -> IntArray:
+        """(S,), the greedy actions."""
+        return self.snapshot.greedy
+
+    @cached_property
+    def gamma(self) -> float:
+        """The discount that the agent learns with."""
+        return float(getattr(self.config.agent, "gamma", self.evaluator.solution.gamma))
+
+    @cached_property
+    def own(self) -> Solution:
+        """The optimum under the agent's own discount, or the evaluation's where that has none."""
+        try:
+            return solved(self.mdp, self.gamma)
+        except InputError:
+            return self.evaluator.solution
+
+    @cached_property
+    def values(self) -> FloatArray:
+        """(S,), the agent's values; 0 where it is over."""
+        return np.where(self.mdp.terminal, 0.0, self.snapshot.values)
+
+    @cached_property
+    def q(self) -> FloatArray:
+        """(S, A), the agent's Q; of an agent without, one backup of its values."""
+        return backup(self.mdp, self.values, self.gamma) if self.snapshot.q is None else self.snapshot.q
+
+    @cached_property
+    def gap(self) -> FloatArray:
+        """(S,), what the greedy action loses under the agent's own discount."""
+        lost: FloatArray = self.own.v - pick(self.own.q, self.greedy)
+        return lost
+
+    @property
+    def is_tabular(self) -> bool:
+        """Whether it learns a table."""
+        return self.config.agent.family == "tabular"
+
+    @property
+    def is_actor_critic(self) -> bool:
+        """Whether it has a policy of its own and no Q."""
+        return self.snapshot.q is None
+
+    @cached_property
+    def largest_reward(self) -> float:
+        """The largest |reward| of a step."""
+        return float(np.abs(self.mdp.reward).max())
+
+    @cached_property
+    def spread(self) -> FloatArray:
+        """(S,), the entropy of the sampled policy, 1 where it is uniform."""
+        return entropy(self.snapshot.sampled)
+
+    @cached_property
+    def steps_to_goal(self) -> float:
+        """The exact expected number of steps until a random walk first meets a goal.
+
+        By Wald's identity the expected length of an episode by its probability of a goal, time-outs included.
+        """
+        uniform = np.full_like(self.snapshot.sampled, 1 / self.mdp.num_actions)
+        walk = Chain(self.mdp, uniform).outcome(self.evaluator.max_episode_steps)
+        return walk.expected_length / walk.goal if walk.goal > 0 else np.inf
+
+    @property
+    def acting(self) -> BoolArray:
+        """(S,), the states that an episode can come to and act in."""
+        return np.asarray(self.mdp.reachable & ~self.mdp.absorbing)
+
+    def setting(self, name: str, default: float = 0.0) -> float:
+        """A number among the agent's settings: as configured, or as its model has it by default.
+
+        Of a schedule it is the first value; the default stands in for what the agent has not.
+        """
+        agent = self.config.agent
+        given = getattr(agent, name, None)
+        if given is None:
+            given = getattr(agent, "arguments", {}).get(name)
+        if given is None and not self.is_tabular:
+            given = getattr(self.agent.model, name, None)
+        if isinstance(given, str):
+            return parse_schedule(name, given)[0]
+        given = getattr(given, "frequency", given)  # of SB3's TrainFreq
+        if isinstance(given, list | tuple):
+            given = given[0]
+        return float(given) if isinstance(given, int | float) else default
+
+    def change(self, name: str, value: float | str) -> str:
+        """The word that sets one of the agent's settings on a command line."""
+        text = value if isinstance(value, str) else f"{value:.3g}" if value % 1 else f"{value:.0f}"
+        if hasattr(self.config.agent, name):
+            return f"agent.{name}={text}"
+        prefix = "" if name in getattr(self.config.agent, "arguments", {}) else "+"
+        return f"{prefix}agent.arguments.{name}={text}"
+
+    @cached_property
+    def updates(self) -> float:
+        """How many gradient steps training made, as its settings say."""
+        total, envs = self.config.total_timesteps, self.config.n_envs
+        if epochs := self.setting("n_epochs"):
+            rollout = self.setting("n_steps", 1) * envs
+            return total / rollout * epochs * math.ceil(rollout / self.setting("batch_size", 64))
+        if not self.setting("train_freq"):
+            return total / (self.setting("n_steps", 1) * envs)
+        rollout = self.setting("train_freq", 1) * envs
+        steps = self.setting("gradient_steps", 1)
+        learns = max(0.0, total - self.setting("learning_starts"))
+        return learns / rollout * (rollout if steps < 0 else steps)
+
+
+def entropy(policy: FloatArray) -> FloatArray:
+    """(S,), the entropy of a policy (S, A), 1 where it is uniform."""
+    logs = np.log(np.maximum(policy, 1e-300))
+    return np.asarray(-(policy * logs).sum(axis=1) / max(np.log(policy.shape[1]), 1e-300))

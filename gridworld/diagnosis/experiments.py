@@ -1,0 +1,81 @@
+"""Experiments on the tables: what another learner, or the same one with more time, would come to."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gridworld.diagnosis.evidence import Evidence
+from gridworld.world.bellman import backup
+from gridworld.world.evaluation import Evaluator
+from gridworld.world.markov_chain import Chain
+from gridworld.world.mdp import BoolArray, FloatArray, Mdp
+
+_SWEEPS = 1000
+_ROUNDS = 60
+
+
+def best_of_what_was_tried(evaluator: Evaluator, tried: BoolArray) -> FloatArray:
+    """The value of the best policy that takes tried actions only.
+
+    Args:
+        evaluator: of the world.
+        tried: (S, A), bool; where nothing was tried, V* is granted.
+
+    Returns:
+        (S,), at most V*.
+    """
+    mdp, best = evaluator.mdp, evaluator.solution
+    known = tried.any(axis=1) & ~mdp.absorbing
+    least = np.where(np.isfinite(best.v), -best.scale.max(), best.v)
+    v: FloatArray = np.where(known, least, best.v)
+    for _ in range(_SWEEPS):
+        q = np.where(tried[known], backup(mdp, v, best.gamma, np.flatnonzero(known)), -np.inf)
+        new = q.max(axis=1, initial=-np.inf)
+        change = np.abs(new - v[known]).max(initial=0.0)
+        v[known] = new
+        if not change > 1e-9 * best.scale.max():
+            break
+    return v
+
+
+def entropy_optimum(run: Evidence, bonus: float) -> FloatArray:
+    """The policy (S, A) that an entropy bonus aims at: π = softmax(A_π / bonus), found by iteration.
+
+    Where advantages are normalised, as PPO does, they are divided by their deviation under π first.
+    """
+    mdp, normalised = run.mdp, bool(getattr(run.agent.model, "normalize_advantage", False))
+    policy = np.full_like(run.snapshot.sampled, 1 / mdp.num_actions)
+    for _ in range(_ROUNDS):
+        v = Chain(mdp, policy).value(min(run.gamma, 0.9999))
+        advantage = backup(mdp, v, run.gamma) - v[:, None]
+        weight = run.acting[:, None] * policy
+        deviation = np.sqrt((weight * advantage**2).sum() / weight.sum()) if normalised else 1.0
+        logits = advantage / max(bonus * deviation, 1e-12)
+        aimed = np.exp(np.minimum(logits - logits.max(axis=1, keepdims=True), 0.0))
+        policy = 0.5 * policy + 0.5 * aimed / aimed.sum(axis=1, keepdims=True)
+    return policy
+
+
+def optimum_of_epsilon(mdp: Mdp, gamma: float, epsilon: float) -> BoolArray:
+    """(S, A), the best actions where each is replaced by a random one with probability epsilon."""
+    v = np.zeros(mdp.num_states)
+    for _ in range(_SWEEPS):
+        q = backup(mdp, v, gamma)
+        new = ((1 - epsilon) * q.max(axis=1) + epsilon * q.mean(axis=1)) * ~mdp.absorbing
+        change, v = np.abs(new - v).max(), new
+        if change <= 1e-12:
+            break
+    q = backup(mdp, v, gamma)
+    return np.asarray(q >= q.max(axis=1, keepdims=True) - 1e-9)
+
+
+def sweeps_missing(run: Evidence) -> int:
+    """How many sweeps of value iteration from its own values make its errors right; 0: it cannot be told."""
+    v = run.q.max(axis=1) * ~run.mdp.terminal
+    states = np.flatnonzero(run.split.wrong)
+    for sweep in range(1, _SWEEPS):
+        q = backup(run.mdp, v, run.gamma)
+        if run.own.optimal[states, q[states].argmax(axis=1)].all():
+            return sweep
+        v = q.max(axis=1) * ~run.mdp.terminal
+    return 0

@@ -1,0 +1,10 @@
+"""Say why a finished run is not optimal: `python scripts/diagnose.py runs/...`; see `--help`."""
+
+from gridworld.process.early_signals import listen
+
+if __name__ == "__main__":
+    listen()  # before what takes time to import
+    from gridworld.commands import run
+    from gridworld.commands.diagnose import main
+
+    run(main)

@@ -1,0 +1,74 @@
+"""The command `diagnose` on finished runs, and the picture that it draws."""
+
+import re
+import shlex
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import gridworld
+from gridworld.commands import diagnose
+from gridworld.diagnosis.picture import draw_diagnosis
+
+_SPOILT = ["agent=q_learning", "agent.learning_rate=0.001", "total_timesteps=2000", "seed=0"]
+
+
+@pytest.fixture(scope="module")
+def spoilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs") / "spoilt"
+    gridworld.train(*_SPOILT, folder=folder, progress=False)
+    return folder
+
+
+def test_it_ends_with_a_sentence_and_commands_that_can_be_typed(spoilt: Path, capsys) -> None:
+    started = time.monotonic()
+    diagnose.main([str(spoilt)])
+    assert time.monotonic() - started < 5
+    told = capsys.readouterr().out
+    assert re.search(r"^(The|\d+% of the) regret of 0.932: .*\.$", told, re.MULTILINE)
+    lines = [line.strip() for line in told.splitlines() if "train.py" in line]
+    assert 1 <= len(lines) <= 3
+    for line in lines:
+        gridworld.compose(*shlex.split(line)[2:])  # every one is a valid setting
+
+
+def test_the_picture_has_the_world_and_the_cells_that_cost(spoilt: Path) -> None:
+    diagnose.main([str(spoilt)])
+    with Image.open(spoilt / "diagnosis.png") as picture:
+        assert min(picture.size) > 200
+    found = gridworld.diagnose(spoilt)
+    frame = draw_diagnosis(found, 40)
+    costly = int(np.argmax(found.split.cost))
+    row, col = divmod(costly, 6)
+    cell = frame[(row + 1) * 40 + 4, (col + 1) * 40 + 36]
+    assert cell.tolist() == [127, 0, 0]  # the end of the scale
+
+
+def test_a_folder_and_an_open_run_are_the_same(spoilt: Path) -> None:
+    run = gridworld.open_run(spoilt)
+    assert gridworld.diagnose(spoilt).sentence() == gridworld.diagnose(run).sentence()
+    assert gridworld.diagnose(run).split.cost.sum() == pytest.approx(run.summary["regret"], abs=1e-9)
+
+
+def test_a_world_without_places_is_diagnosed_and_drawn_too() -> None:
+    pessimistic = ["agent.initial_value=-1", "total_timesteps=500"]
+    run = gridworld.train("agent=q_learning", "env=combination_lock", *pessimistic, seed=0, progress=False)
+    found = gridworld.diagnose(run)
+    assert found.findings
+    assert draw_diagnosis(found).ndim == 3
+
+
+def test_of_a_certified_run_nothing_is_named_or_drawn(tmp_path: Path, capsys) -> None:
+    gridworld.train("agent=value_iteration", folder=tmp_path / "best", progress=False)
+    diagnose.main([str(tmp_path / "best")])
+    told = capsys.readouterr().out.splitlines()
+    assert told[1:] == ["Certified optimal: there is no regret to explain."]
+    assert not (tmp_path / "best" / "diagnosis.png").exists()
+
+
+def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(gridworld.InputError, match=r"no such folder; give the folder of a run"):
+        diagnose.main([str(tmp_path / "nowhere")])
