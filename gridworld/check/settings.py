@@ -1,0 +1,131 @@
+"""With which arguments, and how long, an algorithm trains on the probes.
+
+They are chosen so that what fails is a bug: training goes on several times longer than SB3's own classes need,
+and step sizes are such that values come to rest within the tolerance. What kind of algorithm it is, its
+arguments say; it gets those of the kind's that it takes, and keeps its other defaults.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from gridworld.agents.sb3.schemas import SB3ClassConfig, SB3Config
+from gridworld.config.agents import AgentConfig
+from gridworld.errors import InputError
+
+_OURS = {"gamma": "each probe has its own", "seed": "see --seed", "device": "it is cpu"}
+_ENVS = 8
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Algorithms that are trained alike.
+
+    Attributes:
+        sign: an argument by which it is told.
+        steps: environment steps of a training run.
+        arguments: of the algorithm, by SB3's names.
+        num_envs: environments that step together.
+    """
+
+    sign: str
+    steps: int
+    arguments: Mapping[str, Any]
+    num_envs: int = _ENVS
+
+
+_EXPLORING = {"exploration_fraction": 0.5, "exploration_initial_eps": 1.0, "exploration_final_eps": 0.05}
+KINDS = (  # the first that fits
+    Kind(  # DQN, QR-DQN
+        "buffer_size",
+        6400,
+        {
+            **_EXPLORING,
+            "learning_rate": 2e-3,
+            "buffer_size": 10_000,
+            "learning_starts": 400,
+            "batch_size": 64,
+            "train_freq": 1,
+            "gradient_steps": 1,
+            "target_update_interval": 80,
+        },
+    ),
+    Kind(  # TRPO
+        "cg_max_steps",
+        20_480,
+        {"learning_rate": 3e-3, "n_steps": 64, "batch_size": 128, "target_kl": 0.05},
+    ),
+    Kind(  # PPO
+        "n_epochs",
+        10_240,
+        {"learning_rate": 2e-3, "n_steps": 64, "batch_size": 128, "n_epochs": 10, "ent_coef": 0.0},
+    ),
+    Kind("n_steps", 25_600, {"learning_rate": 2e-3, "n_steps": 16, "ent_coef": 0.0}),  # A2C
+    Kind("learning_rate_power", 16_000, {**_EXPLORING, "learning_rate": 0.05}),  # tables
+    Kind("", 20_000, {"learning_rate": 1e-3}),
+)
+
+
+def settings(
+    config: AgentConfig, gamma: float, arguments: Mapping[str, Any], given: Mapping[str, Any]
+) -> tuple[AgentConfig, Kind] | None:
+    """The settings of an algorithm on a probe.
+
+    Args:
+        config: what is checked.
+        gamma: the probe's discount.
+        arguments: the probe's own arguments.
+        given: the user's arguments, which win.
+
+    Returns:
+        The settings and the kind of the algorithm; None where it takes none of the probe's own arguments.
+
+    Raises:
+        InputError: an argument of the user's that it does not take, or that is not the user's to choose.
+    """
+    known = _argument_names(config)
+    for name in given:
+        if name in _OURS:
+            raise InputError(f"--set {name}: {_OURS[name]}; leave it out")
+        if name not in known:
+            raise InputError(f"--set {name}: {config.name} has no such argument; it has {', '.join(known)}")
+    if arguments and not set(arguments) & set(known):
+        return None
+    kind = next(each for each in KINDS if each.sign in known or not each.sign)
+    wanted = {**kind.arguments, "gamma": gamma, **given, **arguments}
+    return _with(config, {name: value for name, value in wanted.items() if name in known}), kind
+
+
+def _with(config: AgentConfig, arguments: Mapping[str, Any]) -> AgentConfig:
+    if isinstance(config, SB3ClassConfig):
+        return dataclasses.replace(config, arguments={**config.arguments, **arguments})
+    return dataclasses.replace(config, **arguments)
+
+
+def _argument_names(config: AgentConfig) -> list[str]:
+    if not isinstance(config, SB3ClassConfig):
+        fields = {field.name for field in dataclasses.fields(config)}
+        return sorted(fields - {field.name for field in dataclasses.fields(SB3Config)})
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    from gridworld.agents.sb3.constructor_arguments import import_class
+
+    return _of_class(import_class("check", config.algorithm, BaseAlgorithm))
+
+
+def _of_class(algorithm: type) -> list[str]:
+    """Names of its constructor's arguments; one with **kwargs takes those of the classes that it is made of."""
+    names: set[str] = set()
+    for each in algorithm.__mro__:
+        if "__init__" not in vars(each):
+            continue
+        parameters = inspect.signature(each).parameters.values()
+        kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+        names |= {parameter.name for parameter in parameters if parameter.kind in kinds}
+        if all(parameter.kind is not parameter.VAR_KEYWORD for parameter in parameters):
+            break
+    return sorted(name for name in names - {"policy", "env"} if not name.startswith("_"))
