@@ -17,7 +17,7 @@ _VISITED = 0.05  # share of steps; an actor-critic knows the values of the state
 _LIMIT = 100
 
 
-class Unmet(Exception):
+class UnmetError(Exception):
     """An expectation that does not hold; says what was found instead."""
 
 
@@ -39,7 +39,7 @@ def optimal(trained: Trained) -> str:
     score = Evaluator(mdp, trained.gamma, mdp.max_episode_steps or _LIMIT).score(trained.greedy)
     if not score.certified:
         actions = trained.greedy.argmax(axis=1)[_live(mdp)].tolist()
-        raise Unmet(f"its best actions are {actions}, with regret {score.regret:.3g}")
+        raise UnmetError(f"its best actions are {actions}, with regret {score.regret:.3g}")
     return "optimal"
 
 
@@ -56,14 +56,14 @@ def acts_as_learnt(trained: Trained) -> str:
         return "takes no steps"
     share = float(trained.visits[best].sum()) / steps
     if share < _LEAST_BEST:
-        raise Unmet(f"{share:.0%} of its last actions are best ones, must be {_LEAST_BEST:.0%}")
+        raise UnmetError(f"{share:.0%} of its last actions are best ones, must be {_LEAST_BEST:.0%}")
     return f"{share:.0%} of its last actions are best ones"
 
 
 def all_layers_learn(trained: Trained) -> str:
     """Training has changed every parameter."""
     if trained.frozen:
-        raise Unmet(f"{', '.join(trained.frozen)} did not change")
+        raise UnmetError(f"{', '.join(trained.frozen)} did not change")
     return "all have changed"
 
 
@@ -89,5 +89,5 @@ def _near(mdp: Mdp, found: FloatArray, exact: FloatArray, where: BoolArray) -> s
     name = f"{'Q' if len(worst) == 2 else 'V'}({', '.join(map(str, worst))})"
     text = f"{name} {found[worst]:.3f}, exact {exact[worst]:.3f}"
     if not error[worst] <= tolerance:
-        raise Unmet(f"{text}, tolerance {tolerance:.2g}")
+        raise UnmetError(f"{text}, tolerance {tolerance:.2g}")
     return text

@@ -19,7 +19,7 @@ class Probe:
     Attributes:
         name: as the command line has it.
         world: makes the world that it trains on.
-        holds: what must hold after training; raises `expectations.Unmet`, else says what was found.
+        holds: what must hold after training; raises `expectations.UnmetError`, else says what was found.
         meaning: what a failure means.
         gamma: the discount that it trains with.
         arguments: arguments of the algorithm that differ from `settings`. An algorithm that takes none of

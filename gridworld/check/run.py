@@ -11,13 +11,14 @@ from functools import partial
 from multiprocessing import get_context
 from typing import Any
 
-from gridworld.check.expectations import Unmet
+from gridworld.check.expectations import UnmetError
 from gridworld.check.probes import PROBES, Probe
 from gridworld.check.settings import settings
 from gridworld.check.training import build, train
 from gridworld.config.agents import AgentConfig
 from gridworld.errors import InputError, in_short
 
+Outcomes = list[tuple[bool | None, str]]  # of one probe on each seed: see `Finding`
 SEEDS = 3  # of a probe that fails at first: it has failed if it fails on most of them
 
 
@@ -129,33 +130,33 @@ def _findings(
         yield from pool.map(check, groups)
 
 
-def _check_group(config: AgentConfig, given: Mapping[str, Any], seed: int, group: list[Probe]) -> list[Finding]:
+def _check_group(
+    config: AgentConfig, given: Mapping[str, Any], seed: int, group: list[Probe]
+) -> list[Finding]:
     """The findings of probes that share a training run; those that fail get further seeds."""
     started = time.monotonic()
-    outcomes: dict[str, list[tuple[bool | None, str]]] = {probe.name: [] for probe in group}
+    outcomes: dict[str, Outcomes] = {probe.name: [] for probe in group}
     for number in range(SEEDS):
-        open_ = [probe for probe in group if _is_open(outcomes[probe.name])]
-        if open_:
-            for probe, outcome in zip(open_, _once(config, given, seed + number, open_), strict=True):
+        unsettled = [probe for probe in group if _is_open(outcomes[probe.name])]
+        if unsettled:
+            for probe, outcome in zip(unsettled, _once(config, given, seed + number, unsettled), strict=True):
                 outcomes[probe.name].append(outcome)
     seconds = (time.monotonic() - started) / len(group)
     return [_finding(probe, outcomes[probe.name], seconds) for probe in group]
 
 
-def _is_open(outcomes: list[tuple[bool | None, str]]) -> bool:
-    """Whether another seed could still decide: it failed on some, on as many as most of them on none yet."""
+def _is_open(outcomes: Outcomes) -> bool:
+    """Whether it has failed, but neither failed nor passed on most seeds."""
     failures = [passed for passed, _ in outcomes].count(False)
     return not outcomes or (0 < failures <= SEEDS // 2 and len(outcomes) - failures <= SEEDS // 2)
 
 
-def _finding(probe: Probe, outcomes: list[tuple[bool | None, str]], seconds: float) -> Finding:
+def _finding(probe: Probe, outcomes: Outcomes, seconds: float) -> Finding:
     passed, found = outcomes[-1]
     return Finding(probe.name, passed, found, probe.meaning, len(outcomes), seconds)
 
 
-def _once(
-    config: AgentConfig, given: Mapping[str, Any], seed: int, probes: list[Probe]
-) -> list[tuple[bool | None, str]]:
+def _once(config: AgentConfig, given: Mapping[str, Any], seed: int, probes: list[Probe]) -> Outcomes:
     first = probes[0]
     found = settings(config, first.gamma, first.arguments, given)
     if found is None:
@@ -165,10 +166,10 @@ def _once(
         trained = train(settled, first.world(), first.gamma, kind.num_envs, kind.steps, seed)
     except Exception as error:  # it may be anybody's code
         return [(False, f"training failed: {in_short(error)}")] * len(probes)
-    outcomes: list[tuple[bool | None, str]] = []
+    outcomes: Outcomes = []
     for probe in probes:
         try:
             outcomes.append((True, probe.holds(trained)))
-        except Unmet as unmet:
+        except UnmetError as unmet:
             outcomes.append((False, str(unmet)))
     return outcomes

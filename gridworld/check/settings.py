@@ -1,7 +1,7 @@
 """With which arguments, and how long, an algorithm trains on the probes.
 
-They are chosen so that what fails is a bug: training goes on several times longer than SB3's own classes need,
-and step sizes are such that values come to rest within the tolerance. What kind of algorithm it is, its
+They are chosen so that what fails is a bug: training goes on longer than SB3's own classes need, and the
+learning rate falls to 0, so that values come to rest well within the tolerance. What kind of algorithm it is, its
 arguments say; it gets those of the kind's that it takes, and keeps its other defaults.
 """
 
@@ -19,6 +19,7 @@ from gridworld.errors import InputError
 
 _OURS = {"gamma": "each probe has its own", "seed": "see --seed", "device": "it is cpu"}
 _ENVS = 8
+_FEW_QUANTILES = {"n_quantiles": 25}  # of a policy that has them; 200 take ten times as long
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,10 @@ KINDS = (  # the first that fits
         6400,
         {
             **_EXPLORING,
-            "learning_rate": 2e-3,
+            "learning_rate": "lin_0.003",
             "buffer_size": 10_000,
             "learning_starts": 400,
-            "batch_size": 64,
+            "batch_size": 128,
             "train_freq": 1,
             "gradient_steps": 1,
             "target_update_interval": 80,
@@ -57,15 +58,21 @@ KINDS = (  # the first that fits
     Kind(  # TRPO
         "cg_max_steps",
         20_480,
-        {"learning_rate": 3e-3, "n_steps": 64, "batch_size": 128, "target_kl": 0.05},
+        {"learning_rate": "lin_0.003", "n_steps": 64, "batch_size": 128, "target_kl": 0.05},
     ),
     Kind(  # PPO
         "n_epochs",
         10_240,
-        {"learning_rate": 2e-3, "n_steps": 64, "batch_size": 128, "n_epochs": 10, "ent_coef": 0.0},
+        {"learning_rate": "lin_0.003", "n_steps": 64, "batch_size": 128, "n_epochs": 10, "ent_coef": 0.0},
     ),
-    Kind("n_steps", 25_600, {"learning_rate": 2e-3, "n_steps": 16, "ent_coef": 0.0}),  # A2C
-    Kind("learning_rate_power", 16_000, {**_EXPLORING, "learning_rate": 0.05}),  # tables
+    Kind(
+        "n_steps", 51_200, {"learning_rate": "lin_0.003", "n_steps": 8, "ent_coef": 0.0}, num_envs=16
+    ),  # A2C
+    Kind(  # tables
+        "learning_rate_power",
+        16_000,
+        {**_EXPLORING, "learning_rate": 0.05, "learning_rate_power": 0.0, "initial_value": 0.0},
+    ),
     Kind("", 20_000, {"learning_rate": 1e-3}),
 )
 
@@ -96,7 +103,7 @@ def settings(
     if arguments and not set(arguments) & set(known):
         return None
     kind = next(each for each in KINDS if each.sign in known or not each.sign)
-    wanted = {**kind.arguments, "gamma": gamma, **given, **arguments}
+    wanted = {**kind.arguments, **_of_policy(config), "gamma": gamma, **given, **arguments}
     return _with(config, {name: value for name, value in wanted.items() if name in known}), kind
 
 
@@ -110,17 +117,31 @@ def _argument_names(config: AgentConfig) -> list[str]:
     if not isinstance(config, SB3ClassConfig):
         fields = {field.name for field in dataclasses.fields(config)}
         return sorted(fields - {field.name for field in dataclasses.fields(SB3Config)})
-    from stable_baselines3.common.base_class import BaseAlgorithm
-
-    from gridworld.agents.sb3.constructor_arguments import import_class
-
-    return _of_class(import_class("check", config.algorithm, BaseAlgorithm))
+    return _of_class(class_of(config))
 
 
-def _of_class(algorithm: type) -> list[str]:
-    """Names of its constructor's arguments; one with **kwargs takes those of the classes that it is made of."""
+def _of_policy(config: AgentConfig) -> dict[str, Any]:
+    if not isinstance(config, SB3ClassConfig):
+        return {}
+    policy = class_of(config).policy_aliases.get(config.policy, object)
+    return {"policy_kwargs": _FEW_QUANTILES} if "n_quantiles" in _of_class(policy) else {}
+
+
+def class_of(config: SB3ClassConfig) -> Any:
+    """The class that is checked.
+
+    Raises:
+        InputError: there is no such class of SB3's kind.
+    """
+    from gridworld.agents.sb3.constructor_arguments import algorithm_class  # here, since it imports torch
+
+    return algorithm_class("check", config.algorithm)
+
+
+def _of_class(kind: type) -> list[str]:
+    """Names of its constructor's arguments; one with **kwargs takes those of its base class."""
     names: set[str] = set()
-    for each in algorithm.__mro__:
+    for each in kind.__mro__:
         if "__init__" not in vars(each):
             continue
         parameters = inspect.signature(each).parameters.values()

@@ -17,7 +17,9 @@ def row(finding: Finding) -> str:
     cells = [finding.name, _WORDS[finding.passed], f"{finding.seconds:.1f} s", f" {finding.found}{seeds}"]
     (line,) = aligned([cells], ("<12", "<7", ">7", "<0"))
     if finding.passed is False:
-        line += "\n" + textwrap.fill(finding.meaning, _WIDTH, initial_indent=" " * 4, subsequent_indent=" " * 4)
+        line += "\n" + textwrap.fill(
+            finding.meaning, _WIDTH, initial_indent=" " * 4, subsequent_indent=" " * 4
+        )
     return line
 
 
