@@ -1,4 +1,4 @@
-"""Check an algorithm on worlds with known answers: `python scripts/check.py my_package.MyPPO`; see `--help`."""
+"""Check an implementation on probe worlds: `python scripts/check.py my_package.MyPPO`; see `--help`."""
 
 from gridworld.process.early_signals import listen
 

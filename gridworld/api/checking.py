@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gridworld.check.run import CheckResult, check_all
-from gridworld.check.subject import subject
+from gridworld.checking.run import CheckResult, check_all
+from gridworld.checking.subject import subject
 
 __all__ = ["CheckResult", "check"]
 

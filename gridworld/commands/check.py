@@ -12,10 +12,10 @@ import sys
 import textwrap
 from collections.abc import Sequence
 
-from gridworld.check.probes import PROBES
-from gridworld.check.run import check_all
-from gridworld.check.subject import arguments, subject
-from gridworld.check.table import row, verdict
+from gridworld.checking.probes import PROBES
+from gridworld.checking.run import check_all
+from gridworld.checking.subject import arguments, subject
+from gridworld.checking.table import row, verdict
 from gridworld.commands import whole_number
 from gridworld.errors import InputError
 from gridworld.process.command_line import program
@@ -62,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "algorithm",
-        help="the import path of a class with SB3's interface, e.g. my_package.MyPPO; or a shipped agent, e.g. dqn",
+        help="the import path of a class of SB3's kind, e.g. my_package.MyPPO; or a shipped agent, e.g. dqn",
     )
     parser.add_argument(
         "--set",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridworld.check.training import Trained
+from gridworld.checking.training import Trained
 from gridworld.world.bellman import backup
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.markov_chain import Chain

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 
-from gridworld.check.run import CheckResult, Finding
+from gridworld.checking.run import CheckResult, Finding
 from gridworld.process.columns import aligned
 
 _WIDTH = 100
@@ -17,9 +17,7 @@ def row(finding: Finding) -> str:
     cells = [finding.name, _WORDS[finding.passed], f"{finding.seconds:.1f} s", f" {finding.found}{seeds}"]
     (line,) = aligned([cells], ("<12", "<7", ">7", "<0"))
     if finding.passed is False:
-        line += "\n" + textwrap.fill(
-            finding.meaning, _WIDTH, initial_indent=" " * 4, subsequent_indent=" " * 4
-        )
+        line += "\n" + textwrap.indent(textwrap.fill(finding.meaning, _WIDTH), " " * 4)
     return line
 
 

@@ -79,7 +79,7 @@ def train(config: AgentConfig, mdp: Mdp, gamma: float, num_envs: int, steps: int
 
     agent.learn(steps, watch)
     after = _parameters(agent)
-    frozen = [name for name, table in before.items() if np.array_equal(table, after.get(name))]
+    frozen = [name for name, table in before.items() if name in after and np.array_equal(table, after[name])]
     return Trained(
         mdp, gamma, first, agent.snapshot(), _greedy(agent, context), context.envs.visits - earlier, frozen
     )

@@ -1,8 +1,8 @@
 """With which arguments, and how long, an algorithm trains on the probes.
 
 They are chosen so that what fails is a bug: training goes on longer than SB3's own classes need, and the
-learning rate falls to 0, so that values come to rest well within the tolerance. What kind of algorithm it is, its
-arguments say; it gets those of the kind's that it takes, and keeps its other defaults.
+learning rate falls to 0, so that values come to rest well within the tolerance. The kind of an algorithm
+shows in the names of its arguments. It gets those of the kind's that it takes, and keeps its other defaults.
 """
 
 from __future__ import annotations
@@ -65,9 +65,9 @@ KINDS = (  # the first that fits
         10_240,
         {"learning_rate": "lin_0.003", "n_steps": 64, "batch_size": 128, "n_epochs": 10, "ent_coef": 0.0},
     ),
-    Kind(
+    Kind(  # A2C
         "n_steps", 51_200, {"learning_rate": "lin_0.003", "n_steps": 8, "ent_coef": 0.0}, num_envs=16
-    ),  # A2C
+    ),
     Kind(  # tables
         "learning_rate_power",
         16_000,

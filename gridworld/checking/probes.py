@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from gridworld.check import expectations as expect
-from gridworld.check import worlds
-from gridworld.check.training import Trained
+from gridworld.checking import expectations as expect
+from gridworld.checking import worlds
+from gridworld.checking.training import Trained
 from gridworld.world.mdp import Mdp
 
 

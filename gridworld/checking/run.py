@@ -11,10 +11,10 @@ from functools import partial
 from multiprocessing import get_context
 from typing import Any
 
-from gridworld.check.expectations import UnmetError
-from gridworld.check.probes import PROBES, Probe
-from gridworld.check.settings import settings
-from gridworld.check.training import build, train
+from gridworld.checking.expectations import UnmetError
+from gridworld.checking.probes import PROBES, Probe
+from gridworld.checking.settings import settings
+from gridworld.checking.training import build, train
 from gridworld.config.agents import AgentConfig
 from gridworld.errors import InputError, in_short
 
@@ -68,7 +68,7 @@ class CheckResult:
         return [each.name for each in self.findings if each.passed is False]
 
     def __str__(self) -> str:
-        from gridworld.check.table import text
+        from gridworld.checking.table import text
 
         return text(self)
 
@@ -123,10 +123,11 @@ def _try_out(config: AgentConfig, given: Mapping[str, Any], probe: Probe, seed: 
 def _findings(
     check: Callable[[list[Probe]], list[Finding]], groups: list[list[Probe]], processes: int
 ) -> Iterator[list[Finding]]:
+    processes = min(processes, len(groups))
     if processes == 1:
         yield from map(check, groups)
         return
-    with ProcessPoolExecutor(min(processes, len(groups)), get_context("spawn")) as pool:
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
         yield from pool.map(check, groups)
 
 
