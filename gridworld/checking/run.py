@@ -117,7 +117,10 @@ def _try_out(config: AgentConfig, given: Mapping[str, Any], probe: Probe, seed: 
     """Build it once: what it refuses is the user's mistake, and no finding."""
     found = settings(config, probe.gamma, {}, given)
     assert found is not None
-    build(found[0], probe.world(), found[1].num_envs, seed)
+    try:
+        build(found[0], probe.world(), found[1].num_envs, seed)
+    except InputError as error:
+        raise InputError(str(error).replace("agent.arguments.", "--set ")) from None
 
 
 def _findings(

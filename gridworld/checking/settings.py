@@ -109,7 +109,9 @@ def settings(
 
 def _with(config: AgentConfig, arguments: Mapping[str, Any]) -> AgentConfig:
     if isinstance(config, SB3ClassConfig):
-        return dataclasses.replace(config, arguments={**config.arguments, **arguments})
+        policies = (name for name in class_of(config).policy_aliases if name.startswith("Mlp"))
+        policy = next(policies, config.policy)  # a class may have a name of its own for it
+        return dataclasses.replace(config, policy=policy, arguments={**config.arguments, **arguments})
     return dataclasses.replace(config, **arguments)
 
 

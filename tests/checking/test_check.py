@@ -25,8 +25,8 @@ from gridworld.errors import InputError
 from gridworld.world.markov_chain import one_hot_policy
 from gridworld.world.solver import solved
 
-FEW = [bugs.WrongSign, bugs.PPOColumnsSwapped, bugs.NoTargetNetwork, bugs.ReplayOffByOne]
-ALL = list(bugs.CAUGHT) if os.environ.get("GRIDWORLD_BUGS") == "all" else FEW
+PLANT_ALL = os.environ.get("GRIDWORLD_BUGS") == "all"
+FEW = [bugs.WrongSign, bugs.NoTargetNetwork, bugs.EpsilonNeverFalls, bugs.ReplayOffByOne]
 BY_NAME = {probe.name: probe for probe in PROBES}
 
 
@@ -35,16 +35,14 @@ def once(kind: object, name: str) -> tuple[bool | None, str]:
     return run._once(subject(kind), {}, 0, [BY_NAME[name]])[0]
 
 
-@pytest.mark.parametrize("kind", ALL, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("kind", list(bugs.CAUGHT) if PLANT_ALL else FEW, ids=lambda kind: kind.__name__)
 def test_a_planted_bug_fails_its_probe(kind: type) -> None:
-    for name in bugs.CAUGHT[kind]:
+    for name in bugs.CAUGHT[kind] if PLANT_ALL else bugs.CAUGHT[kind][:1]:
         passed, found = once(kind, name)
         assert passed is False, (name, found)
 
 
-@pytest.mark.parametrize(
-    ("kind", "name"), [(DQN, "target"), (PPO, "behaviour"), (A2C, "choice"), ("dqn", "alternation")]
-)
+@pytest.mark.parametrize(("kind", "name"), [(DQN, "target"), (PPO, "behaviour"), ("dqn", "alternation")])
 def test_sb3s_own_classes_and_shipped_agents_pass(kind: object, name: str) -> None:
     passed, found = once(kind, name)
     assert passed, found
@@ -127,8 +125,12 @@ def test_arguments_are_pythons() -> None:
 
 
 def test_what_a_class_refuses_is_the_users_mistake() -> None:
-    with pytest.raises(InputError, match="cannot be built"):
+    with pytest.raises(InputError, match=r"^--set clip_range=wide: must be a number of at least 0"):
         gridworld.check(PPO, {"clip_range": "wide"}, probes=["choice"])
+    with pytest.raises(InputError, match="PPO cannot be built"):
+        gridworld.check(PPO, {"policy_kwargs": {"depth": 3}}, probes=["choice"])
+    with pytest.raises(InputError, match="keeps a memory from step to step"):
+        gridworld.check("sb3_contrib.RecurrentPPO", probes=["choice"])
 
 
 def test_the_command_ends_with_0_or_1(tmp_path: Path) -> None:
