@@ -62,8 +62,9 @@ KINDS = (  # the first that fits
     ),
     Kind(  # PPO
         "n_epochs",
-        10_240,
-        {"learning_rate": "lin_0.003", "n_steps": 64, "batch_size": 128, "n_epochs": 10, "ent_coef": 0.0},
+        20_480,
+        {"learning_rate": "lin_0.003", "n_steps": 64, "batch_size": 256, "n_epochs": 10, "ent_coef": 0.0},
+        num_envs=16,
     ),
     Kind(  # A2C
         "n_steps", 51_200, {"learning_rate": "lin_0.003", "n_steps": 8, "ent_coef": 0.0}, num_envs=16
@@ -112,6 +113,10 @@ def _with(config: AgentConfig, arguments: Mapping[str, Any]) -> AgentConfig:
         policies = (name for name in class_of(config).policy_aliases if name.startswith("Mlp"))
         policy = next(policies, config.policy)  # a class may have a name of its own for it
         return dataclasses.replace(config, policy=policy, arguments={**config.arguments, **arguments})
+    for name, value in arguments.items():
+        own = getattr(config, name)
+        if isinstance(own, int) and type(value) is not type(own):
+            raise InputError(f"--set {name}={value}: must be {type(own).__name__}")
     return dataclasses.replace(config, **arguments)
 
 

@@ -13,7 +13,7 @@ import textwrap
 from collections.abc import Sequence
 
 from gridworld.checking.probes import PROBES
-from gridworld.checking.run import check_all
+from gridworld.checking.run import Finding, check_all
 from gridworld.checking.subject import arguments, subject
 from gridworld.checking.table import row, verdict
 from gridworld.commands import whole_number
@@ -42,11 +42,16 @@ def main(words: Sequence[str]) -> None:
         options.probe,
         options.seed,
         options.processes,
-        told=lambda finding: print(printable(row(finding)), flush=True),
+        told=_print,
     )
     print(printable(verdict(result)))
     if not result.passed:
         sys.exit(_FAILED)
+
+
+def _print(finding: Finding) -> None:
+    for line in row(finding).splitlines():
+        print(printable(line), flush=True)
 
 
 def _parser() -> argparse.ArgumentParser:

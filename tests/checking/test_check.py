@@ -107,7 +107,7 @@ def test_expectations_have_a_tolerance_and_tell_what_is_farthest() -> None:
 
 
 def test_settings_are_those_of_the_kind_that_a_class_takes() -> None:
-    for kind, steps in ((DQN, 6400), (PPO, 10_240), (A2C, 51_200), (bugs.WrongSign, 10_240)):
+    for kind, steps in ((DQN, 6400), (PPO, 20_480), (A2C, 51_200), (bugs.WrongSign, 20_480)):
         found = settings(subject(kind), 0.5, {}, {"learning_rate": 1.0})
         assert found is not None
         assert found[1].steps == steps
@@ -141,7 +141,7 @@ def test_the_command_ends_with_0_or_1(tmp_path: Path) -> None:
     bad = script("check.py", *words, cwd=tmp_path, PYTHONPATH=str(ROOT / "tests"))
     assert bad.returncode == 1, bad.stderr
     assert "constant     FAILED" in bad.stdout
-    assert "    the value is not learnt at all" in bad.stdout
+    assert "\n    the value is not learnt at all" in bad.stdout
     assert "failed 1 of 1 probes (constant)" in bad.stdout
 
 

@@ -424,6 +424,7 @@ def test_divergence_is_told_and_marked(tmp_path: Path) -> None:
             "--set momentum: sarsa has no such argument; it has exploration",
         ),
         ("check.py", "sarsa --set learning_rate", "must be NAME=VALUE, e.g. learning_rate=0.001"),
+        ("check.py", "dqn --set batch_size=big", "--set batch_size=big: must be int"),
         ("check.py", "sarsa --processes 0", "--processes 0: must be at least 1"),
         ("jobs.py", "nowhere", "nowhere: no such folder; give the folder of a sweep"),
         ("jobs.py", ".", "not a sweep's folder, it has no sweep.json"),
