@@ -15,6 +15,7 @@ TYPE_CHECKING = False  # what type checkers take for True; `typing` itself would
 if TYPE_CHECKING:
     from gridworld.agents.sb3.interop.exact_eval_callback import ExactEvalCallback
     from gridworld.agents.sb3.interop.make_vec_env import make_vec_env
+    from gridworld.api.checking import CheckResult, check
     from gridworld.api.diagnosis import diagnose
     from gridworld.api.runs import RunResult, open_run, train
     from gridworld.api.scores import evaluate
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
+    "CheckResult": "api.checking",
     "CoordinateObservation": "envs.observations",
     "Evaluator": "world.evaluation",
     "ExactEvalCallback": "agents.sb3.interop.exact_eval_callback",
@@ -55,6 +57,7 @@ _HOME = {
     "VectorCoordinateObservation": "envs.observations",
     "VectorImageObservation": "envs.observations",
     "VectorOneHotObservation": "envs.observations",
+    "check": "api.checking",
     "compile_env": "api.worlds",
     "compile_mdp": "world.grid",
     "compose": "api.settings",
@@ -71,6 +74,7 @@ _HOME = {
 
 __all__ = [
     "ENV_ID",
+    "CheckResult",
     "CoordinateObservation",
     "Evaluator",
     "ExactEvalCallback",
@@ -86,6 +90,7 @@ __all__ = [
     "VectorCoordinateObservation",
     "VectorImageObservation",
     "VectorOneHotObservation",
+    "check",
     "compile_env",
     "compile_mdp",
     "compose",

@@ -15,7 +15,7 @@ from pathlib import Path
 CONSOLE = "gridworld"
 _called_from: list[Path] = []  # nothing, or the folder that `called_from` names
 _SCRIPTS = Path(__file__).parents[2] / "scripts"
-_SCRIPT = re.compile(r"(?:python )?(?:scripts/)?\b(train|tune|record|report|evaluate|jobs|play)\.py")
+_SCRIPT = re.compile(r"(?:python )?(?:scripts/)?\b(train|tune|record|report|evaluate|jobs|play|check)\.py")
 
 
 def command(name: str) -> str:

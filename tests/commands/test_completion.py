@@ -56,6 +56,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("python scripts/evaluate.py runs/mine --pol", "--policy"),
         ("gridworld evaluate runs/mine --policy s", "sampled"),
         ("gridworld play --b", "--best"),
+        ("gridworld check tr", "trpo"),
+        ("gridworld check ppo --pro", "--probe --processes"),
         ("gridworld record runs/mine --be", "--best"),
         ("gridworld report runs --po", ""),
         ("gridworld play --agent runs/", "runs/group/ runs/mine runs/sweep"),

@@ -61,7 +61,7 @@ def algorithm_and_arguments(
         InputError: a class or an argument that there is not, or of another type.
     """
     if isinstance(config, SB3ClassConfig):
-        algorithm: type[BaseAlgorithm] = import_class("agent.algorithm", config.algorithm, BaseAlgorithm)
+        algorithm = algorithm_class("agent.algorithm", config.algorithm)
         _check_arguments(config, algorithm)
         arguments = _convert(config.arguments, "agent.arguments.")
     else:
@@ -164,6 +164,12 @@ def _is_widths(value: Any) -> bool:
         and len(value) <= _MOST_LAYERS
         and all(type(width) is int and 0 < width <= _WIDEST_LAYER for width in value)
     )
+
+
+def algorithm_class(where: str, path: Any) -> type[BaseAlgorithm]:
+    """Import a class of SB3's kind; see `import_class`."""
+    algorithm: type[BaseAlgorithm] = import_class(where, path, BaseAlgorithm)
+    return algorithm
 
 
 def import_class(where: str, path: Any, kind: type) -> Any:

@@ -76,6 +76,8 @@ def _arguments(word: str, earlier: Sequence[str], command: str) -> list[str]:
     last = earlier[-1] if earlier else ""
     if last in options and (options[last] or last not in ("--agent", "--trust", "--open")):
         return _starting(options[last], word)
+    if command == "check":
+        return _starting(_groups(())["agent"], word)
     return _folders(word)
 
 

@@ -22,6 +22,7 @@ COMMANDS = {
     "export": "hand finished runs to W&B, MLflow or the Hugging Face Hub",
     "reproduce": "run a run again and compare bit for bit",
     "tune": "search an agent's settings for a task, and confirm the winner",
+    "check": "check an algorithm's implementation on worlds with known answers",
     "play": "play a world with the arrow keys, beside a trained agent if you like",
     "benchmark": "measure the speed of this project beside its peers",
 }

@@ -1,0 +1,159 @@
+"""With which arguments, and how long, an algorithm trains on the probes.
+
+They are chosen so that what fails is a bug: training goes on longer than SB3's own classes need, and the
+learning rate falls to 0, so that values come to rest well within the tolerance. The kind of an algorithm
+shows in the names of its arguments. It gets those of the kind's that it takes, and keeps its other defaults.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from gridworld.agents.sb3.schemas import SB3ClassConfig, SB3Config
+from gridworld.config.agents import AgentConfig
+from gridworld.errors import InputError
+
+_OURS = {"gamma": "each probe has its own", "seed": "see --seed", "device": "it is cpu"}
+_ENVS = 8
+_FEW_QUANTILES = {"n_quantiles": 25}  # of a policy that has them; 200 take ten times as long
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Algorithms that are trained alike.
+
+    Attributes:
+        sign: an argument by which it is told.
+        steps: environment steps of a training run.
+        arguments: of the algorithm, by SB3's names.
+        num_envs: environments that step together.
+    """
+
+    sign: str
+    steps: int
+    arguments: Mapping[str, Any]
+    num_envs: int = _ENVS
+
+
+_EXPLORING = {"exploration_fraction": 0.5, "exploration_initial_eps": 1.0, "exploration_final_eps": 0.05}
+KINDS = (  # the first that fits
+    Kind(  # DQN, QR-DQN
+        "buffer_size",
+        6400,
+        {
+            **_EXPLORING,
+            "learning_rate": "lin_0.003",
+            "buffer_size": 10_000,
+            "learning_starts": 400,
+            "batch_size": 128,
+            "train_freq": 1,
+            "gradient_steps": 1,
+            "target_update_interval": 80,
+        },
+    ),
+    Kind(  # TRPO
+        "cg_max_steps",
+        20_480,
+        {"learning_rate": "lin_0.003", "n_steps": 64, "batch_size": 128, "target_kl": 0.05},
+    ),
+    Kind(  # PPO
+        "n_epochs",
+        20_480,
+        {"learning_rate": "lin_0.003", "n_steps": 64, "batch_size": 256, "n_epochs": 10, "ent_coef": 0.0},
+        num_envs=16,
+    ),
+    Kind(  # A2C
+        "n_steps", 51_200, {"learning_rate": "lin_0.003", "n_steps": 8, "ent_coef": 0.0}, num_envs=16
+    ),
+    Kind(  # tables
+        "learning_rate_power",
+        16_000,
+        {**_EXPLORING, "learning_rate": 0.05, "learning_rate_power": 0.0, "initial_value": 0.0},
+    ),
+    Kind("", 20_000, {"learning_rate": 1e-3}),
+)
+
+
+def settings(
+    config: AgentConfig, gamma: float, arguments: Mapping[str, Any], given: Mapping[str, Any]
+) -> tuple[AgentConfig, Kind] | None:
+    """The settings of an algorithm on a probe.
+
+    Args:
+        config: what is checked.
+        gamma: the probe's discount.
+        arguments: the probe's own arguments.
+        given: the user's arguments, which win.
+
+    Returns:
+        The settings and the kind of the algorithm; None where it takes none of the probe's own arguments.
+
+    Raises:
+        InputError: an argument of the user's that it does not take, or that is not the user's to choose.
+    """
+    known = _argument_names(config)
+    for name in given:
+        if name in _OURS:
+            raise InputError(f"--set {name}: {_OURS[name]}; leave it out")
+        if name not in known:
+            raise InputError(f"--set {name}: {config.name} has no such argument; it has {', '.join(known)}")
+    if arguments and not set(arguments) & set(known):
+        return None
+    kind = next(each for each in KINDS if each.sign in known or not each.sign)
+    wanted = {**kind.arguments, **_of_policy(config), "gamma": gamma, **given, **arguments}
+    return _with(config, {name: value for name, value in wanted.items() if name in known}), kind
+
+
+def _with(config: AgentConfig, arguments: Mapping[str, Any]) -> AgentConfig:
+    if isinstance(config, SB3ClassConfig):
+        policies = (name for name in class_of(config).policy_aliases if name.startswith("Mlp"))
+        policy = next(policies, config.policy)  # a class may have a name of its own for it
+        return dataclasses.replace(config, policy=policy, arguments={**config.arguments, **arguments})
+    for name, value in arguments.items():
+        own = getattr(config, name)
+        if isinstance(own, int) and type(value) is not type(own):
+            raise InputError(f"--set {name}={value}: must be {type(own).__name__}")
+    return dataclasses.replace(config, **arguments)
+
+
+def _argument_names(config: AgentConfig) -> list[str]:
+    if not isinstance(config, SB3ClassConfig):
+        fields = {field.name for field in dataclasses.fields(config)}
+        return sorted(fields - {field.name for field in dataclasses.fields(SB3Config)})
+    return _of_class(class_of(config))
+
+
+def _of_policy(config: AgentConfig) -> dict[str, Any]:
+    if not isinstance(config, SB3ClassConfig):
+        return {}
+    policy = class_of(config).policy_aliases.get(config.policy, object)
+    return {"policy_kwargs": _FEW_QUANTILES} if "n_quantiles" in _of_class(policy) else {}
+
+
+def class_of(config: SB3ClassConfig) -> Any:
+    """The class that is checked.
+
+    Raises:
+        InputError: there is no such class of SB3's kind.
+    """
+    from gridworld.agents.sb3.constructor_arguments import algorithm_class  # here, since it imports torch
+
+    return algorithm_class("check", config.algorithm)
+
+
+def _of_class(kind: type) -> list[str]:
+    """Names of its constructor's arguments; one with **kwargs takes those of its base class."""
+    names: set[str] = set()
+    for each in kind.__mro__:
+        if "__init__" not in vars(each):
+            continue
+        parameters = inspect.signature(each).parameters.values()
+        kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+        names |= {parameter.name for parameter in parameters if parameter.kind in kinds}
+        if all(parameter.kind is not parameter.VAR_KEYWORD for parameter in parameters):
+            break
+    return sorted(name for name in names - {"policy", "env"} if not name.startswith("_"))

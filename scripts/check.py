@@ -1,0 +1,10 @@
+"""Check an implementation on probe worlds: `python scripts/check.py my_package.MyPPO`; see `--help`."""
+
+from gridworld.process.early_signals import listen
+
+if __name__ == "__main__":
+    listen()  # before what takes time to import
+    from gridworld.commands import run
+    from gridworld.commands.check import main
+
+    run(main)

@@ -1,0 +1,156 @@
+"""`check`: right implementations pass, planted bugs fail the probe that is theirs.
+
+CI plants a few bugs; GRIDWORLD_BUGS=all python -m pytest tests/checking plants all.
+"""
+
+import dataclasses
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import planted_bugs as bugs
+from helpers.support import ROOT, script
+from stable_baselines3 import A2C, DQN, PPO
+
+import gridworld
+from gridworld.agents import PolicySnapshot
+from gridworld.checking import expectations as expect
+from gridworld.checking import run, worlds
+from gridworld.checking.probes import PROBES
+from gridworld.checking.settings import settings
+from gridworld.checking.subject import arguments, subject
+from gridworld.checking.training import Trained
+from gridworld.errors import InputError
+from gridworld.world.markov_chain import one_hot_policy
+from gridworld.world.solver import solved
+
+PLANT_ALL = os.environ.get("GRIDWORLD_BUGS") == "all"
+FEW = [bugs.WrongSign, bugs.NoTargetNetwork, bugs.EpsilonNeverFalls, bugs.ReplayOffByOne]
+BY_NAME = {probe.name: probe for probe in PROBES}
+
+
+def once(kind: object, name: str) -> tuple[bool | None, str]:
+    """What a probe finds on one seed."""
+    return run._once(subject(kind), {}, 0, [BY_NAME[name]])[0]
+
+
+@pytest.mark.parametrize("kind", list(bugs.CAUGHT) if PLANT_ALL else FEW, ids=lambda kind: kind.__name__)
+def test_a_planted_bug_fails_its_probe(kind: type) -> None:
+    for name in bugs.CAUGHT[kind] if PLANT_ALL else bugs.CAUGHT[kind][:1]:
+        passed, found = once(kind, name)
+        assert passed is False, (name, found)
+
+
+@pytest.mark.parametrize(("kind", "name"), [(DQN, "target"), (PPO, "behaviour"), ("dqn", "alternation")])
+def test_sb3s_own_classes_and_shipped_agents_pass(kind: object, name: str) -> None:
+    passed, found = once(kind, name)
+    assert passed, found
+
+
+@pytest.mark.parametrize("name", ["q_learning", "expected_sarsa", "value_iteration"])
+def test_tables_pass_all(name: str) -> None:
+    result = gridworld.check(name)
+    assert result.passed, str(result)
+    assert [finding.passed for finding in result.findings].count(None) == 1  # target
+    assert "passed all 13 probes" in str(result)
+
+
+def test_a_crash_is_a_failure_and_is_told() -> None:
+    assert once(bugs.PPOCrashes, "constant") == (False, "training failed: RuntimeError: shapes do not fit")
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "seeds", "passed"),
+    [
+        ([True], 1, True),
+        ([False, False], 2, False),
+        ([False, True, True], 3, True),
+        ([False, True, False], 3, False),
+    ],
+)
+def test_two_of_three_seeds_decide(
+    outcomes: list[bool], seeds: int, passed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rest = iter(outcomes)
+    monkeypatch.setattr(run, "_once", lambda *given: [(next(rest), "found")])
+    monkeypatch.setattr(run, "_try_out", lambda *given: None)
+    (finding,) = gridworld.check("q_learning", probes=["choice"]).findings
+    assert (finding.passed, finding.seeds) == (passed, seeds)
+
+
+def trained(q: np.ndarray) -> Trained:
+    """A learner of Q on the alternation, which acts as it has learnt."""
+    mdp = worlds.alternation()
+    greedy = q.argmax(axis=1)
+    last = PolicySnapshot(greedy, one_hot_policy(greedy, 2), q.max(axis=1), q)
+    return Trained(mdp, 0.8, last, last, last.greedy_policy(), np.ones((2, 2), np.int64), ["a.bias"])
+
+
+def test_expectations_have_a_tolerance_and_tell_what_is_farthest() -> None:
+    exact = solved(worlds.alternation(), 0.8).q
+    assert expect.optimal_with_values(trained(exact)) == "optimal, Q(0, 0) 1.778, exact 1.778"
+    near, far = exact.copy(), exact.copy()
+    near[1, 0] += 0.27
+    far[1, 0] += 0.29
+    expect.values(trained(near))
+    with pytest.raises(expect.UnmetError, match=r"^Q\(1, 0\) 2.512, exact 2.222, tolerance 0.28$"):
+        expect.values(trained(far))
+    with pytest.raises(expect.UnmetError, match=r"its best actions are \[0, 0\], with regret 2.22"):
+        expect.optimal(trained(-exact))
+    with pytest.raises(expect.UnmetError, match="50% of its last actions"):
+        expect.acts_as_learnt(trained(exact))
+    with pytest.raises(expect.UnmetError, match=r"^a.bias did not change$"):
+        expect.all_layers_learn(trained(exact))
+    with pytest.raises(expect.UnmetError, match="nan"):
+        expect.values(trained(exact * np.nan))
+
+
+def test_settings_are_those_of_the_kind_that_a_class_takes() -> None:
+    for kind, steps in ((DQN, 6400), (PPO, 20_480), (A2C, 51_200), (bugs.WrongSign, 20_480)):
+        found = settings(subject(kind), 0.5, {}, {"learning_rate": 1.0})
+        assert found is not None
+        assert found[1].steps == steps
+        assert found[0].arguments["learning_rate"] == 1.0
+        assert found[0].gamma == 0.5
+    assert settings(subject(PPO), 0.5, {"target_update_interval": 1}, {}) is None
+    shipped = settings(subject("dqn"), 0.5, {}, {})
+    assert shipped is not None
+    assert dataclasses.asdict(shipped[0])["batch_size"] == 128
+
+
+def test_arguments_are_pythons() -> None:
+    found = arguments(["a=1e-3", "b=[64, 64]", "c=true", "d=lin_0.1", "e={'x': None}"])
+    assert found == {"a": 1e-3, "b": [64, 64], "c": True, "d": "lin_0.1", "e": {"x": None}}
+
+
+def test_what_a_class_refuses_is_the_users_mistake() -> None:
+    with pytest.raises(InputError, match=r"^--set clip_range=wide: must be a number of at least 0"):
+        gridworld.check(PPO, {"clip_range": "wide"}, probes=["choice"])
+    with pytest.raises(InputError, match="PPO cannot be built"):
+        gridworld.check(PPO, {"policy_kwargs": {"depth": 3}}, probes=["choice"])
+    with pytest.raises(InputError, match="keeps a memory from step to step"):
+        gridworld.check("sb3_contrib.RecurrentPPO", probes=["choice"])
+
+
+def test_the_command_ends_with_0_or_1(tmp_path: Path) -> None:
+    good = script("check.py", "q_learning", "--processes", "1", "--probe", "choice", cwd=tmp_path)
+    assert (good.returncode, good.stderr) == (0, "")
+    assert good.stdout.splitlines()[-1].startswith("q_learning: passed all 1 probes, ")
+    words = ["helpers.planted_bugs.PPOCrashes", "--processes", "1", "--probe", "constant"]
+    bad = script("check.py", *words, cwd=tmp_path, PYTHONPATH=str(ROOT / "tests"))
+    assert bad.returncode == 1, bad.stderr
+    assert "constant     FAILED" in bad.stdout
+    assert "\n    the value is not learnt at all" in bad.stdout
+    assert "failed 1 of 1 probes (constant)" in bad.stdout
+
+
+def test_two_processes_find_the_same(tmp_path: Path) -> None:
+    words = ["q_learning", "--probe", "choice", "--probe", "trap"]
+    one, two = (
+        script("check.py", *words, "--processes", number, cwd=tmp_path, real=number == "2")
+        for number in ("1", "2")
+    )
+    assert two.returncode == 0, two.stderr
+    cells = [[line.split(" s ")[1] for line in done.stdout.splitlines()[:2]] for done in (one, two)]
+    assert cells[0] == cells[1]
