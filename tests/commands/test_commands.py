@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 
 import gridworld
 from gridworld.benchmark import end_to_end as whole
-from gridworld.benchmark import training, worlds
+from gridworld.benchmark import population, training, worlds
 from gridworld.benchmark.measure import QUICK, Comparison
 from gridworld.commands import benchmark, evaluate, run
 from gridworld.commands import record as record_command
@@ -338,19 +338,27 @@ def test_rl_zoo_is_given_the_same_steps_of_the_same_world(
         theirs()
 
 
+def test_populations_are_measured() -> None:
+    rows = list(population.comparisons(QUICK))
+    commands = [row for row in rows if "whole command" in row.table]
+    assert len(commands) == 7
+    assert all(row.theirs is not None for row in commands)
+    assert population._shipped("a2c", 2) > 0
+
+
 @pytest.mark.slow
 def test_whole_runs_are_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("RL_ZOO_PYTHON", raising=False)
-    train, run, measured = whole._train, whole._run, {}
+    train, run, measured = whole.train, whole.run, {}
 
     def shorter(*words: str) -> list[str]:
         """How long a run is measured is not the point here, where the table does not name its steps."""
         named = f"total_timesteps={whole._STEPS}" in words
         return train(*words, *(() if named else ("total_timesteps=2000",)))
 
-    monkeypatch.setattr(whole, "_train", shorter)
+    monkeypatch.setattr(whole, "train", shorter)
 
     def once(command: list[str], env: dict[str, str] | None = None) -> tuple[float, float]:
         """Commands that differ in the agent or the steps alone are measured once, a peer's import too.
@@ -359,7 +367,7 @@ def test_whole_runs_are_measured(
         """
         kind = tuple(word for word in command if not word.startswith(("agent=", "total_timesteps=")))
         if kind not in measured:
-            is_short = command[:4] == whole._train()[:4] and "env.num_rows=200" not in command
+            is_short = command[:4] == whole.train()[:4] and "env.num_rows=200" not in command
             measured[kind] = in_a_fork(command[4:]) if is_short else run(command, env)
         return measured[kind]
 
@@ -369,7 +377,7 @@ def test_whole_runs_are_measured(
         assert done.returncode == 0, done.stderr
         return time.monotonic() - began, 1.0
 
-    monkeypatch.setattr(whole, "_run", once)
+    monkeypatch.setattr(whole, "run", once)
     benchmark.main(["--quick", "--only", "whole", "--out", str(tmp_path / "benchmark.json")])
     output = capsys.readouterr().out
     assert re.search(r"dqn, median of 1 seeds +[\d.]+", output)

@@ -73,7 +73,7 @@ def test_the_memory_of_a_long_sweep_stays_flat(tmp_path: Path) -> None:
                 sizes[done] = max(sizes.get(done, 0), pages * os.sysconf("SC_PAGE_SIZE"))
             time.sleep(0.02)
         assert process.wait(60) == 0
-    early = max(size for done, size in sizes.items() if done <= 20)
-    late = max(size for done, size in sizes.items() if 20 < done < 60)  # then come means over seeds
+    early = max(size for done, size in sizes.items() if done <= 30)
+    late = max(size for done, size in sizes.items() if 30 < done < 60)  # then come means over seeds
     assert max(sizes) == 60
-    assert late - early < 8 * 2**20, sizes
+    assert late - early < 16 * 2**20, sizes

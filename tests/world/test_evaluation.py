@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from scipy.stats import binom, chi2_contingency
 
 from gridworld.agents import family
+from gridworld.agents.sb3.tabulated import on_policy
 from gridworld.envs import rollout
+from gridworld.envs.joint_rollout import roll
 from gridworld.envs.observations import make_observation
 from gridworld.envs.rollout import play_episode, sample_episodes
 from gridworld.envs.statistics_env import StatisticsVectorEnv
@@ -152,7 +154,14 @@ def test_slips_do_not_depend_on_the_actions_of_training(monkeypatch, agent: str)
         walked.append((before, np.asarray(actions), answer[0] if answer[4] is None else answer[4].states))
         return answer
 
+    def rolled(*arguments):
+        found = roll(*arguments)
+        for each in found:
+            walked.extend(zip(each.states, each.actions, each.last_states, strict=True))
+        return found
+
     monkeypatch.setattr(StatisticsVectorEnv, "advance", advance)
+    monkeypatch.setattr(on_policy, "roll", rolled)
     config = configure(f"agent={agent}", "env.slip=0.3", "env=four_rooms", "total_timesteps=19200")
     if agent == "dqn":
         config.agent.learning_starts = 19_000
