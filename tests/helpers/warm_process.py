@@ -167,6 +167,7 @@ def _run_as(
     words: list[str], cwd: str, environment: dict[str, str], program: Callable[[], object]
 ) -> NoReturn:
     os.chdir(cwd)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # whoever started the warm process
     os.environ.clear()
     os.environ.update(environment)
     paths = [path for path in environment.get("PYTHONPATH", "").split(os.pathsep) if path]
