@@ -13,8 +13,14 @@ from dataclasses import dataclass
 from stable_baselines3 import A2C
 
 from gridworld.agents.sb3.tabulated.flat_optimizer import not_finite
-from gridworld.agents.sb3.tabulated.on_policy import Rollouts, TabulatedOnPolicy, normalized, tables_of_runs
-from gridworld.agents.sb3.tabulated.ppo_loss import Weights, column, losses_and_slopes, sum_up
+from gridworld.agents.sb3.tabulated.on_policy import (
+    Rollouts,
+    TabulatedOnPolicy,
+    normalized,
+    tables_of_runs,
+    weights_of,
+)
+from gridworld.agents.sb3.tabulated.ppo_loss import losses_and_slopes, sum_up
 from gridworld.agents.sb3.tabulated.side_by_side import SideBySide, update_together
 from gridworld.process.together import meet
 
@@ -50,9 +56,7 @@ def _train(runs: Sequence[_Run]) -> list[Exception | None]:
         outputs = batch.outputs(which)
         new = tables_of_runs(*outputs)
         sums = sum_up(states, pairs, advantages, batch.returns, new.log_prob.shape)
-        coefficients = (column([getattr(m, name) for m in models]) for name in ("ent_coef", "vf_coef"))
-        unclipped = Weights(column([0.0] * len(models)), None, *coefficients)
-        losses, *slopes = losses_and_slopes(new, new, sums, unclipped)
+        losses, *slopes = losses_and_slopes(new, new, sums, weights_of(models, [0.0] * len(models)))
         norms = [model.max_grad_norm for model in models]
         finite = rows.step(outputs, slopes, norms, range(len(models)))
     gains = (sums.positive + sums.negative) * new.log_prob

@@ -82,13 +82,7 @@ class TabulatedOffPolicy(OffPolicyAlgorithm):
     env: GridWorldVecEnv
     replay_buffer: StateReplayBuffer
     # From the rest: no part of a checkpoint.
-    derived = (
-        "descent",
-        "inputs",
-        "_online",
-        "_greedy",
-        "_target_values",
-    )
+    derived = ("descent", "inputs", "_online", "_greedy", "_target_values")
     # Of the online network here and, with "_target", of the target network; and of the layers in either.
     network: str
     exploration_rate: float
@@ -115,35 +109,27 @@ class TabulatedOffPolicy(OffPolicyAlgorithm):
             *self.derived,
         ]
 
-    def outputs(self, network: Any, states: IntArray | None = None) -> Tensor:
+    def outputs(self, network: Any, states: IntArray | None = None, leaves: Leaves | None = None) -> Tensor:
         """Run one of the two networks.
 
         Args:
             network: the online or the target network.
             states: (U,), integers; None: all.
+            leaves: the weights of P networks of this shape, to run these on all states instead.
 
         Returns:
-            (U, ...), with its graph.
+            (U, ...), with its graph; (P, S, ...) for `leaves`.
         """
         layers = getattr(network, self.network)
         observations = self.inputs.observations(states, layers)
         features = None
         if observations is not None:
             features = network.extract_features(observations, network.features_extractor)
-        return self.inputs.latent(layers, states, features)
+        return forward(layers, leaves, features) if leaves else self.inputs.latent(layers, states, features)
 
-    def outputs_alone(self) -> tuple[Tensor]:
+    def outputs_of_all(self, leaves: Leaves | None = None) -> tuple[Tensor]:
         """See `side_by_side.Tabulated`."""
-        return (self.outputs(getattr(self, self.network)),)
-
-    def outputs_together(self, leaves: Leaves) -> tuple[Tensor]:
-        """See `side_by_side.Tabulated`."""
-        network = getattr(self, self.network)
-        layers, features = getattr(network, self.network), None
-        observations = self.inputs.observations(None, layers)
-        if observations is not None:
-            features = network.extract_features(observations, network.features_extractor)
-        return (forward(layers, leaves, features),)
+        return (self.outputs(getattr(self, self.network), None, leaves),)
 
     def q_values(self, states: IntArray | None = None) -> Tensor:
         """Q (U, A) of these states (U,), with its graph. None: of all states."""
@@ -359,14 +345,14 @@ class Update:
         """Let the models know what their networks say now."""
         if len(self._models) > 1:
             with torch.no_grad():
-                (outputs,) = self._models[0].outputs_together(self._rows.leaves)
+                (outputs,) = self._models[0].outputs_of_all(self._rows.leaves)
             for model, greedy in zip(self._models, self._models[0].greedy_of(outputs), strict=True):
                 model.was_updated(greedy)
 
     def _outputs(self, states: IntArray) -> tuple[IntArray, Tensor]:
         """The online networks' outputs for all or some states; where in them each of `states` (P, B) is."""
         if len(self._models) > 1:
-            return states, self._models[0].outputs_together(self._rows.leaves)[0]
+            return states, self._models[0].outputs_of_all(self._rows.leaves)[0]
         which, index = self._models[0].inputs.distinct(states[0])
         return index[None], self._models[0].online(which)
 

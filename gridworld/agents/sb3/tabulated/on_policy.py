@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer
-from gridworld.agents.sb3.tabulated.ppo_loss import Outputs, log_softmax
+from gridworld.agents.sb3.tabulated.ppo_loss import Outputs, Weights, column, log_softmax
 from gridworld.agents.sb3.tabulated.side_by_side import Leaves, SideBySide, forward
 from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv, StateStep
@@ -73,30 +73,30 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "rollout_buffer_class", *self.derived]
 
-    def outputs(self, states: IntArray | None = None) -> tuple[Tensor, Tensor]:
-        """Logits (U, A) and values (U, 1) of these states (U,), with their graph. None: of all states."""
+    def outputs(self, states: IntArray | None = None, leaves: Leaves | None = None) -> tuple[Tensor, Tensor]:
+        """Run the network.
+
+        Args:
+            states: (U,), integers; None: all.
+            leaves: the weights of P networks of this shape, to run these on all states instead.
+
+        Returns:
+            Logits (U, A) and values (U, 1), with their graph; with an axis P before them for `leaves`.
+        """
         policy, extractor = self.policy, self.policy.mlp_extractor
         nets = (extractor.policy_net, extractor.value_net)
         observations = self.inputs.observations(states, *nets)
         features: Any = None if observations is None else policy.extract_features(observations)
         actor, critic = features if isinstance(features, tuple) else (features, features)
+        if leaves:
+            logits = forward([*nets[0], policy.action_net], leaves, actor)
+            return logits, forward([*nets[1], policy.value_net], leaves, critic)
         logits = policy.action_net(self.inputs.latent(nets[0], states, actor))
-        values = policy.value_net(self.inputs.latent(nets[1], states, critic))
-        return logits, values
+        return logits, policy.value_net(self.inputs.latent(nets[1], states, critic))
 
-    def outputs_alone(self) -> tuple[Tensor, Tensor]:
+    def outputs_of_all(self, leaves: Leaves | None = None) -> tuple[Tensor, Tensor]:
         """See `side_by_side.Tabulated`."""
-        return self.outputs()
-
-    def outputs_together(self, leaves: Leaves) -> tuple[Tensor, Tensor]:
-        """See `side_by_side.Tabulated`."""
-        policy, extractor = self.policy, self.policy.mlp_extractor
-        nets = (extractor.policy_net, extractor.value_net)
-        observations = self.inputs.observations(None, *nets)
-        features: Any = None if observations is None else policy.extract_features(observations)
-        actor, critic = features if isinstance(features, tuple) else (features, features)
-        logits = forward([*nets[0], policy.action_net], leaves, actor)
-        return logits, forward([*nets[1], policy.value_net], leaves, critic)
+        return self.outputs(None, leaves)
 
     def collect_rollouts(
         self,
@@ -117,18 +117,16 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         meet(_roll_together, request, (shape_of(env.envs), n_rollout_steps))
         rolled = request.rolled
         over = rolled.terminated | rolled.truncated
-        starts = np.concatenate(
-            [np.atleast_2d(cast(Any, self._last_episode_starts)), over]
-        )  # of episodes, step by step
+        began = np.atleast_2d(cast(Any, self._last_episode_starts))
+        starts = np.concatenate([began, over])  # whether an episode starts, step by step
         for step in range(n_rollout_steps):
             actions, ended = rolled.actions[step], rolled.ended(step)
             episodes = env.episodes(*ended)
             env.envs.count(rolled.pairs[step], *ended)
             self.num_timesteps += env.num_envs
             if getattr(callback, "reads_locals", True):
-                callback.update_locals(
-                    {**locals(), **_told(env.told(rolled.step(step), episodes), env.num_envs)}
-                )
+                done = env.told(rolled.step(step), episodes)
+                callback.update_locals({**locals(), **_told(done, env.num_envs)})
             if not callback.on_step():
                 self._last_episode_starts = starts[step]
                 return False
@@ -226,9 +224,7 @@ class Rollouts:
 
     def outputs(self, which: IntArray | None) -> tuple[Tensor, Tensor]:
         """Logits and values of all states, (R, S, ...); of a single model, (U, ...) of the states `which`."""
-        if len(self._models) == 1:
-            return self._models[0].outputs(which)
-        return self._models[0].outputs_together(self._rows.leaves)
+        return self._models[0].outputs(which, self._rows.leaves)
 
     def distinct(self, states: IntArray, pairs: IntArray) -> tuple[IntArray | None, IntArray, IntArray]:
         """Find the states to run the network on.
@@ -264,7 +260,10 @@ def normalized(advantages: Float32Array) -> Float32Array:
     return scaled
 
 
-def minibatches(count: int, batch_size: int) -> list[IntArray]:
-    """All samples in random order, cut into batches; the draw is SB3's own."""
-    order = np.random.permutation(count)
-    return [order[start : start + batch_size] for start in range(0, count, batch_size)]
+def weights_of(
+    models: Sequence[Any], clip_ranges: Sequence[float], clip_ranges_vf: Sequence[float] | None = None
+) -> Weights:
+    """The settings that the losses of these models depend on, with the clip ranges of now."""
+    coefficients = ([getattr(model, name) for model in models] for name in ("ent_coef", "vf_coef"))
+    clipped = None if clip_ranges_vf is None else column(clip_ranges_vf)
+    return Weights(column(clip_ranges), clipped, *map(column, coefficients))

@@ -15,15 +15,14 @@ import numpy as np
 from stable_baselines3 import PPO
 
 from gridworld.agents.sb3.tabulated.flat_optimizer import not_finite
-from gridworld.agents.sb3.tabulated.on_policy import Rollouts, TabulatedOnPolicy, normalized, tables_of_runs
-from gridworld.agents.sb3.tabulated.ppo_loss import (
-    Losses,
-    Outputs,
-    Weights,
-    column,
-    losses_and_slopes,
-    sum_up,
+from gridworld.agents.sb3.tabulated.on_policy import (
+    Rollouts,
+    TabulatedOnPolicy,
+    normalized,
+    tables_of_runs,
+    weights_of,
 )
+from gridworld.agents.sb3.tabulated.ppo_loss import Losses, Outputs, losses_and_slopes, sum_up
 from gridworld.agents.sb3.tabulated.side_by_side import SideBySide, update_together
 from gridworld.process.together import chance, meet
 from gridworld.world.mdp import FloatArray, IntArray
@@ -103,7 +102,8 @@ class _Update:
         self._going = np.arange(len(runs))  # those that have not ended their epochs
         self._all_going = True
         self._old = Outputs(*map(np.stack, zip(*(model.old for model in self._models), strict=True)))
-        self._weights = _weights(self._models)
+        clip_ranges, of_values = zip(*(model.clip_ranges() for model in self._models), strict=True)
+        self._weights = weights_of(self._models, clip_ranges, None if of_values[0] is None else of_values)
         self._norms = [model.max_grad_norm for model in self._models]
 
     def make_epoch(self, epoch: int) -> None:
@@ -165,10 +165,3 @@ class _Update:
         whole = np.zeros((len(self._runs), *slopes.shape[1:]))
         whole[self._going] = slopes
         return whole
-
-
-def _weights(models: Sequence[TabulatedPPO]) -> Weights:
-    clip_ranges, clip_ranges_vf = zip(*(model.clip_ranges() for model in models), strict=True)
-    vf = None if clip_ranges_vf[0] is None else column(clip_ranges_vf)
-    coefficients = ([getattr(model, name) for model in models] for name in ("ent_coef", "vf_coef"))
-    return Weights(column(clip_ranges), vf, *map(column, coefficients))

@@ -24,15 +24,9 @@ class TabulatedQRDQN(TabulatedOffPolicy, QRDQN):  # type: ignore[misc]
 
     network = "quantile_net"
 
-    def outputs(self, network: Any, states: IntArray | None = None) -> Tensor:
-        """See `TabulatedOffPolicy.outputs`; the quantiles, (U, N, A)."""
-        return self._quantiles(super().outputs(network, states))
-
-    def outputs_together(self, leaves: Leaves) -> tuple[Tensor]:
-        """See `TabulatedOffPolicy.outputs_together`; the quantiles, (P, S, N, A)."""
-        return (self._quantiles(super().outputs_together(leaves)[0]),)
-
-    def _quantiles(self, outputs: Tensor) -> Tensor:
+    def outputs(self, network: Any, states: IntArray | None = None, leaves: Leaves | None = None) -> Tensor:
+        """See `TabulatedOffPolicy.outputs`; the quantiles, (..., U, N, A)."""
+        outputs = super().outputs(network, states, leaves)
         return outputs.view(*outputs.shape[:-1], self.n_quantiles, -1)
 
     @staticmethod

@@ -35,11 +35,12 @@ class Tabulated(Protocol):
     descent: FlatOptimizer
     inputs: Any  # `state_inputs.StateInputs`
 
-    def outputs_alone(self) -> Sequence[Tensor]:
-        """What its network says of all states, (S, ...) each, with the graph."""
+    def outputs_of_all(self, leaves: Leaves | None = None) -> Sequence[Tensor]:
+        """What its network says of all states, (S, ...) each, with the graph.
 
-    def outputs_together(self, leaves: Leaves) -> Sequence[Tensor]:
-        """The same of P networks of this shape, (P, S, ...) each, by their weights of `SideBySide`."""
+        Args:
+            leaves: the weights of P networks of this shape, of `SideBySide`; then (P, S, ...) each, of these.
+        """
 
 
 class Member(Protocol):
@@ -89,11 +90,11 @@ def _try_out(models: Sequence[Tabulated]) -> bool:
     generator = np.random.default_rng(0)
     optimizers = [model.descent for model in models]
     with SideBySide(optimizers) as rows:
-        outputs = models[0].outputs_together(rows.leaves)
+        outputs = models[0].outputs_of_all(rows.leaves)
         slopes = [generator.normal(size=output.shape) for output in outputs]
         gradients = rows.backward(outputs, slopes)
         for row, model in enumerate(models):
-            alone = model.outputs_alone()
+            alone = model.outputs_of_all()
             if not all(torch.equal(mine, all_[row]) for mine, all_ in zip(alone, outputs, strict=True)):
                 return False
             model.descent.backward(alone, [slope[row] for slope in slopes])

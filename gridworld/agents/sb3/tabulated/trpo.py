@@ -23,7 +23,6 @@ from gridworld.agents.sb3.tabulated.jacobian import Jacobian
 from gridworld.agents.sb3.tabulated.on_policy import (
     Float32Array,
     TabulatedOnPolicy,
-    minibatches,
     normalized,
 )
 from gridworld.agents.sb3.tabulated.ppo_loss import log_softmax
@@ -62,7 +61,7 @@ class TabulatedTRPO(TabulatedOnPolicy, TRPO):  # type: ignore[misc]
         self, states: IntArray, actions: IntArray, advantages: Float32Array
     ) -> tuple[float, float, bool]:
         """Make the policy's step; return the surrogate, the divergence, and whether the step was made."""
-        (order,) = minibatches(len(states), len(states))
+        (order,) = _minibatches(len(states), len(states))
         part = order[:: self.sub_sampling_factor]
         which, index = self.inputs.distinct(states[part])
         weighed = normalized(advantages[part]) if self.normalize_advantage else advantages[part]
@@ -114,7 +113,7 @@ class TabulatedTRPO(TabulatedOnPolicy, TRPO):  # type: ignore[misc]
         """Fit the value network; return the losses."""
         losses = []
         for _ in range(self.n_critic_updates):
-            for batch in minibatches(len(states), self.batch_size):
+            for batch in _minibatches(len(states), self.batch_size):
                 which, index = self.inputs.distinct(states[batch])
                 _, values = self.outputs(which)
                 sums = trpo_loss.value_sums(index, returns[batch], len(values))
@@ -122,6 +121,12 @@ class TabulatedTRPO(TabulatedOnPolicy, TRPO):  # type: ignore[misc]
                 losses.append(float(loss))
                 self.descent.step([values], [slope], math.inf)
         return losses
+
+
+def _minibatches(count: int, batch_size: int) -> list[IntArray]:
+    """All samples in random order, cut into batches; the draw is SB3's own."""
+    order = np.random.permutation(count)
+    return [order[start : start + batch_size] for start in range(0, count, batch_size)]
 
 
 def _slopes(output: Tensor, parameters: Sequence[Tensor]) -> Any:
