@@ -7,11 +7,8 @@ files and a folder of its own; `process.together` has them meet where the networ
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import math
-import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -26,6 +23,7 @@ from omegaconf import DictConfig
 
 from gridworld.config.sweep import SweepConfig
 from gridworld.errors import InputError
+from gridworld.process.machine import core_count, free_memory
 from gridworld.process.together import LARGEST, run_together
 from gridworld.sweep.folder import JobEntry, SweepFolder
 from gridworld.sweep.plan import Job
@@ -139,7 +137,7 @@ def populations(
             f"{_KEY}: tells a launcher's process its runs; leave it out, and set hydra.sweeper.population"
         )
     workers = _workers(hydra.launcher)
-    memory = _free_memory() / _SHARE_OF_MEMORY / workers
+    memory = free_memory() / _SHARE_OF_MEMORY / workers
     shapes: dict[str, list[tuple[JobEntry, Job]]] = {}
     for entry, job in jobs:
         key = entry.job if job.shape is None else f"shape {job.shape}"
@@ -182,19 +180,7 @@ def _workers(launcher: DictConfig) -> int:
     if launcher._target_.endswith("BasicLauncher") or "jobs_per_task" in launcher:
         return 1
     asked = launcher.get("n_jobs") or -1
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return asked if asked > 0 else max(1, cores + 1 + asked)
-
-
-def _free_memory() -> int:
-    """Bytes that programs can still have; half of all where the system does not tell."""
-    with contextlib.suppress(OSError):
-        known = re.search(r"^MemAvailable:\s*(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE)
-        if known is not None:
-            return 1024 * int(known[1])
-    with contextlib.suppress(OSError, ValueError, AttributeError):
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
-    return 4 * 2**30
+    return asked if asked > 0 else max(1, core_count() + 1 + asked)
 
 
 def _quoted(text: str) -> str:

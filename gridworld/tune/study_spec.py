@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 import re
 import warnings
 from collections.abc import Sequence
@@ -33,6 +32,7 @@ from gridworld.config.train import TrainConfig
 from gridworld.config.tune import TuneConfig
 from gridworld.errors import InputError
 from gridworld.process.command_line import program
+from gridworld.process.machine import core_count
 from gridworld.sweep.plan import shape
 from gridworld.training.setup import check_settings
 from gridworld.tune.search.search_space import SearchSpace
@@ -192,16 +192,11 @@ def _check(settings: TuneConfig) -> None:
             raise InputError(f"tune.{key}={value}: must be {', '.join(known[:-1])} or {known[-1]}")
 
 
-def _core_count() -> int:
-    """The cores that this process may use, as far as the system says so."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def _completed(settings: TuneConfig, agent: str, base: TrainConfig) -> TuneConfig:
     study = settings.study or f"tune_{slug(agent)}_{slug(base.env.name)}"
     if slug(study) != study:
         raise InputError(f"tune.study={study}: must be of letters, digits and _.,=+-, e.g. {slug(study)}")
-    workers = _core_count() if settings.workers == -1 else settings.workers
+    workers = core_count() if settings.workers == -1 else settings.workers
     together = settings.together or (1 if workers == 1 else math.ceil(_TRIALS_AT_ONCE / workers))
     together = together if shape(base) is not None else 1
     folder = settings.folder or f"runs/{study}"

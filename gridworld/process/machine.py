@@ -1,0 +1,26 @@
+"""What this process may use of the machine."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from pathlib import Path
+
+_USUAL_MEMORY = 4 * 2**30  # bytes, where the system does not tell
+
+
+def core_count() -> int:
+    """The cores, as far as the system says so."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def free_memory() -> int:
+    """Bytes that programs can still have; half of all where the system does not tell."""
+    with contextlib.suppress(OSError):
+        known = re.search(r"^MemAvailable:\s*(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE)
+        if known is not None:
+            return 1024 * int(known[1])
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+    return _USUAL_MEMORY
