@@ -14,7 +14,8 @@ from __future__ import annotations
 import numpy as np
 from stable_baselines3 import DQN
 
-from gridworld.agents.sb3.tabulated.off_policy import Float32Array, TabulatedOffPolicy
+from gridworld.agents.sb3.tabulated.off_policy import TabulatedOffPolicy
+from gridworld.agents.sb3.tabulated.state_buffers import Float32Array
 from gridworld.world.mdp import FloatArray, IntArray
 
 

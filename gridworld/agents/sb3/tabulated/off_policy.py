@@ -12,7 +12,6 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -24,56 +23,13 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer, not_finite
-from gridworld.agents.sb3.tabulated.side_by_side import Leaves, SideBySide, forward, update_together
-from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of, smallest_integer
-from gridworld.agents.sb3.vec_env import GridWorldVecEnv, StateStep
+from gridworld.agents.sb3.tabulated.side_by_side import SideBySide, update_together
+from gridworld.agents.sb3.tabulated.stacked_layers import Leaves, forward
+from gridworld.agents.sb3.tabulated.state_buffers import Float32Array, StateReplayBuffer
+from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of
+from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.process.together import chance, meet
 from gridworld.world.mdp import FloatArray, IntArray
-
-Float32Array = NDArray[np.float32]
-
-
-class StateReplayBuffer(ReplayBuffer):
-    """SB3's replay buffer with states in the smallest integer type in place of observations."""
-
-    def __init__(
-        self,
-        buffer_size: int,
-        observation_space: Any,
-        *arguments: Any,
-        num_states: int,
-        **options: Any,
-    ) -> None:
-        super().__init__(buffer_size, spaces.Discrete(1), *arguments, **options)
-        shape = (self.buffer_size, self.n_envs)
-        self.observations = np.zeros(shape, dtype=smallest_integer(num_states - 1))
-        self.next_observations = np.zeros_like(self.observations)
-        self.actions = np.zeros(shape, dtype=np.uint8)
-
-    def store(self, states: IntArray, actions: IntArray, step: StateStep) -> None:
-        """Add one step of every environment, from `states` (num_envs,) with `actions` (num_envs,)."""
-        at = self.pos
-        self.observations[at], self.actions[at] = states, actions
-        self.next_observations[at] = step.last_states
-        self.rewards[at], self.dones[at], self.timeouts[at] = step.rewards, step.dones, step.truncated
-        self.pos = (at + 1) % self.buffer_size
-        self.full |= self.pos == 0
-
-    def draw(
-        self, batch_size: int, chance: np.random.RandomState
-    ) -> tuple[IntArray, IntArray, IntArray, Float32Array, Float32Array]:
-        """Draw a minibatch of B transitions; drawn from numpy's global generator, they are SB3's own.
-
-        Returns:
-            (B,) each: states (int64), actions (uint8), next states (int64), rewards and ends (float32);
-            time-outs are no ends.
-        """
-        steps = chance.randint(0, self.buffer_size if self.full else self.pos, size=batch_size)
-        which = steps * self.n_envs + chance.randint(0, high=self.n_envs, size=batch_size)
-        ends = self.dones.take(which) * (1 - self.timeouts.take(which))
-        states, following = self.observations.take(which), self.next_observations.take(which)
-        rewards = self.rewards.take(which)
-        return states.astype(np.int64), self.actions.take(which), following.astype(np.int64), rewards, ends
 
 
 class TabulatedOffPolicy(OffPolicyAlgorithm):

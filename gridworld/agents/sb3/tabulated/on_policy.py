@@ -12,7 +12,6 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -24,32 +23,15 @@ from torch import Tensor
 
 from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer
 from gridworld.agents.sb3.tabulated.ppo_loss import Outputs, Weights, column, log_softmax
-from gridworld.agents.sb3.tabulated.side_by_side import Leaves, SideBySide, forward
+from gridworld.agents.sb3.tabulated.side_by_side import SideBySide
+from gridworld.agents.sb3.tabulated.stacked_layers import Leaves, forward
+from gridworld.agents.sb3.tabulated.state_buffers import Float32Array, StateRolloutBuffer
 from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv, StateStep
 from gridworld.envs.joint_rollout import Rollout, roll, shape_of
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.process.together import meet
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray
-
-Float32Array = NDArray[np.float32]
-
-
-class StateRolloutBuffer(RolloutBuffer):
-    """SB3's rollout buffer with the state's number in place of an observation."""
-
-    def __init__(self, buffer_size: int, observation_space: Any, *arguments: Any, **options: Any) -> None:
-        super().__init__(buffer_size, spaces.Discrete(1), *arguments, **options)
-
-    def compute_returns_and_advantage(self, last_values: Tensor, dones: BoolArray) -> None:
-        """SB3's own recursion to the last bit, with everything that does not recur done at once."""
-        going_on = 1.0 - np.concatenate([self.episode_starts[1:], dones[None].astype(np.float32)])
-        following = np.concatenate([self.values[1:], last_values.numpy()[None]])
-        self.advantages = self.rewards + self.gamma * following * going_on - self.values
-        carry = self.gamma * self.gae_lambda * going_on
-        for step in range(self.buffer_size - 2, -1, -1):
-            self.advantages[step] += carry[step] * self.advantages[step + 1]
-        self.returns = self.advantages + self.values
+from gridworld.world.mdp import FloatArray, IntArray
 
 
 class TabulatedOnPolicy(OnPolicyAlgorithm):

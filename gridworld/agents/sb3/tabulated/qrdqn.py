@@ -13,9 +13,10 @@ import torch
 from sb3_contrib import QRDQN
 from torch import Tensor
 
-from gridworld.agents.sb3.tabulated.off_policy import Float32Array, TabulatedOffPolicy
+from gridworld.agents.sb3.tabulated.off_policy import TabulatedOffPolicy
 from gridworld.agents.sb3.tabulated.qrdqn_loss import losses_and_slopes
-from gridworld.agents.sb3.tabulated.side_by_side import Leaves
+from gridworld.agents.sb3.tabulated.stacked_layers import Leaves
+from gridworld.agents.sb3.tabulated.state_buffers import Float32Array
 from gridworld.world.mdp import FloatArray, IntArray
 
 

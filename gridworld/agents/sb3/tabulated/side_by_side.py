@@ -1,10 +1,9 @@
 """Networks of one shape side by side: P of them make a step in the time that one takes.
 
 While several runs train together (`process.together`), an update is made for all of them at once: their
-weights stand in one matrix (P, N), a layer is a batched product of (P, U, in) with (P, in, out), and each
-row is clipped and stepped as it would be alone. A batched product calls, for each of its matrices, the
-routine that a single one calls, so each network's numbers are the same to the last bit. That depends on the
-processor and on the build of torch; `agree` tries it out on the networks at hand.
+weights stand in one matrix (P, N), the networks run at once (`tabulated.stacked_layers`), and each row is
+clipped and stepped as it would be alone. That each network's numbers are then the same to the last bit
+depends on the processor and on the build of torch; `agree` tries it out on the networks at hand.
 """
 
 from __future__ import annotations
@@ -12,21 +11,20 @@ from __future__ import annotations
 import inspect
 import math
 import sys
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer, clipping, run_backward
+from gridworld.agents.sb3.tabulated.stacked_layers import ALIGNMENT, Leaves
 from gridworld.process.terminal import tell
 
 _adam: Any = inspect.unwrap(sys.modules["torch.optim.adam"].adam)
-_ALIGNMENT = 16  # numbers; torch begins every tensor at a multiple of 64 bytes
-Leaves = Mapping[int, Tensor]  # by the identity of the first network's parameter: (P, *its shape)
 
 
 class Tabulated(Protocol):
@@ -113,7 +111,7 @@ class SideBySide:
         optimizers: of P networks of the same shapes.
 
     Attributes:
-        leaves: the weights, for `forward`; none where there is one optimiser.
+        leaves: the weights, for `stacked_layers.forward`; none where there is one optimiser.
     """
 
     def __init__(self, optimizers: Sequence[FlatOptimizer]) -> None:
@@ -126,7 +124,7 @@ class SideBySide:
             return self
         own = [each.weights for each in self._optimizers]
         # Each row begins where a vector of its own would: products with vectors add up by alignment.
-        width = -(-len(own[0]) // _ALIGNMENT) * _ALIGNMENT
+        width = -(-len(own[0]) // ALIGNMENT) * ALIGNMENT
         rows = torch.empty(len(own), width)[:, : len(own[0])]
         self._weights = torch.stack(own, out=rows)
         self._gradients = torch.zeros(len(own), width)[:, : len(own[0])]
@@ -196,86 +194,6 @@ class SideBySide:
             self._adams = {rows: adams}
         for each in self._adams[rows]:
             each.step()
-
-
-def forward(network: Iterable[nn.Module], leaves: Leaves, features: Tensor | None) -> Tensor:
-    """Run P networks of one shape.
-
-    Args:
-        network: the layers of the first of them.
-        leaves: the weights of all, of `SideBySide`.
-        features: (U, n), the same for all; None: the first layer is linear and its input the unit vectors.
-
-    Returns:
-        (P, U, m).
-    """
-    hidden = features
-    for layer in network:
-        if not isinstance(layer, nn.Linear):
-            hidden = layer(hidden)
-            continue
-        weight, bias = leaves[id(layer.weight)], leaves[id(layer.bias)][:, None]
-        if hidden is None:
-            hidden = weight.transpose(1, 2) + bias
-            continue
-        if hidden.dim() == 2:
-            hidden = hidden.expand(len(weight), *hidden.shape)
-        hidden = _linear(hidden, weight, bias)
-    assert hidden is not None
-    return hidden
-
-
-class _Linear(torch.autograd.Function):
-    """P linear layers, with the products that torch makes for a single one, in both directions.
-
-    A layer with one output is a product with a vector, which adds up in an order that depends on where its
-    numbers lie. Where they do not lie as those of a single layer do, it is made run by run, of copies.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        ctx.save_for_backward(inputs, weight)
-        if weight.shape[1] > 1:
-            return torch.baddbmm(bias, inputs, weight.transpose(1, 2))
-        if _lies_as_alone(inputs):
-            return torch.bmm(weight, inputs.transpose(1, 2)).transpose(1, 2) + bias
-        rows = zip(bias, inputs, weight, strict=True)
-        return torch.stack([torch.addmm(own, x.clone(), w.t()) for own, x, w in rows])
-
-    @staticmethod
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
-        inputs, weight = ctx.saved_tensors
-        of_inputs = None
-        if ctx.needs_input_grad[0] and _is_transposed(inputs):
-            of_inputs = torch.bmm(weight.transpose(1, 2), slope.transpose(1, 2)).transpose(1, 2)
-        elif ctx.needs_input_grad[0]:
-            of_inputs = torch.bmm(slope, weight)
-        if weight.shape[1] > 1 or _lies_as_alone(inputs):
-            of_weight = torch.bmm(slope.transpose(1, 2), inputs)
-        else:
-            rows = zip(slope, inputs, strict=True)
-            of_weight = torch.stack([torch.mm(g.clone().t(), x.clone()) for g, x in rows])
-        return of_inputs, of_weight, slope.sum(1, keepdim=True)
-
-
-def _is_transposed(inputs: Tensor) -> bool:
-    return inputs.stride()[1:] == (1, inputs.shape[1])
-
-
-def _lies_as_alone(inputs: Tensor) -> bool:
-    return not _is_transposed(inputs) and inputs.stride(0) % _ALIGNMENT == 0
-
-
-_linear: Any = _Linear.apply
-
-
-def can_stand(*networks: nn.Module) -> bool:
-    """Whether all that these networks learn is in linear layers with a bias, as `forward` runs them."""
-    layers = [layer for network in networks for layer in network.modules() if not list(layer.children())]
-    return all(
-        layer.bias is not None if isinstance(layer, nn.Linear) else not list(layer.parameters())
-        for layer in layers
-    )
 
 
 def _adams(optimizers: Sequence[FlatOptimizer]) -> list[_Adams] | None:

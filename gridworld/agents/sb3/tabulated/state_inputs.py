@@ -29,7 +29,7 @@ from torch import Tensor, nn
 
 from gridworld.agents.sb3.schemas import SB3ClassConfig, SB3Config
 from gridworld.agents.sb3.tabulated.flat_optimizer import ELEMENTWISE
-from gridworld.agents.sb3.tabulated.side_by_side import can_stand
+from gridworld.agents.sb3.tabulated.stacked_layers import can_stand
 from gridworld.agents.sb3.vec_env import StateStep
 from gridworld.envs.observations import ObservationTable
 from gridworld.world.mdp import IntArray

@@ -21,11 +21,11 @@ from gridworld.agents.sb3.tabulated import trpo_loss
 from gridworld.agents.sb3.tabulated.flat_optimizer import ENGINE, FlatOptimizer
 from gridworld.agents.sb3.tabulated.jacobian import Jacobian
 from gridworld.agents.sb3.tabulated.on_policy import (
-    Float32Array,
     TabulatedOnPolicy,
     normalized,
 )
 from gridworld.agents.sb3.tabulated.ppo_loss import log_softmax
+from gridworld.agents.sb3.tabulated.state_buffers import Float32Array
 from gridworld.world.mdp import FloatArray, IntArray
 
 

@@ -1,0 +1,77 @@
+"""SB3's buffers with a state's number in place of an observation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
+from torch import Tensor
+
+from gridworld.agents.sb3.tabulated.state_inputs import smallest_integer
+from gridworld.agents.sb3.vec_env import StateStep
+from gridworld.world.mdp import BoolArray, IntArray
+
+Float32Array = NDArray[np.float32]
+
+
+class StateRolloutBuffer(RolloutBuffer):
+    """SB3's rollout buffer with the state's number in place of an observation."""
+
+    def __init__(self, buffer_size: int, observation_space: Any, *arguments: Any, **options: Any) -> None:
+        super().__init__(buffer_size, spaces.Discrete(1), *arguments, **options)
+
+    def compute_returns_and_advantage(self, last_values: Tensor, dones: BoolArray) -> None:
+        """SB3's own recursion to the last bit, with everything that does not recur done at once."""
+        going_on = 1.0 - np.concatenate([self.episode_starts[1:], dones[None].astype(np.float32)])
+        following = np.concatenate([self.values[1:], last_values.numpy()[None]])
+        self.advantages = self.rewards + self.gamma * following * going_on - self.values
+        carry = self.gamma * self.gae_lambda * going_on
+        for step in range(self.buffer_size - 2, -1, -1):
+            self.advantages[step] += carry[step] * self.advantages[step + 1]
+        self.returns = self.advantages + self.values
+
+
+class StateReplayBuffer(ReplayBuffer):
+    """SB3's replay buffer with states in the smallest integer type in place of observations."""
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: Any,
+        *arguments: Any,
+        num_states: int,
+        **options: Any,
+    ) -> None:
+        super().__init__(buffer_size, spaces.Discrete(1), *arguments, **options)
+        shape = (self.buffer_size, self.n_envs)
+        self.observations = np.zeros(shape, dtype=smallest_integer(num_states - 1))
+        self.next_observations = np.zeros_like(self.observations)
+        self.actions = np.zeros(shape, dtype=np.uint8)
+
+    def store(self, states: IntArray, actions: IntArray, step: StateStep) -> None:
+        """Add one step of every environment, from `states` (num_envs,) with `actions` (num_envs,)."""
+        at = self.pos
+        self.observations[at], self.actions[at] = states, actions
+        self.next_observations[at] = step.last_states
+        self.rewards[at], self.dones[at], self.timeouts[at] = step.rewards, step.dones, step.truncated
+        self.pos = (at + 1) % self.buffer_size
+        self.full |= self.pos == 0
+
+    def draw(
+        self, batch_size: int, chance: np.random.RandomState
+    ) -> tuple[IntArray, IntArray, IntArray, Float32Array, Float32Array]:
+        """Draw a minibatch of B transitions; drawn from numpy's global generator, they are SB3's own.
+
+        Returns:
+            (B,) each: states (int64), actions (uint8), next states (int64), rewards and ends (float32);
+            time-outs are no ends.
+        """
+        steps = chance.randint(0, self.buffer_size if self.full else self.pos, size=batch_size)
+        which = steps * self.n_envs + chance.randint(0, high=self.n_envs, size=batch_size)
+        ends = self.dones.take(which) * (1 - self.timeouts.take(which))
+        states, following = self.observations.take(which), self.next_observations.take(which)
+        rewards = self.rewards.take(which)
+        return states.astype(np.int64), self.actions.take(which), following.astype(np.int64), rewards, ends
