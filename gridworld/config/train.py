@@ -20,6 +20,7 @@ from gridworld.errors import InputError
 # OmegaConf reads the annotations at run time and knows no `X | None`.
 
 MOST_ENVS = 2**17  # eight times the largest batch that any measurement here is faster with
+MOST_BONUS = 1e6  # of exploration; any reward beside it would be lost in the numbers of a network
 MOST_THREADS = 1024
 AUTO = "auto"  # checkpoints as often as they cost next to nothing
 
@@ -65,6 +66,8 @@ class TrainConfig:
     seed: int = field(default=0, metadata=affects(Effect.SEED))  # of all random numbers
     total_timesteps: int = field(default=20_000, metadata=affects(Effect.LENGTH))  # environment steps
     n_envs: int = 64  # environments that step together
+    # b of b / sqrt(N), added to a reward of training for an action that was taken there N times; 0 for none
+    exploration_bonus: float = 0.0
     device: str = field(default="cpu", metadata=affects(Effect.MACHINE))
     threads: int = field(default=1, metadata=affects(Effect.MACHINE))  # of torch
     # of SB3: each a mapping of `_target_`, the import path of a class, and its arguments
@@ -93,6 +96,7 @@ def check(config: TrainConfig) -> None:
     at_least("total_timesteps", config.total_timesteps, 1)
     at_least("n_envs", config.n_envs, 1)
     at_most("n_envs", config.n_envs, MOST_ENVS)
+    within("exploration_bonus", config.exploration_bonus, 0, MOST_BONUS)
     at_least("threads", config.threads, 1)
     at_most("threads", config.threads, MOST_THREADS)
     config.env.check()

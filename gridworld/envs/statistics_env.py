@@ -2,6 +2,13 @@
 
 Both can be counted only while training happens. It costs some microseconds a step of the whole batch, however
 many cells the world has. The return and length of every single episode stand in `vector_env.Ended`.
+
+From the counts N(s, a) it can pay for exploring: a step that takes action a in state s pays its reward and
+β / sqrt(N(s, a)), with the visits of this step counted. Returns are those of the world's own rewards.
+
+References: A. Strehl and M. Littman, An analysis of model-based interval estimation for Markov decision
+processes, 2008 (MBIE-EB); M. Bellemare et al., Unifying count-based exploration and intrinsic motivation,
+2016.
 """
 
 from __future__ import annotations
@@ -42,14 +49,16 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
 
     Args:
         num_envs: see `GridWorldVectorEnv`.
-        settings: its other arguments.
+        exploration_bonus: β, at least 0.
+        settings: the other arguments of `GridWorldVectorEnv`.
 
     Attributes:
         visits: (S, A), int64, how often each action was taken in each state.
     """
 
-    def __init__(self, num_envs: int, **settings: Any) -> None:
+    def __init__(self, num_envs: int, *, exploration_bonus: float = 0.0, **settings: Any) -> None:
         super().__init__(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
+        self._bonus = exploration_bonus
         self.visits = np.zeros((self.mdp.num_states, self.mdp.num_actions), dtype=np.int64)
         self._flat_visits = self.visits.reshape(-1)
         self._ended = NO_EPISODES  # since they were last taken
@@ -60,12 +69,16 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
         step = super().advance(actions)
         np.add(pairs, actions, out=pairs, casting="unsafe")  # unsigned ones too
         ended = step[4]
-        self.count(pairs, *((_NONE, _NONE) if ended is None else (ended.returns, ended.lengths)))
+        self.count(pairs, step[1], *((_NONE, _NONE) if ended is None else (ended.returns, ended.lengths)))
         return step
 
-    def count(self, pairs: NDArray[Any], returns: FloatArray, lengths: NDArray[Any]) -> None:
-        """See `GridWorldVectorEnv.count`."""
+    def count(
+        self, pairs: NDArray[Any], rewards: FloatArray, returns: FloatArray, lengths: NDArray[Any]
+    ) -> None:
+        """See `GridWorldVectorEnv.count`; adds the exploration bonus to `rewards`."""
         np.add.at(self._flat_visits, pairs, 1)
+        if self._bonus:
+            rewards += self._bonus / np.sqrt(self._flat_visits.take(pairs))
         if len(returns):
             total = float(np.add.reduce(returns))
             self._ended = Returns(self._ended.episodes + len(returns), self._ended.total + total)

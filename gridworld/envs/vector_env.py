@@ -288,11 +288,14 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         """Put back what `under_way` returned, or what has become of it."""
         self._state, self._elapsed, self._returns = states.copy(), elapsed.copy(), returns.copy()
 
-    def count(self, pairs: NDArray[Any], returns: FloatArray, lengths: NDArray[np.int64]) -> None:
+    def count(
+        self, pairs: NDArray[Any], rewards: FloatArray, returns: FloatArray, lengths: NDArray[np.int64]
+    ) -> None:
         """Count a step that was made elsewhere (`joint_rollout`), where a subclass counts steps.
 
         Args:
             pairs: (num_envs,), state * A + action of each environment.
+            rewards: (num_envs,), what it paid; a subclass may add what it pays for exploring.
             returns: (m,), undiscounted, of the episodes that it ended.
             lengths: (m,), theirs, in steps.
         """

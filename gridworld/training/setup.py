@@ -31,7 +31,12 @@ def make_context(
     Returns:
         `config.n_envs` fresh environments and what else the agent's family builds it from.
     """
-    envs = StatisticsVectorEnv(config.n_envs, max_episode_steps=config.env.step_limit(mdp), mdp=mdp)
+    envs = StatisticsVectorEnv(
+        config.n_envs,
+        exploration_bonus=config.exploration_bonus,
+        max_episode_steps=config.env.step_limit(mdp),
+        mdp=mdp,
+    )
     return TrainingContext(
         envs, observation, config.seed, config.device, config.threads, write_scalars, config.callbacks
     )

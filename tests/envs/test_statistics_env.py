@@ -11,15 +11,15 @@ from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.vector_env import Advance, GridWorldVectorEnv
 
 
-@pytest.mark.parametrize("dtype", [np.int64, np.int32, np.uint8])
+@pytest.mark.parametrize(("dtype", "bonus"), [(np.int64, 0.0), (np.int32, 0.0), (np.uint8, 0.7)])
 @pytest.mark.parametrize(
     "settings",
     [{"slip": 0.3, "step_reward": -0.1}, {"layout": "maze", "max_episode_steps": 7, "step_reward": -1}],
     ids=["slippery", "cut"],
 )
-def test_visits_and_returns_are_those_of_a_naive_tally(settings: dict, dtype: type) -> None:
+def test_visits_and_returns_are_those_of_a_naive_tally(settings: dict, dtype: type, bonus: float) -> None:
     num_envs, steps = 5, 400
-    counted = StatisticsVectorEnv(num_envs, **settings)
+    counted = StatisticsVectorEnv(num_envs, exploration_bonus=bonus, **settings)
     plain = GridWorldVectorEnv(num_envs, autoreset_mode="SameStep", **settings)
     counted.reset(seed=3)
     states, _ = plain.reset(seed=3)
@@ -29,7 +29,9 @@ def test_visits_and_returns_are_those_of_a_naive_tally(settings: dict, dtype: ty
     for chosen in actions:
         for state, action in zip(states, chosen, strict=True):
             visits[state, action] += 1
+        pairs = list(zip(states, chosen, strict=True))
         states, rewards, terminated, truncated, _ = plain.step(chosen)
+        paid = [reward + bonus / visits[pair] ** 0.5 for reward, pair in zip(rewards, pairs, strict=True)]
         over = []
         for index in range(num_envs):
             under_way[index] += rewards[index]
@@ -40,6 +42,7 @@ def test_visits_and_returns_are_those_of_a_naive_tally(settings: dict, dtype: ty
                 under_way[index], length[index] = 0.0, 0
         *step, told = counted.advance(chosen)
         assert np.array_equal(step[0], states)  # counting changes nothing
+        assert np.allclose(step[1], paid, rtol=1e-12, atol=0)  # but the bonus, which is in no return
         assert over == (
             [] if told is None else list(zip(told.which, told.returns, told.lengths, strict=True))
         )

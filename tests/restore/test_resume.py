@@ -17,7 +17,7 @@ CASES = {
     **{f"{name} stock": [*SHORT[name], "agent.engine=stock"] for name in ("a2c", "qrdqn", "trpo")},
     **{name: SHORT[name] for name in ("a2c", "qrdqn", "trpo", "q_learning", "sarsa", "expected_sarsa")},
 }
-LESS = ["recording.frames=false", "recording.gif=false", "env.slip=0.1"]
+LESS = ["recording.frames=false", "recording.gif=false", "env.slip=0.1", "exploration_bonus=0.1"]
 
 
 @pytest.fixture(scope="module")

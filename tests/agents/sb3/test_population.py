@@ -112,7 +112,7 @@ def meetings(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 @pytest.mark.parametrize("agent", SMALL)
 def test_seeds_train_as_alone(agent: str, meetings: list[int]) -> None:
-    runs = [(*SMALL[agent], f"seed={seed}", "env.slip=0.1") for seed in range(4)]
+    runs = [(*SMALL[agent], f"seed={n}", f"exploration_bonus={n / 4}", "env.slip=0.1") for n in range(4)]
     expected = [alone(words) for words in runs]
     assert set(meetings) == {1}
     meetings.clear()

@@ -30,6 +30,7 @@ from gridworld.agents.sb3.tabulated.side_by_side import SideBySide
 from gridworld.agents.sb3.tabulated.trpo import TabulatedTRPO
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.envs.observations import make_observation
+from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
 
 NUM_ENVS, STEPS = 16, 32
@@ -258,6 +259,39 @@ def test_ppo_collects_what_stock_would_compute() -> None:
     assert (buffer.observations[1:][starts] == 0).all()
     plain = np.isin(buffer.rewards, [-1, 0, 1])
     assert 0 < (~plain).sum() < buffer.rewards.size // 4
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "arguments"),
+    [(TabulatedPPO, {"n_steps": STEPS, "batch_size": 64}), (TabulatedDQN, {"learning_starts": 10_000})],
+)
+def test_buffers_hold_the_exploration_bonus_as_it_was_paid(algorithm: Any, arguments: Any) -> None:
+    """Against a naive count of the same walk, and a model on the same walk without a bonus."""
+    rewards: list[Any] = []
+    world: dict[str, Any] = {"slip": 0.2, "max_episode_steps": 12}
+    for bonus in (0.0, 0.5):
+        envs = StatisticsVectorEnv(NUM_ENVS, exploration_bonus=bonus, **world)
+        env = GridWorldVecEnv(envs, make_observation(envs.mdp, "one_hot"))
+        model = algorithm("MlpPolicy", env, seed=0, device="cpu", **arguments)
+        model.set_logger(Logger(None, [Keep()]))
+        model._setup_learn(10_000)
+        if algorithm is TabulatedPPO:
+            buffer = model.rollout_buffer
+            model.collect_rollouts(env, no_callback(model), buffer, STEPS)
+        else:
+            buffer = model.replay_buffer
+            frequency = TrainFreq(STEPS, TrainFrequencyUnit.STEP)
+            model.collect_rollouts(env, no_callback(model), frequency, buffer, learning_starts=10_000)
+        rewards.append(buffer.rewards[:STEPS].copy())
+    visits, paid = np.zeros(envs.visits.shape), np.zeros((STEPS, NUM_ENVS))
+    for step in range(STEPS):
+        pairs = list(zip(buffer.observations[step], buffer.actions[step].ravel(), strict=True))
+        for pair in pairs:
+            visits[pair] += 1
+        paid[step] = [0.5 / visits[pair] ** 0.5 for pair in pairs]
+    assert np.allclose(rewards[1] - rewards[0], paid, atol=1e-6)
+    assert np.array_equal(visits, envs.visits)
+    assert np.isin([episode["r"] for episode in model.ep_info_buffer], [-1, 0, 1]).all()  # the true return
 
 
 def test_advantages_are_sb3s_to_the_last_bit() -> None:

@@ -104,7 +104,7 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         for step in range(n_rollout_steps):
             actions, ended = rolled.actions[step], rolled.ended(step)
             episodes = env.episodes(*ended)
-            env.envs.count(rolled.pairs[step], *ended)
+            env.envs.count(rolled.pairs[step], rolled.rewards[step], *ended)
             self.num_timesteps += env.num_envs
             if getattr(callback, "reads_locals", True):
                 done = env.told(rolled.step(step), episodes)
