@@ -93,6 +93,7 @@ def test_no_recipe_is_the_default() -> None:
 def test_the_manual_has_a_line_per_task() -> None:
     _, shown = manual(CONF).split("experiment=...\n", 1)
     shown = re.split(r"^  \S+=\.\.\.$", shown, flags=re.MULTILINE)[0]
+    shown, failing = shown.split("    These fail:\n")
     assert max(map(len, shown.splitlines())) <= 100
     found = set()
     for word in shown.replace(",", "").split():
@@ -101,6 +102,13 @@ def test_the_manual_has_a_line_per_task() -> None:
         else:
             found.add(task + word)
     assert found == set(RECIPES)
+    comments = {name: (CONF / "experiment" / f"{name}.yaml").read_text("utf-8") for name in RECIPES}
+    expected = [name for name, text in comments.items() if re.search("^# .*(on none of| 0 of)", text, re.M)]
+    lines = [line.split(maxsplit=1) for line in failing.splitlines()]
+    assert [name for name, _ in lines] == expected
+    for name, about in lines:
+        assert about.startswith("does not solve its task: ")
+        assert f"\n# {about}\n" in comments[name]
 
 
 @pytest.mark.parametrize("name", ["dqn", "ppo", "a2c"])

@@ -12,6 +12,7 @@ from gridworld.process.command_line import as_called
 
 EXPERIMENTS = "experiment"  # the group of recipes
 SPACES = "tune"  # the group of search spaces, which is tune.py's
+FAILS = "does not solve its task"  # so begins the first comment of a recipe that never does
 
 _TEXT = """\
 Train an agent on a GridWorld whose optimum is known exactly.
@@ -24,6 +25,7 @@ Choices:
 
 Keys, with their values: python scripts/train.py --cfg job
   seed, total_timesteps, n_envs, device, threads  the run itself
+  exploration_bonus  what training pays for actions that were seldom taken; 0 for nothing
   agent.*        the algorithm's own settings, by their names in Stable-Baselines3 where it has them
   env.*          layout (a name above or a map file), slip, rewards, max_episode_steps
   observation.*  kind, cell_size of images
@@ -96,13 +98,17 @@ def choices(group: Path) -> list[str]:
 
 
 def _choice(file: Path) -> str:
+    return f"    {file.stem:<16} {_about(file)}"
+
+
+def _about(file: Path) -> str:
+    """The first comment of a yaml file."""
     comments = [line[2:] for line in file.read_text("utf-8").splitlines() if line.startswith("# ")]
-    about = next((comment for comment in comments if not comment.startswith("@package")), "")
-    return f"    {file.stem:<16} {about}"
+    return next((comment for comment in comments if not comment.startswith("@package")), "")
 
 
 def _recipes(conf: Path, files: list[Path]) -> list[str]:
-    """A line or two per task; recipes are named TASK_AGENT."""
+    """A line or two per task, recipes are named TASK_AGENT; then those that fail, with what comes of them."""
     tasks = sorted((file.stem for file in (conf / "env").glob("*.yaml")), key=len, reverse=True)
     agents: dict[str, list[str]] = {}
     for file in files:
@@ -117,4 +123,6 @@ def _recipes(conf: Path, files: list[Path]) -> list[str]:
             subsequent_indent=" " * 25,
         )
         lines += text.splitlines()
-    return lines
+    told = [(file.stem, _about(file)) for file in files]
+    failing = [f"      {name:<24} {about}" for name, about in told if about.startswith(FAILS)]
+    return [*lines, "    These fail:", *failing] if failing else lines
