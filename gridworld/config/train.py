@@ -20,7 +20,7 @@ from gridworld.errors import InputError
 # OmegaConf reads the annotations at run time and knows no `X | None`.
 
 MOST_ENVS = 2**17  # eight times the largest batch that any measurement here is faster with
-MOST_BONUS = 1e6  # of exploration; any reward beside it would be lost in the numbers of a network
+MOST_BONUS = 10**6  # of exploration; any reward beside it would be lost in the numbers of a network
 MOST_THREADS = 1024
 AUTO = "auto"  # checkpoints as often as they cost next to nothing
 

@@ -74,6 +74,7 @@ TRAIN = [
     ("seed=[1", "seed=[1: no viable alternative"),
     ("n_envs=0", "n_envs=0: must be at least 1"),
     ("threads=0", "threads=0: must be at least 1"),
+    ("exploration_bonus=-0.1", "exploration_bonus=-0.1: must be from 0 to 1000000"),
     ("agent=ppo agent.batch_size=1000", "agent.batch_size=1000: must divide the rollout"),
     ("agent=ppo agent.use_sde=true", "agent.use_sde=true: gSDE explores continuous actions"),
     ("agent=ppo agent.clip_range=-0.1", "agent.clip_range=-0.1: must be"),
