@@ -8,10 +8,10 @@ from gridworld.diagnosis.evidence import Evidence, entropy
 from gridworld.diagnosis.experiments import entropy_optimum, optimum_of_epsilon
 from gridworld.diagnosis.finding import Finding, costliest
 from gridworld.world.bellman import pick
+from gridworld.world.discounts import fitting_discounts
 from gridworld.world.mdp import BoolArray, FloatArray
-from gridworld.world.solver import value_iteration
+from gridworld.world.solver import solved
 
-_GAMMAS = (0.8, 0.9, 0.95, 0.97, 0.99)
 _CLEARER = 5  # times the gap
 _FAINT = 1e-3  # of the largest reward: less than a network's values resolve
 _SPREAD = 0.5  # of the entropy of a uniform policy
@@ -58,7 +58,7 @@ def _faint(run: Evidence, limit: FloatArray) -> Finding | None:
 
 def gap_under(run: Evidence, gamma: float) -> FloatArray:
     """(S,), what the greedy action loses under a discount."""
-    best = run.own if gamma == run.gamma else value_iteration(run.mdp, gamma)
+    best = solved(run.mdp, gamma)
     gap: FloatArray = best.v - pick(best.q, run.greedy)
     return gap
 
@@ -70,12 +70,8 @@ def clearest_gamma(run: Evidence, states: BoolArray) -> float:
         run: the run.
         states: (S,), bool, where it errs.
     """
-    best = run.evaluator.solution
-    found: dict[float, float] = {}
-    for gamma in dict.fromkeys((*_GAMMAS, best.gamma)):
-        optimal = best.optimal if gamma == best.gamma else value_iteration(run.mdp, gamma).optimal
-        if not (optimal & ~best.optimal)[run.acting].any():
-            found[gamma] = float(np.min(gap_under(run, gamma)[states], initial=np.inf))
+    gammas = fitting_discounts(run.evaluator)
+    found = {gamma: float(np.min(gap_under(run, gamma)[states], initial=np.inf)) for gamma in gammas}
     return max(found, key=lambda each: found[each])
 
 
