@@ -30,3 +30,18 @@ CAUSES: tuple[Cause, ...] = (
     *(cannot_represent, hardly_moved, too_much_entropy, overshot, spoilt_policy, not_tried, collapsed),
     *(faint_gamma, spoilt, not_there_yet, ended_early, unsettled),
 )
+
+PHRASES = {  # by name
+    "implementation": "the class is wrong",
+    "objective": "gamma of another optimum",
+    "lost": "lost its certificate again",
+    "diverged": "values diverged",
+    "epsilon": "plays safe for epsilon",
+    "network": "network cannot hold it",
+    "entropy": "entropy bonus too large",
+    "rate": "updates too large",
+    "exploration": "too little exploration",
+    "budget": "too few steps",
+    "target": "target network too old",
+    "slow": "was still learning",
+}
