@@ -39,7 +39,7 @@ def hopeless_gamma(run: Evidence) -> Finding | None:
 
 def faint_gamma(run: Evidence) -> Finding | None:
     """Under its own discount, actions differ by less than a network errs, and under another by much more."""
-    return None if run.is_tabular else _faint(run, np.abs(run.q - run.own.q).max(axis=1))
+    return _faint(run, np.abs(run.q - run.own.q).max(axis=1))
 
 
 def _faint(run: Evidence, limit: FloatArray) -> Finding | None:
@@ -50,8 +50,8 @@ def _faint(run: Evidence, limit: FloatArray) -> Finding | None:
         return None
     worst = costliest(run, states)
     why = (
-        f"with its gamma of {run.gamma:g} the right action is worth only {run.gap[worst]:.2g} more, which "
-        f"its values do not resolve; with {better:g} it is {clear[worst]:.2g}"
+        f"with its gamma of {run.gamma:g} the right action is worth only {run.gap[worst]:.2g} more, less "
+        f"than its values err; with {better:g} it is {clear[worst]:.2g}"
     )
     return Finding("objective", states, why, (run.change("gamma", better),))
 
@@ -98,8 +98,11 @@ def too_much_epsilon(run: Evidence) -> Finding | None:
     if run.config.agent.algorithm not in ("sarsa", "expected_sarsa") or epsilon <= 0:
         return None
     optimal = optimum_of_epsilon(run.mdp, run.gamma, epsilon)
-    states = run.split.wrong & optimal[np.arange(len(optimal)), run.greedy]
+    aimed = optimal[np.arange(len(optimal)), run.greedy]
+    states = run.split.wrong & (aimed | ~(optimal & run.evaluator.solution.optimal).any(axis=1))
     if not states.any():
         return None
-    why = f"what it does is optimal for an agent that acts at random with probability {epsilon:g}, as it does"
+    why = (
+        f"it learns what is optimal for an agent that acts at random with probability {epsilon:g}, as it does"
+    )
     return Finding("epsilon", states, why, (run.change("exploration_final_eps", epsilon / 10),))

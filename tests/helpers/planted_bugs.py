@@ -253,6 +253,19 @@ class DQNFrozenLayer(DQN):
         self.q_net.q_net[-1].requires_grad_(False)
 
 
+class DQNDeadUnits(DQN):
+    """The units of the first layer never fire."""
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        for net in (self.q_net, self.q_net_target):
+            torch.nn.init.constant_(net.q_net[0].bias, -100.0)
+
+
+class QuietDQN(DQN):
+    """No bug at all."""
+
+
 class DQNColumnsSwapped(DQN):
     """It sees the first two columns in another order when it acts in training."""
 
@@ -312,6 +325,7 @@ CAUGHT: dict[type, tuple[str, ...]] = {
     DQNGammaForgotten: ("discount",),
     EpsilonNeverFalls: ("behaviour",),
     DQNFrozenLayer: ("layers",),
+    DQNDeadUnits: ("context",),
     DQNColumnsSwapped: ("behaviour",),
     WorstAction: ("choice",),
     MeanOfNext: ("alternation",),
