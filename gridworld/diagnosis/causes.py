@@ -27,18 +27,9 @@ from gridworld.diagnosis.objective import (
 )
 
 CAUSES: tuple[Cause, ...] = (
-    *(faulty_class, hopeless_gamma, lost_again, diverged, other_optimum, too_much_epsilon),
-    *(
-        cannot_represent,
-        hardly_moved,
-        forgets,
-        too_much_entropy,
-        overshot,
-        spoilt_policy,
-        not_tried,
-        collapsed,
-    ),
-    *(faint_gamma, spoilt, not_there_yet, ended_early, unsettled),
+    *(faulty_class, hopeless_gamma, other_optimum, too_much_epsilon, too_much_entropy),
+    *(forgets, lost_again, diverged, cannot_represent, hardly_moved, overshot),
+    *(spoilt_policy, not_tried, collapsed, faint_gamma, spoilt, not_there_yet, ended_early, unsettled),
 )
 
 PHRASES = {  # by name

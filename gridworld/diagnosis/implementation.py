@@ -23,43 +23,47 @@ _SECONDS = 3.0  # of the processor
 
 def faulty_class(run: Evidence) -> Finding | None:
     """The library's own class is certified with the same settings."""
-    if run.config.agent.family != "sb3" or run.curve["certified"].any():
+    if run.config.agent.family != "sb3":
         return None
     from gridworld.agents.sb3.ancestor import of_library  # imports torch
 
     sound = of_library(run.config.agent)
     if sound is None:
         return None
-    end, steps = time.process_time() + _SECONDS, []
+    until, steps = time.process_time() + _SECONDS, []
+    lost = bool(run.curve["certified"].any())
     for seed in range(run.config.seed, run.config.seed + _SEEDS):
-        if (found := _certified_after(run, sound, seed, end)) is None:
+        if (found := _certified_after(run, sound, seed, until, lost)) is None:
             return None
-        steps.append(found)
+        steps.append(f"{found:,}")
     own, seed = run.config.agent.algorithm, run.config.seed
-    after = " and ".join(f"{each:,}" for each in steps)
+    when = f"{'still at' if lost else 'at'} steps {' and '.join(steps)} (seeds {seed} and {seed + 1})"
     why = (
         f"its class is at fault: {sound.algorithm} in the place of {own}, with the same settings, is "
-        f"certified after {after} steps (seeds {seed} and {seed + 1}); check.py {own} tells what is wrong"
+        f"certified {when}; check.py {own} tells what is wrong"
     )
     return Finding("implementation", run.split.wrong, why, (f"agent.algorithm={sound.algorithm}",))
 
 
-def _certified_after(run: Evidence, agent: SB3ClassConfig, seed: int, end: float) -> int | None:
-    """The steps until a certificate; None: there is none, or not in time."""
+def _certified_after(
+    run: Evidence, agent: SB3ClassConfig, seed: int, until: float, to_the_end: bool
+) -> int | None:
+    """The steps until a certificate, the first or that at the end; None: there is none, or not in time."""
     config = replace(run.config, agent=agent, seed=seed, callbacks=[])
     observation = make_observation(run.mdp, config.observation.kind, config.observation.cell_size)
-    every, found = config.evaluation.every, [0]  # the next evaluation, and the certificate
+    every, due, found = config.evaluation.every, 0, None
 
     def watch(step: int) -> bool:
-        if step >= found[0]:
-            found[0] = (step // every + 1) * every
-            if run.evaluator.score(learner.snapshot().greedy_policy()).certified:
-                found.append(step)
-        return len(found) == 1 and time.process_time() < end
+        nonlocal due, found
+        if step >= min(due, config.total_timesteps):
+            due = (step // every + 1) * every
+            certified = run.evaluator.score(learner.snapshot().greedy_policy()).certified
+            found = step if certified else None
+        return (to_the_end or found is None) and time.process_time() < until
 
     try:
         learner = family(agent).build(agent, make_context(config, run.mdp, observation))
         learner.learn(config.total_timesteps, watch)
     except InputError:  # it diverged
         return None
-    return found[1] if len(found) > 1 else None
+    return found if time.process_time() < until else None

@@ -47,9 +47,10 @@ def forgets(run: Evidence) -> Finding | None:
     _, spoilt = _alone(run, worst)
     if not len(spoilt):
         return None
+    where = run.mdp.state_name(worst)
     why = (
-        f"it forgets: {run.mdp.state_name(worst)} was met {met[worst]:,} times, of which "
-        f"{kept[worst]:.1g} are in a replay buffer of {size:,.0f}, and to learn that state alone makes {len(spoilt)} others wrong"
+        f"it forgets: {where} was met {met[worst]:,} times, of which {kept[worst]:.1g} are in its replay "
+        f"buffer, and to learn that state alone makes {len(spoilt)} others wrong"
     )
     return Finding("forgetting", states, why, (run.change("buffer_size", total),))
 

@@ -97,9 +97,10 @@ def too_much_epsilon(run: Evidence) -> Finding | None:
     epsilon = run.setting("exploration_final_eps")
     if run.config.agent.algorithm not in ("sarsa", "expected_sarsa") or epsilon <= 0:
         return None
-    optimal = optimum_of_epsilon(run.mdp, run.gamma, epsilon)
-    aimed = optimal[np.arange(len(optimal)), run.greedy]
-    states = run.split.wrong & (aimed | ~(optimal & run.evaluator.solution.optimal).any(axis=1))
+    q = optimum_of_epsilon(run.mdp, run.gamma, epsilon)
+    gap = q.max(axis=1) - pick(q, run.greedy)
+    unresolved = (gap < np.abs(run.q - q).max(axis=1)) & (run.gap > _CLEARER * gap)
+    states = run.split.wrong & ((gap <= 1e-9) | unresolved)
     if not states.any():
         return None
     why = (

@@ -121,6 +121,17 @@ class PPOColumnsSwapped(PPO):
     policy_aliases: ClassVar = {"MlpPolicy": _ActsOnSwapped}
 
 
+class _ActsOnReversed(ActorCriticPolicy):
+    def forward(self, obs: torch.Tensor, deterministic: bool = False) -> Any:
+        return super().forward(obs.flip(1))
+
+
+class PPOColumnsReversed(PPO):
+    """It sees all columns in the opposite order when it acts."""
+
+    policy_aliases: ClassVar = {"MlpPolicy": _ActsOnReversed}
+
+
 class PPOFrozenLayer(PPO):
     """The first layer of the policy has no gradient."""
 
@@ -311,6 +322,7 @@ CAUGHT: dict[type, tuple[str, ...]] = {
     PPOOnlyRewards: ("delay", "discount"),
     PPOTimeoutsAreEnds: ("truncation",),
     PPOColumnsSwapped: ("behaviour",),
+    PPOColumnsReversed: ("behaviour",),
     PPOFrozenLayer: ("layers",),
     PPONoValueLoss: ("constant",),
     PPOBlind: ("context",),

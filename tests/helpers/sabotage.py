@@ -10,7 +10,7 @@ import numpy as np
 from helpers import planted_bugs as bugs
 
 MADE_ON = (("classic", 5), ("1", 6))  # a map, and the seed of training
-HELD_OUT = (("11", 101), ("12", 102))
+HELD_OUT = (("11", 101), ("12", 102), ("13", 103), ("14", 104))
 _SIZE = 5, 6
 
 
@@ -134,7 +134,7 @@ CATALOGUE = [
     *_settings(
         "q_learning",
         ("step too small", "agent.learning_rate=0.001", "slow"),
-        ("step too large where chance decides", "agent.learning_rate=1 env.slip=0.3", "rate"),
+        ("step too large where chance decides", "agent.learning_rate=1 env.slip=0.3", "rate lost"),
         ("too few steps", f"{_ALWAYS} total_timesteps=200", "budget"),
         ("no look ahead", f"{_ALWAYS} agent.gamma=0", "objective"),
         ("first values too high", "agent.initial_value=1000", "slow"),
@@ -180,7 +180,11 @@ CATALOGUE = [
         ("horizon too short", "agent.gamma=0.1", "objective"),
         ("horizon too long", "agent.gamma=1", "objective"),
         ("too few updates", "agent.gradient_steps=1 agent.train_freq=32", "slow target"),
-        ("buffer too small", "agent.buffer_size=256", "forgetting"),
+        (
+            "buffer too small",
+            "n_envs=8 agent.batch_size=16 agent.gradient_steps=8 agent.buffer_size=16",
+            "forgetting lost",
+        ),
         ("too few steps", "total_timesteps=1000", "budget slow"),
     ),
     *_settings(
@@ -199,11 +203,11 @@ CATALOGUE = [
         Sabotage(kind.__name__, (kind.__doc__ or "").strip("."), (), ("implementation",))
         for kind in (
             *(bugs.WrongSign, bugs.PPOBootstrapsTerminal, bugs.PPORewardsShifted, bugs.PPOGammaForgotten),
-            *(bugs.PPOActionsShifted, bugs.PPOOnlyRewards, bugs.PPOColumnsSwapped, bugs.PPOFrozenLayer),
+            *(bugs.PPOActionsShifted, bugs.PPOOnlyRewards, bugs.PPOColumnsReversed, bugs.PPOFrozenLayer),
             *(bugs.PPOBlind, bugs.NoTargetNetwork, bugs.TargetNeverUpdated, bugs.DQNBootstrapsTerminal),
             *(bugs.ReplayOffByOne, bugs.DQNRewardsShifted, bugs.CostsLost, bugs.DQNGammaForgotten),
-            *(bugs.EpsilonNeverFalls, bugs.DQNFrozenLayer, bugs.DQNDeadUnits, bugs.DQNColumnsSwapped),
-            *(bugs.WorstAction, bugs.MeanOfNext),
+            *(bugs.EpsilonNeverFalls, bugs.DQNFrozenLayer, bugs.DQNDeadUnits),
+            bugs.MeanOfNext,
         )
     ),
     Sabotage("QuietDQN", "a sound class, rate too small", ("agent.arguments.learning_rate=1e-6",), ("slow",)),
