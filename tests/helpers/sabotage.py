@@ -57,16 +57,20 @@ class Sabotage:
     words: tuple[str, ...]
     causes: tuple[str, ...]
 
+    def __str__(self) -> str:
+        return f"{self.agent}: {self.name}"
+
     @property
-    def is_bug(self) -> bool:
-        """Whether it is in a class."""
-        return hasattr(bugs, self.agent)
+    def like(self) -> str:
+        """The agent whose settings it begins with."""
+        if self.agent in SOUND:
+            return self.agent
+        return "ppo" if issubclass(getattr(bugs, self.agent), bugs.PPO) else "dqn"
 
     def settings(self) -> list[str]:
         """The whole command line but for the world and the seed."""
-        if not self.is_bug:
-            return [*SOUND[self.agent], *self.words]
-        return [*_of_class(self.agent), *self.words]
+        sound = SOUND[self.agent] if self.agent in SOUND else _of_class(self.agent, self.like)
+        return [*sound, *self.words]
 
 
 _DQN = {
@@ -106,9 +110,8 @@ SOUND = {
 }
 
 
-def _of_class(name: str) -> list[str]:
+def _of_class(name: str, like: str) -> list[str]:
     """The sound settings of DQN or PPO for a class that is derived from it."""
-    like = "ppo" if issubclass(getattr(bugs, name), bugs.PPO) else "dqn"
     own = _PPO if like == "ppo" else _DQN
     given = ("learning_rate", "n_steps", "gamma", "ent_coef")  # of A2C, whose yaml has them
     return [

@@ -44,7 +44,7 @@ def oracle_fit(
     Returns:
         Whether the greedy actions became optimal; None: the network is too large to say in time.
     """
-    fit = _Fit.of(agent, best, states)
+    fit = _Fit.of(agent, best, states, advantages=True)
     if fit is None:
         return None
     elsewhere = np.argmax(best.q, axis=1)
@@ -60,7 +60,7 @@ def oracle_fit(
 class OneState(NamedTuple):
     """What comes of teaching a network one state only."""
 
-    told_apart: bool  # it can be right there while all others stay as they are
+    told_apart: bool  # it can be right there while all others are held where they are
     spoilt: IntArray  # (k,), states that were right and are not, where nothing holds the others
 
 
@@ -76,25 +76,26 @@ def one_state_fit(agent: Agent, best: Solution, states: IntArray, state: int) ->
     Returns:
         What came of it; None: the network is too large to say in time.
     """
-    fit = _Fit.of(agent, best, states)
+    fit = _Fit.of(agent, best, states, advantages=False)
     if fit is None:
         return None
     here, rows, right = int(np.flatnonzero(states == state)[0]), np.arange(len(states)), best.optimal[states]
     with torch.no_grad():
         before = read(fit.policy, fit.observations)
-    actions = last = _greedy(before)
+    last = _greedy(before)
+    was_right = right[rows, last]
 
-    def all_others_stay(found: IntArray) -> bool:
-        return bool(right[here, found[here]] and (found == actions)[rows != here].all())
+    def no_other_is_lost(found: IntArray) -> bool:
+        return bool(right[rows, found][was_right | (rows == here)].all())
 
     def is_right_there(found: IntArray) -> bool:
         nonlocal last
         last = found
         return bool(right[here, found[here]])
 
-    told_apart = fit.run(lambda found: fit.error(found, [here]) + _moved(found, before), all_others_stay)
+    told_apart = fit.run(lambda found: fit.error(found, [here]) + _moved(found, before), no_other_is_lost)
     fit.run(lambda found: fit.error(found, [here]), is_right_there)
-    return OneState(told_apart, states[right[rows, actions] & ~right[rows, last] & (rows != here)])
+    return OneState(told_apart, states[was_right & ~right[rows, last]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +105,7 @@ class _Fit:
     Attributes:
         policy: it; every fit takes a copy.
         observations: of the states.
-        q: (n, A), advantages in units of their deviation: a scale that no network finds hard.
+        q: (n, A); or advantages, in units of their deviation: a scale that no network finds hard.
         optimal: (n, A), 1 for the optimal actions.
         steps: of a fit.
     """
@@ -116,7 +117,7 @@ class _Fit:
     steps: int
 
     @classmethod
-    def of(cls, agent: Agent, best: Solution, states: IntArray) -> _Fit | None:
+    def of(cls, agent: Agent, best: Solution, states: IntArray, advantages: bool) -> _Fit | None:
         """Prepare them; None: the network is too large to be fitted in time."""
         assert isinstance(agent, SB3Agent)
         policy = agent.model.policy
@@ -125,9 +126,9 @@ class _Fit:
         if steps < _FEWEST:
             return None
         observations, _ = policy.obs_to_tensor(agent.observation.rows(states))
-        q = best.q[states] - best.v[states][:, None]
+        q = best.q[states] - (best.v[states][:, None] if advantages else 0.0)
         q = np.where(np.isfinite(q), q, 0.0)
-        tables = (q / max(float(q.std()), 1e-12), best.optimal[states])
+        tables = (q / (max(float(q.std()), 1e-12) if advantages else 1.0), best.optimal[states])
         scaled, optimal = (torch.tensor(table, dtype=torch.float32) for table in tables)
         return cls(policy, observations, scaled, optimal, steps)
 
