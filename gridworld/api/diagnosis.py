@@ -5,7 +5,7 @@ from __future__ import annotations
 from os import PathLike
 from pathlib import Path
 
-from gridworld.api.runs import RunResult
+from gridworld.api.runs import RunResult, torch_threads_kept
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.verdict import Diagnosis
 from gridworld.diagnosis.verdict import diagnose as _diagnose
@@ -31,8 +31,9 @@ def diagnose(run: RunResult | str | PathLike[str]) -> Diagnosis:
         >>> found.cause, bool(abs(found.split.cost.sum() - found.split.score.regret) < 1e-9)
         ('slow', True)
     """
-    if not isinstance(run, RunResult):
-        return _diagnose(Evidence.of(SavedRun(Path(run).expanduser())))
-    return _diagnose(
-        Evidence(run.config, run.overrides, run.curve, run.visits, run.evaluator, run.agent, run.policy)
-    )
+    with torch_threads_kept():
+        if not isinstance(run, RunResult):
+            return _diagnose(Evidence.of(SavedRun(Path(run).expanduser())))
+        return _diagnose(
+            Evidence(run.config, run.overrides, run.curve, run.visits, run.evaluator, run.agent, run.policy)
+        )

@@ -145,7 +145,7 @@ def train(
     config = compose_words(given)
     if progress is not None:
         config.logging.progress = progress
-    with _ONE_AT_A_TIME, _torch_threads_kept(), _as_python_interrupts(folder is not None):
+    with _ONE_AT_A_TIME, torch_threads_kept(), _as_python_interrupts(folder is not None):
         if folder is not None:
             return _train_in(Path(folder).expanduser(), config, given)
         return _train_without_files(config, given)
@@ -216,7 +216,7 @@ def _as_python_interrupts(is_kept: bool) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _torch_threads_kept() -> Iterator[None]:
+def torch_threads_kept() -> Iterator[None]:
     """Give the caller's torch its number of threads back, which a run sets for the whole process."""
     torch: Any = sys.modules.get("torch")
     before = None if torch is None else torch.get_num_threads()

@@ -11,6 +11,7 @@ import argparse
 import sys
 import webbrowser
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from gridworld.commands import parser_for_runs, whole_number
@@ -20,9 +21,12 @@ from gridworld.process.memory_budget import limited
 from gridworld.process.progress import telling_if_slow
 from gridworld.process.terminal import printable
 from gridworld.report.build import Report, gather
+from gridworld.report.evidence.reasons import Reason, reasons
 from gridworld.report.writer import FORMATS, MARKERS, check_markers, check_out, write_readme, write_report
+from gridworld.restore.saved_run import SavedRun
 from gridworld.run.claim import check_inside
 
+_MOST_DIAGNOSED = 10
 _MOST_TOLD = 20  # sentences on standard error; the page has them all
 
 
@@ -34,8 +38,9 @@ def main(arguments: Sequence[str]) -> None:
         InputError: An option is not valid, or there is nothing to report.
     """
     options = _parser().parse_args(arguments)
-    if options.seed < 0:
-        raise InputError(f"--seed {options.seed}: must be at least 0")
+    for name in ("seed", "diagnose"):
+        if getattr(options, name) < 0:
+            raise InputError(f"--{name} {getattr(options, name)}: must be at least 0")
     if options.out is not None:
         check_inside(options.out, "--out")
     out = options.out or _usual_out(options.runs)
@@ -44,6 +49,8 @@ def main(arguments: Sequence[str]) -> None:
         check_markers(options.readme)
     with telling_if_slow("reading the runs"):
         report = gather(options.runs, options.seed, options.log_steps)
+    with telling_if_slow("diagnosing runs that are not certified"):
+        report = replace(report, reasons=reasons(report.study.groups, _reason, options.diagnose))
     with telling_if_slow("writing the report"):
         page = write_report(report, out, options.formats)
     if options.readme is not None:
@@ -82,8 +89,28 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="curves against the logarithm of the steps (without it, where an agent is ten times slower)",
     )
+    parser.add_argument(
+        "--diagnose",
+        type=whole_number,
+        default=_MOST_DIAGNOSED,
+        metavar="COUNT",
+        help="say of so many runs at most why they are not certified, each in a second or some "
+        f"(default {_MOST_DIAGNOSED}; 0: of none)",
+    )
     parser.add_argument("--seed", type=whole_number, default=0, help="of the bootstrap (default 0)")
     return parser
+
+
+def _reason(folder: Path) -> Reason | None:
+    # Here, since of most reports nothing is to be diagnosed.
+    from gridworld.diagnosis.evidence import Evidence
+    from gridworld.diagnosis.verdict import diagnose
+
+    try:
+        found = diagnose(Evidence.of(SavedRun(folder)))
+    except Exception:  # a run may be another version's, or anybody's; its numbers stand without a reason
+        return None
+    return None if found.phrase is None else Reason(found.phrase, found.first_change)
 
 
 def _usual_out(runs: Sequence[Path]) -> Path:

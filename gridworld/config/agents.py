@@ -45,6 +45,10 @@ class AgentConfig:
         """What must be equal for runs of it to train as one population; None: each trains by itself."""
         return None
 
+    def key(self, name: str) -> str:
+        """What the command line calls one of the algorithm's settings, which may not be given yet."""
+        return f"agent.{name}"
+
     def memory(self, num_states: int, num_envs: int, total_timesteps: int) -> int:
         """About the bytes that a run of it takes while it trains, the larger part at least."""
         return 0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from gridworld.diagnosis.exploration import collapsed, ended_early, not_tried
 from gridworld.diagnosis.finding import Cause
+from gridworld.diagnosis.implementation import faulty_class
 from gridworld.diagnosis.learning import (
     diverged,
     hardly_moved,
@@ -16,7 +17,7 @@ from gridworld.diagnosis.learning import (
     overshot,
     unsettled,
 )
-from gridworld.diagnosis.network import cannot_represent, spoilt, spoilt_policy
+from gridworld.diagnosis.network import cannot_represent, forgets, spoilt, spoilt_policy
 from gridworld.diagnosis.objective import (
     faint_gamma,
     hopeless_gamma,
@@ -26,7 +27,23 @@ from gridworld.diagnosis.objective import (
 )
 
 CAUSES: tuple[Cause, ...] = (
-    *(hopeless_gamma, lost_again, diverged, other_optimum, too_much_epsilon),
-    *(cannot_represent, hardly_moved, too_much_entropy, overshot, spoilt_policy, not_tried, collapsed),
-    *(faint_gamma, spoilt, not_there_yet, ended_early, unsettled),
+    *(faulty_class, hopeless_gamma, other_optimum, too_much_epsilon, too_much_entropy),
+    *(forgets, lost_again, diverged, cannot_represent, hardly_moved, overshot),
+    *(spoilt_policy, not_tried, collapsed, faint_gamma, spoilt, not_there_yet, ended_early, unsettled),
 )
+
+PHRASES = {  # by name
+    "implementation": "the class is wrong",
+    "objective": "gamma of another optimum",
+    "lost": "lost its certificate again",
+    "diverged": "values diverged",
+    "epsilon": "plays safe for epsilon",
+    "network": "network cannot hold it",
+    "forgetting": "forgets what it learnt",
+    "entropy": "entropy bonus too large",
+    "rate": "updates too large",
+    "exploration": "too little exploration",
+    "budget": "too few steps",
+    "target": "target network too old",
+    "slow": "was still learning",
+}

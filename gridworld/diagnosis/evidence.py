@@ -165,10 +165,7 @@ class Evidence:
     def change(self, name: str, value: float | str) -> str:
         """The word that sets one of the agent's settings on a command line."""
         text = value if isinstance(value, str) else f"{value:.3g}" if value % 1 else f"{value:.0f}"
-        if hasattr(self.config.agent, name):
-            return f"agent.{name}={text}"
-        prefix = "" if name in getattr(self.config.agent, "arguments", {}) else "+"
-        return f"{prefix}agent.arguments.{name}={text}"
+        return f"{self.config.agent.key(name)}={text}"
 
     @cached_property
     def updates(self) -> float:

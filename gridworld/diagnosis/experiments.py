@@ -56,8 +56,8 @@ def entropy_optimum(run: Evidence, bonus: float) -> FloatArray:
     return policy
 
 
-def optimum_of_epsilon(mdp: Mdp, gamma: float, epsilon: float) -> BoolArray:
-    """(S, A), the best actions where each is replaced by a random one with probability epsilon."""
+def optimum_of_epsilon(mdp: Mdp, gamma: float, epsilon: float) -> FloatArray:
+    """Q (S, A) of the best policy whose actions are replaced by random ones with probability epsilon."""
     v = np.zeros(mdp.num_states)
     for _ in range(_SWEEPS):
         q = backup(mdp, v, gamma)
@@ -65,8 +65,7 @@ def optimum_of_epsilon(mdp: Mdp, gamma: float, epsilon: float) -> BoolArray:
         change, v = np.abs(new - v).max(), new
         if change <= 1e-12:
             break
-    q = backup(mdp, v, gamma)
-    return np.asarray(q >= q.max(axis=1, keepdims=True) - 1e-9)
+    return backup(mdp, v, gamma)
 
 
 def sweeps_missing(run: Evidence) -> int:

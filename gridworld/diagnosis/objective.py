@@ -8,10 +8,10 @@ from gridworld.diagnosis.evidence import Evidence, entropy
 from gridworld.diagnosis.experiments import entropy_optimum, optimum_of_epsilon
 from gridworld.diagnosis.finding import Finding, costliest
 from gridworld.world.bellman import pick
+from gridworld.world.discounts import fitting_discounts
 from gridworld.world.mdp import BoolArray, FloatArray
-from gridworld.world.solver import value_iteration
+from gridworld.world.solver import solved
 
-_GAMMAS = (0.8, 0.9, 0.95, 0.97, 0.99)
 _CLEARER = 5  # times the gap
 _FAINT = 1e-3  # of the largest reward: less than a network's values resolve
 _SPREAD = 0.5  # of the entropy of a uniform policy
@@ -39,7 +39,7 @@ def hopeless_gamma(run: Evidence) -> Finding | None:
 
 def faint_gamma(run: Evidence) -> Finding | None:
     """Under its own discount, actions differ by less than a network errs, and under another by much more."""
-    return None if run.is_tabular else _faint(run, np.abs(run.q - run.own.q).max(axis=1))
+    return _faint(run, np.abs(run.q - run.own.q).max(axis=1))
 
 
 def _faint(run: Evidence, limit: FloatArray) -> Finding | None:
@@ -50,15 +50,15 @@ def _faint(run: Evidence, limit: FloatArray) -> Finding | None:
         return None
     worst = costliest(run, states)
     why = (
-        f"with its gamma of {run.gamma:g} the right action is worth only {run.gap[worst]:.2g} more, which "
-        f"its values do not resolve; with {better:g} it is {clear[worst]:.2g}"
+        f"with its gamma of {run.gamma:g} the right action is worth only {run.gap[worst]:.2g} more, less "
+        f"than its values err; with {better:g} it is {clear[worst]:.2g}"
     )
     return Finding("objective", states, why, (run.change("gamma", better),))
 
 
 def gap_under(run: Evidence, gamma: float) -> FloatArray:
     """(S,), what the greedy action loses under a discount."""
-    best = run.own if gamma == run.gamma else value_iteration(run.mdp, gamma)
+    best = solved(run.mdp, gamma)
     gap: FloatArray = best.v - pick(best.q, run.greedy)
     return gap
 
@@ -70,12 +70,8 @@ def clearest_gamma(run: Evidence, states: BoolArray) -> float:
         run: the run.
         states: (S,), bool, where it errs.
     """
-    best = run.evaluator.solution
-    found: dict[float, float] = {}
-    for gamma in dict.fromkeys((*_GAMMAS, best.gamma)):
-        optimal = best.optimal if gamma == best.gamma else value_iteration(run.mdp, gamma).optimal
-        if not (optimal & ~best.optimal)[run.acting].any():
-            found[gamma] = float(np.min(gap_under(run, gamma)[states], initial=np.inf))
+    gammas = fitting_discounts(run.evaluator)
+    found = {gamma: float(np.min(gap_under(run, gamma)[states], initial=np.inf)) for gamma in gammas}
     return max(found, key=lambda each: found[each])
 
 
@@ -101,9 +97,13 @@ def too_much_epsilon(run: Evidence) -> Finding | None:
     epsilon = run.setting("exploration_final_eps")
     if run.config.agent.algorithm not in ("sarsa", "expected_sarsa") or epsilon <= 0:
         return None
-    optimal = optimum_of_epsilon(run.mdp, run.gamma, epsilon)
-    states = run.split.wrong & optimal[np.arange(len(optimal)), run.greedy]
+    q = optimum_of_epsilon(run.mdp, run.gamma, epsilon)
+    gap = q.max(axis=1) - pick(q, run.greedy)
+    unresolved = (gap < np.abs(run.q - q).max(axis=1)) & (run.gap > _CLEARER * gap)
+    states = run.split.wrong & ((gap <= 1e-9) | unresolved)
     if not states.any():
         return None
-    why = f"what it does is optimal for an agent that acts at random with probability {epsilon:g}, as it does"
+    why = (
+        f"it learns what is optimal for an agent that acts at random with probability {epsilon:g}, as it does"
+    )
     return Finding("epsilon", states, why, (run.change("exploration_final_eps", epsilon / 10),))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridworld.diagnosis.causes import CAUSES
+from gridworld.diagnosis.causes import CAUSES, PHRASES
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.finding import Finding
 from gridworld.diagnosis.split import RegretSplit
@@ -46,6 +46,16 @@ class Diagnosis:
     def cause(self) -> str | None:
         """The name of the first cause; None for a certified run."""
         return self.findings[0].cause if self.findings else None
+
+    @property
+    def phrase(self) -> str | None:
+        """The first cause in about four words; None for a certified run."""
+        return PHRASES[self.cause] if self.cause else None
+
+    @property
+    def first_change(self) -> str:
+        """The word for a command line to try first; "" where there is none."""
+        return next((each.changes[0] for each in self.findings[:1] if each.changes), "")
 
     def sentence(self) -> str:
         """The verdict in one sentence."""

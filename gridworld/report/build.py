@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import gridworld
@@ -16,6 +16,7 @@ from gridworld.report.analysis.analyse import Overall, TaskAnalysis, analyse
 from gridworld.report.embedded_images import changed_pictures
 from gridworld.report.evidence.discovery import find_runs
 from gridworld.report.evidence.grouping import Study, arrange
+from gridworld.report.evidence.reasons import Reasons
 from gridworld.report.evidence.run_reader import Evidence, Unusable, read
 from gridworld.report.evidence.tuning_study import TuningStudy, find_tunings
 
@@ -32,6 +33,7 @@ class Report:
     notes: tuple[str, ...]
     seed: int  # of the bootstrap
     tunings: tuple[TuningStudy, ...] = ()
+    reasons: Reasons = field(default_factory=dict)  # of runs that are not certified
 
     @property
     def complete(self) -> bool:

@@ -90,6 +90,7 @@ def render(report: Report, drawn: dict[str, list[Chart]]) -> str:
         if report.overall
         else [],
         unusable=tables.unusable_table(report.unusable),
+        reasons=tables.reasons_table(report.study, report.reasons),
         runs=tables.runs_table(report.study),
         settings=tables.settings_table(report.study),
         resamples=f"{RESAMPLES:,}",

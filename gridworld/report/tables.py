@@ -9,14 +9,15 @@ from gridworld.report.analysis.analyse import Comparison, Overall, Result, TaskA
 from gridworld.report.analysis.metrics import BY_KEY, METRICS
 from gridworld.report.analysis.statistics import Share
 from gridworld.report.evidence.grouping import Study, differing, learning_key
+from gridworld.report.evidence.reasons import Reasons, most_common
 from gridworld.report.evidence.run_reader import Unusable
 from gridworld.report.table import NOTHING, Cell, Estimate, Table, number, steps_up_to
 
 _SCORES = tuple(metric.key for metric in METRICS if metric.key not in ("regret", "steps"))
 
 
-def results_table(tasks: Sequence[TaskAnalysis]) -> Table:
-    """The main results on all tasks; also the table for a README."""
+def results_table(tasks: Sequence[TaskAnalysis], reasons: Reasons) -> Table:
+    """The main results on all tasks; also the table for a README. `reasons` are of runs not certified."""
     shown = [("regret", "iqm"), ("steps", "median")]
     rows: list[list[Cell]] = [
         [
@@ -25,11 +26,13 @@ def results_table(tasks: Sequence[TaskAnalysis]) -> Table:
             result.certified,
             result.ever,
             *(estimate(result, *which) for which in shown),
+            *([most_common(result.group, reasons)] if reasons else []),
         ]
         for task in tasks
         for result in task.results
     ]
     columns = ["task", "agent", "seeds certified", "ever certified", *(_heading(*which) for which in shown)]
+    columns += ["why not"] if reasons else []
     return Table("results", "Certified seeds, exact regret and steps, with 95 % intervals", columns, rows)
 
 
@@ -151,6 +154,20 @@ def runs_table(study: Study) -> Table:
         "folder",
     ]
     return Table("runs", "Every run that is counted", columns, rows)
+
+
+def reasons_table(study: Study, reasons: Reasons) -> Table:
+    """A row for each run whose reason is known."""
+    rows: list[list[Cell]] = [
+        [group.agent, group.task, run.seed, run.regret, reason.cause, reason.change]
+        for group in study.groups
+        for run in group.runs
+        if (reason := reasons.get(run.folder)) is not None
+    ]
+    missing = sum(not run.certified for group in study.groups for run in group.runs) - len(rows)
+    rest = f"; {missing} more were not looked into, see --diagnose" if missing else ""
+    columns = ["agent", "task", "seed", "regret", "largest cause", "to try"]
+    return Table("not certified", f"Why runs are not certified{rest}", columns, rows)
 
 
 def unusable_table(unusable: Sequence[Unusable]) -> Table:

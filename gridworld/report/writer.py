@@ -128,7 +128,7 @@ def check_markers(path: Path) -> None:
 def write_readme(report: Report, path: Path) -> None:
     """Put the table of results between the two markers of a Markdown file; see `check_markers`."""
     before, after = _around_markers(path)
-    table = to_markdown(tables.results_table(report.tasks))
+    table = to_markdown(tables.results_table(report.tasks, report.reasons))
     write_text(path, f"{before}{MARKERS[0]}\n{table}{MARKERS[1]}{after}")
 
 
@@ -146,10 +146,12 @@ def _around_markers(path: Path) -> tuple[str, str]:
 
 
 def _tables(report: Report) -> Iterator[Table]:
-    yield tables.results_table(report.tasks)
+    yield tables.results_table(report.tasks, report.reasons)
     yield tables.answer_table(report.study, report.tasks)
     yield tables.runs_table(report.study)
     yield tables.unusable_table(report.unusable)
+    if report.reasons:
+        yield tables.reasons_table(report.study, report.reasons)
     yield tables.settings_table(report.study)
     for task in report.tasks:
         yield tables.task_table(task)

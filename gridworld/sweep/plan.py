@@ -27,7 +27,7 @@ from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig
 from gridworld.errors import InputError
 from gridworld.storage.safe_read import sha256
-from gridworld.training.setup import check_settings
+from gridworld.training.setup import check_settings, objective_note
 from gridworld.world.mdp import Mdp
 
 _LONGEST_NAME = 100  # characters of a job's folder
@@ -47,6 +47,7 @@ class Job:
     progress: bool  # whether its settings ask for a progress line
     shape: str | None = None  # equal for jobs that can train as one population; None: it trains alone
     memory: int = 0  # bytes, about, that it takes while it trains
+    note: str | None = None  # what to say before training
 
 
 def expand(
@@ -159,21 +160,30 @@ def plan(
             worlds[key] = env.compile()
         return worlds[key]
 
+    notes: dict[str, str | None] = {}
+
+    def noted(config: TrainConfig, mdp: Mdp) -> str | None:
+        key = repr((config.env, config.evaluation.gamma, getattr(config.agent, "gamma", None)))
+        if config.logging.progress and key not in notes:
+            notes[key] = objective_note(config, mdp)
+        return notes.get(key)
+
     planned: dict[str, Job] = {}
     for overrides, swept in jobs:
         config = configure(overrides)
-        mistake, layout, memory = None, "", 0
+        mistake, note, layout, memory = None, None, "", 0
         try:
             mdp = check_settings(config, world)
             layout, memory = (
                 mdp.text(),
                 config.agent.memory(mdp.num_states, config.n_envs, config.total_timesteps),
             )
+            note = noted(config, mdp)
         except InputError as error:
             mistake = str(error)
         digest = settings_hash(dataclasses.asdict(config), layout)
         progress = config.logging.progress
-        job = Job(tuple(overrides), tuple(swept), digest, mistake, progress, shape(config), memory)
+        job = Job(tuple(overrides), tuple(swept), digest, mistake, progress, shape(config), memory, note)
         planned.setdefault(digest, job)
     return list(planned.values())
 

@@ -21,7 +21,7 @@ from gridworld.config.sweep import SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.errors import EXIT_CODE, FolderLostError, InputError, reason
 from gridworld.process.signals import exiting, signal_name
-from gridworld.process.terminal import tell_error
+from gridworld.process.terminal import tell, tell_error
 from gridworld.sweep import console
 from gridworld.sweep.config_loader import SweepLoader
 from gridworld.sweep.folder import JobEntry, SweepFolder
@@ -81,6 +81,8 @@ def run_sweep(
     _refuse_mistakes(jobs, settings)
     folder.check(jobs, settings.extend)
     populations([], settings, master.hydra)  # finds a mistake
+    if notes := [job.note for job in jobs if job.note is not None]:
+        tell(f"{notes[0]} (of {len(jobs)} jobs, {len(notes)} cannot be certified)")
     try:
         with folder.at_work():
             entries = folder.add(jobs, words)

@@ -10,8 +10,13 @@ from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.rendering import frame_size
 from gridworld.envs.statistics_env import StatisticsVectorEnv
+from gridworld.errors import InputError
 from gridworld.visualization.video import require_video
+from gridworld.world.discounts import fitting_discounts, score_of_optimum
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
+
+_QUICKLY_SOLVED = 6000  # outcomes of all states and actions
 
 
 def make_context(
@@ -61,6 +66,33 @@ def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = comp
     config.env.step_limit(mdp)
     check_recording(config, mdp)
     return mdp
+
+
+def objective_note(config: TrainConfig, mdp: Mdp) -> str | None:
+    """Say that no agent with this discount can be certified, if that is so.
+
+    Args:
+        config: the settings of a run.
+        mdp: its world; one that takes longer than some tens of milliseconds to solve is not looked at.
+
+    Returns:
+        The sentence, with what would be right; None: the agent has no discount, or its optimum is certified.
+    """
+    gamma, judged = getattr(config.agent, "gamma", None), config.evaluation.gamma
+    if gamma in (None, judged) or mdp.probability.size > _QUICKLY_SOLVED:
+        return None
+    judge = Evaluator(mdp, judged, config.env.step_limit(mdp))
+    try:
+        score = score_of_optimum(judge, float(gamma))
+    except InputError:  # no finite optimum
+        return None
+    if score.certified:
+        return None
+    key, right = config.agent.key("gamma"), fitting_discounts(judge)[0]
+    return (
+        f"{key.lstrip('+')}={gamma:g}: what is optimal under it has a regret of {score.regret:.2g} under "
+        f"evaluation.gamma={judged:g}, too much for a certificate; take {key}={right:g}"
+    )
 
 
 def check_recording(config: TrainConfig, mdp: Mdp) -> None:

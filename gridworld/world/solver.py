@@ -29,7 +29,7 @@ TIE = 1e-9
 _SWEEP_TOLERANCE = 1e-3  # sweeps need only find a good policy; the rest is solved exactly
 _IMPROVEMENT = 1e-11  # relative; less than that is rounding
 _PATIENT = 100.0  # steps; a longer horizon, 1 / (1 - γ), adds up more of what counts as a tie in one step
-_MOST_SOLUTIONS = 4  # of a world that are kept
+_MOST_SOLUTIONS = 8  # of a world that are kept
 _NOTHING = 1e-290  # a value that has faded so far is 0: the smallest numbers of all never get smaller
 
 

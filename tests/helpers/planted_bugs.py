@@ -121,6 +121,17 @@ class PPOColumnsSwapped(PPO):
     policy_aliases: ClassVar = {"MlpPolicy": _ActsOnSwapped}
 
 
+class _ActsOnReversed(ActorCriticPolicy):
+    def forward(self, obs: torch.Tensor, deterministic: bool = False) -> Any:
+        return super().forward(obs.flip(1))
+
+
+class PPOColumnsReversed(PPO):
+    """It sees all columns in the opposite order when it acts."""
+
+    policy_aliases: ClassVar = {"MlpPolicy": _ActsOnReversed}
+
+
 class PPOFrozenLayer(PPO):
     """The first layer of the policy has no gradient."""
 
@@ -253,6 +264,19 @@ class DQNFrozenLayer(DQN):
         self.q_net.q_net[-1].requires_grad_(False)
 
 
+class DQNDeadUnits(DQN):
+    """The units of the first layer never fire."""
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        for net in (self.q_net, self.q_net_target):
+            torch.nn.init.constant_(net.q_net[0].bias, -100.0)
+
+
+class QuietDQN(DQN):
+    """No bug at all."""
+
+
 class DQNColumnsSwapped(DQN):
     """It sees the first two columns in another order when it acts in training."""
 
@@ -298,6 +322,7 @@ CAUGHT: dict[type, tuple[str, ...]] = {
     PPOOnlyRewards: ("delay", "discount"),
     PPOTimeoutsAreEnds: ("truncation",),
     PPOColumnsSwapped: ("behaviour",),
+    PPOColumnsReversed: ("behaviour",),
     PPOFrozenLayer: ("layers",),
     PPONoValueLoss: ("constant",),
     PPOBlind: ("context",),
@@ -312,6 +337,7 @@ CAUGHT: dict[type, tuple[str, ...]] = {
     DQNGammaForgotten: ("discount",),
     EpsilonNeverFalls: ("behaviour",),
     DQNFrozenLayer: ("layers",),
+    DQNDeadUnits: ("context",),
     DQNColumnsSwapped: ("behaviour",),
     WorstAction: ("choice",),
     MeanOfNext: ("alternation",),

@@ -40,6 +40,7 @@ from gridworld.report.charts.overall_charts import overall_charts
 from gridworld.report.charts.style import house_style, line_count, styles, text_width, wrapped_apart
 from gridworld.report.charts.sweep_charts import sweep_charts
 from gridworld.report.charts.task_charts import task_charts
+from gridworld.report.evidence.reasons import Reason, reasons
 from gridworld.report.evidence.run_reader import Evidence, read
 from gridworld.report.evidence.tuning_study import find_tunings
 from gridworld.report.page import charts, render
@@ -99,6 +100,33 @@ def test_real_runs_are_reported(tmp_path: Path) -> None:
             assert row["first certificate"] == str(summary["first_certified_step"] or "")
     page = (folder / "report.html").read_text()
     assert page.count('src="data:image/png;base64,') == 2 * 3  # a median seed's maps for each agent
+    assert [row["why not"] for row in results] == ["too few steps (2 of 2)"] * 2
+    why = rows_of(folder / "tables" / "not_certified.csv")
+    assert {(row["agent"], row["seed"], row["to try"]) for row in why} == {
+        (agent, seed, "total_timesteps=20000") for agent, seed in runs
+    }
+    assert "Why runs are not certified" in page
+
+
+def test_reasons_are_asked_of_each_cell_before_the_second_of_any(maker: Maker, tmp_path: Path) -> None:
+    for seed in range(4):
+        maker.write(tmp_path / f"a{seed}", seed, 1000 if seed == 0 else math.inf)
+        maker.write(tmp_path / f"b{seed}", seed, math.inf, agent__learning_rate=0.001)
+    report = gather([tmp_path])
+    asked: list[str] = []
+
+    def ask(folder: Path) -> Reason | None:
+        asked.append(folder.name)
+        return None if folder.name == "b0" else Reason(f"cause {folder.name > 'a1'}", "seed=1")
+
+    found = reasons(report.study.groups, ask, 5)
+    assert sorted(asked[:2]) == ["a1", "b0"]
+    assert sorted(asked) == ["a1", "a2", "b0", "b1", "b2"]
+    table = tables.results_table(report.tasks, found)
+    assert table.columns[-1] == "why not"
+    assert [row[-1] for row in table.rows] == ["cause True (2 of 2)", "cause False (1 of 2)"]
+    assert "; 3 more were not looked into" in tables.reasons_table(report.study, found).caption
+    assert "why not" not in tables.results_table(report.tasks, {}).columns
 
 
 def test_runs_that_differ_are_reported_apart_and_the_report_says_so(tmp_path: Path) -> None:

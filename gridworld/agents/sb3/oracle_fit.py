@@ -7,8 +7,10 @@ exploration, no bootstrapping, no moving target.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +19,7 @@ from torch import Tensor
 
 from gridworld.agents import Agent
 from gridworld.agents.sb3.agent import SB3Agent
-from gridworld.agents.sb3.policy_outputs import read
+from gridworld.agents.sb3.policy_outputs import Reading, read
 from gridworld.world.mdp import IntArray
 from gridworld.world.solver import Solution
 
@@ -42,78 +44,151 @@ def oracle_fit(
     Returns:
         Whether the greedy actions became optimal; None: the network is too large to say in time.
     """
-    assert isinstance(agent, SB3Agent)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        policy = copy.deepcopy(agent.model.policy)
+    fit = _Fit.of(agent, best, states, advantages=True)
+    if fit is None:
+        return None
+    elsewhere = np.argmax(best.q, axis=1)
+
+    def is_done(found: IntArray) -> bool:
+        actions = elsewhere.copy()
+        actions[states] = found
+        return is_optimal(actions)
+
+    return fit.run(lambda found: fit.error(found, slice(None)), is_done, fresh)
+
+
+class OneState(NamedTuple):
+    """What comes of teaching a network one state only."""
+
+    told_apart: bool  # it can be right there while all others are held where they are
+    spoilt: IntArray  # (k,), states that were right and are not, where nothing holds the others
+
+
+def one_state_fit(agent: Agent, best: Solution, states: IntArray, state: int) -> OneState | None:
+    """Fit a copy of a model's network, from its own weights, to the optimum in one state.
+
+    Args:
+        agent: an `SB3Agent`; stays as it is.
+        best: the optimum under the agent's own discount.
+        states: (n,), those that an episode can come to.
+        state: one of them, where it errs.
+
+    Returns:
+        What came of it; None: the network is too large to say in time.
+    """
+    fit = _Fit.of(agent, best, states, advantages=False)
+    if fit is None:
+        return None
+    here, rows, right = int(np.flatnonzero(states == state)[0]), np.arange(len(states)), best.optimal[states]
+    with torch.no_grad():
+        before = read(fit.policy, fit.observations)
+    last = _greedy(before)
+    was_right = right[rows, last]
+
+    def no_other_is_lost(found: IntArray) -> bool:
+        return bool(right[rows, found][was_right | (rows == here)].all())
+
+    def is_right_there(found: IntArray) -> bool:
+        nonlocal last
+        last = found
+        return bool(right[here, found[here]])
+
+    told_apart = fit.run(lambda found: fit.error(found, [here]) + _moved(found, before), no_other_is_lost)
+    fit.run(lambda found: fit.error(found, [here]), is_right_there)
+    return OneState(told_apart, states[was_right & ~right[rows, last]])
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Supervised fits of one network to the exact answer of n states.
+
+    Attributes:
+        policy: it; every fit takes a copy.
+        observations: of the states.
+        q: (n, A); or advantages, in units of their deviation: a scale that no network finds hard.
+        optimal: (n, A), 1 for the optimal actions.
+        steps: of a fit.
+    """
+
+    policy: BasePolicy
+    observations: Any
+    q: Tensor
+    optimal: Tensor
+    steps: int
+
+    @classmethod
+    def of(cls, agent: Agent, best: Solution, states: IntArray, advantages: bool) -> _Fit | None:
+        """Prepare them; None: the network is too large to be fitted in time."""
+        assert isinstance(agent, SB3Agent)
+        policy = agent.model.policy
         weights = sum(each.numel() for each in policy.parameters())
         steps = int(min(_STEPS, _WORK / (weights * len(states))))
         if steps < _FEWEST:
             return None
-        if fresh:
-            _renew(policy)
         observations, _ = policy.obs_to_tensor(agent.observation.rows(states))
-        greedy = np.argmax(best.q, axis=1)
-        return _fit(
-            policy,
-            observations,
-            _Targets(best, states),
-            steps,
-            lambda actions: is_optimal(_placed(greedy, states, actions)),
-        )
-
-
-class _Targets:
-    """The exact answer of n states.
-
-    Attributes:
-        q: (n, A), advantages in units of their deviation: a scale that no network finds hard.
-        optimal: (n, A), 1 for the optimal actions.
-    """
-
-    def __init__(self, best: Solution, states: IntArray) -> None:
-        q = best.q[states] - best.v[states][:, None]
+        q = best.q[states] - (best.v[states][:, None] if advantages else 0.0)
         q = np.where(np.isfinite(q), q, 0.0)
-        self.q = torch.tensor(q / max(float(q.std()), 1e-12), dtype=torch.float32)
-        self.optimal = torch.tensor(best.optimal[states], dtype=torch.float32)
+        tables = (q / (max(float(q.std()), 1e-12) if advantages else 1.0), best.optimal[states])
+        scaled, optimal = (torch.tensor(table, dtype=torch.float32) for table in tables)
+        return cls(policy, observations, scaled, optimal, steps)
 
-    def loss(self, policy: BasePolicy, observations: Any) -> tuple[Tensor, Tensor]:
-        """What to descend, and the greedy actions (n,)."""
-        found = read(policy, observations)
+    def error(self, found: Reading, where: Any) -> Tensor:
+        """How far an answer is from the exact one in some of the states."""
         if found.probabilities is not None:
-            right = (found.probabilities * self.optimal).sum(dim=1).clamp_min(1e-12)
-            return -right.log().mean(), found.probabilities.argmax(dim=1)
+            right = (found.probabilities * self.optimal)[where].sum(dim=1).clamp_min(1e-12)
+            return -right.log().mean()
         assert found.q is not None
-        return ((found.q - self.q) ** 2).mean(), found.q.argmax(dim=1)
+        return ((found.q - self.q)[where] ** 2).mean()
+
+    def run(
+        self, loss: Callable[[Reading], Tensor], is_done: Callable[[IntArray], bool], fresh: bool = False
+    ) -> bool:
+        """Descend a loss until the greedy actions (n,) will do; False: they never did."""
+        with torch.random.fork_rng(devices=[]), _one_thread():
+            torch.manual_seed(0)
+            policy = copy.deepcopy(self.policy)
+            if fresh:
+                _renew(policy)
+            for weights in policy.parameters():
+                weights.requires_grad_(True)
+            optimizer = torch.optim.Adam(policy.parameters(), lr=_RATE)
+            for step in range(self.steps + 1):
+                found = read(policy, self.observations)
+                if step % _EVERY == 0 and is_done(_greedy(found)):
+                    return True
+                optimizer.zero_grad()
+                loss(found).backward()  # type: ignore[no-untyped-call]
+                optimizer.step()
+        return False
 
 
-def _fit(
-    policy: BasePolicy,
-    observations: Any,
-    targets: _Targets,
-    steps: int,
-    is_optimal: Callable[[IntArray], bool],
-) -> bool:
-    for weights in policy.parameters():
-        weights.requires_grad_(True)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=_RATE)
-    for step in range(steps + 1):
-        loss, actions = targets.loss(policy, observations)
-        if step % _EVERY == 0 and is_optimal(actions.numpy()):
-            return True
-        optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-    return False
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """For networks as small as these: threads would wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _greedy(found: Reading) -> IntArray:
+    known = found.q if found.probabilities is None else found.probabilities
+    assert known is not None
+    return np.asarray(known.argmax(dim=1).numpy())
+
+
+def _moved(found: Reading, before: Reading) -> Tensor:
+    """How far an answer is from an earlier one."""
+    if found.probabilities is not None and before.probabilities is not None:
+        return -(before.probabilities * found.probabilities.clamp_min(1e-12).log()).sum(dim=1).mean()
+    assert found.q is not None
+    assert before.q is not None
+    return ((found.q - before.q) ** 2).mean()
 
 
 def _renew(policy: BasePolicy) -> None:
     for module in policy.modules():
         if callable(reset := getattr(module, "reset_parameters", None)):
             reset()
-
-
-def _placed(actions: IntArray, states: IntArray, found: IntArray) -> IntArray:
-    placed = actions.copy()
-    placed[states] = found
-    return placed

@@ -117,6 +117,10 @@ class SB3ClassConfig(SB3Config):
         """The discount it learns with; 0.99 is the default of all of SB3's classes."""
         return float(self.arguments.get("gamma", 0.99))
 
+    def key(self, name: str) -> str:
+        """See `AgentConfig.key`."""
+        return f"{'' if name in self.arguments else '+'}agent.arguments.{name}"
+
 
 @dataclass
 class SB3CheckedConfig(SB3Config):

@@ -1,0 +1,37 @@
+"""Whether the discount that an agent learns with leads to the optimum that it is judged by.
+
+Another discount may make another policy optimal: a shorter horizon takes a risk, or a detour, that a longer
+one does not. Then no agent that learns perfectly can be certified.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gridworld.world.evaluation import Evaluator, Score
+from gridworld.world.markov_chain import one_hot_policy
+from gridworld.world.solver import solved
+
+_USUAL = (0.8, 0.9, 0.95, 0.97, 0.99)
+
+
+def score_of_optimum(judge: Evaluator, gamma: float) -> Score:
+    """Score the optimum under a discount; of actions that are equally good under it, the judge's best.
+
+    Args:
+        judge: evaluates under the discount that counts.
+        gamma: the agent's.
+
+    Raises:
+        InputError: there is no finite optimum under it.
+    """
+    mdp, best = judge.mdp, judge.solution
+    own = solved(mdp, gamma)
+    rank = np.where(own.optimal, np.maximum(best.q, np.finfo(np.float64).min), -np.inf)
+    return judge.score(one_hot_policy(rank.argmax(axis=1), mdp.num_actions))
+
+
+def fitting_discounts(judge: Evaluator) -> list[float]:
+    """Of the usual discounts and the judge's own, ascending, those whose optimum is certified."""
+    gammas = sorted({*_USUAL, judge.solution.gamma})
+    return [gamma for gamma in gammas if score_of_optimum(judge, gamma).certified]
