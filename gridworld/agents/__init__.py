@@ -1,6 +1,6 @@
 """Agents: what learns. An algorithm family is one package here; nothing outside knows how it works.
 
-A family is the package `gridworld.agents.<family>` with the five functions of `Family`. It is found by the
+A family is the package `gridworld.agents.<family>` with the functions of `Family`. It is found by the
 `family` of an agent's settings. Importing a family, and asking it for its schemas or to check settings, must
 not import torch.
 """
@@ -136,6 +136,9 @@ class Family(Protocol):
         Raises:
             InputError: the first setting that could not train as it says.
         """
+
+    def import_for(self, config: AgentConfig) -> None:
+        """Import what training takes; settings that cannot work are left for the run to refuse."""
 
     def rehearse(self, config: TrainConfig, make_context: Callable[[int], TrainingContext]) -> None:
         """Try out the settings that `check` cannot judge.

@@ -21,6 +21,15 @@ class SweepConfig:
     paired: list[Any] = field(default_factory=list)  # swept settings that vary together, or lists of such
     population: Optional[Union[int, str]] = "auto"  # noqa: UP007, UP045  # runs that train as one; 1: each alone
     together: list[str] = field(default_factory=list)  # the sweeper's own: the jobs of a population
+    in_fork: bool = False  # the sweeper's own: these may run in a fork
+
+
+@dataclass
+class ForksConfig:
+    """`hydra/launcher=forks`, the default: populations side by side in forks of one process, on Linux."""
+
+    _target_: str = "hydra_plugins.gridworld_sweeper.ForksLauncher"
+    n_jobs: int = -1
 
 
 @dataclass
@@ -59,4 +68,9 @@ class RayConfig:
     remote: dict[str, Any] = field(default_factory=dict)
 
 
-LAUNCHER_SCHEMAS: dict[str, type] = {"joblib": JoblibConfig, "slurm": SlurmConfig, "ray": RayConfig}
+LAUNCHER_SCHEMAS: dict[str, type] = {
+    "forks": ForksConfig,
+    "joblib": JoblibConfig,
+    "slurm": SlurmConfig,
+    "ray": RayConfig,
+}

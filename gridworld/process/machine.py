@@ -15,6 +15,11 @@ def core_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def worker_count(asked: int) -> int:
+    """How many workers `n_jobs` asks for: so many, or below 0 one for each core but `-1 - n_jobs`."""
+    return asked if asked > 0 else max(1, core_count() + 1 + asked)
+
+
 def free_memory() -> int:
     """Bytes that programs can still have; half of all where the system does not tell."""
     with contextlib.suppress(OSError):

@@ -109,6 +109,49 @@ def send_sigterm(number: int = 0, frame: FrameType | None = None) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
 
+def relay(number: int, times: int, process: int) -> None:
+    """Have another process, which has called `obey_relay`, take a signal as often as this one did.
+
+    Args:
+        number: SIGINT or SIGTERM.
+        times: how many of both have come here so far, 1 or 2.
+        process: its id.
+    """
+    os.kill(process, _relayed(number, times))
+
+
+def obey_relay() -> None:
+    """From here on, exit with 128 + their number at SIGINT and SIGTERM, and take those that are relayed.
+
+    A terminal sends Ctrl-C to all of its processes, `kill` to one. So one that is relayed is left alone where
+    as many have come here by themselves. For the main thread of a process that has nothing to clean up.
+    """
+    _received.clear()
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        _received.append(number)
+        raise SystemExit(128 + number)
+
+    def take(relayed: int, frame: FrameType | None) -> None:
+        times, which = divmod(relayed - signal.SIGRTMIN, len(_RELAYED))
+        if len(_received) < times:
+            signal.raise_signal(_RELAYED[which])
+
+    for number in _RELAYED:
+        signal.signal(number, stop)
+        for times in (1, 2):
+            signal.signal(_relayed(number, times), take)
+
+
+def _relayed(number: int, times: int) -> int:
+    """The signal that stands for a relayed one; Python handles it after those that it stands for."""
+    return signal.SIGRTMIN + len(_RELAYED) * times + _RELAYED.index(signal.Signals(number))
+
+
+_RELAYED = (signal.SIGINT, signal.SIGTERM)
+_received: list[int] = []  # of these, by this process, once it has called `obey_relay`
+
+
 def _set_alarm(seconds: float) -> None:
     """Send SIGALRM to this process after so many seconds, 0 for never, where there is such a signal."""
     if _HAS_ALARM:
@@ -190,6 +233,7 @@ class _Listeners:
             _listeners.remove(self)
 
     def _asked(self, number: int, frame: FrameType | None) -> None:
+        _received.append(number)
         running = _inside.get()
         again = self._requests[0].number is not None
         for request in self._requests:

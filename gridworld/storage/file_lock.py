@@ -23,6 +23,17 @@ _SECONDS_BETWEEN_TRIES = 0.02
 Held = dict[str, int]  # paths of lock files, and their inodes: in use as long as somebody has the file open
 
 _held: Held = {}  # by this process, or by the one that it works for
+_files: set[int] = set()  # the descriptors of this process's own
+
+
+def _leave_to_parent() -> None:
+    """In a fork: close the files, with which the locks would outlive the parent. The fork works for it."""
+    while _files:
+        os.close(_files.pop())
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_to_parent)
 
 
 @contextmanager
@@ -97,9 +108,11 @@ def work_for(holder: Held) -> None:
 def _noted(path: Path, file: int) -> Iterator[None]:
     where, before = os.path.abspath(path), dict(_held)
     _held[where] = os.fstat(file).st_ino
+    _files.add(file)
     try:
         yield
     finally:
+        _files.discard(file)
         if where in before:  # a shared one, which this process has twice
             _held[where] = before[where]
         else:

@@ -72,6 +72,12 @@ class BasicLauncher(_OwnLauncher, Launcher):
     _module = "in_process"
 
 
+class ForksLauncher(_OwnLauncher, Launcher):
+    """Runs jobs side by side in forks of this process."""
+
+    _module = "on_forks"
+
+
 class JoblibLauncher(_OwnLauncher, Launcher):
     """Runs jobs side by side on this machine."""
 

@@ -47,6 +47,7 @@ class Job:
     progress: bool  # whether its settings ask for a progress line
     shape: str | None = None  # equal for jobs that can train as one population; None: it trains alone
     memory: int = 0  # bytes, about, that it takes while it trains
+    in_fork: bool = False  # whether it may run in a fork of the process that plans it
     note: str | None = None  # what to say before training
 
 
@@ -183,9 +184,25 @@ def plan(
             mistake = str(error)
         digest = settings_hash(dataclasses.asdict(config), layout)
         progress = config.logging.progress
-        job = Job(tuple(overrides), tuple(swept), digest, mistake, progress, shape(config), memory, note)
+        job = Job(
+            tuple(overrides),
+            tuple(swept),
+            digest,
+            mistake,
+            progress,
+            shape=shape(config),
+            memory=memory,
+            in_fork=_in_fork(config),
+            note=note,
+        )
         planned.setdefault(digest, job)
     return list(planned.values())
+
+
+def _in_fork(config: TrainConfig) -> bool:
+    """Whether it has only our code and the libraries', and trains on one core."""
+    own_code = any(foreign_imports(dataclasses.asdict(config)))
+    return config.device == "cpu" and config.threads == 1 and not own_code
 
 
 def shape(config: TrainConfig) -> str | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,8 @@ from omegaconf import DictConfig
 
 from gridworld.config.sweep import SweepConfig
 from gridworld.errors import InputError
-from gridworld.process.machine import core_count, free_memory
+from gridworld.process.forks import can_fork
+from gridworld.process.machine import free_memory, worker_count
 from gridworld.process.together import LARGEST, run_together
 from gridworld.sweep.folder import JobEntry, SweepFolder
 from gridworld.sweep.plan import Job
@@ -31,7 +32,9 @@ from gridworld.sweep.plan import Job
 AUTO = "auto"
 _SHARE_OF_MEMORY = 4  # a population takes a fourth of what is free, shared by the workers
 _RUNS_BYTES = 16 * 2**20  # of a run beside its agent, with its pictures
+_FEWEST = 4  # runs of a population for which another core is taken
 _KEY = "hydra.sweeper.together"
+_IN_FORK = "hydra.sweeper.in_fork=true"
 
 
 @dataclass(frozen=True)
@@ -91,23 +94,32 @@ def line(folder: Path, entry: JobEntry) -> list[str]:
     return [*entry.overrides, *(f"hydra.sweep.{key}={_quoted(text)}" for key, text in where.items())]
 
 
-def lines(folder: Path, groups: Sequence[Sequence[JobEntry]], first: int) -> list[list[str]]:
+def lines(
+    folder: Path, groups: Sequence[Sequence[JobEntry]], first: int, in_fork: Container[str] = ()
+) -> list[list[str]]:
     """A launcher's overrides for each population.
 
     Args:
         folder: the sweep's.
         groups: the populations.
         first: the number of their first job, `hydra.job.num`.
+        in_fork: the jobs that may run in a fork of this process.
     """
     found = []
     for number_given, group in enumerate(groups, first):  # by the launcher, to each population
         words = line(folder, group[0])
-        if len(group) > 1 or number_given != first:
+        if len(group) > 1 or number_given != first or group[0].job in in_fork:
             names = ",".join(_quoted(f"{number}:{each.job}") for number, each in enumerate(group, first))
             words += [f"{_KEY}=[{names}]", "hydra.output_subdir=null"]
+            words += [_IN_FORK] if group[0].job in in_fork else []
         found.append(words)
         first += len(group)
     return found
+
+
+def goes_in_fork(overrides: Sequence[str]) -> bool:
+    """Whether a launcher's job may run in a fork of this process."""
+    return _IN_FORK in overrides
 
 
 def count_jobs(overrides: Sequence[str]) -> int:
@@ -132,9 +144,10 @@ def populations(
     Raises:
         InputError: `hydra.sweeper.population` is no number of runs, or `hydra.sweeper.together` is given.
     """
-    if settings.together:
+    if settings.together or settings.in_fork:
         raise InputError(
-            f"{_KEY}: tells a launcher's process its runs; leave it out, and set hydra.sweeper.population"
+            f"{_KEY if settings.together else _IN_FORK}: tells a launcher's process its runs; leave it out, "
+            "and set hydra.sweeper.population"
         )
     workers = _workers(hydra.launcher)
     memory = free_memory() / _SHARE_OF_MEMORY / workers
@@ -143,18 +156,34 @@ def populations(
         key = entry.job if job.shape is None else f"shape {job.shape}"
         shapes.setdefault(key, []).append((entry, job))
     most = _most(settings)
-    if settings.stop_at_first_failure or hydra.job.chdir or hydra.job.env_set:
-        most = 1  # which one failed first would be chance, and a process has one folder and one environment
+    if _in_turn(settings, hydra):
+        most = 1
     found = []
     for members in shapes.values():
-        bounds = [most or LARGEST, math.ceil(len(members) / workers)]
+        share = math.ceil(len(members) / workers)
+        bounds = [most or LARGEST, max(share, _FEWEST) if _forks(hydra.launcher) else share]
         if most is None:
             bounds.append(int(memory / (_RUNS_BYTES + max(job.memory for _, job in members))))
         if (own := hydra.launcher.get("jobs_per_task")) is not None:  # a task of Slurm's has its own number
             bounds.append(own)
         count = math.ceil(len(members) / max(1, min(bounds)))
+        if count > workers:
+            count = min(len(members), math.ceil(count / workers) * workers)  # so that all end at once
         found += _even([entry for entry, _ in members], count)
     return found
+
+
+def may_fork(jobs: Iterable[tuple[JobEntry, Job]], settings: SweepConfig, hydra: DictConfig) -> set[str]:
+    """The jobs, of these as for `populations`, that may run in a fork, by their folders' names."""
+    own_callbacks = len(hydra.callbacks) > 1  # in Hydra's configuration, beside ours: one object for all jobs
+    if _in_turn(settings, hydra) or own_callbacks:
+        return set()
+    return {entry.job for entry, job in jobs if job.in_fork}
+
+
+def _in_turn(settings: SweepConfig, hydra: DictConfig) -> bool:
+    """Whether jobs cannot mix: the first failure is to count, or they change what a process has only once."""
+    return bool(settings.stop_at_first_failure or hydra.job.chdir or hydra.job.env_set)
 
 
 def _even(entries: Sequence[JobEntry], count: int) -> list[list[JobEntry]]:
@@ -179,8 +208,13 @@ def _workers(launcher: DictConfig) -> int:
     """How many processes the launcher runs jobs in on this machine; of a cluster's, one for each job."""
     if launcher._target_.endswith("BasicLauncher") or "jobs_per_task" in launcher:
         return 1
-    asked = launcher.get("n_jobs") or -1
-    return asked if asked > 0 else max(1, core_count() + 1 + asked)
+    if _forks(launcher) and not can_fork():
+        return 1
+    return worker_count(launcher.get("n_jobs") or -1)
+
+
+def _forks(launcher: DictConfig) -> bool:
+    return bool(launcher._target_.endswith("ForksLauncher"))
 
 
 def _quoted(text: str) -> str:

@@ -5,6 +5,7 @@ It is read from jobs.csv, so it is the same wherever the jobs run.
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections import Counter
@@ -16,6 +17,12 @@ from gridworld.sweep.job_table import DONE, FAILED, RUNNING, JobTable
 
 _SECONDS_BETWEEN_READS = 0.5
 _SHARE_OF_TIME = 30  # reading a long table takes at most one thirtieth of the time
+
+_showing = threading.Lock()  # held by none while this process forks: what the thread has locked would stay so
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(
+        before=_showing.acquire, after_in_parent=_showing.release, after_in_child=_showing.release
+    )
 
 
 @contextmanager
@@ -44,16 +51,17 @@ def sweep_progress(
         wait = _SECONDS_BETWEEN_READS
         while not over.wait(wait):
             began = time.monotonic()
-            try:
-                changed = table.file.stat().st_mtime_ns
-            except OSError:  # somebody took the table away; the next change of a row brings it back
-                continue
-            if changed != seen:
-                seen = changed
-                rows = table.read()
-                counts = Counter(rows[job].status for job in jobs if job in rows)
-                wait = max(_SECONDS_BETWEEN_READS, _SHARE_OF_TIME * (time.monotonic() - began))
-            show(counts)
+            with _showing:
+                try:
+                    changed = table.file.stat().st_mtime_ns
+                except OSError:  # somebody took the table away; the next change of a row brings it back
+                    continue
+                if changed != seen:
+                    seen = changed
+                    rows = table.read()
+                    counts = Counter(rows[job].status for job in jobs if job in rows)
+                    wait = max(_SECONDS_BETWEEN_READS, _SHARE_OF_TIME * (time.monotonic() - began))
+                show(counts)
 
     thread = threading.Thread(target=watch, daemon=True, name="sweep progress")
     thread.start()

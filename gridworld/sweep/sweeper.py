@@ -38,7 +38,7 @@ from gridworld.sweep.job_table import (
     run_status,
 )
 from gridworld.sweep.plan import Job, expand, plan
-from gridworld.sweep.population import lines, populations
+from gridworld.sweep.population import lines, may_fork, populations
 from gridworld.sweep.progress import sweep_progress
 
 _ORPHANS_END_WITHIN = 5.0  # seconds; workers of a sweep that was killed
@@ -88,7 +88,8 @@ def run_sweep(
             entries = folder.add(jobs, words)
             mistakes = {e.job: job.mistake for e, job in zip(entries, jobs, strict=True) if job.mistake}
             by_name = {entry.job: job for entry, job in zip(entries, jobs, strict=True)}
-            sweep = _Sweep(folder, entries, launcher, partial(divided, by_name))
+            in_fork = may_fork(zip(entries, jobs, strict=True), settings, master.hydra)
+            sweep = _Sweep(folder, entries, launcher, partial(divided, by_name), in_fork)
             code = sweep.run(mistakes, settings.retry_failed, any(job.progress for job in jobs))
     except ConnectionError:
         raise  # from a cluster, not from a disk
@@ -128,11 +129,13 @@ class _Sweep:
         entries: list[JobEntry],
         launcher: Launcher,
         divided: Callable[[list[JobEntry]], list[list[JobEntry]]],
+        in_fork: set[str],
     ) -> None:
         self._folder = folder
         self._entries = entries
         self._launcher = launcher
         self._divided = divided  # into populations
+        self._in_fork = in_fork  # the jobs that may run in a fork
         self._table = JobTable(folder.path)
         self._launcher_failed = False  # before any job had begun
 
@@ -185,7 +188,8 @@ class _Sweep:
                 continue
             groups = self._divided(batch)
             try:
-                results = self._launcher.launch(lines(self._folder.path, groups, count), count)
+                jobs = lines(self._folder.path, groups, count, self._in_fork)
+                results = self._launcher.launch(jobs, count)
             except Exception as error:
                 batches = self._after_a_crash(batch, error) + batches
             else:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from gridworld.agents import TrainingContext, WriteScalars, family
+from gridworld.config.pictures import PICTURES
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.rendering import frame_size
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
+from gridworld.visualization.picture import drawer
 from gridworld.visualization.video import require_video
 from gridworld.world.discounts import fitting_discounts, score_of_optimum
 from gridworld.world.evaluation import Evaluator
@@ -45,6 +47,14 @@ def make_context(
     return TrainingContext(
         envs, observation, config.seed, config.device, config.threads, write_scalars, config.callbacks
     )
+
+
+def import_for(config: TrainConfig) -> None:
+    """Import what a run of this configuration takes, for processes that are forked from this one."""
+    family(config.agent).import_for(config.agent)
+    for picture in PICTURES:
+        if getattr(config.recording, picture.setting):
+            drawer(picture.drawer)
 
 
 def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = compiled) -> Mdp:

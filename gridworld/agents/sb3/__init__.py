@@ -5,10 +5,12 @@ Settings are checked without importing torch, as far as they can be; building an
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING
 
-from gridworld.agents.sb3.schemas import SCHEMAS, SB3CheckedConfig
+from gridworld.agents.sb3.schemas import SCHEMAS, SB3CheckedConfig, SB3Config
 from gridworld.agents.sb3.validation import check, left_to_the_class
+from gridworld.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -21,12 +23,22 @@ if TYPE_CHECKING:
     from gridworld.config.agents import AgentConfig
     from gridworld.config.train import TrainConfig
 
-__all__ = ["build", "check", "rehearse", "schemas", "weights"]
+__all__ = ["build", "check", "import_for", "rehearse", "schemas", "weights"]
 
 
 def schemas() -> dict[str, type[AgentConfig]]:
     """See `gridworld.agents.Family.schemas`."""
     return SCHEMAS
+
+
+def import_for(config: AgentConfig) -> None:
+    """See `gridworld.agents.Family.import_for`. Nothing is computed, which would keep torch from forking."""
+    from gridworld.agents.sb3 import agent  # noqa: F401
+    from gridworld.agents.sb3.constructor_arguments import algorithm_and_arguments
+
+    assert isinstance(config, SB3Config)
+    with contextlib.suppress(InputError):
+        algorithm_and_arguments(config)
 
 
 def rehearse(config: TrainConfig, make_context: Callable[[int], TrainingContext]) -> None:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gridworld.config.agents import AgentConfig
     from gridworld.config.train import TrainConfig
 
-__all__ = ["build", "check", "rehearse", "schemas", "weights"]
+__all__ = ["build", "check", "import_for", "rehearse", "schemas", "weights"]
 
 
 def schemas() -> dict[str, type[AgentConfig]]:
@@ -49,6 +49,10 @@ def check(config: TrainConfig) -> None:
     if config.device not in ("cpu", "auto"):
         raise InputError(f"device={config.device}: agent={agent.name} runs on the processor; must be cpu")
     agent.check()
+
+
+def import_for(config: AgentConfig) -> None:
+    """See `gridworld.agents.Family.import_for`. There is nothing that takes time."""
 
 
 def rehearse(config: TrainConfig, make_context: Callable[[int], TrainingContext]) -> None:

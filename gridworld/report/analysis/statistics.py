@@ -3,8 +3,11 @@
 Interquartile mean (IQM): the mean of what is left when the lowest and the highest quarter are cut off,
 `scipy.stats.trim_mean(x, 0.25)`; ⌊n/4⌋ values at either end, so the plain mean of up to three.
 
-Intervals: the 95 % percentile bootstrap, runs drawn anew within each task (the strata), by
-`scipy.stats.bootstrap`. The same draws serve every point of a curve: what is drawn is runs, not points.
+Intervals: the 95 % percentile bootstrap, runs drawn anew within each task (the strata), as
+`scipy.stats.bootstrap` does. The same draws serve every point of a curve: what is drawn is runs, not points.
+
+Both come to SciPy's bits, but by hand: a sweep ends with them, and to import `scipy.stats` takes as long as
+to train two runs of a population.
 
 Probability of improvement: P(X > Y) + P(X = Y) / 2 for a random run of either agent, the Mann-Whitney
 statistic over n·m; over several tasks, the mean of the tasks' probabilities.
@@ -24,7 +27,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
 
 from gridworld.envs.intervals import wilson_interval
 from gridworld.world.mdp import FloatArray
@@ -73,7 +75,12 @@ def median(*samples: FloatArray, axis: int = -1) -> FloatArray:
 
 def iqm(*samples: FloatArray, axis: int = -1) -> FloatArray:
     """Interquartile mean of all samples together, each (..., n)."""
-    return np.asarray(scipy.stats.trim_mean(np.concatenate(samples, axis=axis), TRIMMED, axis=axis))
+    values = np.concatenate(samples, axis=axis)
+    count = values.shape[axis]
+    cut = int(TRIMMED * count)
+    ordered = np.partition(values, (cut, count - cut - 1), axis=axis)
+    middle = np.moveaxis(np.moveaxis(ordered, axis, -1)[..., cut : count - cut], -1, axis)  # a view
+    return np.asarray(np.mean(middle, axis=axis))
 
 
 def share(count: int, total: int) -> Share:
@@ -110,20 +117,35 @@ def bands(
     if min(sample.shape[-1] for sample in finite) < 2:
         unknown = np.full(point.shape, math.nan)
         return _extended(point), unknown, unknown
-    size = sum(sample.size for sample in finite)
-    answer = scipy.stats.bootstrap(
-        finite,
-        statistic,
-        axis=-1,
-        n_resamples=resamples,
-        confidence_level=LEVEL,
-        method="percentile",
-        vectorized=True,
-        paired=False,
-        batch=max(1, _LARGEST_BATCH // size),
-        rng=np.random.default_rng(seed),
-    ).confidence_interval
-    return _extended(point), _extended(answer.low), _extended(answer.high)
+    drawn = _bootstrapped(statistic, finite, np.random.default_rng(seed), resamples)
+    tail = (1 - LEVEL) / 2
+    return _extended(point), _extended(_quantile(drawn, tail)), _extended(_quantile(drawn, 1 - tail))
+
+
+def _bootstrapped(
+    statistic: Statistic, samples: Sequence[FloatArray], chance: np.random.Generator, resamples: int
+) -> FloatArray:
+    """The statistic of samples (..., n) that are drawn anew, (..., resamples) in order of size."""
+    batch = max(1, _LARGEST_BATCH // sum(sample.size for sample in samples))
+    parts = []
+    for begun in range(0, resamples, batch):
+        rows = min(batch, resamples - begun)
+        counts = [sample.shape[-1] for sample in samples]
+        drawn = [
+            sample[..., chance.integers(0, count, (rows, count))]
+            for sample, count in zip(samples, counts, strict=True)
+        ]
+        parts.append(statistic(*drawn, axis=-1))
+    return np.sort(np.concatenate(parts, axis=-1), axis=-1)
+
+
+def _quantile(ordered: FloatArray, share: float) -> FloatArray:
+    """A quantile of ordered values (..., n), interpolated linearly: `scipy.stats.quantile`."""
+    count = ordered.shape[-1]
+    place = share * count + (1 - share) - 1  # from 0
+    below = int(place // 1)
+    weight = place % 1
+    return (1 - weight) * ordered[..., below] + weight * ordered[..., min(below + 1, count - 1)]
 
 
 def profile(samples: Sequence[FloatArray], levels: FloatArray, seed: int) -> tuple[FloatArray, ...]:

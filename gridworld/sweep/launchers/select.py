@@ -38,14 +38,12 @@ def make_launcher(context: HydraContext, task: TaskFunction, config: DictConfig)
     """
     settings = config.hydra.launcher
     choice = f"hydra/launcher={config.hydra.runtime.choices['hydra/launcher']}"
+    if settings.get("n_jobs") == 0:
+        raise InputError("hydra.launcher.n_jobs=0: must be the number of workers, or -1 for one on each core")
     if needed := _NEEDS.get(settings._target_):
         package, extra = needed
         if not _is_installed(package):
             raise InputError(f"{choice}: {package} is not installed; {install_command(extra)}")
-        if settings.get("n_jobs") == 0:
-            raise InputError(
-                "hydra.launcher.n_jobs=0: must be the number of workers, or -1 for one on each core"
-            )
         for key in _AT_LEAST_ONE:
             if settings.get(key) is not None:
                 at_least(f"hydra.launcher.{key}", settings[key], 1)
