@@ -38,7 +38,13 @@ def saved(sweep: Path) -> int:
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", ["ppo", "dqn"])
 def test_a_population_that_is_killed_comes_to_the_same(agent: str, tmp_path: Path) -> None:
-    words = (f"agent={agent}", "seed=range(10)", *RUNS, f"checkpoint.every={EVERY}", f"evaluation.every={EVERY}")
+    words = (
+        f"agent={agent}",
+        "seed=range(10)",
+        *RUNS,
+        f"checkpoint.every={EVERY}",
+        f"evaluation.every={EVERY}",
+    )
     assert train_all("calm", *words, "hydra.sweeper.population=1", cwd=tmp_path).returncode == 0
     calm = {run.parent.name: left_behind(run.parent) for run in tmp_path.glob("calm/*/summary.json")}
     assert len(calm) == 10
