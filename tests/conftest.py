@@ -10,6 +10,8 @@ from typing import Any
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # before pygame is imported
 
 import pytest
+from helpers import huge_pages
+from helpers.composing import compose_quickly
 from hypothesis import settings
 
 from gridworld.process import progress
@@ -84,9 +86,11 @@ def pytest_collection_finish() -> None:
         sys.modules["torch"].set_num_threads(1)  # networks this small take longer with more
     if "gridworld.agents.sb3.factory" in sys.modules:
         sys.modules["gridworld.agents.sb3.factory"].keep_compiler_out()
+    compose_quickly()
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000)  # 700 is Python's own
+    huge_pages.collapse()
 
 
 @pytest.hookimpl(optionalhook=True)

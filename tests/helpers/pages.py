@@ -74,7 +74,8 @@ def shortened(words: list[str]) -> list[str]:
     if any(word.startswith("resume=") for word in rest):
         return [program, *_replaced(rest, ["total_timesteps=10000"])]
     few = _FEW_STEPS[1:] if any(re.match(r"total_timesteps=.*,", word) for word in rest) else _FEW_STEPS
-    return [program, *_replaced(rest, [*few, *(_NO_PICTURES if "-m" in rest else [])])]
+    looked_at = any(word.startswith("hydra.run.dir=") for word in rest)  # by another line
+    return [program, *_replaced(rest, few if looked_at else [*few, *_NO_PICTURES])]
 
 
 def _replaced(words: list[str], others: list[str]) -> list[str]:

@@ -36,6 +36,7 @@ from multiprocessing.reduction import recv_handle
 from pathlib import Path
 from typing import Any, NoReturn
 
+import huge_pages
 import numpy as np
 import PIL.Image
 import reserve
@@ -259,6 +260,7 @@ if __name__ == "__main__":
     _end_without_finalizers()
     gc.collect()
     gc.freeze()  # so that a fork shares what is there
+    huge_pages.collapse()
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
     listener = socket.socket(fileno=int(sys.argv[1]))
     listener.set_inheritable(False)

@@ -16,6 +16,7 @@ from helpers.support import script, start
 from helpers.sweeps import rows
 
 POPULATION_KILLS = int(os.environ.get("GRIDWORLD_POPULATION_KILLS", "20"))
+EVERY = 256  # steps: checkpoints
 RUNS = (
     *("n_envs=16", "total_timesteps=1536", "evaluation.every=512", "agent.batch_size=64"),
     *("agent.log_interval=1", "recording.gif=false", "recording.frames=false", "logging.progress=false"),
@@ -26,13 +27,25 @@ def train_all(name: str, *words: str, cwd: Path) -> subprocess.CompletedProcess[
     return script("train.py", "-m", *words, f"hydra.sweep.dir={name}", cwd=cwd)
 
 
+def saved(sweep: Path) -> int:
+    """How many checkpoints its runs have come to."""
+    steps: dict[Path, int] = {}
+    for path in sweep.glob("*/checkpoints/*.state"):
+        steps[path.parent] = max(steps.get(path.parent, 0), int(path.stem))
+    return sum(steps.values()) // EVERY
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", ["ppo", "dqn"])
 def test_a_population_that_is_killed_comes_to_the_same(agent: str, tmp_path: Path) -> None:
-    words = (f"agent={agent}", "seed=range(10)", *RUNS, "checkpoint.every=256", "evaluation.every=256")
-    started = time.monotonic()
+    words = (
+        f"agent={agent}",
+        "seed=range(10)",
+        *RUNS,
+        f"checkpoint.every={EVERY}",
+        f"evaluation.every={EVERY}",
+    )
     assert train_all("calm", *words, "hydra.sweeper.population=1", cwd=tmp_path).returncode == 0
-    longest = time.monotonic() - started
     calm = {run.parent.name: left_behind(run.parent) for run in tmp_path.glob("calm/*/summary.json")}
     assert len(calm) == 10
     chance, kills, folder = random.Random(agent), 0, tmp_path / "killed"
@@ -46,10 +59,12 @@ def test_a_population_that_is_killed_comes_to_the_same(agent: str, tmp_path: Pat
         shutil.rmtree(folder)
 
     while kills < most:
+        # A sweep has 60 checkpoints: one is killed about so often before it comes to its end.
+        enough = saved(folder) + chance.randrange(12)
         with start("train.py", "-m", *words, "hydra.sweep.dir=killed", cwd=tmp_path) as process:
-            end = time.monotonic() + chance.uniform(0.1, 1.0) * longest
-            while process.poll() is None and time.monotonic() < end:
+            while process.poll() is None and saved(folder) < enough:
                 time.sleep(0.01)
+            time.sleep(chance.uniform(0, 0.3))
             kills += process.poll() is None
             process.kill()
         if process.returncode == 0:
