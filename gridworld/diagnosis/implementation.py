@@ -18,7 +18,7 @@ from gridworld.errors import InputError
 from gridworld.training.setup import make_context
 
 _SEEDS = 2  # its own and the next, as one that was certified may have been lucky
-_SECONDS = 3.0  # of the processor
+_SECONDS = 2.5  # of the processor
 
 
 def faulty_class(run: Evidence) -> Finding | None:

@@ -13,6 +13,7 @@ from gridworld.world.markov_chain import one_hot_policy
 from gridworld.world.solver import solved
 
 _USUAL = (0.8, 0.9, 0.95, 0.97, 0.99)
+_QUICKLY_SOLVED = 20_000  # outcomes of all states and actions: a few tenths of a second
 
 
 def score_of_optimum(judge: Evaluator, gamma: float) -> Score:
@@ -32,6 +33,10 @@ def score_of_optimum(judge: Evaluator, gamma: float) -> Score:
 
 
 def fitting_discounts(judge: Evaluator) -> list[float]:
-    """Of the usual discounts and the judge's own, ascending, those whose optimum is certified."""
-    gammas = sorted({*_USUAL, judge.solution.gamma})
+    """Of the usual discounts and the judge's own, ascending, those whose optimum is certified.
+
+    In a large world, which takes long to solve, it is the judge's own only.
+    """
+    usual = _USUAL if judge.mdp.probability.size <= _QUICKLY_SOLVED else ()
+    gammas = sorted({*usual, judge.solution.gamma})
     return [gamma for gamma in gammas if score_of_optimum(judge, gamma).certified]

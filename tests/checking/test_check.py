@@ -20,7 +20,7 @@ from gridworld.checking import run, worlds
 from gridworld.checking.probes import PROBES
 from gridworld.checking.settings import settings
 from gridworld.checking.subject import arguments, subject
-from gridworld.checking.training import Trained
+from gridworld.checking.training import Trained, train
 from gridworld.errors import InputError
 from gridworld.world.markov_chain import one_hot_policy
 from gridworld.world.solver import solved
@@ -54,6 +54,18 @@ def test_tables_pass_all(name: str) -> None:
     assert result.passed, str(result)
     assert [finding.passed for finding in result.findings].count(None) == 1  # target
     assert "passed all 13 probes" in str(result)
+
+
+@pytest.mark.parametrize("kind", [DQN, A2C])
+def test_states_that_look_alike_are_alike_in_both_loops(kind: type) -> None:
+    found = settings(subject(kind), 0.9, {}, {})
+    assert found is not None
+    stock, tabulated = (
+        train(dataclasses.replace(found[0], engine=engine), worlds.end_like_the_start(), 0.9, 8, 640, 0).last
+        for engine in ("stock", "tabulated")
+    )
+    assert tabulated.values == pytest.approx(stock.values, abs=1e-4)
+    assert tabulated.values[0] == tabulated.values[2]
 
 
 def test_a_crash_is_a_failure_and_is_told() -> None:

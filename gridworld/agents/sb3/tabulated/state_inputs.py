@@ -82,6 +82,18 @@ def why_not(config: SB3Config, algorithm: type[BaseAlgorithm], arguments: Mappin
     return None
 
 
+def _is_look_up(observation: ObservationTable) -> bool:
+    """Whether what a policy sees of a state is the unit vector of its number, as SB3 makes one of a number.
+
+    Of a world in which states look alike it is that of another number.
+    """
+    if observation.kind not in ("one_hot", "none") or observation.stored is None:
+        return observation.kind in ("one_hot", "none")
+    numbers = np.arange(observation.num_states)
+    own = np.eye(observation.num_states) if observation.kind == "one_hot" else numbers
+    return np.array_equal(observation.stored.reshape(observation.num_states, -1), own.reshape(len(own), -1))
+
+
 class StateInputs:
     """Feeds a policy's networks with states, all of them or some.
 
@@ -94,7 +106,7 @@ class StateInputs:
         self.num_states = observation.num_states
         self._policy = policy
         self._observation = observation
-        self._one_hot = observation.kind in ("one_hot", "none")  # SB3 makes unit vectors of numbers
+        self._one_hot = _is_look_up(observation)
         self._all: Tensor | None = None  # the observations of all states, once they were asked for
 
     @functools.cached_property
