@@ -39,23 +39,19 @@ IN_TURN = (
     *("sweep/test_sweep_cluster.py", "sweep/test_sweep_kills.py", "sweep/test_population_kills.py"),
     *("training/test_tensorboard.py", "report/test_report_page.py"),
 )
-# What takes longest, in this order; most have few tests that start processes.
+# What takes more than five seconds of a processor, the longest first.
 LONG = (
-    *("in turn", "tests/test_docs.py", "commands/test_commands.py", "commands/test_hostile_runs.py"),
-    *(
-        "api/test_scores.py",
-        "sweep/test_sweep.py",
-        "sweep/test_sweep_population.py",
-        "tune/test_tune.py",
-        "restore/test_reproduce.py",
-    ),
-    *("restore/test_resume_kills.py", "process/test_output.py", "tune/test_tune_parts.py"),
-    *("commands/test_bad_input.py", "agents/tabular/test_tabular.py", "api/test_runs.py"),
-    *("report/test_report.py", "config/test_experiments.py", "restore/test_resume.py"),
-    *("restore/test_resume_commands.py", "restore/test_resume_states.py", "training/test_certified.py"),
-    *("training/test_training.py", "storage/test_other_systems.py", "commands/test_console.py"),
-    *("agents/sb3/test_resume_own_classes.py", "agents/sb3/test_any_class.py", "export/test_export.py"),
-    *("run/test_power_cuts.py", "docs/test_examples.py", "process/test_forks.py", "run/test_lost_folders.py"),
+    *("in turn", "tests/test_docs.py", "commands/test_hostile_runs.py", "config/test_experiments.py"),
+    *("sweep/test_sweep_population.py", "report/test_report.py", "commands/test_bad_input.py"),
+    *("commands/test_commands.py", "tune/test_tune.py", "sweep/test_sweep.py", "process/test_output.py"),
+    *("tune/test_tune_parts.py", "restore/test_resume_kills.py", "agents/sb3/test_tabulated.py"),
+    *("diagnosis/test_sabotage.py", "restore/test_resume_states.py", "restore/test_reproduce.py"),
+    *("restore/test_resume_commands.py", "restore/test_resume.py", "training/test_training.py"),
+    *("training/test_certified.py", "docs/test_examples.py", "storage/test_other_systems.py"),
+    *("commands/test_console.py", "checking/test_check.py", "agents/tabular/test_tabular.py"),
+    *("agents/sb3/test_resume_own_classes.py", "world/test_evaluation.py", "process/test_forks.py"),
+    *("api/test_runs.py", "run/test_power_cuts.py", "api/test_scores.py", "agents/sb3/test_any_class.py"),
+    *("export/test_export.py", "run/test_lost_folders.py"),
 )
 
 

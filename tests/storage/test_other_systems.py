@@ -6,6 +6,7 @@ Python starts. That is not Windows, only as near as it can be tried here.
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -35,6 +36,15 @@ def locking(file, mode, count):
 sys.modules["msvcrt"] = types.ModuleType("msvcrt")
 sys.modules["msvcrt"].LK_NBLCK, sys.modules["msvcrt"].locking = 2, locking
 """
+_RUN_ALL = """
+import json, runpy, sys
+for words in json.loads(sys.argv.pop()):
+    sys.argv[1:] = words
+    try:
+        runpy.run_module("gridworld", run_name="__main__")
+    except SystemExit as end:
+        assert end.code in (None, 0), (words, end.code)
+"""
 _IMPORT_ALL = """
 import importlib, pkgutil, gridworld
 for module in pkgutil.walk_packages(gridworld.__path__, "gridworld."):
@@ -60,9 +70,9 @@ def python(
     )
 
 
-def gridworld(folder: Path, *words: str, hide: str = _WITHOUT_UNIX + _MSVCRT) -> str:
-    """What a command prints that ends well."""
-    done = python(folder, "-m", "gridworld", *words, hide=hide)
+def gridworld(folder: Path, *lines: list[str]) -> str:
+    """What commands print that end well, one after the other in one process."""
+    done = python(folder, "-c", _RUN_ALL, json.dumps(lines))
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -85,17 +95,19 @@ def test_without_locks_training_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("agent", ["dqn", "q_learning"])
 def test_with_the_locks_of_windows_a_run_trains_and_is_resumed(agent: str, tmp_path: Path) -> None:
-    words = [*SHORT[agent], "hydra.run.dir=run"]
-    gridworld(tmp_path, "train", *words)
-    first = json.loads((tmp_path / "run" / "summary.json").read_text())
-    gridworld(tmp_path, "train", "resume=run", "total_timesteps=3000")
-    longer = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert longer["timesteps"] > first["timesteps"]
+    lines = [
+        ["train", *SHORT[agent], "hydra.run.dir=run"],
+        ["train", "resume=run", "total_timesteps=3000"],
+    ]
     if agent == "q_learning":  # nothing of an agent is left to be told apart
-        assert "policy of run" in gridworld(tmp_path, "evaluate", "run", "--episodes", "10")
+        lines.append(["evaluate", "run", "--episodes", "10"])
+    told = gridworld(tmp_path, *lines)
+    first, longer = re.findall(rf"^{agent} on classic, seed 0: ([\d,]+) steps", told, re.MULTILINE)
+    assert int(longer.replace(",", "")) > int(first.replace(",", ""))
+    assert ("policy of run" in told) == (agent == "q_learning")
 
 
 def test_with_the_locks_of_windows_a_sweep_runs(tmp_path: Path) -> None:
     words = [*SHORT["q_learning"], "seed=0,1", "hydra.sweep.dir=sweep"]
-    gridworld(tmp_path, "train", "-m", *words)
-    assert "2 jobs: 2 done" in gridworld(tmp_path, "jobs", "sweep")
+    told = gridworld(tmp_path, ["train", "-m", *words], ["jobs", "sweep"])
+    assert told.endswith("2 jobs: 2 done\n")

@@ -68,6 +68,20 @@ def statuses(folder: Path) -> dict[str, str]:
     return {job: row["status"] for job, row in table(folder).items()}
 
 
+@pytest.fixture(scope="module")
+def two_jobs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which a sweep of two jobs has come to its end."""
+    folder = tmp_path_factory.mktemp("two")
+    assert sweep("seed=0,1", cwd=folder).returncode == 0
+    return folder
+
+
+@pytest.fixture
+def swept(two_jobs: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(two_jobs, tmp_path / "copy"))
+
+
 def test_a_sweep_is_come_back_to(tmp_path: Path) -> None:
     folder = tmp_path / "sweep"
     done = sweep("seed=0,1", cwd=tmp_path)
@@ -201,41 +215,37 @@ def test_a_worker_that_is_killed_takes_no_other_job_along(tmp_path: Path) -> Non
     assert "0 to run" in again.stderr  # what failed is remembered
 
 
-def test_a_job_that_cannot_go_on_says_why_and_begins_anew_if_asked(tmp_path: Path) -> None:
-    assert sweep("seed=0,1", cwd=tmp_path).returncode == 0
-    run = read_run(tmp_path / "sweep" / "seed=0")
+def test_a_job_that_cannot_go_on_says_why_and_begins_anew_if_asked(swept: Path) -> None:
+    run = read_run(swept / "sweep" / "seed=0")
     run.manifest["config"]["total_timesteps"] = 700
     RunWriter(run.folder, run.manifest).end("interrupted")
-    check_told_and_begun_anew(tmp_path, "holds an unfinished run with other settings (total_timesteps=500")
+    check_told_and_begun_anew(swept, "holds an unfinished run with other settings (total_timesteps=500")
 
 
-def test_a_job_that_was_made_longer_is_no_longer_done(tmp_path: Path) -> None:
-    assert sweep("seed=0,1", cwd=tmp_path).returncode == 0
-    longer = script("train.py", "resume=sweep/seed=0", "total_timesteps=700", cwd=tmp_path)
+def test_a_job_that_was_made_longer_is_no_longer_done(swept: Path) -> None:
+    longer = script("train.py", "resume=sweep/seed=0", "total_timesteps=700", cwd=swept)
     assert longer.returncode == 0, longer.stderr
-    check_told_and_begun_anew(tmp_path, "the run in seed=0 was made 700 steps long")
+    check_told_and_begun_anew(swept, "the run in seed=0 was made 700 steps long")
 
 
 @pytest.mark.parametrize("keep", [0, 300])
-def test_a_job_with_a_damaged_manifest_is_told(keep: int, tmp_path: Path) -> None:
-    assert sweep("seed=0,1", cwd=tmp_path).returncode == 0
-    file = tmp_path / "sweep" / "seed=0" / "manifest.json"
+def test_a_job_with_a_damaged_manifest_is_told(keep: int, swept: Path) -> None:
+    file = swept / "sweep" / "seed=0" / "manifest.json"
     file.write_bytes(file.read_bytes()[:keep])
     shutil.rmtree(file.parent / "checkpoints")  # which have a copy of it
-    check_told_and_begun_anew(tmp_path, "manifest.json: is no JSON, it was changed or cut off")
+    check_told_and_begun_anew(swept, "manifest.json: is no JSON, it was changed or cut off")
 
 
-def test_a_job_with_a_damaged_manifest_goes_on_by_a_checkpoints(tmp_path: Path) -> None:
-    assert sweep("seed=0,1", cwd=tmp_path).returncode == 0
-    file = tmp_path / "sweep" / "seed=0" / "manifest.json"
+def test_a_job_with_a_damaged_manifest_goes_on_by_a_checkpoints(swept: Path) -> None:
+    file = swept / "sweep" / "seed=0" / "manifest.json"
     file.write_bytes(b"")
     curve = (file.parent / "curve.csv").read_bytes()
-    again = sweep("seed=0,1", cwd=tmp_path)
+    again = sweep("seed=0,1", cwd=swept)
     assert again.returncode == 0, again.stderr
     assert "1 to run" in again.stderr
     assert "manifest.json: is no JSON" in again.stderr
     assert "; goes by the copy in checkpoints/" in again.stderr
-    assert statuses(tmp_path / "sweep") == {"seed=0": "done", "seed=1": "done"}
+    assert statuses(swept / "sweep") == {"seed=0": "done", "seed=1": "done"}
     assert (file.parent / "curve.csv").read_bytes() == curve
 
 
@@ -421,15 +431,14 @@ def test_a_table_that_is_taken_away_during_the_sweep_is_made_again(tmp_path: Pat
     assert Counter(statuses(tmp_path / "sweep").values()) == {"done": 6}
 
 
-def test_a_table_that_was_damaged_or_lost_is_made_again(tmp_path: Path) -> None:
-    assert sweep("seed=0,1", cwd=tmp_path).returncode == 0
-    file = tmp_path / "sweep" / "jobs.csv"
+def test_a_table_that_was_damaged_or_lost_is_made_again(swept: Path) -> None:
+    file = swept / "sweep" / "jobs.csv"
     before = file.read_text()
     for damage in ("nonsense\n", before.replace("done", "running"), before.splitlines()[0] + "\n", None):
         file.unlink()
         if damage is not None:
             file.write_text(damage)
-        jobs_command.main([str(tmp_path / "sweep")])
+        jobs_command.main([str(swept / "sweep")])
         assert file.read_text() == before
 
 

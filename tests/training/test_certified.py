@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 from helpers.support import train_in
 
+from gridworld.process.together import run_together
+
 QUIET = (
     "recording.frames=false",
     "recording.gif=false",
@@ -15,11 +17,19 @@ QUIET = (
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize("agent", ["dqn", "ppo", "q_learning", "sarsa", "expected_sarsa", "value_iteration"])
-def test_the_default_job_is_certified(agent: str, seed: int, tmp_path: Path) -> None:
-    summary = train_in(tmp_path, f"agent={agent}", f"seed={seed}", *QUIET)
-    assert summary["certified"]
-    assert summary["goal_probability"] == 1
-    assert summary["length"] == 8
-    assert int(summary["first_certified_step"]) <= int(summary["certified_since_step"])
+def test_the_default_job_is_certified(agent: str, tmp_path: Path) -> None:
+    """On ten seeds, which train together: each run is what it is alone, see agents/sb3/test_population.py."""
+    summaries = run_together(
+        [
+            lambda seed=seed: train_in(tmp_path / str(seed), f"agent={agent}", f"seed={seed}", *QUIET)
+            for seed in range(10)
+        ]
+    )
+    assert len(summaries) == 10
+    for seed, summary in enumerate(summaries):
+        assert isinstance(summary, dict), summary
+        assert summary["certified"], seed
+        assert summary["goal_probability"] == 1
+        assert summary["length"] == 8
+        assert int(summary["first_certified_step"]) <= int(summary["certified_since_step"])

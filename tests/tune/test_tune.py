@@ -227,6 +227,7 @@ def test_a_search_space_that_makes_no_sense(
 ) -> None:
     (tmp_path / "tune").mkdir()
     (tmp_path / "tune" / "bad.yaml").write_text(yaml)
+    monkeypatch.setattr("gridworld.tune.search.search_space._CORNERS", 5)  # it goes with none of them
     told = refusal(monkeypatch, tmp_path, "agent=q_learning", "tune=bad", "--config-dir", ".")
     assert sentence in told
     assert "\n" not in told

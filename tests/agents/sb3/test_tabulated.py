@@ -1,7 +1,8 @@
 """The tabulated engine is SB3, only faster: same losses, same gradients, same files, same interface."""
 
+import copy
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,10 @@ class Keep(KVWriter):
 def twins(ours: type, theirs: type, kind: str, **arguments: Any) -> tuple[Any, Any]:
     """The two classes with the same weights, ready to collect."""
     policy = "CnnPolicy" if kind == "image" else "MlpPolicy"
-    pair = tuple(cls(policy, batch(kind), seed=0, device="cpu", **arguments) for cls in (ours, theirs))
+    pair = tuple(
+        cls(policy, batch(kind), seed=0, device="cpu", **copy.deepcopy(arguments))  # SB3 writes into it
+        for cls in (ours, theirs)
+    )
     for model in pair:
         model.policy.load_state_dict(pair[0].policy.state_dict())
         model.set_logger(Logger(None, [Keep()]))
@@ -111,9 +115,14 @@ def share_rollout(ours: Any, theirs: Any, is_moved: bool = True) -> None:
             peer.copy_(mine)
 
 
-@pytest.mark.parametrize(
-    ("kind", "arguments"),
-    [
+SEPARATE = {"policy_kwargs": {"share_features_extractor": False}}
+LINEAR = {"policy_kwargs": {"net_arch": []}}
+TWO_SIZES = {"policy_kwargs": {"net_arch": {"pi": [8], "vf": [16, 16]}}}
+RELU = {"activation_fn": torch.nn.ReLU, "optimizer_class": torch.optim.RMSprop}
+# Conjugate gradients on a convolutional network's weights would blow rounding up, in SB3's class as here.
+FEW_PRODUCTS = {"cg_max_steps": 2, "cg_damping": 1.0, "n_critic_updates": 1}
+FROM_ROLLOUTS: dict[tuple[type, type], list[tuple[str, dict[str, Any]]]] = {
+    (TabulatedPPO, PPO): [
         *[(kind, {}) for kind in KINDS],
         ("one_hot", {"clip_range": 0.02, "ent_coef": 0.3, "vf_coef": 0.1}),
         ("one_hot", {"clip_range_vf": 0.05}),
@@ -121,63 +130,16 @@ def share_rollout(ours: Any, theirs: Any, is_moved: bool = True) -> None:
         ("one_hot", {"max_grad_norm": 0.01}),
         ("one_hot", {"target_kl": 1e-3}),
         ("one_hot", {"n_epochs": 3, "batch_size": 100}),
-        ("none", {"policy_kwargs": {"net_arch": []}}),
-        ("coordinates", {"policy_kwargs": {"net_arch": {"pi": [8], "vf": [16, 16]}}}),
-        ("coordinates", {"policy_kwargs": {"share_features_extractor": False}}),
-        ("image", {"policy_kwargs": {"share_features_extractor": False}}),
-        (
-            "one_hot",
-            {"policy_kwargs": {"activation_fn": torch.nn.ReLU, "optimizer_class": torch.optim.RMSprop}},
-        ),
+        *[("none", LINEAR), ("coordinates", TWO_SIZES), ("coordinates", SEPARATE), ("image", SEPARATE)],
+        ("one_hot", {"policy_kwargs": RELU}),
     ],
-    ids=str,
-)
-@pytest.mark.parametrize("few_states", [1024, 0], ids=["all states", "distinct states"])
-@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size of 100")
-def test_ppo_updates_as_stock(
-    kind: str, arguments: dict[str, Any], few_states: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tabulated, "_FEW_STATES", few_states)
-    if few_states == 0:  # below the number of states, so that batches hold fewer distinct ones
-        # Many updates then follow each other, in which Adam would blow rounding up to its full step size.
-        policy_kwargs = {"optimizer_class": torch.optim.SGD, **arguments.get("policy_kwargs", {})}
-        arguments = {"batch_size": 16, **arguments, "policy_kwargs": policy_kwargs}
-    arguments = {"n_epochs": 1, "batch_size": 256, **arguments}
-    ours, theirs = twins(TabulatedPPO, PPO, kind, n_steps=STEPS, **arguments)
-    share_rollout(ours, theirs)
-    assert_same_update(ours, theirs)
-
-
-@pytest.mark.parametrize(
-    ("kind", "arguments"),
-    [
+    (TabulatedA2C, A2C): [
         *[(kind, {}) for kind in KINDS],
         ("one_hot", {"ent_coef": 0.3, "vf_coef": 0.1, "gae_lambda": 0.9, "normalize_advantage": True}),
         ("one_hot", {"use_rms_prop": False, "max_grad_norm": 0.01}),
-        ("none", {"policy_kwargs": {"net_arch": []}}),
-        ("coordinates", {"policy_kwargs": {"net_arch": {"pi": [8], "vf": [16, 16]}}}),
-        ("image", {"policy_kwargs": {"share_features_extractor": False}}),
+        *[("none", LINEAR), ("coordinates", TWO_SIZES), ("image", SEPARATE)],
     ],
-    ids=str,
-)
-@pytest.mark.parametrize("few_states", [1024, 0], ids=["all states", "distinct states"])
-def test_a2c_updates_as_stock(
-    kind: str, arguments: dict[str, Any], few_states: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tabulated, "_FEW_STATES", few_states)
-    steps = STEPS if few_states else 1  # of fewer samples than states
-    ours, theirs = twins(TabulatedA2C, A2C, kind, n_steps=steps, **arguments)
-    share_rollout(ours, theirs)
-    assert_same_update(ours, theirs)
-
-
-# Conjugate gradients on a convolutional network's weights would blow rounding up, in SB3's class as here.
-FEW_PRODUCTS = {"cg_max_steps": 2, "cg_damping": 1.0, "n_critic_updates": 1}
-
-
-@pytest.mark.parametrize(
-    ("kind", "arguments"),
-    [
+    (TabulatedTRPO, TRPO): [
         *[(kind, {}) for kind in KINDS if kind != "image"],
         *[("image", {**FEW_PRODUCTS, "policy_kwargs": {"share_features_extractor": x}}) for x in (0, 1)],
         ("one_hot", {"normalize_advantage": False, "cg_max_steps": 3, "cg_damping": 1.0}),
@@ -185,28 +147,56 @@ FEW_PRODUCTS = {"cg_max_steps": 2, "cg_damping": 1.0, "n_critic_updates": 1}
         ("one_hot", {"target_kl": 0.5, "line_search_shrinking_factor": 0.5}),
         ("one_hot", {"line_search_max_iter": 0}),
         ("one_hot", {"policy_kwargs": {"optimizer_class": torch.optim.AdamW}}),
-        ("none", {"policy_kwargs": {"net_arch": []}}),
-        ("coordinates", {"policy_kwargs": {"net_arch": {"pi": [8], "vf": [16, 16]}}}),
+        *[("none", LINEAR), ("coordinates", TWO_SIZES)],
     ],
-    ids=str,
-)
-@pytest.mark.parametrize("few_states", [1024, 0], ids=["all states", "distinct states"])
+}
+
+
+def cases(
+    by_classes: dict[tuple[type, type], list[tuple[str, dict[str, Any]]]],
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Of the test, for every case of every class, with few and with many states to a batch."""
+    values = [(*classes, *case) for classes, listed in by_classes.items() for case in listed]
+
+    def mark(test: Callable[..., None]) -> Callable[..., None]:
+        every = pytest.mark.parametrize(("ours", "theirs", "kind", "arguments"), values, ids=str)
+        sizes = pytest.mark.parametrize("few_states", [1024, 0], ids=["all states", "distinct states"])
+        return every(sizes(test))  # type: ignore[no-any-return]
+
+    return mark
+
+
+@cases(FROM_ROLLOUTS)
 @pytest.mark.filterwarnings("ignore:You have specified a mini-batch size of")
-def test_trpo_updates_as_stock(
-    kind: str, arguments: dict[str, Any], few_states: int, monkeypatch: pytest.MonkeyPatch
+def test_updates_from_rollouts_are_as_stock(
+    ours: Any,
+    theirs: Any,
+    kind: str,
+    arguments: dict[str, Any],
+    few_states: int,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(tabulated, "_FEW_STATES", few_states)
-    steps = STEPS if few_states else 1  # of fewer samples than states
-    arguments = {"n_steps": steps, "batch_size": 300, "n_critic_updates": 2, **arguments}
-    ours, theirs = twins(TabulatedTRPO, TRPO, kind, **arguments)
+    n_steps = 1 if few_states == 0 and theirs is not PPO else STEPS  # of fewer samples than states
+    if few_states == 0 and theirs is PPO:  # so that batches hold fewer distinct ones
+        # Many updates then follow each other, in which Adam would blow rounding up to its full step size.
+        policy_kwargs = {"optimizer_class": torch.optim.SGD, **arguments.get("policy_kwargs", {})}
+        arguments = {"batch_size": 16, **arguments, "policy_kwargs": policy_kwargs}
+    fixed: dict[type, dict[str, int]] = {
+        PPO: {"n_epochs": 1, "batch_size": 256},
+        A2C: {},
+        TRPO: {"batch_size": 300, "n_critic_updates": 2},
+    }
+    ours, theirs = twins(ours, theirs, kind, **{"n_steps": n_steps, **fixed[theirs], **arguments})
     share_rollout(ours, theirs)
     before = [parameter.detach().clone() for parameter in ours.policy.parameters()]
     assert_same_update(ours, theirs)
-    moved = [not torch.equal(*pair) for pair in zip(before, ours.policy.parameters(), strict=True)]
-    told = ours.logger.output_formats[0].values["train/is_line_search_success"]
-    assert all(moved) == (told == 1) == ("line_search_max_iter" not in arguments)
-    kept = ours.policy.optimizer.state_dict()["state"].keys()
-    assert kept == theirs.policy.optimizer.state_dict()["state"].keys() != set(range(len(moved)))
+    if isinstance(theirs, TRPO):
+        moved = [not torch.equal(*pair) for pair in zip(before, ours.policy.parameters(), strict=True)]
+        told = ours.logger.output_formats[0].values["train/is_line_search_success"]
+        assert all(moved) == (told == 1) == ("line_search_max_iter" not in arguments)
+        kept = ours.policy.optimizer.state_dict()["state"].keys()
+        assert kept == theirs.policy.optimizer.state_dict()["state"].keys() != set(range(len(moved)))
 
 
 @pytest.mark.parametrize(
@@ -326,47 +316,38 @@ def share_replay(ours: Any, theirs: Any) -> None:
     ours._target_values = None
 
 
-@pytest.mark.parametrize(
-    ("kind", "arguments"),
-    [
+FROM_REPLAY: dict[tuple[type, type], list[tuple[str, dict[str, Any]]]] = {
+    (TabulatedDQN, DQN): [
         *[(kind, {}) for kind in KINDS],
         ("one_hot", {"max_grad_norm": 1e-3, "gamma": 0.5}),
-        ("one_hot", {"policy_kwargs": {"net_arch": []}}),
+        ("one_hot", LINEAR),
         ("none", {"policy_kwargs": {"net_arch": [8], "activation_fn": torch.nn.Tanh}}),
         ("one_hot", {"policy_kwargs": {"activation_fn": torch.nn.PReLU}}),
     ],
-    ids=str,
-)
-@pytest.mark.parametrize("few_states", [1024, 0], ids=["all states", "distinct states"])
-def test_dqn_updates_as_stock(
-    kind: str, arguments: dict[str, Any], few_states: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tabulated, "_FEW_STATES", few_states)
-    steps, size = (1, 64) if few_states else (3, 16)
-    ours, theirs = twins(TabulatedDQN, DQN, kind, buffer_size=800, exploration_fraction=1.0, **arguments)
-    share_replay(ours, theirs)
-    assert_same_update(ours, theirs, steps, size)
-
-
-@pytest.mark.parametrize(
-    ("kind", "arguments"),
-    [
+    (TabulatedQRDQN, QRDQN): [
         *[(kind, {}) for kind in KINDS],
         ("one_hot", {"max_grad_norm": 1e-3, "gamma": 0.5}),
         ("one_hot", {"policy_kwargs": {"net_arch": [], "n_quantiles": 7}}),
         ("none", {"policy_kwargs": {"n_quantiles": 1, "optimizer_class": torch.optim.SGD}}),
     ],
-    ids=str,
-)
-@pytest.mark.parametrize("few_states", [1024, 0], ids=["all states", "distinct states"])
-def test_qrdqn_updates_as_stock(
-    kind: str, arguments: dict[str, Any], few_states: int, monkeypatch: pytest.MonkeyPatch
+}
+
+
+@cases(FROM_REPLAY)
+def test_updates_from_replay_are_as_stock(
+    ours: Any,
+    theirs: Any,
+    kind: str,
+    arguments: dict[str, Any],
+    few_states: int,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(tabulated, "_FEW_STATES", few_states)
     steps, size = (1, 64) if few_states else (3, 16)
-    policy_kwargs = {"n_quantiles": 20, **arguments.get("policy_kwargs", {})}
-    arguments = {"learning_rate": 1e-3, **arguments, "policy_kwargs": policy_kwargs}
-    ours, theirs = twins(TabulatedQRDQN, QRDQN, kind, buffer_size=800, exploration_fraction=1.0, **arguments)
+    if theirs is QRDQN:
+        policy_kwargs = {"n_quantiles": 20, **arguments.get("policy_kwargs", {})}
+        arguments = {"learning_rate": 1e-3, **arguments, "policy_kwargs": policy_kwargs}
+    ours, theirs = twins(ours, theirs, kind, buffer_size=800, exploration_fraction=1.0, **arguments)
     share_replay(ours, theirs)
     assert_same_update(ours, theirs, steps, size)
 
