@@ -65,6 +65,7 @@ class TrainConfig:
     seed: int = field(default=0, metadata=affects(Effect.SEED))  # of all random numbers
     total_timesteps: int = field(default=20_000, metadata=affects(Effect.LENGTH))  # environment steps
     n_envs: int = 64  # environments that step together
+    exploring_starts: float = 0.0  # share of training episodes that begin in a state drawn uniformly
     device: str = field(default="cpu", metadata=affects(Effect.MACHINE))
     threads: int = field(default=1, metadata=affects(Effect.MACHINE))  # of torch
     # of SB3: each a mapping of `_target_`, the import path of a class, and its arguments
@@ -93,6 +94,7 @@ def check(config: TrainConfig) -> None:
     at_least("total_timesteps", config.total_timesteps, 1)
     at_least("n_envs", config.n_envs, 1)
     at_most("n_envs", config.n_envs, MOST_ENVS)
+    within("exploring_starts", config.exploring_starts, 0, 1)
     at_least("threads", config.threads, 1)
     at_most("threads", config.threads, MOST_THREADS)
     config.env.check()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 from gridworld.agents import TrainingContext, WriteScalars, family
@@ -31,10 +32,17 @@ def make_context(
     Returns:
         `config.n_envs` fresh environments and what else the agent's family builds it from.
     """
-    envs = StatisticsVectorEnv(config.n_envs, max_episode_steps=config.env.step_limit(mdp), mdp=mdp)
+    limit, share = config.env.step_limit(mdp), config.exploring_starts
+    trained_in = _with_exploring_starts(mdp, share) if share else mdp
+    envs = StatisticsVectorEnv(config.n_envs, max_episode_steps=limit, mdp=trained_in)
     return TrainingContext(
         envs, observation, config.seed, config.device, config.threads, write_scalars, config.callbacks
     )
+
+
+@functools.lru_cache(maxsize=4)  # the runs of a population share a world
+def _with_exploring_starts(mdp: Mdp, share: float) -> Mdp:
+    return mdp.with_exploring_starts(share)
 
 
 def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = compiled) -> Mdp:
