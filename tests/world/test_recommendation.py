@@ -50,7 +50,7 @@ def test_the_evaluations_discount_is_the_last_candidate() -> None:
 
 
 def huber_optimum(mdp: Mdp, gamma: float, scale: float) -> np.ndarray:
-    """Q that minimises the expected Huber loss to its own targets in every state and action, by brute force."""
+    """(S, A), what minimises the expected Huber loss to its own targets, by bisection."""
     q = solved(mdp, gamma).q * scale
     for _ in range(200):
         target = mdp.reward * scale + gamma * q.max(axis=1)[mdp.next_state]
