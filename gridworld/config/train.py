@@ -68,6 +68,7 @@ class TrainConfig:
     n_envs: int = 64  # environments that step together
     # b of b / sqrt(N), added to a reward of training for an action that was taken there N times; 0 for none
     exploration_bonus: float = 0.0
+    exploring_starts: float = 0.0  # share of training episodes that begin in a state drawn uniformly
     device: str = field(default="cpu", metadata=affects(Effect.MACHINE))
     threads: int = field(default=1, metadata=affects(Effect.MACHINE))  # of torch
     # of SB3: each a mapping of `_target_`, the import path of a class, and its arguments
@@ -97,6 +98,7 @@ def check(config: TrainConfig) -> None:
     at_least("n_envs", config.n_envs, 1)
     at_most("n_envs", config.n_envs, MOST_ENVS)
     within("exploration_bonus", config.exploration_bonus, 0, MOST_BONUS)
+    within("exploring_starts", config.exploring_starts, 0, 1)
     at_least("threads", config.threads, 1)
     at_most("threads", config.threads, MOST_THREADS)
     config.env.check()

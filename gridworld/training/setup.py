@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 from gridworld.agents import TrainingContext, WriteScalars, family
@@ -38,11 +39,12 @@ def make_context(
     Returns:
         `config.n_envs` fresh environments and what else the agent's family builds it from.
     """
+    share = config.exploring_starts
     envs = StatisticsVectorEnv(
         config.n_envs,
         exploration_bonus=config.exploration_bonus,
         max_episode_steps=config.env.step_limit(mdp),
-        mdp=mdp,
+        mdp=_with_exploring_starts(mdp, share) if share else mdp,
     )
     return TrainingContext(
         envs, observation, config.seed, config.device, config.threads, write_scalars, config.callbacks
@@ -55,6 +57,11 @@ def import_for(config: TrainConfig) -> None:
     for picture in PICTURES:
         if getattr(config.recording, picture.setting):
             drawer(picture.drawer)
+
+
+@functools.lru_cache(maxsize=4)  # the runs of a population share a world
+def _with_exploring_starts(mdp: Mdp, share: float) -> Mdp:
+    return mdp.with_exploring_starts(share)
 
 
 def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = compiled) -> Mdp:

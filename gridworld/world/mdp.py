@@ -11,13 +11,14 @@ Reference: M. L. Puterman, Markov Decision Processes, 1994, chapter 2.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import math
 from collections import deque
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,6 +141,19 @@ class Mdp:
     def reachable(self) -> BoolArray:
         """(S,), the states that an episode can come to."""
         return np.asarray(self.steps_away >= 0)
+
+    def with_exploring_starts(self, share: float) -> Self:
+        """The same world, in which a share of the episodes begins in any state that can be come to.
+
+        Reference: R. Sutton and A. Barto, Reinforcement Learning, 2nd ed., 2018, section 5.3.
+
+        Args:
+            share: a probability. Their start is drawn uniformly from the reachable states in which an
+                episode goes on.
+        """
+        anywhere = self.reachable & ~self.absorbing
+        start = (1 - share) * self.start + share * anywhere / anywhere.sum()
+        return dataclasses.replace(self, start=frozen(start))
 
     def text(self) -> str:
         """A text that tells this world from others, for a run's manifest."""

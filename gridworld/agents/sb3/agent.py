@@ -17,7 +17,7 @@ from gridworld.agents.sb3.callbacks import make_callbacks
 from gridworld.agents.sb3.factory import make_model
 from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters, reason
 from gridworld.agents.sb3.policy_outputs import Reading, epsilon_greedy, of_q, read, read_states
-from gridworld.agents.sb3.schemas import SB3Config
+from gridworld.agents.sb3.schemas import SB3Config, reward_scale
 from gridworld.agents.sb3.snapshot.callback import CheckpointCallback, check_finite, diverged
 from gridworld.agents.sb3.tabulated.off_policy import TabulatedOffPolicy
 from gridworld.agents.sb3.tabulated.on_policy import TabulatedOnPolicy
@@ -84,6 +84,8 @@ class SB3Agent:
         if probabilities is not None:
             return PolicySnapshot(np.argmax(probabilities, axis=1), probabilities, values)
         assert q is not None
+        if (scale := reward_scale(self.config)) != 1:
+            values, q = values / scale, q / scale
         return PolicySnapshot(np.argmax(q, axis=1), epsilon_greedy(q, self._exploration_rate()), values, q)
 
     def _exploration_rate(self) -> float:

@@ -29,7 +29,7 @@ from gridworld.process.terminal import tell
 Arguments = dict[str, Any]
 
 # Fields of the config that are ours, not arguments of the algorithm's class.
-_OWN_FIELDS = {"name", "family", "algorithm", "engine", "log_interval"}
+_OWN_FIELDS = {"name", "family", "algorithm", "engine", "log_interval", "reward_scale"}
 _MOST_LAYERS, _WIDEST_LAYER = 16, 4096
 _EXAMPLES: dict[type, str] = {
     BaseAlgorithm: "stable_baselines3.A2C",

@@ -13,7 +13,7 @@ from gridworld.agents import TrainingContext
 from gridworld.agents.sb3.constructor_arguments import Arguments, algorithm_and_arguments
 from gridworld.agents.sb3.memory_size import NoBuffer, check_model, weighed
 from gridworld.agents.sb3.policy_outputs import why_unreadable
-from gridworld.agents.sb3.schemas import SB3Config
+from gridworld.agents.sb3.schemas import SB3Config, reward_scale
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.envs.observations import ObservationTable
 from gridworld.errors import InputError
@@ -52,7 +52,7 @@ def make_model(config: SB3Config, context: TrainingContext) -> BaseAlgorithm:
     if arguments["policy"].__name__.endswith("CnnPolicy") and not own_extractor:
         _check_image_size(context.observation)
     device = _device(context.device)
-    envs = GridWorldVecEnv(context.envs, context.observation)
+    envs = GridWorldVecEnv(context.envs, context.observation, reward_scale(config))
     try:
         with weighed(config.name, context.observation), warnings.catch_warnings():
             if context.only_asked:

@@ -31,6 +31,7 @@ _NUMBERS = frozenset(
         "tau",
         "target_update_interval",
         "buffer_size",
+        "reward_scale",
         "log_interval",
         "stats_window_size",
         "name",
@@ -149,6 +150,8 @@ class DQNConfig(SB3CheckedConfig):
     gradient_steps: int = 1
     replay_buffer_class: Optional[str] = None  # noqa: UP045
     replay_buffer_kwargs: dict[str, Any] = field(default_factory=dict)
+    # rewards are multiplied by it on their way to DQN; null: they are as they are
+    reward_scale: Optional[float] = None  # noqa: UP045
     optimize_memory_usage: bool = False
     n_steps: int = 1
     target_update_interval: int = 10_000
@@ -156,6 +159,12 @@ class DQNConfig(SB3CheckedConfig):
     exploration_initial_eps: float = 1.0
     exploration_final_eps: float = 0.05
     max_grad_norm: float = 10.0
+
+
+def reward_scale(config: AgentConfig) -> float:
+    """By what an agent's rewards are multiplied; its values are the true ones times this."""
+    given = getattr(config, "reward_scale", None)
+    return 1.0 if given is None else float(given)
 
 
 @dataclass

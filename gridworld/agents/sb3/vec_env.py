@@ -53,16 +53,20 @@ class GridWorldVecEnv(VecEnv):
     Args:
         envs: the batch. It must reset in the same step, which is how SB3 sees episodes.
         observation: the table.
+        reward_scale: rewards are multiplied by it; the reported episodes' returns are not.
 
     Raises:
         InputError: the batch resets otherwise.
     """
 
-    def __init__(self, envs: GridWorldVectorEnv, observation: ObservationTable) -> None:
+    def __init__(
+        self, envs: GridWorldVectorEnv, observation: ObservationTable, reward_scale: float = 1.0
+    ) -> None:
         if envs.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP:
             raise InputError("SB3 needs environments made with autoreset_mode='SameStep'")
         self.envs = envs
         self.observation = observation
+        self._reward_scale = reward_scale
         self._started = time.time()
         super().__init__(envs.num_envs, observation.space, envs.single_action_space)
 
@@ -113,6 +117,8 @@ class GridWorldVecEnv(VecEnv):
     def told(self, step: Advance, episodes: list[dict[str, Any]]) -> StateStep:
         """A step of the batch as SB3 is told of it; `episodes` are those that it ended."""
         states, rewards, terminated, truncated, ended = step
+        if self._reward_scale != 1:
+            rewards = rewards * self._reward_scale
         if ended is None:
             return StateStep(states, states, rewards, terminated, truncated, {})
         truncated &= ~terminated

@@ -1,0 +1,110 @@
+"""Values of settings that follow the world: the functions that the agents' yaml files call.
+
+    ${clearest_gamma:${env},${evaluation.gamma},[0.9,0.95]}  see `world.recommendation`
+    ${quadratic_scale:${env},${agent.gamma}}                 see there
+    ${for_size:${env},30000}                        30000 up to 30 states, in larger worlds in proportion
+    ${if_chance:${env},A,B}                         A where an action may have several outcomes, else B
+    ${if_seen:${observation.kind},coordinates,A,B}  A where that is what the agent sees, else B
+
+They know the worlds of maps of up to 512 cells. Any other world, and settings that make none, get what the
+default world gets; the check before training says what is wrong with the settings.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Sequence
+from dataclasses import astuple
+from typing import TYPE_CHECKING, Any, cast
+
+from omegaconf import DictConfig, OmegaConf
+
+from gridworld.config.worlds import MapConfig
+from gridworld.errors import InputError
+
+if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
+    from gridworld.world.mdp import Mdp
+
+_DEFAULT_CELLS = 30  # of the default world, whose settings were tuned
+_MOST_CELLS = 512  # the rules solve the world a few times, which takes 0.3 s there
+
+
+def register_world_rules() -> None:
+    """Register these functions with OmegaConf."""
+    for rule in (clearest_gamma, for_size, if_chance, if_seen, quadratic_scale):
+        OmegaConf.register_new_resolver(rule.__name__, rule, replace=True)
+
+
+def clearest_gamma(env: DictConfig, evaluation_gamma: float, candidates: Sequence[float]) -> float:
+    """The discount to learn with in the world of the section `env`."""
+    world = _world(env)
+    try:
+        return candidates[0] if world is None else _gamma(world, evaluation_gamma, tuple(candidates))
+    except InputError:  # of the discount, or a world without a finite optimum
+        return candidates[0]
+
+
+def for_size(env: DictConfig, number: int) -> int:
+    """`number` in a world of up to 30 states, and in larger ones in proportion to their states."""
+    world = _world(env)
+    return number if world is None else number * max(world.num_states, _DEFAULT_CELLS) // _DEFAULT_CELLS
+
+
+def if_chance(env: DictConfig, then: Any, otherwise: Any) -> Any:
+    """`then` where an action may have several outcomes in the world of the section `env`."""
+    world = _world(env)
+    return then if world is not None and _has_chance(world) else otherwise
+
+
+def quadratic_scale(env: DictConfig, gamma: float) -> float | None:
+    """What rewards are multiplied with in the world of the section `env`; None: they stay as they are."""
+    world = _world(env)
+    return None if world is None else _scale(world, gamma)
+
+
+def if_seen(kind: str, this: str, then: Any, otherwise: Any) -> Any:
+    """`then` where the observation is of the kind `this`."""
+    chosen = then if kind == this else otherwise
+    return OmegaConf.create(chosen) if isinstance(chosen, list) else chosen
+
+
+def _world(env: DictConfig) -> Mdp | None:
+    if OmegaConf.get_type(env) is not MapConfig:
+        return None
+    try:
+        config = MapConfig(**cast(dict[str, Any], OmegaConf.to_container(env)))
+        stamp = os.stat(config.layout).st_mtime_ns if os.path.isfile(config.layout) else None
+        return _compiled(astuple(config), stamp)
+    except (InputError, TypeError, ValueError, OSError):
+        return None
+
+
+@functools.lru_cache(maxsize=16, typed=True)  # reading a large map takes longer than composing
+def _compiled(settings: tuple[Any, ...], stamp: int | None) -> Mdp | None:
+    mdp = MapConfig(*settings).compile()
+    return mdp if mdp.num_states <= _MOST_CELLS else None
+
+
+@functools.lru_cache(maxsize=64)
+def _gamma(world: Mdp, evaluation_gamma: float, candidates: tuple[float, ...]) -> float:
+    from gridworld.world.recommendation import clearest_gamma as clearest
+
+    return clearest(world, candidates, evaluation_gamma)
+
+
+@functools.lru_cache(maxsize=64)
+def _has_chance(world: Mdp) -> bool:
+    from gridworld.world.recommendation import has_chance
+
+    return has_chance(world)
+
+
+@functools.lru_cache(maxsize=64)
+def _scale(world: Mdp, gamma: float) -> float | None:
+    from gridworld.world.recommendation import quadratic_scale as scale
+
+    try:
+        return scale(world, gamma)
+    except InputError:  # of the discount
+        return None

@@ -1,0 +1,101 @@
+"""Settings that follow the world: what the agents' yaml files compute of it."""
+
+from pathlib import Path
+
+import pytest
+from helpers.support import configure, script, train_in
+
+import gridworld
+from gridworld.config.agents import AgentConfig
+
+DEFAULT = {
+    "dqn": {"gamma": 0.9, "learning_rate": 0.001, "batch_size": 128, "buffer_size": 50_000}
+    | {
+        "gradient_steps": 32,
+        "target_update_interval": 512,
+        "exploration_final_eps": 0.05,
+        "reward_scale": None,
+    },
+    "ppo": {"gamma": 0.95, "learning_rate": 0.01, "batch_size": 2048, "ent_coef": 0.5, "gae_lambda": 0.95},
+}
+LENGTHS = {"dqn": (30_000, 2_000), "ppo": (180_000, 10_000)}
+AGENTS = pytest.mark.parametrize("agent", DEFAULT)
+
+
+def widths(agent: AgentConfig) -> object:
+    return vars(agent)["policy_kwargs"].net_arch
+
+
+@AGENTS
+def test_the_default_world_has_the_settings_that_it_was_tuned_with(agent: str) -> None:
+    config = configure(f"agent={agent}")
+    assert {name: vars(config.agent)[name] for name in DEFAULT[agent]} == DEFAULT[agent]
+    assert (config.total_timesteps, config.evaluation.every) == LENGTHS[agent]
+    assert (config.n_envs, config.exploring_starts, widths(config.agent)) == (128, 0.0, None)
+
+
+@AGENTS
+def test_they_follow_the_world_and_the_observation(agent: str) -> None:
+    plain, random = configure(f"agent={agent}"), configure(f"agent={agent}", "env.slip=0.1")
+    assert random.total_timesteps > plain.total_timesteps
+    assert random.n_envs > plain.n_envs
+    assert random.exploring_starts == 1
+    assert vars(random.agent)["gamma"] == 0.95
+    assert vars(configure(f"agent={agent}", "env.slip=0.2").agent)["gamma"] == 0.98
+    large = configure(f"agent={agent}", "env.num_rows=12", "env.num_cols=12")
+    assert large.total_timesteps == plain.total_timesteps * 144 // 30
+    assert widths(configure(f"agent={agent}", "observation=coordinates").agent) == [128, 128]
+    assert (
+        configure(f"agent={agent}", "env.num_rows=4", "env.num_cols=4").total_timesteps == LENGTHS[agent][0]
+    )
+
+
+@AGENTS
+def test_the_evaluations_discount_bounds_the_agents(agent: str) -> None:
+    assert vars(configure(f"agent={agent}", "evaluation.gamma=0.5").agent)["gamma"] == 0.5
+
+
+def test_the_command_line_goes_before_them() -> None:
+    config = configure("agent=dqn", "env.slip=0.1", "agent.gamma=0.5", "n_envs=7", "exploring_starts=0.25")
+    assert (vars(config.agent)["gamma"], config.n_envs, config.exploring_starts) == (0.5, 7, 0.25)
+    assert vars(config.agent)["reward_scale"] == 0.72  # by the discount that was given
+    assert vars(configure("agent=dqn", "env.slip=0.1").agent)["reward_scale"] == 0.54
+
+
+@AGENTS
+@pytest.mark.parametrize(
+    "word",
+    [
+        *("env=taxi_v4", "env=river_swim", "env.layout=nothing", "env.slip=3", "env.num_rows=1"),
+        *("evaluation.gamma=2", "env.step_reward=0.1 evaluation.gamma=1"),
+    ],
+)
+def test_unknown_worlds_have_the_default_worlds_settings(agent: str, word: str) -> None:
+    """What is wrong with the others is told before training, in the sentence that it always had."""
+    config = configure(f"agent={agent}", *word.split())
+    assert config.n_envs == 128
+    assert vars(config.agent)["gamma"] == DEFAULT[agent]["gamma"]
+
+
+def test_a_map_that_changes_is_read_again(tmp_path: Path) -> None:
+    file = tmp_path / "map.txt"
+    file.write_text("S....G\n")
+    small = gridworld.compose("agent=dqn", {"env.layout": str(file)})
+    file.write_text("S....G\n" + 9 * "......\n")
+    large = gridworld.compose("agent=dqn", {"env.layout": str(file)})
+    assert large.total_timesteps == 2 * small.total_timesteps
+
+
+def test_the_command_line_shows_rules_and_values(tmp_path: Path) -> None:
+    rules = script("train.py", "--cfg", "job", "env.slip=0.2", cwd=tmp_path).stdout
+    values = script("train.py", "--cfg", "job", "--resolve", "env.slip=0.2", cwd=tmp_path).stdout
+    assert "gamma: ${clearest_gamma:${env}" in rules
+    assert "gamma: 0.98" in values
+    assert "n_envs: 4096" in values
+
+
+def test_a_small_world_with_chances_is_certified(tmp_path: Path) -> None:
+    quiet = [f"recording.{name}=false" for name in ("frames", "gif", "learning")]
+    world = ["env.num_rows=4", "env.num_cols=4", "env.slip=0.1", "env.step_reward=-0.1"]
+    summary = train_in(tmp_path, "agent=ppo", *world, "total_timesteps=400000", *quiet)
+    assert summary["certified"]
