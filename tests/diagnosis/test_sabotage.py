@@ -14,7 +14,9 @@ import pytest
 from helpers.sabotage import CATALOGUE, HELD_OUT, MADE_ON, SOUND, Sabotage, random_map
 
 import gridworld
+from gridworld.agents.sb3.ancestor import of_library
 from gridworld.agents.sb3.oracle_fit import one_state_fit
+from gridworld.agents.sb3.schemas import SB3ClassConfig
 from gridworld.diagnosis.causes import PHRASES
 from gridworld.diagnosis.verdict import Diagnosis
 from gridworld.world.solver import solved
@@ -95,6 +97,19 @@ def test_one_state_is_taught_alone(width: int, fewest: int, most: int) -> None:
     assert best.optimal[found.spoilt, greedy[found.spoilt]].all()
     assert wrong not in found.spoilt
     assert one_state_fit(run.agent, best, np.tile(states, 99999), wrong) is None  # too large
+
+
+def test_a_class_has_the_librarys_own_in_its_place() -> None:
+    def own(algorithm: str) -> SB3ClassConfig | None:
+        arguments = {"gamma": 0.5, "caution": 1}
+        return of_library(SB3ClassConfig("own", "sb3", algorithm, arguments=arguments))
+
+    found = own("helpers.planted_bugs.WrongSign")
+    assert found is not None
+    assert (found.algorithm, found.arguments) == ("stable_baselines3.PPO", {"gamma": 0.5})
+    assert own("stable_baselines3.PPO") is None
+    assert own("stable_baselines3.common.on_policy_algorithm.OnPolicyAlgorithm") is None
+    assert of_library(gridworld.compose("agent=dqn").agent) is None
 
 
 def test_two_optima_that_differ_are_told_apart() -> None:
