@@ -44,14 +44,16 @@ LONG = (
     *("in turn", "tests/test_docs.py", "commands/test_hostile_runs.py", "config/test_experiments.py"),
     *("sweep/test_sweep_population.py", "report/test_report.py", "commands/test_bad_input.py"),
     *("commands/test_commands.py", "tune/test_tune.py", "sweep/test_sweep.py", "process/test_output.py"),
-    *("tune/test_tune_parts.py", "restore/test_resume_kills.py", "agents/sb3/test_tabulated.py"),
+    *("tune/test_tune_parts.py", "restore/test_resume_kills.py", "checking/test_check.py"),
+    "agents/sb3/test_tabulated.py",
     *("diagnosis/test_sabotage.py", "restore/test_resume_states.py", "restore/test_reproduce.py"),
     *("restore/test_resume_commands.py", "restore/test_resume.py", "training/test_training.py"),
     *("training/test_certified.py", "docs/test_examples.py", "storage/test_other_systems.py"),
-    *("commands/test_console.py", "checking/test_check.py", "agents/tabular/test_tabular.py"),
+    *("commands/test_console.py", "agents/tabular/test_tabular.py", "tune/test_tune_together.py"),
     *("agents/sb3/test_resume_own_classes.py", "world/test_evaluation.py", "process/test_forks.py"),
     *("api/test_runs.py", "run/test_power_cuts.py", "api/test_scores.py", "agents/sb3/test_any_class.py"),
-    *("export/test_export.py", "run/test_lost_folders.py"),
+    *("commands/test_fuzz.py", "agents/sb3/test_callbacks.py", "export/test_export.py"),
+    "run/test_lost_folders.py",
 )
 
 

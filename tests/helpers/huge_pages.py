@@ -9,8 +9,11 @@ _MADV_COLLAPSE = 25  # from Linux 6.1 on; elsewhere nothing changes
 
 def collapse() -> None:
     """Put what this process has written so far into huge pages, where it fills them."""
+    maps = Path("/proc/self/maps")
+    if not maps.exists():  # on other systems
+        return
     library = ctypes.CDLL(None)
-    for line in Path("/proc/self/maps").read_text().splitlines():
+    for line in maps.read_text().splitlines():
         span, rights, _, _, inode, *_ = line.split()
         if rights != "rw-p" or inode != "0":
             continue
