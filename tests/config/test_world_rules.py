@@ -44,7 +44,6 @@ def test_they_follow_the_world_and_the_observation(agent: str) -> None:
     assert vars(configure(f"agent={agent}", "env.slip=0.2").agent)["gamma"] == 0.98
     large = configure(f"agent={agent}", "env.num_rows=12", "env.num_cols=12")
     assert large.total_timesteps == plain.total_timesteps * 144 // 30
-    assert widths(configure(f"agent={agent}", "observation=coordinates").agent) == [128, 128]
     assert (
         configure(f"agent={agent}", "env.num_rows=4", "env.num_cols=4").total_timesteps == LENGTHS[agent][0]
     )
@@ -53,6 +52,13 @@ def test_they_follow_the_world_and_the_observation(agent: str) -> None:
 @AGENTS
 def test_the_evaluations_discount_bounds_the_agents(agent: str) -> None:
     assert vars(configure(f"agent={agent}", "evaluation.gamma=0.5").agent)["gamma"] == 0.5
+
+
+def test_two_numbers_take_a_wider_network_and_starts_anywhere() -> None:
+    config = configure("agent=dqn", "observation=coordinates")
+    assert widths(config.agent) == [128, 128]
+    assert config.exploring_starts == 1
+    assert config.total_timesteps == 60_000
 
 
 def test_the_command_line_goes_before_them() -> None:

@@ -29,7 +29,8 @@ CONF = ROOT / "conf"
 # A run that takes a moment: too short to learn, long enough to pass through everything.
 SHORT = {
     "dqn": [
-        *("agent=dqn", "total_timesteps=2000", "evaluation.every=500"),
+        *("agent=dqn", "total_timesteps=2000", "evaluation.every=500", "n_envs=128"),
+        *("agent.batch_size=128", "agent.target_update_interval=512"),  # with slip too
         *("agent.learning_starts=300", "agent.exploration_fraction=1", "agent.log_interval=4"),
     ],
     "ppo": ["agent=ppo", "total_timesteps=2000", "n_envs=16", "agent.n_steps=32", "agent.batch_size=64"],
