@@ -40,13 +40,13 @@ def comparisons(workload: Workload) -> Iterator[Comparison]:
             f"train.py agent={agent}",
             partial(_seconds, train(f"agent={agent}")),
         )
-        if count == seeds:
+        if count == seeds and agent != "a2c":
             yield Comparison(
                 "whole command with all pictures, seconds",
                 "the same",
                 partial(_seconds, sweep),
-                "run by run, hydra.sweeper.population=1",
-                partial(_seconds, [*sweep, "hydra.sweeper.population=1"]),
+                "run by run in one process, hydra.sweeper.population=1 hydra/launcher=basic",
+                partial(_seconds, [*sweep, "hydra.sweeper.population=1", "hydra/launcher=basic"]),
             )
     for agent in ("ppo", "dqn", "a2c"):
         yield Comparison(

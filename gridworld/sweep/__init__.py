@@ -8,7 +8,8 @@
     console.py       terminal output at the start and at the end
     progress.py      the progress line on the terminal
     sweeper.py       a sweep from its command line to its exit code
-    launchers/       which launcher runs the jobs (select.py); on_joblib.py, on_slurm.py, on_ray.py; worker.py
+    population.py    the jobs that train together, or in forks
+    launchers/       which launcher runs the jobs (select.py); on_forks.py, on_joblib.py, ...; worker.py
     hydra_plugin.py  the plugins for Hydra
 
 The jobs' folders decide: a run's manifest says how it ended, and a lock that ends with its process says that

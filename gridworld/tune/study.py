@@ -183,7 +183,7 @@ def _confirm(spec: StudySpec, winner: list[HeldOutRun], began_from: list[HeldOut
     print(f"{len(runs)} runs on {count} held-out seeds confirm the winner", file=sys.stderr, flush=True)
     prepare(spec.folder, runs)
     workers = min(spec.settings.workers, len(runs))
-    run_workers(run_held_out, HeldOutRuns(tuple(runs), workers), workers, as_alone=True)
+    run_workers(run_held_out, HeldOutRuns(tuple(runs), workers), workers)
     before = read_results(began_from)
     if winner:
         return verdict_on(read_results(winner), before, "the winner")

@@ -26,6 +26,7 @@ from gridworld.errors import InputError
 from gridworld.world.absorption import Absorption, factor
 from gridworld.world.layout import positive_int
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+from gridworld.world.one_thread import in_one_thread
 
 ORDINARY_GAMMA = 0.9999  # up to here a plain solution of the linear system is accurate
 DENSE_STATES = 512  # up to here a dense matrix is both faster and small
@@ -94,6 +95,7 @@ class Chain:
         used = weight > 0
         return csr_array((weight[used], (rows[used], self.mdp.next_state[used])), shape=(size, size))
 
+    @in_one_thread
     def value(self, gamma: float) -> FloatArray:
         """The expected discounted sum of rewards, without a step limit.
 
@@ -118,6 +120,7 @@ class Chain:
         value[states] = np.linalg.solve(matrix, self.reward[states])
         return value
 
+    @in_one_thread
     def evaluation(self, gamma: float, with_slope: bool = False) -> Evaluation:
         """The value and what else policy iteration needs, in which tiny values are accurate too.
 
@@ -137,6 +140,7 @@ class Chain:
         slopes = self._sums(self.transition @ np.where(finite, sums, 0.0), gamma)
         return Evaluation(*_value_and_scale(sums), *_value_and_scale(np.where(finite, slopes, np.inf)))
 
+    @in_one_thread
     def outcome(self, max_steps: int) -> Outcome:
         """The outcome of an episode of at most `max_steps` steps, exact.
 
@@ -156,6 +160,7 @@ class Chain:
         goal, trap = float(mass[self.mdp.goal].sum()), float(mass[self.mdp.trap].sum())
         return Outcome(goal, trap, float(mass[live].sum()), float(total[1]), float(total[0]))
 
+    @in_one_thread
     def discounted_return(self, max_steps: int, gamma: float) -> float:
         """The expected discounted sum of rewards of an episode of at most `max_steps` steps, exact.
 

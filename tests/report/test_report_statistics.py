@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import binomtest
+from scipy.stats import binomtest, bootstrap, trim_mean
 
 from gridworld.report.analysis import statistics
 from gridworld.report.analysis.statistics import (
@@ -50,6 +50,21 @@ def test_infinity_is_a_number_like_any_other() -> None:
     assert interval(mean, [np.array([-inf, -inf])], 0).point == -inf
     nowhere = interval(median, [np.array([inf, inf, inf])], 0)
     assert (nowhere.point, nowhere.low, nowhere.high) == (inf, inf, inf)
+
+
+def test_intervals_are_those_of_scipy() -> None:
+    chance = np.random.default_rng(3)
+    tasks = [chance.normal(size=(7, 9)), chance.normal(size=(7, 6))]
+
+    def theirs(*drawn: np.ndarray, axis: int = -1) -> np.ndarray:
+        return np.asarray(trim_mean(np.concatenate(drawn, axis=axis), 0.25, axis=axis))
+
+    answer = bootstrap(
+        tasks, theirs, n_resamples=400, axis=-1, method="percentile", rng=np.random.default_rng(5)
+    ).confidence_interval
+    point, low, high = bands(iqm, tasks, 5, resamples=400)
+    np.testing.assert_array_equal(point, theirs(*tasks))
+    np.testing.assert_allclose([low, high], [answer.low, answer.high], rtol=1e-13)
 
 
 def test_one_run_has_no_interval() -> None:

@@ -34,6 +34,7 @@ from gridworld.sweep.progress import sweep_line
 QUICK = ("agent=q_learning", "total_timesteps=500", "recording.frames=false", "recording.gif=false")
 FOLDER = "hydra.sweep.dir=sweep"
 WORKERS = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
+FORKS = ("hydra/launcher=forks", "hydra.launcher.n_jobs=2")
 OWN_CLASSES = """
 import os, signal
 from stable_baselines3 import A2C
@@ -119,7 +120,7 @@ def test_a_sweep_is_come_back_to(tmp_path: Path) -> None:
     assert statuses(folder)["seed=1"] == "done"
 
 
-@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+@pytest.mark.parametrize("launcher", ["basic", "forks", "joblib"])
 def test_a_failure_stops_no_other_job(launcher: str, tmp_path: Path) -> None:
     words = ("agent.learning_rate=0.1,2,0.2", "seed=0,1", f"hydra/launcher={launcher}", "agent=q_learning")
     done = sweep(*words, cwd=tmp_path)
@@ -168,7 +169,7 @@ def test_an_unforeseen_error_leaves_its_traceback(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+@pytest.mark.parametrize("launcher", ["basic", "forks", "joblib"])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_and_it_says_how_to_go_on(
     number: signal.Signals, launcher: str, tmp_path: Path
@@ -190,9 +191,10 @@ def test_a_signal_ends_it_and_it_says_how_to_go_on(
     assert "running" not in statuses(folder).values()
 
 
-def test_workers_do_not_outlive_a_killed_sweep(tmp_path: Path) -> None:
+@pytest.mark.parametrize("workers", [FORKS, WORKERS])
+def test_workers_do_not_outlive_a_killed_sweep(workers: tuple[str, ...], tmp_path: Path) -> None:
     folder = tmp_path / "sweep"
-    words = ["-m", *QUICK, "seed=0,1,2", "total_timesteps=100000000", FOLDER, *WORKERS]
+    words = ["-m", *QUICK, "seed=0,1,2", "total_timesteps=100000000", FOLDER, *workers]
     with start("train.py", *words, cwd=tmp_path) as process:
         wait_for(lambda: any(curve_begun(path) for path in folder.glob("*/curve.csv")))
         process.kill()
@@ -202,6 +204,17 @@ def test_workers_do_not_outlive_a_killed_sweep(tmp_path: Path) -> None:
     assert looked.stdout.splitlines()[-1].startswith("3 jobs: ")
     assert "running" not in looked.stdout
     assert set(statuses(folder).values()) <= {"interrupted", "pending"}
+
+
+def test_a_fork_that_is_killed_takes_no_other_job_along(tmp_path: Path) -> None:
+    words = ["-m", *QUICK, "seed=range(4)", "total_timesteps=40000", FOLDER, *FORKS]
+    with start("train.py", *words, cwd=tmp_path) as process:
+        wait_for(lambda: any(curve_begun(path) for path in (tmp_path / "sweep").glob("*/curve.csv")))
+        os.kill(max(int(each) for each in members(process.pid)), signal.SIGKILL)
+        _, errors = process.communicate(timeout=30)
+    assert process.returncode == 0, errors
+    assert "Traceback" not in errors
+    assert list(statuses(tmp_path / "sweep").values()) == ["done"] * 4
 
 
 def test_a_worker_that_is_killed_takes_no_other_job_along(tmp_path: Path) -> None:

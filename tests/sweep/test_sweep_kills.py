@@ -34,7 +34,7 @@ def test_a_sweep_that_is_killed_comes_to_the_same(tmp_path: Path) -> None:
     done: dict[str, bytes] = {}
     at_work = 0
     for kill in range(KILLS):
-        launcher = ("basic", "joblib")[kill % 2]
+        launcher = ("basic", "joblib", "forks", "forks")[kill % 4]
         at_work += kill_after(chance.randrange(JOBS // KILLS), chance.uniform(0, 0.3), killed, launcher)
         done = check_what_is_left(killed / "sweep", done)
         print(f"kill {kill}: {len(done)} done")

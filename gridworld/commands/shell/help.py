@@ -47,7 +47,8 @@ Hydra reads them, and they can have it run code.
 
 Sweeps (-m):
   hydra.sweep.dir        the folder to write to; the same one again runs what is not done yet
-  hydra/launcher=joblib  as many jobs at once as there are cores, or hydra.launcher.n_jobs
+  hydra/launcher=basic   one job at a time, in this process; else as many as there are cores, in forks of it
+  hydra/launcher=joblib  the same in processes of their own; hydra.launcher.n_jobs, of either, is how many
   hydra/launcher=slurm   on a cluster, or ray; hydra.launcher.* as in conf/hydra/launcher
   hydra.sweeper.*        retry_failed, stop_at_first_failure, extend, max_jobs
   hydra.sweeper.paired=[agent,n_envs]  these lists vary together, not in every combination

@@ -145,7 +145,8 @@ def _quantile(ordered: FloatArray, share: float) -> FloatArray:
     place = share * count + (1 - share) - 1  # from 0
     below = int(place // 1)
     weight = place % 1
-    return (1 - weight) * ordered[..., below] + weight * ordered[..., min(below + 1, count - 1)]
+    above = min(below + 1, count - 1)
+    return np.asarray((1 - weight) * ordered[..., below] + weight * ordered[..., above])
 
 
 def profile(samples: Sequence[FloatArray], levels: FloatArray, seed: int) -> tuple[FloatArray, ...]:

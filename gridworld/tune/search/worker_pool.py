@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import multiprocessing
 import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from multiprocessing.context import SpawnProcess
 from typing import Any, TypeVar
 
@@ -25,7 +24,6 @@ T = TypeVar("T")
 
 UNREACHABLE = 3  # exit code of a worker that lost the study, and printed nothing
 
-_BLAS = "OPENBLAS_NUM_THREADS"  # numpy's, read when a process loads it
 _POLL_SECONDS = 0.1
 _STOP_WITHIN = 3.0  # seconds
 _MOST_LOST = 20  # a machine on which more are killed has no room for them
@@ -44,7 +42,6 @@ def run_workers(
     context: Any,
     workers: int,
     on_tick: Callable[[], None] = lambda: None,
-    as_alone: bool = False,
 ) -> None:
     """Run `main` in worker processes until all have ended.
 
@@ -53,9 +50,6 @@ def run_workers(
         context: what `main` needs to know, to be pickled.
         workers: how many processes.
         on_tick: called ten times a second meanwhile.
-        as_alone: whether each solves linear systems in as many threads as a process that runs alone, which
-            the last bits of a policy's value depend on. Several then wait for one another for much of the
-            time.
 
     Raises:
         Interrupted: at Ctrl-C and SIGTERM.
@@ -66,9 +60,8 @@ def run_workers(
     lost = 0
     with StopRequest().listening():
         try:
-            shares = workers > 1 and not as_alone
             for number in range(workers):
-                processes[number] = _start(main, context, number, shares)
+                processes[number] = _start(main, context, number)
             while processes:
                 for number, process in list(processes.items()):
                     if process.exitcode is None:
@@ -83,7 +76,7 @@ def run_workers(
                         _tell(-process.exitcode)
                         if lost > _MOST_LOST:
                             raise SearchError(f"{lost} workers were killed; is there memory for so many?")
-                        processes[workers + lost] = _start(main, context, workers + lost, shares)
+                        processes[workers + lost] = _start(main, context, workers + lost)
                 on_tick()
                 time.sleep(_POLL_SECONDS)
         finally:
@@ -97,26 +90,13 @@ def share(work: Sequence[T], worker: int, workers: int) -> Sequence[T]:
     return work[len(work) * worker // workers : len(work) * (worker + 1) // workers]
 
 
-def _start(main: WorkerMain, context: Any, number: int, shares: bool) -> SpawnProcess:
+def _start(main: WorkerMain, context: Any, number: int) -> SpawnProcess:
     process = multiprocessing.get_context("spawn").Process(
         target=_run, args=(main, held(), context, number, os.getpid()), daemon=True
     )
-    with blocking(signal.SIGINT), _one_thread(shares):  # Ctrl-C is for this process
+    with blocking(signal.SIGINT):  # Ctrl-C is for this process
         process.start()
     return process
-
-
-@contextlib.contextmanager
-def _one_thread(is_asked: bool) -> Iterator[None]:
-    """Let processes that start in the block solve linear systems in one thread, unless the user says."""
-    if not is_asked or _BLAS in os.environ:
-        yield
-        return
-    os.environ[_BLAS] = "1"
-    try:
-        yield
-    finally:
-        del os.environ[_BLAS]
 
 
 def _run(main: WorkerMain, holder: Held, context: Any, number: int, parent: int) -> None:
