@@ -27,7 +27,12 @@ from gridworld.training.learning_curve import LearningCurve
 
 # It is optimal on the way and no more at the end, at which it explores still.
 FORGETFUL = ["agent=q_learning", "total_timesteps=3000", "n_envs=1", "evaluation.every=250", "env.slip=0.2"]
-FORGETFUL += ["agent.learning_rate=0.9", "recording.frames=false", "recording.gif=false"]
+FORGETFUL += [
+    "agent.learning_rate=0.9",
+    "recording.frames=false",
+    "recording.gif=false",
+    "logging.progress=false",
+]
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +45,9 @@ def forgetful(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def deep(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("deep") / "run"
-    begin(folder, *SHORT["dqn"], "env=frozen_lake_4x4", "evaluation.every=200", "agent.learning_rate=0.01")
+    few = ["n_envs=128", "agent.batch_size=128", "agent.exploration_final_eps=0.05", "exploring_starts=0"]
+    few += ["agent.target_update_interval=512", "agent.learning_rate=0.01", "agent.gamma=0.9"]
+    begin(folder, *SHORT["dqn"], "env=frozen_lake_4x4", "evaluation.every=200", *few)
     return folder
 
 
