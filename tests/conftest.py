@@ -2,6 +2,7 @@
 
 import gc
 import os
+import signal
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -19,6 +20,9 @@ from gridworld.process import progress
 # The package and the tests are compiled once, not in every process.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a background job
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 progress._SECONDS_BETWEEN_LINES = 600.0  # no line says that something takes long, as on a busy machine it may
 settings.register_profile("gridworld", derandomize=True, deadline=None, database=None, max_examples=30)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -166,6 +167,10 @@ class Evidence:
         """The word that sets one of the agent's settings on a command line."""
         text = value if isinstance(value, str) else f"{value:.3g}" if value % 1 else f"{value:.0f}"
         return f"{self.config.agent.key(name)}={text}"
+
+    def takes(self, name: str) -> bool:
+        """Whether the agent has a setting of this name."""
+        return hasattr(self.config.agent, name) or name in signature(type(self.agent.model)).parameters
 
     @cached_property
     def updates(self) -> float:

@@ -15,6 +15,7 @@ _EXPLAINED = 0.5  # of what its policy loses from a state on
 _RANDOM = 0.5  # of all steps, or of a uniform policy's entropy: above, it did explore
 _DECIDED = 0.3  # of a uniform policy's entropy: below, it hardly explores
 _WIDE = 128  # environments
+_BONUS = 0.1  # what a first visit pays
 _LEFT = 0.2  # of how often the first policy met the goal
 
 
@@ -80,10 +81,12 @@ def _random(run: Evidence) -> float:
 
 
 def _explore(run: Evidence) -> tuple[str, ...]:
+    visits = () if run.config.exploration_bonus else (f"exploration_bonus={_BONUS}",)
     if run.is_actor_critic:
         bonus = min(max(10 * run.setting("ent_coef"), 0.1), 1.0)
         wider = (f"n_envs={_WIDE}",) if run.config.n_envs < _WIDE else ()
-        return run.change("ent_coef", bonus), *wider
+        entropy = (run.change("ent_coef", bonus),) if run.takes("ent_coef") else visits
+        return *entropy, *wider
     names = ("exploration_initial_eps", "exploration_fraction")
     changes = tuple(run.change(name, 1.0) for name in names if run.setting(name) < 1)
-    return changes or (run.change("exploration_final_eps", 0.3),)
+    return changes or (run.change("exploration_final_eps", 0.3), *visits)

@@ -313,7 +313,7 @@ def test_a_folder_under_a_file_is_refused(tmp_path: Path) -> None:
         ("hydra.sweeper.retry_fail=true", "did you mean retry_failed?"),
         (
             "hydra/launcher=abacus",
-            "hydra/launcher=abacus: there is no such choice; there are basic, joblib, ray",
+            "hydra/launcher=abacus: there is no such choice; there are basic, forks, joblib, ray, slurm",
         ),
         ("hydra/launcher=joblib hydra.launcher.n_jobs=0", "hydra.launcher.n_jobs=0: must be the number"),
         ("hydra/launcher=slurm hydra.launcher.jobs_per_task=0", "jobs_per_task=0: must be at least 1"),

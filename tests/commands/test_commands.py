@@ -341,7 +341,7 @@ def test_rl_zoo_is_given_the_same_steps_of_the_same_world(
 def test_populations_are_measured() -> None:
     rows = list(population.comparisons(QUICK))
     commands = [row for row in rows if "whole command" in row.table]
-    assert len(commands) == 7
+    assert len(commands) == 6
     assert all(row.theirs is not None for row in commands)
     assert population._shipped("a2c", 2) > 0
 

@@ -128,6 +128,14 @@ def test_on_policy_control_learns_what_is_best_for_one_that_explores() -> None:
     assert gridworld.diagnose(run).cause == "epsilon"
 
 
+def test_an_agent_without_an_entropy_bonus_is_offered_the_one_for_exploring() -> None:
+    still = ["agent=trpo", "exploration_bonus=0", "total_timesteps=40000"]
+    found = gridworld.diagnose(gridworld.train(*still, seed=0, progress=False))
+    assert found.cause in ("exploration", "budget")
+    assert "exploration_bonus=0.1" in " ".join(found.commands)
+    assert "ent_coef" not in " ".join(found.commands)
+
+
 @pytest.mark.parametrize("agent", ["q_learning", "dqn"])
 def test_nothing_is_named_for_a_certified_run(agent: str) -> None:
     run = gridworld.train(f"agent={agent}", seed=0, progress=False)
