@@ -78,7 +78,7 @@ def test_wandb(place: Path) -> None:
     assert not run.host
     config = {item.key: json.loads(item.value_json) for item in run.config.update}
     assert config["env.slip"] == 0.1
-    assert config["agent.gamma"] == 0.9
+    assert config["agent.gamma"] == 0.95  # what follows the slip
     rows = [values_of(each.item) for each in found["history"]]
     curve = curve_of(place)
     assert [row["_step"] for row in rows] == [int(row["step"]) for row in curve]
