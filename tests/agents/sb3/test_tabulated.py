@@ -20,12 +20,14 @@ from gridworld import GridWorldVectorEnv
 from gridworld.agents.sb3 import check
 from gridworld.agents.sb3.constructor_arguments import algorithm_and_arguments
 from gridworld.agents.sb3.schemas import SB3Config
-from gridworld.agents.sb3.tabulated import off_policy, qrdqn_loss, trpo_loss
+from gridworld.agents.sb3.tabulated import off_policy
 from gridworld.agents.sb3.tabulated import state_inputs as tabulated
 from gridworld.agents.sb3.tabulated.a2c import TabulatedA2C
 from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
+from gridworld.agents.sb3.tabulated.losses import qrdqn as qrdqn_losses
+from gridworld.agents.sb3.tabulated.losses import trpo as trpo_losses
+from gridworld.agents.sb3.tabulated.losses.ppo import log_softmax
 from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
-from gridworld.agents.sb3.tabulated.ppo_loss import log_softmax
 from gridworld.agents.sb3.tabulated.qrdqn import TabulatedQRDQN
 from gridworld.agents.sb3.tabulated.side_by_side import SideBySide
 from gridworld.agents.sb3.tabulated.trpo import TabulatedTRPO
@@ -229,9 +231,9 @@ def test_trpos_curvature_is_the_divergences_second_derivative() -> None:
     shares, start = rng.random((2, 5)), log_softmax(logits)
     half = 1e-4
     ahead, behind, here = (
-        trpo_loss.divergence(log_softmax(logits + step * move), start, shares) for step in (half, -half, 0)
+        trpo_losses.divergence(log_softmax(logits + step * move), start, shares) for step in (half, -half, 0)
     )
-    product = (move * trpo_loss.curved(np.exp(start), shares, move)).sum(axis=(-2, -1))
+    product = (move * trpo_losses.curved(np.exp(start), shares, move)).sum(axis=(-2, -1))
     assert np.allclose((ahead - 2 * here + behind) / half**2, product, rtol=1e-4)
 
 
@@ -373,9 +375,9 @@ def test_the_same_seed_walks_and_learns_the_same(ours: type, theirs: type) -> No
 def test_losses_of_several_minibatches_at_once_are_those_of_each() -> None:
     """Arrays may have leading axes, of runs that are trained together."""
     quantiles, targets = np.random.default_rng(0).normal(size=(2, 3, 7, 16)).astype(np.float32)
-    losses, slopes = qrdqn_loss.losses_and_slopes(quantiles, targets)
+    losses, slopes = qrdqn_losses.losses_and_slopes(quantiles, targets)
     for one, its_targets, loss, its_slopes in zip(quantiles, targets, losses, slopes, strict=True):
-        alone, slopes_alone = qrdqn_loss.losses_and_slopes(one, its_targets)
+        alone, slopes_alone = qrdqn_losses.losses_and_slopes(one, its_targets)
         assert (alone == loss, np.array_equal(slopes_alone, its_slopes)) == (True, True)
 
 

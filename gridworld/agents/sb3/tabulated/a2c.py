@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from stable_baselines3 import A2C
 
 from gridworld.agents.sb3.tabulated.flat_optimizer import not_finite
+from gridworld.agents.sb3.tabulated.losses.ppo import losses_and_slopes, sum_up
 from gridworld.agents.sb3.tabulated.on_policy import (
     Rollouts,
     TabulatedOnPolicy,
@@ -20,7 +21,6 @@ from gridworld.agents.sb3.tabulated.on_policy import (
     tables_of_runs,
     weights_of,
 )
-from gridworld.agents.sb3.tabulated.ppo_loss import losses_and_slopes, sum_up
 from gridworld.agents.sb3.tabulated.side_by_side import SideBySide, update_together
 from gridworld.process.together import meet
 

@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer
-from gridworld.agents.sb3.tabulated.ppo_loss import Outputs, Weights, column, log_softmax
+from gridworld.agents.sb3.tabulated.losses.ppo import Outputs, Weights, column, log_softmax
 from gridworld.agents.sb3.tabulated.side_by_side import SideBySide
 from gridworld.agents.sb3.tabulated.stacked_layers import Leaves, forward
 from gridworld.agents.sb3.tabulated.state_buffers import Float32Array, StateRolloutBuffer

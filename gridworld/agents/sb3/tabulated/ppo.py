@@ -1,7 +1,7 @@
 """PPO with the network run once per state.
 
 In an update, a minibatch's loss depends on the network only through its outputs at the states, and has its
-slopes there in closed form (`tabulated.ppo_loss`); from there they go back through the network once.
+slopes there in closed form (`tabulated.losses.ppo`); from there they go back through the network once.
 `tabulated.state_inputs` says why that is the gradient of the whole batch.
 """
 
@@ -15,6 +15,7 @@ import numpy as np
 from stable_baselines3 import PPO
 
 from gridworld.agents.sb3.tabulated.flat_optimizer import not_finite
+from gridworld.agents.sb3.tabulated.losses.ppo import Losses, Outputs, losses_and_slopes, sum_up
 from gridworld.agents.sb3.tabulated.on_policy import (
     Rollouts,
     TabulatedOnPolicy,
@@ -22,7 +23,6 @@ from gridworld.agents.sb3.tabulated.on_policy import (
     tables_of_runs,
     weights_of,
 )
-from gridworld.agents.sb3.tabulated.ppo_loss import Losses, Outputs, losses_and_slopes, sum_up
 from gridworld.agents.sb3.tabulated.side_by_side import SideBySide, update_together
 from gridworld.process.together import chance, meet
 from gridworld.world.mdp import FloatArray, IntArray

@@ -1,7 +1,7 @@
 """QR-DQN with the network run once per state.
 
 As in DQN, with N quantiles of the return in place of its mean: the best action is that of the largest mean,
-and a sample's targets are the quantiles of the next state's best action (`tabulated.qrdqn_loss`).
+and a sample's targets are the quantiles of the next state's best action (`tabulated.losses.qrdqn`).
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import torch
 from sb3_contrib import QRDQN
 from torch import Tensor
 
+from gridworld.agents.sb3.tabulated.losses.qrdqn import losses_and_slopes
 from gridworld.agents.sb3.tabulated.off_policy import TabulatedOffPolicy
-from gridworld.agents.sb3.tabulated.qrdqn_loss import losses_and_slopes
 from gridworld.agents.sb3.tabulated.stacked_layers import Leaves
 from gridworld.agents.sb3.tabulated.state_buffers import Float32Array
 from gridworld.world.mdp import FloatArray, IntArray

@@ -1,7 +1,7 @@
 """TRPO with the network run once per state.
 
 The surrogate, the divergence and its curvature depend on the policy only through its table over states
-(`tabulated.trpo_loss`). So conjugate gradients multiply with the Fisher matrix by two passes through the
+(`tabulated.losses.trpo`). So conjugate gradients multiply with the Fisher matrix by two passes through the
 network on the states that occur, and the line search compares tables.
 """
 
@@ -17,14 +17,14 @@ from sb3_contrib import TRPO
 from sb3_contrib.common.utils import conjugate_gradient_solver
 from torch import Tensor
 
-from gridworld.agents.sb3.tabulated import trpo_loss
 from gridworld.agents.sb3.tabulated.flat_optimizer import ENGINE, FlatOptimizer
-from gridworld.agents.sb3.tabulated.jacobian import Jacobian
+from gridworld.agents.sb3.tabulated.losses import trpo as losses
+from gridworld.agents.sb3.tabulated.losses.jacobian import Jacobian
+from gridworld.agents.sb3.tabulated.losses.ppo import log_softmax
 from gridworld.agents.sb3.tabulated.on_policy import (
     TabulatedOnPolicy,
     normalized,
 )
-from gridworld.agents.sb3.tabulated.ppo_loss import log_softmax
 from gridworld.agents.sb3.tabulated.state_buffers import Float32Array
 from gridworld.world.mdp import FloatArray, IntArray
 
@@ -66,9 +66,9 @@ class TabulatedTRPO(TabulatedOnPolicy, TRPO):  # type: ignore[misc]
         which, index = self.inputs.distinct(states[part])
         weighed = normalized(advantages[part]) if self.normalize_advantage else advantages[part]
         old = self.old.log_prob if which is None else self.old.log_prob[which]
-        gains, shares = trpo_loss.sum_up(index, actions[part], weighed, old.shape)
+        gains, shares = losses.sum_up(index, actions[part], weighed, old.shape)
         step, start = self._step(which, old, gains, shares)
-        surrogate = float(trpo_loss.surrogate(start, old, gains))
+        surrogate = float(losses.surrogate(start, old, gains))
         before = torch.cat([parameter.detach().reshape(-1) for parameter in self._actor])
         scale = 1.0
         for _ in range(self.line_search_max_iter):
@@ -77,8 +77,8 @@ class TabulatedTRPO(TabulatedOnPolicy, TRPO):  # type: ignore[misc]
                 log_prob = log_softmax(self.outputs(which)[0].cpu().numpy())
             if not np.isfinite(log_prob).all():
                 raise FloatingPointError("the network's weights are no finite number")
-            divergence = float(trpo_loss.divergence(log_prob, start, shares))
-            reached = float(trpo_loss.surrogate(log_prob, old, gains))
+            divergence = float(losses.divergence(log_prob, start, shares))
+            reached = float(losses.surrogate(log_prob, old, gains))
             if divergence < self.target_kl and reached > surrogate:
                 return reached, divergence, True
             scale *= self.line_search_shrinking_factor
@@ -94,10 +94,10 @@ class TabulatedTRPO(TabulatedOnPolicy, TRPO):  # type: ignore[misc]
         prob, jacobian = np.exp(start), Jacobian(logits, self._actor)
 
         def damped_fisher(vector: Tensor) -> Tensor:
-            curved = trpo_loss.curved(prob, shares, jacobian.push(vector))
+            curved = losses.curved(prob, shares, jacobian.push(vector))
             return jacobian.pull(curved).add(vector, alpha=self.cg_damping)
 
-        gradient = jacobian.pull(trpo_loss.surrogate_slope(start, old, gains))
+        gradient = jacobian.pull(losses.surrogate_slope(start, old, gains))
         direction: Tensor = conjugate_gradient_solver(damped_fisher, gradient, max_iter=self.cg_max_steps)
         squared = 2 * self.target_kl / float(direction @ damped_fisher(direction))
         return direction.mul(np.sqrt(squared)), start
@@ -111,16 +111,16 @@ class TabulatedTRPO(TabulatedOnPolicy, TRPO):  # type: ignore[misc]
 
     def _fit_values(self, states: IntArray, returns: Float32Array) -> list[float]:
         """Fit the value network; return the losses."""
-        losses = []
+        fitted = []
         for _ in range(self.n_critic_updates):
             for batch in _minibatches(len(states), self.batch_size):
                 which, index = self.inputs.distinct(states[batch])
                 _, values = self.outputs(which)
-                sums = trpo_loss.value_sums(index, returns[batch], len(values))
-                loss, slope = trpo_loss.value_loss_and_slope(values.detach().cpu().numpy()[:, 0], *sums)
-                losses.append(float(loss))
+                sums = losses.value_sums(index, returns[batch], len(values))
+                loss, slope = losses.value_loss_and_slope(values.detach().cpu().numpy()[:, 0], *sums)
+                fitted.append(float(loss))
                 self.descent.step([values], [slope], math.inf)
-        return losses
+        return fitted
 
 
 def _minibatches(count: int, batch_size: int) -> list[IntArray]:
