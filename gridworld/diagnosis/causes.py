@@ -34,7 +34,7 @@ CAUSES: tuple[Cause, ...] = (
 
 PHRASES = {  # by name
     "implementation": "the class is wrong",
-    "objective": "gamma of another optimum",
+    "objective": "discount does not fit",
     "lost": "lost its certificate again",
     "diverged": "values diverged",
     "epsilon": "plays safe for epsilon",
