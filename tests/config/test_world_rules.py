@@ -34,6 +34,14 @@ def test_the_default_world_has_the_settings_that_it_was_tuned_with(agent: str) -
     assert (config.n_envs, config.exploring_starts, widths(config.agent)) == (128, 0.0, None)
 
 
+@pytest.mark.parametrize(("envs", "batch"), [(1024, 8192), (128, 1024), (1, 8)])
+def test_a_minibatch_divides_the_rollout_of_any_number_of_environments(envs: int, batch: int) -> None:
+    config = configure("agent=ppo", "env.slip=0.1", f"n_envs={envs}")
+    assert vars(config.agent)["batch_size"] == batch
+    odd = configure("agent=ppo", "env.slip=0.1", "n_envs=1", "agent.n_steps=5")
+    assert vars(odd.agent)["batch_size"] == 5
+
+
 @AGENTS
 def test_they_follow_the_world_and_the_observation(agent: str) -> None:
     plain, random = configure(f"agent={agent}"), configure(f"agent={agent}", "env.slip=0.1")

@@ -5,6 +5,7 @@
     ${for_size:${env},30000}                        30000 up to 30 states, in larger worlds in proportion
     ${if_chance:${env},A,B}                         A where an action may have several outcomes, else B
     ${if_seen:${observation.kind},coordinates,A,B}  A where that is what the agent sees, else B
+    ${quarter:${agent.n_steps},${n_envs}}           a quarter of a rollout's steps
 
 They know the worlds of maps of up to 512 cells. Any other world, and settings that make none, get what the
 default world gets; the check before training says what is wrong with the settings.
@@ -32,7 +33,7 @@ _MOST_CELLS = 512  # the rules solve the world a few times, which takes 0.3 s th
 
 def register_world_rules() -> None:
     """Register these functions with OmegaConf."""
-    for rule in (clearest_gamma, for_size, if_chance, if_seen, quadratic_scale):
+    for rule in (clearest_gamma, for_size, if_chance, if_seen, quadratic_scale, quarter):
         OmegaConf.register_new_resolver(rule.__name__, rule, replace=True)
 
 
@@ -67,6 +68,12 @@ def if_seen(kind: str, this: str, then: Any, otherwise: Any) -> Any:
     """`then` where the observation is of the kind `this`."""
     chosen = then if kind == this else otherwise
     return OmegaConf.create(chosen) if isinstance(chosen, list) else chosen
+
+
+def quarter(n_steps: int, n_envs: int) -> int:
+    """A quarter of a rollout, or all of it where four do not divide it."""
+    whole = n_steps * n_envs
+    return whole if whole % 4 else whole // 4
 
 
 def _world(env: DictConfig) -> Mdp | None:
