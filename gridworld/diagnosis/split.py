@@ -17,13 +17,13 @@ Reference: S. Kakade and J. Langford, Approximately optimal approximate reinforc
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from gridworld.world.evaluation import Evaluator, Score
-from gridworld.world.markov_chain import Chain, can_reach
+from gridworld.world.markov_chain import Chain
 from gridworld.world.mdp import BoolArray, FloatArray
+from gridworld.world.occupancy import discounted_visits, stopping_states
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +58,8 @@ def split_regret(evaluator: Evaluator, policy: FloatArray) -> RegretSplit:
     """
     mdp, best = evaluator.mdp, evaluator.solution
     chain = Chain(mdp, policy)
-    stops = _stops(chain, best.gamma)
-    visits = _visits(chain, best.gamma, stops)
+    stops = stopping_states(chain, best.gamma)
+    visits = discounted_visits(chain, best.gamma, stops)
     with np.errstate(invalid="ignore"):  # where V* is -inf, every action is as good
         chosen = np.where(chain.policy > 0, chain.policy * best.q, 0.0).sum(axis=1)
         lost = best.v - chosen
@@ -68,32 +68,3 @@ def split_regret(evaluator: Evaluator, policy: FloatArray) -> RegretSplit:
     lost, cost = (np.where(np.isnan(each), 0.0, each) for each in (lost, cost))
     errs = ((chain.policy > 0) & ~best.optimal).any(axis=1) & ~mdp.absorbing
     return RegretSplit(evaluator.score(policy), visits, lost, cost, (visits > 0) & errs)
-
-
-def _stops(chain: Chain, gamma: float) -> BoolArray:
-    """Where nothing is counted any more; without a discount, where an episode cannot end any more."""
-    mdp = chain.mdp
-    if gamma < 1:
-        return mdp.absorbing
-    taken = (chain.policy[:, :, None] > 0) & (mdp.probability > 0)
-    return mdp.absorbing | ~can_reach(mdp, taken, mdp.terminal)
-
-
-def _visits(chain: Chain, gamma: float, stops: BoolArray) -> FloatArray:
-    """d = start + γ Pᵀ d, where no one leaves a state of `stops`."""
-    start, going = chain.mdp.start, np.flatnonzero(~stops)
-    ahead = gamma * chain.transition[going]
-    visits = start.copy()
-    visits[going] = _solved(ahead[:, going], start[going])
-    visits[stops] += (ahead.T @ visits[going])[stops]
-    visits[visits < 0] = 0.0  # rounding
-    return visits
-
-
-def _solved(ahead: Any, right: FloatArray) -> FloatArray:
-    if isinstance(ahead, np.ndarray):
-        return np.asarray(np.linalg.solve(np.eye(len(right)) - ahead.T, right))
-    from scipy.sparse import eye_array
-    from scipy.sparse.linalg import spsolve
-
-    return np.atleast_1d(spsolve((eye_array(len(right)) - ahead.T).tocsc(), right))

@@ -20,6 +20,7 @@ from gridworld.world.bellman import backup
 from gridworld.world.evaluation import REGRET_TOLERANCE
 from gridworld.world.markov_chain import Chain
 from gridworld.world.mdp import BoolArray, FloatArray, Mdp
+from gridworld.world.occupancy import discounted_visits, stopping_states
 from gridworld.world.solver import Solution, solved
 
 _SAMPLES = 4000  # of a state and action that a run sees
@@ -117,10 +118,8 @@ def costly(mdp: Mdp, best: Solution) -> BoolArray:
         Learning, ICML 2002, lemma 6.1).
     """
     policy = best.optimal / best.optimal.sum(axis=1, keepdims=True)
-    playing = np.flatnonzero(~mdp.absorbing)
-    moves = Chain(mdp, policy).transition[np.ix_(playing, playing)]
-    visits: FloatArray = np.zeros(mdp.num_states)
-    visits[playing] = np.linalg.solve(np.eye(len(playing)) - best.gamma * moves.T, mdp.start[playing])
+    chain = Chain(mdp, policy)
+    visits = discounted_visits(chain, best.gamma, stopping_states(chain, best.gamma))
     allowed = REGRET_TOLERANCE * float(mdp.start @ best.scale)
     found: BoolArray = visits[:, None] * (best.v[:, None] - best.q) > allowed
     return found
