@@ -11,9 +11,8 @@ from functools import partial
 from typing import Any
 
 from hydra.core.utils import JobReturn, JobStatus
-from omegaconf import open_dict, read_write
 
-from gridworld.config.composition.compose import to_config
+from gridworld.config.composition.compose import without_hydra
 from gridworld.process.forks import can_fork, run_in_forks
 from gridworld.process.machine import worker_count
 from gridworld.sweep.launchers import in_process
@@ -43,10 +42,8 @@ def launch(
 
 def _import_for(runner: JobRunner, overrides: Sequence[str]) -> None:
     """Import what a job takes, once for all forks."""
-    settings = runner.context.config_loader.load_sweep_config(runner.config, list(overrides))
-    with read_write(settings), open_dict(settings):
-        del settings["hydra"]
-    import_for(to_config(settings))
+    whole = runner.context.config_loader.load_sweep_config(runner.config, list(overrides))
+    import_for(without_hydra(whole))
 
 
 def _run(runner: JobRunner, overrides: Sequence[str], number: int) -> JobReturn:
