@@ -16,7 +16,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gridworld.world.bellman import backup
 from gridworld.world.evaluation import REGRET_TOLERANCE
 from gridworld.world.markov_chain import Chain
 from gridworld.world.mdp import BoolArray, FloatArray, Mdp
@@ -74,8 +73,7 @@ def quadratic_scale(mdp: Mdp, gamma: float) -> float | None:
         InputError: the world has no finite optimum.
     """
     own = solved(mdp, gamma)
-    apart = np.abs(mdp.reward + gamma * own.v[mdp.next_state] - own.q[:, :, None])
-    farthest = float(np.max(apart, where=mdp.probability > 0, initial=0.0))
+    farthest = float(np.abs(_deviations(mdp, own)).max(where=mdp.probability > 0, initial=0.0))
     return None if farthest <= 1 else max(math.floor(100 / farthest) / 100, _LEAST_SCALE)
 
 
@@ -98,7 +96,7 @@ def clarity(mdp: Mdp, gamma: float, evaluation_gamma: float) -> float:
         return np.inf
     if (own.optimal & matters).any():
         return 0.0
-    variance = _variance(mdp, own)
+    variance = (mdp.probability * _deviations(mdp, own) ** 2).sum(axis=2)
     of_best = variance[np.arange(mdp.num_states), np.argmax(own.q, axis=1)]
     error = np.sqrt((variance + of_best[:, None]) / _SAMPLES + _NETWORK_ERROR**2)
     return float(((own.v[:, None] - own.q) / error)[matters].min())
@@ -125,9 +123,7 @@ def costly(mdp: Mdp, best: Solution) -> BoolArray:
     return found
 
 
-def _variance(mdp: Mdp, own: Solution) -> FloatArray:
-    """(S, A), of r + γ V(s') over the outcomes of each state and action."""
-    target = mdp.reward + own.gamma * own.v[mdp.next_state]
-    mean = backup(mdp, own.v, own.gamma)
-    spread: FloatArray = (mdp.probability * (target - mean[:, :, None]) ** 2).sum(axis=2)
-    return spread
+def _deviations(mdp: Mdp, own: Solution) -> FloatArray:
+    """(S, A, K), of the target r + γ V*(s') of each outcome from Q*(s, a), the mean of them."""
+    apart: FloatArray = mdp.reward + own.gamma * own.v[mdp.next_state] - own.q[:, :, None]
+    return apart

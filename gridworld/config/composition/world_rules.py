@@ -54,14 +54,21 @@ def for_size(env: DictConfig, number: int) -> int:
 
 def if_chance(env: DictConfig, then: Any, otherwise: Any) -> Any:
     """`then` where an action may have several outcomes in the world of the section `env`."""
+    from gridworld.world.recommendation import has_chance
+
     world = _world(env)
-    return then if world is not None and _has_chance(world) else otherwise
+    return then if world is not None and has_chance(world) else otherwise
 
 
 def quadratic_scale(env: DictConfig, gamma: float) -> float | None:
     """What rewards are multiplied with in the world of the section `env`; None: they stay as they are."""
+    from gridworld.world.recommendation import quadratic_scale as scale
+
     world = _world(env)
-    return None if world is None else _scale(world, gamma)
+    try:
+        return None if world is None else scale(world, gamma)
+    except InputError:  # of the discount
+        return None
 
 
 def if_seen(kind: str, this: str, then: Any, otherwise: Any) -> Any:
@@ -98,20 +105,3 @@ def _gamma(world: Mdp, evaluation_gamma: float, candidates: tuple[float, ...]) -
     from gridworld.world.recommendation import clearest_gamma as clearest
 
     return clearest(world, candidates, evaluation_gamma)
-
-
-@functools.lru_cache(maxsize=64)
-def _has_chance(world: Mdp) -> bool:
-    from gridworld.world.recommendation import has_chance
-
-    return has_chance(world)
-
-
-@functools.lru_cache(maxsize=64)
-def _scale(world: Mdp, gamma: float) -> float | None:
-    from gridworld.world.recommendation import quadratic_scale as scale
-
-    try:
-        return scale(world, gamma)
-    except InputError:  # of the discount
-        return None
