@@ -22,7 +22,7 @@ from gridworld.restore.saved_run import SavedRun, read_visits
 from gridworld.world.bellman import backup, pick
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.markov_chain import Chain
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+from gridworld.world.mdp import FloatArray, IntArray, Mdp
 from gridworld.world.solver import Solution, solved
 
 
@@ -139,11 +139,6 @@ class Evidence:
         uniform = np.full_like(self.snapshot.sampled, 1 / self.mdp.num_actions)
         walk = Chain(self.mdp, uniform).outcome(self.evaluator.max_episode_steps)
         return walk.expected_length / walk.goal if walk.goal > 0 else np.inf
-
-    @property
-    def acting(self) -> BoolArray:
-        """(S,), the states that an episode can come to and act in."""
-        return np.asarray(self.mdp.reachable & ~self.mdp.absorbing)
 
     def setting(self, name: str, default: float = 0.0) -> float:
         """A number among the agent's settings: as configured, or as its model has it by default.

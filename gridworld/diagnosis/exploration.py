@@ -47,7 +47,7 @@ def collapsed(run: Evidence) -> Finding | None:
 
 def ended_early(run: Evidence) -> Finding | None:
     """Its random steps were fewer than a random walk needs to meet the goal twice."""
-    optimistic = run.setting("initial_value") >= run.own.v[run.acting].max()
+    optimistic = run.setting("initial_value") >= run.own.v[run.mdp.acting].max()
     if (
         run.is_actor_critic
         or optimistic
@@ -74,7 +74,7 @@ def _random(run: Evidence) -> float:
     """How random it acted: the mean epsilon over training, or the entropy that is left of its policy."""
     if run.is_actor_critic:
         goal = run.curve.get("sampled_goal_probability", np.ones(1))
-        return 0.0 if goal[-1] < _LEFT * goal[0] else float(run.spread[run.acting].mean())
+        return 0.0 if goal[-1] < _LEFT * goal[0] else float(run.spread[run.mdp.acting].mean())
     start, end = run.setting("exploration_initial_eps"), run.setting("exploration_final_eps")
     fraction = min(1.0, run.setting("exploration_fraction"))
     return fraction * (start + end) / 2 + (1 - fraction) * end

@@ -30,7 +30,7 @@ def lost_again(run: Evidence) -> Finding | None:
 
 def diverged(run: Evidence) -> Finding | None:
     """A network's values are higher than those of any policy, by more than two rewards."""
-    known = run.acting & (run.visits.sum(axis=1) > 0)
+    known = run.mdp.acting & (run.visits.sum(axis=1) > 0)
     if run.is_tabular or not known.any():
         return None
     highest, possible = float(run.values[known].max()), float(run.own.v[known].max())
@@ -121,7 +121,7 @@ def _behind(run: Evidence) -> str:
 
 def _slow_table(run: Evidence, states: BoolArray) -> Finding | None:
     """What its step sizes have left of the first value; None where that is nothing."""
-    first, possible = run.setting("initial_value"), float(run.own.v[run.acting].max())
+    first, possible = run.setting("initial_value"), float(run.own.v[run.mdp.acting].max())
     worst = costliest(run, states)
     where, expects = run.mdp.state_name(worst), float(run.q[worst].max())
     if first > possible and expects > possible * (1 + 1e-9):

@@ -79,12 +79,12 @@ def _fits(run: Evidence, fresh: bool) -> bool | None:
     def is_optimal(greedy: IntArray) -> bool:
         return judge.score(one_hot_policy(greedy, run.mdp.num_actions)).certified
 
-    return oracle_fit(run.agent, run.own, np.flatnonzero(run.acting), is_optimal, fresh)
+    return oracle_fit(run.agent, run.own, np.flatnonzero(run.mdp.acting), is_optimal, fresh)
 
 
 def _alone(run: Evidence, state: int) -> tuple[bool, IntArray]:
     """Whether a network can learn one state and keep the others, and which it loses if nothing holds them."""
     from gridworld.agents.sb3.oracle_fit import one_state_fit  # imports torch
 
-    found = one_state_fit(run.agent, run.own, np.flatnonzero(run.acting), state)
+    found = one_state_fit(run.agent, run.own, np.flatnonzero(run.mdp.acting), state)
     return (True, np.empty(0, np.int64)) if found is None else found

@@ -142,17 +142,20 @@ class Mdp:
         """(S,), the states that an episode can come to."""
         return np.asarray(self.steps_away >= 0)
 
+    @cached_property
+    def acting(self) -> BoolArray:
+        """(S,), the states that an episode can come to and act in."""
+        return frozen(self.reachable & ~self.absorbing)
+
     def with_exploring_starts(self, share: float) -> Self:
         """The same world, in which a share of the episodes begins in any state that can be come to.
 
         Reference: R. Sutton and A. Barto, Reinforcement Learning, 2nd ed., 2018, section 5.3.
 
         Args:
-            share: a probability. Their start is drawn uniformly from the reachable states in which an
-                episode goes on.
+            share: a probability. Their start is drawn uniformly from the states of `acting`.
         """
-        anywhere = self.reachable & ~self.absorbing
-        start = (1 - share) * self.start + share * anywhere / anywhere.sum()
+        start = (1 - share) * self.start + share * self.acting / self.acting.sum()
         return dataclasses.replace(self, start=frozen(start))
 
     def text(self) -> str:
