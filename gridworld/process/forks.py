@@ -101,7 +101,8 @@ class _Crew:
                     self._note_end(fork)
                     continue
                 if is_well:
-                    self.results[fork.task or 0] = outcome
+                    assert fork.task is not None
+                    self.results[fork.task] = outcome
                 else:
                     self.error = self.error or outcome
                 self._give(fork)
