@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from gridworld.diagnosis.evidence import Evidence
@@ -38,6 +40,7 @@ def best_of_what_was_tried(evaluator: Evaluator, tried: BoolArray) -> FloatArray
     return v
 
 
+@lru_cache(maxsize=1)  # two causes ask
 def entropy_optimum(run: Evidence, bonus: float) -> FloatArray:
     """The policy (S, A) that an entropy bonus aims at: π = softmax(A_π / bonus), found by iteration.
 
@@ -48,7 +51,7 @@ def entropy_optimum(run: Evidence, bonus: float) -> FloatArray:
     for _ in range(_ROUNDS):
         v = Chain(mdp, policy).value(min(run.gamma, 0.9999))
         advantage = backup(mdp, v, run.gamma) - v[:, None]
-        weight = run.acting[:, None] * policy
+        weight = run.mdp.acting[:, None] * policy
         deviation = np.sqrt((weight * advantage**2).sum() / weight.sum()) if normalised else 1.0
         logits = advantage / max(bonus * deviation, 1e-12)
         aimed = np.exp(np.minimum(logits - logits.max(axis=1, keepdims=True), 0.0))
