@@ -52,10 +52,10 @@ class Rollout:
     lengths: StateArray
     first_ended: Sequence[int]
 
-    def ended(self, number: int) -> tuple[FloatArray, StateArray]:
-        """The returns and lengths of the episodes that a step ended."""
-        start, end = self.first_ended[number], self.first_ended[number + 1]
-        return self.returns[start:end], self.lengths[start:end]
+    def ended(self, first: int, stop: int) -> tuple[FloatArray, StateArray]:
+        """The returns and lengths of the episodes that steps ended, from `first` to before `stop`."""
+        part = slice(self.first_ended[first], self.first_ended[stop])
+        return self.returns[part], self.lengths[part]
 
     def step(self, number: int) -> Advance:
         """What `GridWorldVectorEnv.advance` returns for a step."""

@@ -33,6 +33,7 @@ class TabulatedTRPO(TabulatedOnPolicy, TRPO):  # type: ignore[misc]
     """sb3-contrib's TRPO on a `GridWorldVecEnv`, whose files stock `TRPO.load` opens."""
 
     derived = (*TabulatedOnPolicy.derived, "_actor")
+    learns_all_at_once = False
 
     def _make_descent(self) -> FlatOptimizer:
         """That of the value network; what the policy depends on is changed by the line search alone."""
