@@ -17,7 +17,6 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
@@ -158,11 +157,9 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         )
         return states, actions, advantages, returns
 
-    def log_update(self) -> None:
-        """Log what SB3 logs of the rollout after an update."""
-        buffer = self.rollout_buffer
-        variance = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
-        self.logger.record("train/explained_variance", variance)
+    def log_update(self, explained: float) -> None:
+        """Log what SB3 logs of the rollout after an update; see `explained_variances`."""
+        self.logger.record("train/explained_variance", explained)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
 
@@ -271,6 +268,16 @@ def normalized(advantages: Float32Array) -> Float32Array:
     mean = advantages.mean(axis=-1, keepdims=True)
     scaled: Float32Array = (advantages - mean) / (advantages.std(axis=-1, ddof=1, keepdims=True) + 1e-8)
     return scaled
+
+
+def explained_variances(models: Sequence[TabulatedOnPolicy]) -> list[float]:
+    """The share of the variance of each rollout's returns that the values explain, as SB3 logs it."""
+    tables = [(model.rollout_buffer.values.ravel(), model.rollout_buffer.returns.ravel()) for model in models]
+    values, returns = (np.stack(arrays) for arrays in zip(*tables, strict=True))
+    unexplained, total = (returns - values).var(axis=1), returns.var(axis=1)
+    total[total == 0] = np.nan
+    shares: list[float] = (1 - unexplained / total).tolist()
+    return shares
 
 
 def weights_of(
