@@ -28,7 +28,6 @@ from gridworld.agents.sb3.tabulated.state_buffers import Float32Array, StateRoll
 from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv, StateStep
 from gridworld.envs.joint_rollout import Rollout, roll, shape_of
-from gridworld.envs.vector_env import StateArray
 from gridworld.process.together import meet
 from gridworld.world.mdp import FloatArray, IntArray
 
@@ -97,8 +96,7 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         over = rolled.terminated | rolled.truncated
         began = np.atleast_2d(cast(Any, self._last_episode_starts))
         starts = np.concatenate([began, over])  # whether an episode starts, step by step
-        noted = 0  # steps whose episodes SB3 knows
-        is_read = getattr(callback, "reads_locals", True)
+        is_read, noted = getattr(callback, "reads_locals", True), cast(Any, self.ep_info_buffer)
         for step in range(n_rollout_steps):
             env.envs.passed(rolled, step + 1)
             self.num_timesteps += env.num_envs
@@ -107,15 +105,15 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
                 actions, episodes = rolled.actions[step], env.episodes(*rolled.ended(step, step + 1))
                 done = env.told(rolled.step(step), episodes)
                 callback.update_locals({**locals(), **_told(done, env.num_envs)})
-            goes_on = callback.on_step()
-            if is_read or not goes_on or step + 1 == n_rollout_steps:
-                self._note_episodes(env, *rolled.ended(noted, step + 1 if goes_on else step))
-                noted = step + 1
-            if not goes_on:
+            if not callback.on_step():
                 env.envs.catch_up()
+                noted.extend([] if is_read else self._episodes(rolled, step))
                 self._last_episode_starts = starts[step]
                 return False
+            if is_read:
+                noted.extend(episodes)
         env.envs.catch_up()
+        noted.extend([] if is_read else self._episodes(rolled, n_rollout_steps))
         self._last_episode_starts = dones = starts[-1]
 
         states = rolled.final_states
@@ -131,11 +129,11 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         callback.on_rollout_end()
         return True
 
-    def _note_episodes(self, env: GridWorldVecEnv, returns: FloatArray, lengths: StateArray) -> None:
-        """Let SB3 know of episodes that ended, of which it keeps the last."""
-        noted = cast(Any, self.ep_info_buffer)
-        last = slice(-(noted.maxlen or len(returns)), None)
-        noted.extend(env.episodes(returns[last], lengths[last]))
+    def _episodes(self, rolled: Rollout, steps: int) -> list[dict[str, Any]]:
+        """Those that a rollout's first steps ended, as far as SB3 keeps them."""
+        returns, lengths = rolled.ended(0, steps)
+        last = slice(-self._stats_window_size, None)
+        return self.env.episodes(returns[last], lengths[last])
 
     def _rewards(self, rolled: Rollout, values: Float32Array) -> FloatArray:
         """Rewards (n, E), with what the network expects after an episode that the step limit cut off."""
