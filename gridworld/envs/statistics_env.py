@@ -14,6 +14,7 @@ processes, 2008 (MBIE-EB); M. Bellemare et al., Unifying count-based exploration
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -81,7 +82,7 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
         np.add(pairs, actions, out=pairs, casting="unsafe")  # unsigned ones too
         self._count(pairs, step[1])
         if step[4] is not None:
-            self._add_returns(step[4].returns)
+            self._add_returns([step[4].returns])
         return step
 
     def passed(self, rolled: Rollout, steps: int) -> None:
@@ -100,9 +101,8 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
                 self._count(*each)
         else:
             self._count(pairs.ravel(), rewards)
-        for start, stop in itertools.pairwise(rolled.first_ended[first : end + 1]):
-            if start < stop:
-                self._add_returns(rolled.returns[start:stop])
+        bounds = itertools.pairwise(rolled.first_ended[first : end + 1])
+        self._add_returns(rolled.returns[start:stop] for start, stop in bounds if start < stop)
         if end == len(rolled.pairs):
             self._rolled, self._counted, self._passed = None, 0, 0
 
@@ -111,10 +111,13 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
         if self._bonus:
             rewards += self._bonus / np.sqrt(self._flat_visits.take(pairs))
 
-    def _add_returns(self, returns: FloatArray) -> None:
-        """Add the returns of the episodes that one step ended."""
-        total = float(np.add.reduce(returns))
-        self._ended = Returns(self._ended.episodes + len(returns), self._ended.total + total)
+    def _add_returns(self, of_steps: Iterable[FloatArray]) -> None:
+        """Add the returns of the episodes that each of some steps ended."""
+        episodes, total = self._ended
+        for returns in of_steps:
+            episodes += len(returns)
+            total += float(np.add.reduce(returns))
+        self._ended = Returns(episodes, total)
 
     def get_state(self) -> State:
         """See `GridWorldVectorEnv.get_state`."""

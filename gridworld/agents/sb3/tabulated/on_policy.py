@@ -138,8 +138,10 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
     def _rewards(self, rolled: Rollout, values: Float32Array) -> FloatArray:
         """Rewards (n, E), with what the network expects after an episode that the step limit cut off."""
         cut = rolled.truncated & ~rolled.terminated
-        (steps,) = np.nonzero(cut.any(axis=1))
         rewards = rolled.rewards
+        (steps,) = np.nonzero(cut.any(axis=1))
+        if not len(steps):
+            return rewards
         rewards[steps] += self.gamma * cut[steps] * values[rolled.last_states[steps]]
         return rewards
 

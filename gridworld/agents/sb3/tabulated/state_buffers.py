@@ -27,11 +27,11 @@ class StateRolloutBuffer(RolloutBuffer):
         """SB3's own recursion to the last bit, with everything that does not recur done at once."""
         going_on = 1.0 - np.concatenate([self.episode_starts[1:], dones[None].astype(np.float32)])
         following = np.concatenate([self.values[1:], last_values.numpy()[None]])
-        self.advantages = self.rewards + self.gamma * following * going_on - self.values
+        self.advantages = advantages = self.rewards + self.gamma * following * going_on - self.values
         carry = self.gamma * self.gae_lambda * going_on
         for step in range(self.buffer_size - 2, -1, -1):
-            self.advantages[step] += carry[step] * self.advantages[step + 1]
-        self.returns = self.advantages + self.values
+            advantages[step] += carry[step] * advantages[step + 1]
+        self.returns = advantages + self.values
 
 
 class StateReplayBuffer(ReplayBuffer):
