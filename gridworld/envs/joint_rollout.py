@@ -52,10 +52,10 @@ class Rollout:
     lengths: StateArray
     first_ended: Sequence[int]
 
-    def ended(self, number: int) -> tuple[FloatArray, StateArray]:
-        """The returns and lengths of the episodes that a step ended."""
-        start, end = self.first_ended[number], self.first_ended[number + 1]
-        return self.returns[start:end], self.lengths[start:end]
+    def ended(self, first: int, stop: int) -> tuple[FloatArray, StateArray]:
+        """The returns and lengths of the episodes that steps ended, from `first` to before `stop`."""
+        part = slice(self.first_ended[first], self.first_ended[stop])
+        return self.returns[part], self.lengths[part]
 
     def step(self, number: int) -> Advance:
         """What `GridWorldVectorEnv.advance` returns for a step."""
@@ -140,6 +140,9 @@ class _Joint:
             self._still = np.concatenate([batch.mdp.terminal for batch in mdps.values()])
         self._first_state = self._first_pair // self._num_actions
         self._limits = np.repeat([batch.step_limit for batch in batches], self._count)
+        starts = [batch.mdp.start_states for batch in batches]
+        first_starts = np.repeat([each[0] for each in starts], self._count)
+        self._only_starts = first_starts if all(len(each) == 1 for each in starts) else None
         self.states, self._elapsed, self._returns = (
             np.concatenate(arrays) for arrays in zip(*(batch.under_way for batch in batches), strict=True)
         )
@@ -187,6 +190,8 @@ class _Joint:
         return outcomes
 
     def _draw_starts(self, which: StateArray) -> StateArray:
+        if self._only_starts is not None:
+            return self._only_starts[which]
         cuts = self._cuts(which)
         starts = np.empty(len(which), dtype=np.int64)
         for batch, (start, end) in zip(self._batches, itertools.pairwise(cuts), strict=True):

@@ -13,7 +13,9 @@ processes, 2008 (MBIE-EB); M. Bellemare et al., Unifying count-based exploration
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import itertools
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -22,6 +24,9 @@ from numpy.typing import NDArray
 from gridworld.envs.vector_env import Advance, GridWorldVectorEnv
 from gridworld.storage.serialization import State, fill
 from gridworld.world.mdp import FloatArray
+
+if TYPE_CHECKING:
+    from gridworld.envs.joint_rollout import Rollout
 
 
 class Returns(NamedTuple):
@@ -40,7 +45,6 @@ class Returns(NamedTuple):
         return Returns(self.episodes + others.episodes, self.total + others.total)
 
 
-_NONE = np.zeros(0)
 NO_EPISODES = Returns(0, 0.0)
 
 
@@ -53,35 +57,67 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
         settings: the other arguments of `GridWorldVectorEnv`.
 
     Attributes:
-        visits: (S, A), int64, how often each action was taken in each state.
+        visits: (S, A), int64, how often each action was taken in each state; the same array always.
     """
 
     def __init__(self, num_envs: int, *, exploration_bonus: float = 0.0, **settings: Any) -> None:
         super().__init__(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
         self._bonus = exploration_bonus
-        self.visits = np.zeros((self.mdp.num_states, self.mdp.num_actions), dtype=np.int64)
-        self._flat_visits = self.visits.reshape(-1)
+        self._visits = np.zeros((self.mdp.num_states, self.mdp.num_actions), dtype=np.int64)
+        self._flat_visits = self._visits.reshape(-1)
         self._ended = NO_EPISODES  # since they were last taken
+        self._rolled: Rollout | None = None
+        self._counted = self._passed = 0  # steps of this rollout
+
+    @property
+    def visits(self) -> NDArray[np.int64]:
+        """See the class."""
+        self.catch_up()
+        return self._visits
 
     def advance(self, actions: NDArray[Any]) -> Advance:
         """See `GridWorldVectorEnv.advance`."""
         pairs = self._state * self.mdp.num_actions
         step = super().advance(actions)
         np.add(pairs, actions, out=pairs, casting="unsafe")  # unsigned ones too
-        ended = step[4]
-        self.count(pairs, step[1], *((_NONE, _NONE) if ended is None else (ended.returns, ended.lengths)))
+        self._count(pairs, step[1])
+        if step[4] is not None:
+            self._add_returns([step[4].returns])
         return step
 
-    def count(
-        self, pairs: NDArray[Any], rewards: FloatArray, returns: FloatArray, lengths: NDArray[Any]
-    ) -> None:
-        """See `GridWorldVectorEnv.count`; adds the exploration bonus to `rewards`."""
+    def passed(self, rolled: Rollout, steps: int) -> None:
+        """See `GridWorldVectorEnv.passed`; adds the exploration bonus to the rewards when it counts."""
+        self._rolled, self._passed = rolled, steps
+
+    def catch_up(self) -> None:
+        """See `GridWorldVectorEnv.catch_up`."""
+        rolled, first, end = self._rolled, self._counted, self._passed
+        if rolled is None or first == end:
+            return
+        self._counted = end
+        pairs, rewards = rolled.pairs[first:end], rolled.rewards[first:end]
+        if self._bonus:
+            for each in zip(pairs, rewards, strict=True):
+                self._count(*each)
+        else:
+            self._count(pairs.ravel(), rewards)
+        bounds = itertools.pairwise(rolled.first_ended[first : end + 1])
+        self._add_returns(rolled.returns[start:stop] for start, stop in bounds if start < stop)
+        if end == len(rolled.pairs):
+            self._rolled, self._counted, self._passed = None, 0, 0
+
+    def _count(self, pairs: NDArray[Any], rewards: FloatArray) -> None:
         np.add.at(self._flat_visits, pairs, 1)
         if self._bonus:
             rewards += self._bonus / np.sqrt(self._flat_visits.take(pairs))
-        if len(returns):
-            total = float(np.add.reduce(returns))
-            self._ended = Returns(self._ended.episodes + len(returns), self._ended.total + total)
+
+    def _add_returns(self, of_steps: Iterable[FloatArray]) -> None:
+        """Add the returns of the episodes that each of some steps ended."""
+        episodes, total = self._ended
+        for returns in of_steps:
+            episodes += len(returns)
+            total += float(np.add.reduce(returns))
+        self._ended = Returns(episodes, total)
 
     def get_state(self) -> State:
         """See `GridWorldVectorEnv.get_state`."""
@@ -95,10 +131,11 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
     def set_state(self, state: State) -> None:
         """See `GridWorldVectorEnv.set_state`."""
         super().set_state(state)
-        fill(self.visits, state["visits"], "visits")
+        fill(self._visits, state["visits"], "visits")
         self._ended = Returns(int(state["ended"]), float(state["ended_return"]))
 
     def take_returns(self) -> Returns:
         """The returns of the episodes that ended since the last call, or since the start."""
+        self.catch_up()
         taken, self._ended = self._ended, NO_EPISODES
         return taken

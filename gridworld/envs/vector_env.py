@@ -8,7 +8,7 @@ object of its own.
 from __future__ import annotations
 
 from os import PathLike
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -25,6 +25,9 @@ from gridworld.storage.serialization import State, StateError, fill
 from gridworld.world.grid import mdp_or_compiled
 from gridworld.world.layout import CLASSIC, NUM_COLS, NUM_ROWS, Layout, positive_int
 from gridworld.world.mdp import BoolArray, FloatArray, Mdp
+
+if TYPE_CHECKING:
+    from gridworld.envs.joint_rollout import Rollout
 
 StateArray = NDArray[np.int64]
 Step = tuple[StateArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]
@@ -288,17 +291,16 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         """Put back what `under_way` returned, or what has become of it."""
         self._state, self._elapsed, self._returns = states.copy(), elapsed.copy(), returns.copy()
 
-    def count(
-        self, pairs: NDArray[Any], rewards: FloatArray, returns: FloatArray, lengths: NDArray[np.int64]
-    ) -> None:
-        """Count a step that was made elsewhere (`joint_rollout`), where a subclass counts steps.
+    def passed(self, rolled: Rollout, steps: int) -> None:
+        """So many steps of a rollout (`joint_rollout`) have passed, for a subclass that counts steps.
 
         Args:
-            pairs: (num_envs,), state * A + action of each environment.
-            rewards: (num_envs,), what it paid; a subclass may add what it pays for exploring.
-            returns: (m,), undiscounted, of the episodes that it ended.
-            lengths: (m,), theirs, in steps.
+            rolled: whose rewards a subclass may add to, by what it pays for exploring.
+            steps: from its first on.
         """
+
+    def catch_up(self) -> None:
+        """Count the steps that have passed, which takes less time for many at once."""
 
     def draw_starts(self, count: int) -> Any:
         """The states in which so many new episodes begin, (count,), or the one in which all do."""

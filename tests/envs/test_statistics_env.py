@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.support import LEARNING, SHORT, train_in
 
+from gridworld.envs.joint_rollout import roll
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.vector_env import Advance, GridWorldVectorEnv
 
@@ -50,6 +51,29 @@ def test_visits_and_returns_are_those_of_a_naive_tally(settings: dict, dtype: ty
     assert np.array_equal(counted.visits, visits)
     assert counted.take_returns().mean == pytest.approx(np.mean(ended))
     assert counted.take_returns().mean is None
+
+
+@pytest.mark.parametrize("bonus", [0.0, 0.7])
+def test_a_rollout_counted_in_blocks_is_that_counted_step_by_step(bonus: float) -> None:
+    settings: dict = {"slip": 0.3, "step_reward": -0.1, "max_episode_steps": 9}
+    rolling, stepping = (StatisticsVectorEnv(6, exploration_bonus=bonus, **settings) for _ in range(2))
+    for envs in (rolling, stepping):
+        envs.reset(seed=3)
+    asked = {7, 8, 39, 40}  # after so many steps somebody looks
+    for draws in np.random.default_rng(0).random((2, 40, 6)).astype(np.float32):
+        thresholds = np.tile([[0.25], [0.5], [0.75]], rolling.mdp.num_states)
+        (rolled,) = roll([rolling], [thresholds], draws[None])
+        paid = [stepping.advance(actions)[1] for actions in rolled.actions[: min(asked)]]
+        for step in range(min(asked), 41):
+            rolling.passed(rolled, step)
+            if step in asked:
+                assert np.array_equal(rolling.visits, stepping.visits)
+                assert rolling.take_returns() == stepping.take_returns()  # to the last bit
+            if step < 40:
+                paid.append(stepping.advance(rolled.actions[step])[1])
+        assert np.array_equal(rolled.rewards, paid)
+    assert rolling.visits.sum() == 480
+    assert rolling.get_state().keys() == stepping.get_state().keys()
 
 
 def test_an_episode_given_up_is_not_one_that_ended() -> None:

@@ -126,6 +126,9 @@ OF_ALL: list[list[Words]] = [
     [(), ("env.slip=0.3",), ("env.slip=0.1", "env.max_episode_steps=7"), ("env.step_reward=-0.5",)],
     [(), ("total_timesteps=110",), ("total_timesteps=300",)],
 ]
+OPTIMIZERS = [f"policy_kwargs.optimizer_class=torch.optim.{name}" for name in ("AdamW", "SGD", "RMSprop")] + [
+    ""
+]
 DIFFERENT: dict[str, list[list[str]]] = {  # of each argument; the empty one is the agent's own
     "dqn": [
         ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
@@ -136,6 +139,7 @@ DIFFERENT: dict[str, list[list[str]]] = {  # of each argument; the empty one is 
         ["max_grad_norm=0.01", "max_grad_norm=1000", ""],
         ["learning_starts=0", "learning_starts=100", ""],
         ["buffer_size=40", "buffer_size=1000", ""],
+        OPTIMIZERS,
     ],
     "qrdqn": [
         ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
@@ -152,12 +156,14 @@ DIFFERENT: dict[str, list[list[str]]] = {  # of each argument; the empty one is 
         ["clip_range=0.01", "clip_range=lin_0.5", ""],
         ["clip_range_vf=0.01", "clip_range_vf=lin_1", ""],
         ["max_grad_norm=0.01", "max_grad_norm=1000", ""],
+        OPTIMIZERS,
     ],
     "a2c": [
         ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
         ["gamma=0.5", "gae_lambda=0.5", ""],
         ["ent_coef=0.3", "vf_coef=2", ""],
         ["max_grad_norm=0.01", ""],
+        OPTIMIZERS,
     ],
 }
 OBSERVATIONS: list[Words] = [(), ("observation=coordinates",), ("observation=none",)]

@@ -407,6 +407,19 @@ def test_the_replay_buffer_holds_states_in_the_smallest_type() -> None:
     assert tabulated.smallest_integer(256) == np.uint16
 
 
+def test_minibatches_drawn_at_once_are_those_drawn_one_by_one() -> None:
+    ours, _ = twins(TabulatedDQN, DQN, "one_hot", buffer_size=800)
+    ours.learn(400)
+    at_once, in_turn = np.random.RandomState(5), np.random.RandomState(5)
+    drawn = ours.replay_buffer.draw(3, 7, at_once)
+    expected = [ours.replay_buffer.draw(1, 7, in_turn) for _ in range(3)]
+    for arrays, parts in zip(drawn, zip(*expected, strict=True), strict=True):
+        assert np.array_equal(arrays, np.concatenate(parts))
+    steps = [in_turn.randint(0, high, size=7) for high in (ours.replay_buffer.pos, NUM_ENVS)]  # as SB3 draws
+    states, *_ = ours.replay_buffer.draw(1, 7, at_once)
+    assert np.array_equal(states[0], ours.replay_buffer.observations[*steps])
+
+
 class Watch(BaseCallback):
     """Looks at what SB3 lets callbacks see."""
 

@@ -219,7 +219,8 @@ def not_finite(model: BaseAlgorithm) -> str | None:
     """What the last update left that is no finite number, in words; None: nothing."""
     descent = getattr(model, "descent", None)  # of a tabulated engine, with all weights in one
     weights = model.policy.parameters() if descent is None else [descent.weights]
-    if not all(bool(torch.isfinite(each).all()) for each in weights):
+    # A sum takes one pass, and is finite only where all are; of very large weights it need not be.
+    if not all(math.isfinite(each.sum().item()) or bool(torch.isfinite(each).all()) for each in weights):
         return "the network's weights are no finite number"
     losses = [v for key, v in model.logger.name_to_value.items() if "loss" in key]
     return None if all(math.isfinite(loss) for loss in losses) else "a loss is no finite number"

@@ -17,6 +17,7 @@ from gridworld.agents.sb3.tabulated.losses.ppo import losses_and_slopes, sum_up
 from gridworld.agents.sb3.tabulated.on_policy import (
     Rollouts,
     TabulatedOnPolicy,
+    explained_variances,
     normalized,
     tables_of_runs,
     weights_of,
@@ -61,10 +62,11 @@ def _train(runs: Sequence[_Run]) -> list[Exception | None]:
         finite = rows.step(outputs, slopes, norms, range(len(models)))
     gains = (sums.positive + sums.negative) * new.log_prob
     policy_losses = (-gains).reshape(len(models), -1).sum(axis=1).tolist()
-    for model, found, policy_loss, is_finite in zip(models, losses, policy_losses, finite, strict=True):
+    numbers = zip(models, losses, policy_losses, explained_variances(models), finite, strict=True)
+    for model, found, policy_loss, explained, is_finite in numbers:
         if is_finite:
             model._n_updates += 1
-            model.log_update()
+            model.log_update(explained)
             model.logger.record("train/entropy_loss", found.entropy_loss)
             model.logger.record("train/policy_loss", policy_loss)
             model.logger.record("train/value_loss", found.value_loss)

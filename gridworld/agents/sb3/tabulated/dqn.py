@@ -35,4 +35,5 @@ class TabulatedDQN(TabulatedOffPolicy, DQN):
         error = outputs.ravel()[pair] - targets
         slope = np.maximum(np.minimum(error, 1), -1)
         slopes = np.bincount(pair.ravel(), slope.ravel(), outputs.size) / count
-        return [float(s @ (e - s / 2)) / count for s, e in zip(slope, error, strict=True)], slopes
+        losses = slope[:, None] @ (error - slope / 2)[:, :, None]  # a product of vectors for each run
+        return (losses.ravel().astype(np.float64) / count).tolist(), slopes

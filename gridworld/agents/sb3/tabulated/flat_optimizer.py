@@ -10,9 +10,10 @@ and callbacks see what they would see without it.
 from __future__ import annotations
 
 import copy
+import functools
 import inspect
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import torch
@@ -97,8 +98,7 @@ class FlatOptimizer:
         self.settings()
         with torch.no_grad():
             self._step(self._twin)
-        if self._optimizer.state is not self._shared:
-            self._share()
+        self._share()
 
     def settings(self) -> dict[str, Any]:
         """The optimiser's settings for its next step, the learning rate among them."""
@@ -108,21 +108,10 @@ class FlatOptimizer:
         group["lr"] = self._optimizer.param_groups[0]["lr"]
         return group
 
-    def state(self) -> dict[str, Any] | None:
-        """What the optimiser keeps of all weights in one; None before its first step."""
-        return self._twin.state.get(self._joined)
-
     @property
-    def is_adam(self) -> bool:
-        """Whether it is torch's Adam in one pass over all weights, and nothing derived from it."""
-        group = self._twin.param_groups[0]
-        return type(self._optimizer) is torch.optim.Adam and bool(group["fused"]) and not group["amsgrad"]
-
-    @property
-    def vectors(self) -> tuple[Tensor, Tensor]:
-        """The weights (N,) that it steps on, and their gradient."""
-        assert self._joined.grad is not None
-        return self._joined.detach(), self._joined.grad
+    def kind(self) -> Hashable:
+        """Equal for optimisers that `joint_step` takes together."""
+        return type(self._optimizer), repr({**self.settings(), "params": None})
 
     def work_on(self, weights: Tensor, gradient: Tensor) -> None:
         """Step on these vectors (N,) from here on; the parameters stay where they are."""
@@ -130,14 +119,17 @@ class FlatOptimizer:
 
     def take_back(self) -> None:
         """Copy the vectors of `work_on` into its own, and step on these again."""
-        weights, gradient = self.vectors
-        self.weights.copy_(weights)
-        self.gradient.copy_(gradient)
+        assert self._joined.grad is not None
+        self.weights.copy_(self._joined.detach())
+        self.gradient.copy_(self._joined.grad)
         self._attach()
         self.work_on(self.weights, self.gradient)
+        self._share()
 
     def _share(self) -> None:
-        """Let the optimiser's state of each parameter be a view of its twin's."""
+        """Let the optimiser's state of each parameter be a view of its twin's, once that has one."""
+        if self._optimizer.state is self._shared or not self._twin.state[self._joined]:
+            return
         for name, value in self._twin.state[self._joined].items():
             whole = isinstance(value, Tensor) and value.shape == self._joined.shape
             parts = self.cut(value) if whole else [value] * len(self.parameters)
@@ -159,6 +151,16 @@ class FlatOptimizer:
         parts = torch.split(joined, [parameter.numel() for parameter in self.parameters], dim=-1)
         pairs = zip(parts, self.parameters, strict=True)
         return [part.view(*part.shape[:-1], *of.shape) for part, of in pairs]
+
+
+def joint_step(optimizers: Sequence[FlatOptimizer]) -> Callable[[], None]:
+    """A step of optimisers of one kind at once, each as its `advance` makes it, on what they work on."""
+    first, vectors = optimizers[0], [each._joined for each in optimizers]
+    twin: Any = type(first._optimizer)
+    all_ = twin([{**first.settings(), "params": vectors}])
+    for each, vector in zip(optimizers, vectors, strict=True):
+        all_.state[vector] = each._twin.state[vector]
+    return functools.partial(first._step, all_)
 
 
 def run_backward(

@@ -6,8 +6,8 @@ Greedy actions and targets are look-ups in tables, refreshed only when a network
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -30,6 +30,8 @@ from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.process.together import chance, meet
 from gridworld.world.mdp import FloatArray, IntArray
+
+_DRAWN_AT_ONCE = 2**13  # transitions of a model
 
 
 class TabulatedOffPolicy(OffPolicyAlgorithm):
@@ -206,7 +208,7 @@ class TabulatedOffPolicy(OffPolicyAlgorithm):
         return outputs.max(dim=1).values
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Member:
     """One of the models that are updated together."""
 
@@ -214,8 +216,13 @@ class _Member:
     chance: np.random.RandomState  # that its minibatches are drawn with
     gradient_steps: int
     batch_size: int
-    losses: list[float] = field(default_factory=list)
-    error: Exception | None = None
+
+    def draw(self, count: int) -> tuple[NDArray[Any], ...]:
+        """Draw n minibatches (n, B) for `Update.minibatches`, (n, ...) each."""
+        model = self.model
+        states, actions, following, *others = model.replay_buffer.draw(count, self.batch_size, self.chance)
+        best = model.best_values().take(following, axis=-1)
+        return states, actions, *others, np.moveaxis(best, -2, 0)
 
 
 def _train_together(members: Sequence[_Member]) -> list[Exception | None]:
@@ -224,24 +231,26 @@ def _train_together(members: Sequence[_Member]) -> list[Exception | None]:
 
 def _train(members: Sequence[_Member]) -> list[Exception | None]:
     """Make an update of each of P models of one kind; returns what is to be raised in each."""
+    steps, batch_size = members[0].gradient_steps, members[0].batch_size
+    at_once = max(1, _DRAWN_AT_ONCE // batch_size)
+    losses, finite = [], [True] * len(members)
     with SideBySide([member.model.descent for member in members]) as rows:
         update = Update([member.model for member in members], rows)
-        for _ in range(members[0].gradient_steps):
-            drawn = [each.model.replay_buffer.draw(each.batch_size, each.chance) for each in members]
-            losses, finite = update.step(*(_stacked(arrays) for arrays in zip(*drawn, strict=True)))
-            for member, loss, is_finite in zip(members, losses, finite, strict=True):
-                member.losses.append(loss)
-                member.error = member.error or (None if is_finite else not_finite())
-            if not any(finite):
-                break
+        for first in range(0, steps, at_once):
+            drawn = [member.draw(min(at_once, steps - first)) for member in members]
+            together = [np.stack(arrays, axis=1) for arrays in zip(*drawn, strict=True)]
+            for batch in update.minibatches(*together):
+                if any(finite):
+                    found, finite = update.descend(*batch)
+                    losses.append(found)
         update.end()
-    for member in members:
-        if member.error is None:
+    for member, own, is_finite in zip(members, zip(*losses, strict=True), finite, strict=True):
+        if is_finite:
             model = member.model
-            model._n_updates += member.gradient_steps
+            model._n_updates += steps
             model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
-            model.logger.record("train/loss", np.mean(member.losses))
-    return [member.error for member in members]
+            model.logger.record("train/loss", np.mean(own))
+    return [None if is_finite else not_finite() for is_finite in finite]
 
 
 class Update:
@@ -254,38 +263,42 @@ class Update:
 
     def __init__(self, models: Sequence[TabulatedOffPolicy], rows: SideBySide) -> None:
         self._models, self._rows = models, rows
-        self._best_values = [model.best_values() for model in models]
         self._gammas = np.array([[model.gamma] for model in models], dtype=np.float32)
         norms = [model.max_grad_norm for model in models]
         self._norms = [math.inf if norm is None else norm for norm in norms]
         self._finite = np.ones(len(models), dtype=np.bool_)
 
-    def step(
+    def minibatches(
         self,
         states: IntArray,
         actions: IntArray,
-        following: IntArray,
         rewards: Float32Array,
         ends: Float32Array,
-    ) -> tuple[list[float], list[bool]]:
-        """Make one step of each optimiser.
+        best: Float32Array,
+    ) -> Iterator[tuple[IntArray, IntArray, Float32Array]]:
+        """The states, actions and targets of n minibatches of each model, for `descend`.
 
         Args:
-            states: (P, B), and so all others; what `StateReplayBuffer.draw` returns.
-
-        Returns:
-            P, the losses before the step; P, which gradients have been finite so far.
+            states: (n, P, B), and so all others.
+            best: (n, P, ..., B), what the target network says of the best action in the next state.
         """
-        pairs = zip(self._best_values, following, strict=True)
-        best = _stacked([values.take(where, axis=-1) for values, where in pairs])
-        runs, inner = len(states), (1,) * (best.ndim - 2)
-        rewards, discounts = (each.reshape(runs, *inner, -1) for each in (rewards, (1 - ends) * self._gammas))
-        return self.descend(states, actions, rewards + discounts * best)
+        shape = (*rewards.shape[:2], *(1,) * (best.ndim - 3), -1)
+        discounts = (1 - ends) * self._gammas
+        return zip(states, actions, rewards.reshape(shape) + discounts.reshape(shape) * best, strict=True)
 
     def descend(
         self, states: IntArray, actions: IntArray, targets: Float32Array
     ) -> tuple[list[float], list[bool]]:
-        """The same towards targets (P, ..., B), float32, of the outputs for these actions (P, B)."""
+        """Make one step of each optimiser.
+
+        Args:
+            states: (P, B), integers.
+            actions: (P, B), likewise.
+            targets: (P, ..., B), float32, of the outputs for these actions.
+
+        Returns:
+            P, the losses before the step; P, which gradients have been finite so far.
+        """
         index, outputs = self._outputs(states)
         numbers = outputs.detach().cpu().numpy()
         if len(self._models) == 1:
@@ -311,8 +324,3 @@ class Update:
             return states, self._models[0].outputs_of_all(self._rows.leaves)[0]
         which, index = self._models[0].inputs.distinct(states[0])
         return index[None], self._models[0].online(which)
-
-
-def _stacked(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Arrays (...) of P models as one (P, ...)."""
-    return arrays[0][None] if len(arrays) == 1 else np.stack(arrays)

@@ -6,7 +6,7 @@ is a few look-ups.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -17,19 +17,17 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.utils import explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
 from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer
 from gridworld.agents.sb3.tabulated.losses.ppo import Outputs, Weights, column, log_softmax
-from gridworld.agents.sb3.tabulated.side_by_side import SideBySide
+from gridworld.agents.sb3.tabulated.side_by_side import SideBySide, agree, stacked
 from gridworld.agents.sb3.tabulated.stacked_layers import Leaves, forward
 from gridworld.agents.sb3.tabulated.state_buffers import Float32Array, StateRolloutBuffer
 from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv, StateStep
 from gridworld.envs.joint_rollout import Rollout, roll, shape_of
-from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.process.together import meet
 from gridworld.world.mdp import FloatArray, IntArray
 
@@ -40,6 +38,7 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
     env: GridWorldVecEnv
     policy: ActorCriticPolicy
     derived: tuple[str, ...] = ("descent", "inputs", "old")  # from the rest: no part of a checkpoint
+    learns_all_at_once = True  # whether `descent` steps on all of the network's weights
 
     def _setup_model(self) -> None:
         self.rollout_buffer_class = self.rollout_buffer_class or StateRolloutBuffer
@@ -91,28 +90,30 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         assert isinstance(env, GridWorldVecEnv)
         rollout_buffer.reset()
         callback.on_rollout_start()
-        with torch.no_grad():
-            self.old = log_prob, values = tables(*self.outputs())
-        thresholds = np.exp(log_prob).cumsum(axis=1).T[:-1]  # (A - 1, S)
-        draws = torch.rand(n_rollout_steps, env.num_envs).numpy()
-        request = _Request(env.envs, thresholds, draws)
+        request = _Request(self, torch.rand(n_rollout_steps, env.num_envs).numpy())
         meet(_roll_together, request, (shape_of(env.envs), n_rollout_steps))
-        rolled = request.rolled
+        rolled, (log_prob, values) = request.rolled, self.old
         over = rolled.terminated | rolled.truncated
         began = np.atleast_2d(cast(Any, self._last_episode_starts))
         starts = np.concatenate([began, over])  # whether an episode starts, step by step
+        is_read, noted = getattr(callback, "reads_locals", True), cast(Any, self.ep_info_buffer)
         for step in range(n_rollout_steps):
-            actions, ended = rolled.actions[step], rolled.ended(step)
-            episodes = env.episodes(*ended)
-            env.envs.count(rolled.pairs[step], rolled.rewards[step], *ended)
+            env.envs.passed(rolled, step + 1)
             self.num_timesteps += env.num_envs
-            if getattr(callback, "reads_locals", True):
+            if is_read:
+                env.envs.catch_up()
+                actions, episodes = rolled.actions[step], env.episodes(*rolled.ended(step, step + 1))
                 done = env.told(rolled.step(step), episodes)
                 callback.update_locals({**locals(), **_told(done, env.num_envs)})
             if not callback.on_step():
+                env.envs.catch_up()
+                noted.extend([] if is_read else self._episodes(rolled, step))
                 self._last_episode_starts = starts[step]
                 return False
-            cast(Any, self.ep_info_buffer).extend(episodes)
+            if is_read:
+                noted.extend(episodes)
+        env.envs.catch_up()
+        noted.extend([] if is_read else self._episodes(rolled, n_rollout_steps))
         self._last_episode_starts = dones = starts[-1]
 
         states = rolled.final_states
@@ -128,11 +129,19 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         callback.on_rollout_end()
         return True
 
+    def _episodes(self, rolled: Rollout, steps: int) -> list[dict[str, Any]]:
+        """Those that a rollout's first steps ended, as far as SB3 keeps them."""
+        returns, lengths = rolled.ended(0, steps)
+        last = slice(-self._stats_window_size, None)
+        return self.env.episodes(returns[last], lengths[last])
+
     def _rewards(self, rolled: Rollout, values: Float32Array) -> FloatArray:
         """Rewards (n, E), with what the network expects after an episode that the step limit cut off."""
         cut = rolled.truncated & ~rolled.terminated
-        (steps,) = np.nonzero(cut.any(axis=1))
         rewards = rolled.rewards
+        (steps,) = np.nonzero(cut.any(axis=1))
+        if not len(steps):
+            return rewards
         rewards[steps] += self.gamma * cut[steps] * values[rolled.last_states[steps]]
         return rewards
 
@@ -148,11 +157,9 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         )
         return states, actions, advantages, returns
 
-    def log_update(self) -> None:
-        """Log what SB3 logs of the rollout after an update."""
-        buffer = self.rollout_buffer
-        variance = explained_variance(buffer.values.flatten(), buffer.returns.flatten())
-        self.logger.record("train/explained_variance", variance)
+    def log_update(self, explained: float) -> None:
+        """Log what SB3 logs of the rollout after an update; see `explained_variances`."""
+        self.logger.record("train/explained_variance", explained)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
 
 
@@ -160,18 +167,39 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
 class _Request:
     """A rollout that a model asks for, see `envs.joint_rollout.roll`."""
 
-    envs: GridWorldVectorEnv
-    thresholds: FloatArray
+    model: TabulatedOnPolicy
     draws: NDArray[np.float32]
     rolled: Rollout = field(init=False)
 
 
 def _roll_together(requests: Sequence[_Request]) -> list[Exception | None]:
-    envs, thresholds = [each.envs for each in requests], [each.thresholds for each in requests]
+    models = [each.model for each in requests]
+    kinds: dict[Hashable, list[TabulatedOnPolicy]] = {}
+    for model in models:
+        kinds.setdefault(model.inputs.kind if model.learns_all_at_once else id(model), []).append(model)
+    for same in kinds.values():
+        _set_tables(same)
+    thresholds = [np.exp(model.old.log_prob).cumsum(axis=1).T[:-1] for model in models]  # (A - 1, S)
     draws = np.stack([each.draws for each in requests])
-    for request, rolled in zip(requests, roll(envs, thresholds, draws), strict=True):
+    for request, rolled in zip(
+        requests, roll([model.env.envs for model in models], thresholds, draws), strict=True
+    ):
         request.rolled = rolled
     return [None] * len(requests)
+
+
+def _set_tables(models: Sequence[TabulatedOnPolicy]) -> None:
+    """Run the networks of models of one kind, for their next rollouts."""
+    together = len(models) > 1 and agree(models)
+    with torch.no_grad():
+        if not together:
+            for model in models:
+                model.old = tables(*model.outputs())
+            return
+        _, leaves = stacked([model.descent for model in models])
+        found = tables(*models[0].outputs_of_all(leaves))
+    for model, *own in zip(models, *found, strict=True):
+        model.old = Outputs(*own)
 
 
 def _told(done: StateStep, num_envs: int) -> dict[str, Any]:
@@ -240,6 +268,16 @@ def normalized(advantages: Float32Array) -> Float32Array:
     mean = advantages.mean(axis=-1, keepdims=True)
     scaled: Float32Array = (advantages - mean) / (advantages.std(axis=-1, ddof=1, keepdims=True) + 1e-8)
     return scaled
+
+
+def explained_variances(models: Sequence[TabulatedOnPolicy]) -> list[float]:
+    """The share of the variance of each rollout's returns that the values explain, as SB3 logs it."""
+    tables = [(model.rollout_buffer.values.ravel(), model.rollout_buffer.returns.ravel()) for model in models]
+    values, returns = (np.stack(arrays) for arrays in zip(*tables, strict=True))
+    unexplained, total = (returns - values).var(axis=1), returns.var(axis=1)
+    total[total == 0] = np.nan
+    shares: list[float] = (1 - unexplained / total).tolist()
+    return shares
 
 
 def weights_of(

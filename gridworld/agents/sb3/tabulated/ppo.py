@@ -19,6 +19,7 @@ from gridworld.agents.sb3.tabulated.losses.ppo import Losses, Outputs, losses_an
 from gridworld.agents.sb3.tabulated.on_policy import (
     Rollouts,
     TabulatedOnPolicy,
+    explained_variances,
     normalized,
     tables_of_runs,
     weights_of,
@@ -44,15 +45,15 @@ class TabulatedPPO(TabulatedOnPolicy, PPO):
         clip_range, clip_range_vf = cast(Any, self.clip_range), cast(Any, self.clip_range_vf)
         return clip_range(progress), None if clip_range_vf is None else clip_range_vf(progress)
 
-    def log_epochs(self, epochs: int, logged: list[Losses], last_epoch: list[Losses]) -> None:
+    def log_epochs(self, epochs: int, logged: list[Losses], last_epoch: int, explained: float) -> None:
         """Log an update's losses; SB3 has the divergence of the last epoch and the last minibatch's loss."""
         self._n_updates += epochs
         means = Losses(*np.mean(logged, axis=0).tolist())._asdict()
-        means["approx_kl"] = float(np.mean([losses.approx_kl for losses in last_epoch]))
+        means["approx_kl"] = float(np.mean([losses.approx_kl for losses in logged[last_epoch:]]))
         means["loss"] = logged[-1].loss
         for name, mean in means.items():
             self.logger.record(f"train/{name}", mean)
-        self.log_update()
+        self.log_update(explained)
         clip_range, clip_range_vf = self.clip_ranges()
         self.logger.record("train/clip_range", clip_range)
         if clip_range_vf is not None:
@@ -69,9 +70,9 @@ def _train(runs: Sequence[_Run]) -> list[Exception | None]:
         update = _Update(runs, rows)
         for epoch in range(max(run.model.n_epochs for run in runs)):
             update.make_epoch(epoch)
-    for run in runs:
+    for run, explained in zip(runs, explained_variances([run.model for run in runs]), strict=True):
         if run.error is None:
-            run.model.log_epochs(run.epochs, run.logged, run.logged[run.last_epoch :])
+            run.model.log_epochs(run.epochs, run.logged, run.last_epoch, explained)
     return [run.error for run in runs]
 
 

@@ -8,9 +8,7 @@ depends on the processor and on the build of torch; `agree` tries it out on the 
 
 from __future__ import annotations
 
-import inspect
 import math
-import sys
 from collections.abc import Callable, Hashable, Sequence
 from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
@@ -20,11 +18,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer, clipping, run_backward
+from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer, clipping, joint_step, run_backward
 from gridworld.agents.sb3.tabulated.stacked_layers import ALIGNMENT, Leaves
 from gridworld.process.terminal import tell
-
-_adam: Any = inspect.unwrap(sys.modules["torch.optim.adam"].adam)
 
 
 class Tabulated(Protocol):
@@ -101,6 +97,17 @@ def _try_out(models: Sequence[Tabulated]) -> bool:
     return True
 
 
+def stacked(optimizers: Sequence[FlatOptimizer]) -> tuple[Tensor, Leaves]:
+    """Copies of the weights of P optimisers, (P, N); and as `stacked_layers.forward` takes them."""
+    own = [each.weights for each in optimizers]
+    # Each row begins where a vector of its own would: products with vectors add up by alignment.
+    width = -(-len(own[0]) // ALIGNMENT) * ALIGNMENT
+    weights = torch.stack(own, out=torch.empty(len(own), width)[:, : len(own[0])])
+    first = optimizers[0]
+    leaves = [view.detach().requires_grad_() for view in first.cut(weights)]
+    return weights, {id(of): leaf for of, leaf in zip(first.parameters, leaves, strict=True)}
+
+
 class SideBySide:
     """The weights of P optimisers while they step together, as a context manager.
 
@@ -117,20 +124,15 @@ class SideBySide:
     def __init__(self, optimizers: Sequence[FlatOptimizer]) -> None:
         self._optimizers = optimizers
         self.leaves: Leaves = {}
-        self._adams: dict[tuple[int, ...], list[_Adams]] = {}  # by the rows that step
+        self._steps: dict[tuple[int, ...], list[Callable[[], None]]] = {}  # by the rows that step
 
     def __enter__(self) -> Self:
         if len(self._optimizers) == 1:
             return self
-        own = [each.weights for each in self._optimizers]
-        # Each row begins where a vector of its own would: products with vectors add up by alignment.
-        width = -(-len(own[0]) // ALIGNMENT) * ALIGNMENT
-        rows = torch.empty(len(own), width)[:, : len(own[0])]
-        self._weights = torch.stack(own, out=rows)
-        self._gradients = torch.zeros(len(own), width)[:, : len(own[0])]
-        first = self._optimizers[0]
-        leaves = [view.detach().requires_grad_() for view in first.cut(self._weights)]
-        self.leaves = {id(of): leaf for of, leaf in zip(first.parameters, leaves, strict=True)}
+        self._weights, self.leaves = stacked(self._optimizers)
+        self._gradients = torch.zeros(len(self._weights), self._weights.stride(0))[
+            :, : self._weights.shape[1]
+        ]
         for each, weights, gradient in zip(self._optimizers, self._weights, self._gradients, strict=True):
             each.work_on(weights, gradient)
         return self
@@ -185,54 +187,11 @@ class SideBySide:
         return self._gradients
 
     def _advance(self, rows: tuple[int, ...]) -> None:
-        if rows not in self._adams:
-            adams = _adams([self._optimizers[row] for row in rows])
-            if adams is None:
-                for row in rows:
-                    self._optimizers[row].advance()
-                return
-            self._adams = {rows: adams}
-        for each in self._adams[rows]:
-            each.step()
-
-
-def _adams(optimizers: Sequence[FlatOptimizer]) -> list[_Adams] | None:
-    """These optimisers in groups of the same settings, if all are torch's Adam and have begun."""
-    if not all(each.is_adam and each.state() for each in optimizers):
-        return None
-    groups: dict[Any, list[FlatOptimizer]] = {}
-    for each in optimizers:
-        settings = each.settings()
-        groups.setdefault(tuple(settings[name] for name in _SETTINGS), []).append(each)
-    return [_Adams(dict(zip(_SETTINGS, values, strict=True)), same) for values, same in groups.items()]
-
-
-_SETTINGS = ("lr", "betas", "weight_decay", "eps", "maximize", "decoupled_weight_decay")
-
-
-class _Adams:
-    """Several of torch's Adam with the same settings, which step in one call."""
-
-    def __init__(self, settings: dict[str, Any], optimizers: Sequence[FlatOptimizer]) -> None:
-        states = [each.state() or {} for each in optimizers]
-        vectors = [each.vectors for each in optimizers]
-        beta1, beta2 = settings.pop("betas")
-        self._tensors = (
-            [weights for weights, _ in vectors],
-            [gradient for _, gradient in vectors],
-            *([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq")),
-            [],
-            [state["step"] for state in states],
-        )
-        self._settings = {
-            **settings,
-            "fused": True,
-            "amsgrad": False,
-            "has_complex": False,
-            "beta1": beta1,
-            "beta2": beta2,
-        }
-
-    def step(self) -> None:
+        if rows not in self._steps:
+            kinds: dict[Hashable, list[FlatOptimizer]] = {}
+            for each in (self._optimizers[row] for row in rows):
+                kinds.setdefault(each.kind, []).append(each)
+            self._steps = {rows: [joint_step(same) for same in kinds.values()]}
         with torch.no_grad():
-            _adam(*self._tensors, **self._settings)
+            for step in self._steps[rows]:
+                step()

@@ -27,11 +27,11 @@ class StateRolloutBuffer(RolloutBuffer):
         """SB3's own recursion to the last bit, with everything that does not recur done at once."""
         going_on = 1.0 - np.concatenate([self.episode_starts[1:], dones[None].astype(np.float32)])
         following = np.concatenate([self.values[1:], last_values.numpy()[None]])
-        self.advantages = self.rewards + self.gamma * following * going_on - self.values
+        self.advantages = advantages = self.rewards + self.gamma * following * going_on - self.values
         carry = self.gamma * self.gae_lambda * going_on
         for step in range(self.buffer_size - 2, -1, -1):
-            self.advantages[step] += carry[step] * self.advantages[step + 1]
-        self.returns = self.advantages + self.values
+            advantages[step] += carry[step] * advantages[step + 1]
+        self.returns = advantages + self.values
 
 
 class StateReplayBuffer(ReplayBuffer):
@@ -61,16 +61,18 @@ class StateReplayBuffer(ReplayBuffer):
         self.full |= self.pos == 0
 
     def draw(
-        self, batch_size: int, chance: np.random.RandomState
+        self, count: int, batch_size: int, chance: np.random.RandomState
     ) -> tuple[IntArray, IntArray, IntArray, Float32Array, Float32Array]:
-        """Draw a minibatch of B transitions; drawn from numpy's global generator, they are SB3's own.
+        """Draw n minibatches of B transitions; drawn from numpy's global generator, they are SB3's own.
 
         Returns:
-            (B,) each: states (int64), actions (uint8), next states (int64), rewards and ends (float32);
+            (n, B) each: states (int64), actions (uint8), next states (int64), rewards and ends (float32);
             time-outs are no ends.
         """
-        steps = chance.randint(0, self.buffer_size if self.full else self.pos, size=batch_size)
-        which = steps * self.n_envs + chance.randint(0, high=self.n_envs, size=batch_size)
+        # Of each minibatch in turn the steps, then the environments, as SB3 draws them.
+        bounds = np.array([[self.buffer_size if self.full else self.pos], [self.n_envs]])
+        drawn = chance.randint(0, bounds, size=(count, 2, batch_size))
+        which = drawn[:, 0] * self.n_envs + drawn[:, 1]
         ends = self.dones.take(which) * (1 - self.timeouts.take(which))
         states, following = self.observations.take(which), self.next_observations.take(which)
         rewards = self.rewards.take(which)

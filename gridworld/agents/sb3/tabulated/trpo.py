@@ -23,6 +23,7 @@ from gridworld.agents.sb3.tabulated.losses.jacobian import Jacobian
 from gridworld.agents.sb3.tabulated.losses.ppo import log_softmax
 from gridworld.agents.sb3.tabulated.on_policy import (
     TabulatedOnPolicy,
+    explained_variances,
     normalized,
 )
 from gridworld.agents.sb3.tabulated.state_buffers import Float32Array
@@ -33,6 +34,7 @@ class TabulatedTRPO(TabulatedOnPolicy, TRPO):  # type: ignore[misc]
     """sb3-contrib's TRPO on a `GridWorldVecEnv`, whose files stock `TRPO.load` opens."""
 
     derived = (*TabulatedOnPolicy.derived, "_actor")
+    learns_all_at_once = False
 
     def _make_descent(self) -> FlatOptimizer:
         """That of the value network; what the policy depends on is changed by the line search alone."""
@@ -55,7 +57,7 @@ class TabulatedTRPO(TabulatedOnPolicy, TRPO):  # type: ignore[misc]
         self.logger.record("train/value_loss", np.mean(value_losses))
         self.logger.record("train/kl_divergence_loss", divergence)
         self.logger.record("train/is_line_search_success", float(is_success))
-        self.log_update()
+        self.log_update(*explained_variances([self]))
 
     def _improve_policy(
         self, states: IntArray, actions: IntArray, advantages: Float32Array
