@@ -87,7 +87,9 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
 
     def passed(self, rolled: Rollout, steps: int) -> None:
         """See `GridWorldVectorEnv.passed`; adds the exploration bonus to the rewards when it counts."""
-        self._rolled, self._passed = rolled, steps
+        if rolled is not self._rolled:  # of the one before, steps may be left that never passed
+            self._rolled, self._counted = rolled, 0
+        self._passed = steps
 
     def catch_up(self) -> None:
         """See `GridWorldVectorEnv.catch_up`."""
@@ -104,7 +106,7 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
         bounds = itertools.pairwise(rolled.first_ended[first : end + 1])
         self._add_returns(rolled.returns[start:stop] for start, stop in bounds if start < stop)
         if end == len(rolled.pairs):
-            self._rolled, self._counted, self._passed = None, 0, 0
+            self._rolled = None
 
     def _count(self, pairs: NDArray[Any], rewards: FloatArray) -> None:
         np.add.at(self._flat_visits, pairs, 1)
@@ -131,6 +133,7 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
     def set_state(self, state: State) -> None:
         """See `GridWorldVectorEnv.set_state`."""
         super().set_state(state)
+        self._rolled = None
         fill(self._visits, state["visits"], "visits")
         self._ended = Returns(int(state["ended"]), float(state["ended_return"]))
 

@@ -76,6 +76,24 @@ def test_a_rollout_counted_in_blocks_is_that_counted_step_by_step(bonus: float) 
     assert rolling.get_state().keys() == stepping.get_state().keys()
 
 
+@pytest.mark.parametrize("is_restored", [False, True])
+def test_a_rollout_that_training_left_is_no_part_of_the_next(is_restored: bool) -> None:
+    envs = StatisticsVectorEnv(6, slip=0.3)
+    envs.reset(seed=3)
+    thresholds = np.tile([[0.25], [0.5], [0.75]], envs.mdp.num_states)
+    state = envs.get_state()
+    for draws, steps in zip(
+        np.random.default_rng(0).random((2, 9, 6)).astype(np.float32), (5, 9), strict=True
+    ):
+        (rolled,) = roll([envs], [thresholds], draws[None])
+        envs.passed(rolled, steps)
+        if not is_restored:
+            envs.catch_up()
+        elif steps == 5:
+            envs.set_state(state)  # before anybody looked
+    assert envs.visits.sum() == 6 * (9 if is_restored else 5 + 9)
+
+
 def test_an_episode_given_up_is_not_one_that_ended() -> None:
     envs = StatisticsVectorEnv(2, step_reward=-1, max_episode_steps=3)
     envs.reset()
