@@ -5,10 +5,10 @@
 Whoever connects to the socket FD is served by a fork of its own: a request comes over the connection, and the
 answer goes back over it; `helpers.forks` asks. The process ends with the process OWNER. A fork starts
 with what a process of its own would start with: command line, folder, environment, paths, random numbers.
-Four things differ: everything is imported already, Hydra has composed settings once and composes faster,
-garbage is collected less often, and what Python and the libraries read of the environment while they are
-loaded is that of the first request. And no line says that something takes long, as on a busy machine it may;
-the table of a search is written more often, and Slurm is asked more often.
+Four things differ: everything is imported already, Hydra has composed settings once and composes faster (and
+a report's template is compiled), garbage is collected less often, and what Python and the libraries read of
+the environment while they are loaded is that of the first request. And no line says that something takes
+long, as on a busy machine it may; the table of a search is written more often, and Slurm is asked more often.
 """
 
 import atexit
@@ -48,6 +48,7 @@ import gridworld
 from gridworld.config.composition.compose import compose
 from gridworld.envs.rendering import import_pygame
 from gridworld.process import progress
+from gridworld.report import page
 from gridworld.tune import progress as search_progress
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -64,7 +65,8 @@ _LATE = (
     *("sb3_contrib", "torch.utils.tensorboard", "torch.utils.serialization", "torch._dynamo", "av"),
     *("optuna.storages._rdb.storage", "optuna.storages._rdb.models", "sqlalchemy.orm", "joblib"),
     *("sqlalchemy.dialects.sqlite.pysqlite", "alembic.command", "alembic.config", "alembic.migration"),
-    "joblib.externals.loky.backend.synchronize",
+    *("joblib.externals.loky.backend.synchronize", "joblib.externals.loky.backend.popen_loky_posix"),
+    "optuna.importance._fanova",
     *("hydra._internal.hydra", "hydra._internal.logging_config", "hydra.core.plugins", "encodings.cp437"),
     *("matplotlib.backends.backend_svg", "matplotlib.backends.backend_pdf", "fontTools.subset"),
 )
@@ -264,6 +266,7 @@ if __name__ == "__main__":
     compose_quickly()
     compose(CONF, [])
     OverridesParser.create().parse_overrides(list(_WORDS))
+    page.template()
     _end_without_finalizers()
     gc.collect()
     gc.freeze()  # so that a fork shares what is there
