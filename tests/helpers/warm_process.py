@@ -184,6 +184,8 @@ def _run_as(
     sys.argv = words
     np.random.seed()  # `random` sees to it itself
     torch.default_generator.seed()
+    if threads := environment.get("OMP_NUM_THREADS"):
+        torch.set_num_threads(int(threads))
     tempfile.tempdir = None
     multiprocessing_process.ORIGINAL_DIR = cwd  # type: ignore[attr-defined]
     _end(_exit_code(program))
