@@ -43,6 +43,7 @@ import reserve
 import torch
 from composing import compose_quickly
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 
 import gridworld
 from gridworld.config.composition.compose import compose
@@ -267,6 +268,9 @@ if __name__ == "__main__":
     _wait_less_for_slurm()
     compose_quickly()
     compose(CONF, [])
+    for file in CONF.rglob("*.yaml"):
+        with file.open(encoding="utf-8") as opened:
+            OmegaConf.load(opened)  # which `compose_quickly` keeps
     OverridesParser.create().parse_overrides(list(_WORDS))
     page.template()
     _end_without_finalizers()
