@@ -66,7 +66,7 @@ _LATE = (
     *("sb3_contrib", "torch.utils.tensorboard", "torch.utils.serialization", "torch._dynamo", "av"),
     *("optuna.storages._rdb.storage", "optuna.storages._rdb.models", "sqlalchemy.orm", "joblib"),
     *("sqlalchemy.dialects.sqlite.pysqlite", "alembic.command", "alembic.config", "alembic.migration"),
-    *("joblib.externals.loky.backend.synchronize", "joblib.externals.loky.backend.popen_loky_posix"),
+    "joblib.externals.loky.backend.synchronize",
     "optuna.importance._fanova",
     *("hydra._internal.hydra", "hydra._internal.logging_config", "hydra.core.plugins", "encodings.cp437"),
     *("matplotlib.backends.backend_svg", "matplotlib.backends.backend_pdf", "fontTools.subset"),
