@@ -45,19 +45,19 @@ IN_TURN = (
 )
 # What takes more than five seconds of a processor, the longest first.
 LONG = (
-    *("in turn", "tests/test_docs.py", "commands/test_hostile_runs.py", "config/test_experiments.py"),
-    *("sweep/test_sweep_population.py", "report/test_report.py", "commands/test_bad_input.py"),
-    *("commands/test_commands.py", "tune/test_tune.py", "sweep/test_sweep.py", "process/test_output.py"),
-    *("tune/test_tune_parts.py", "restore/test_resume_kills.py", "checking/test_check.py"),
-    "agents/sb3/test_tabulated.py",
-    *("diagnosis/test_sabotage.py", "restore/test_resume_states.py", "restore/test_reproduce.py"),
-    *("restore/test_resume_commands.py", "restore/test_resume.py", "training/test_training.py"),
-    *("training/test_certified.py", "docs/test_examples.py", "storage/test_other_systems.py"),
-    *("commands/test_console.py", "agents/tabular/test_tabular.py", "tune/test_tune_together.py"),
-    *("agents/sb3/test_resume_own_classes.py", "world/test_evaluation.py", "process/test_forks.py"),
-    *("api/test_runs.py", "run/test_power_cuts.py", "api/test_scores.py", "agents/sb3/test_any_class.py"),
-    *("commands/test_fuzz.py", "agents/sb3/test_callbacks.py", "export/test_export.py"),
-    "run/test_lost_folders.py",
+    *("in turn", "tests/test_docs.py", "commands/test_hostile_runs.py", "sweep/test_sweep_population.py"),
+    *("commands/test_commands.py", "sweep/test_sweep.py", "restore/test_resume_kills.py"),
+    *("commands/test_bad_input.py", "tune/test_tune.py", "process/test_output.py", "report/test_report.py"),
+    *("tune/test_tune_parts.py", "agents/sb3/test_population.py", "diagnosis/test_sabotage.py"),
+    *("agents/sb3/test_tabulated.py", "restore/test_resume_states.py", "config/test_experiments.py"),
+    *("restore/test_reproduce.py", "checking/test_check.py", "training/test_training.py"),
+    *("training/test_certified.py", "restore/test_resume.py", "restore/test_resume_commands.py"),
+    *("storage/test_other_systems.py", "docs/test_examples.py", "commands/test_console.py"),
+    *("agents/sb3/test_resume_own_classes.py", "export/test_export.py", "agents/tabular/test_tabular.py"),
+    *("world/test_evaluation.py", "process/test_forks.py", "tune/test_tune_together.py"),
+    *("api/test_scores.py", "api/test_runs.py", "run/test_power_cuts.py", "visualization/test_maps.py"),
+    *("commands/test_fuzz.py", "run/test_lost_folders.py", "agents/sb3/test_any_class.py"),
+    *("agents/sb3/test_callbacks.py", "config/test_config.py"),
 )
 
 

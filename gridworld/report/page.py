@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import re
 from collections import Counter
@@ -49,13 +50,9 @@ def _look(report: Report) -> Styles:
     return styles(agents)
 
 
-def render(report: Report, drawn: dict[str, list[Chart]]) -> str:
-    """The page's HTML.
-
-    Args:
-        report: what it shows.
-        drawn: the figures, from `charts`.
-    """
+@functools.cache
+def template() -> jinja2.Template:
+    """The page's, compiled once."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("gridworld.report", "."),
         autoescape=True,  # a run's folder is data: names in it may hold anything
@@ -63,9 +60,19 @@ def render(report: Report, drawn: dict[str, list[Chart]]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    return environment.get_template("page.html.j2")
+
+
+def render(report: Report, drawn: dict[str, list[Chart]]) -> str:
+    """The page's HTML.
+
+    Args:
+        report: what it shows.
+        drawn: the figures, from `charts`.
+    """
     look = _look(report)
     headline = _headline(report)
-    return environment.get_template("page.html.j2").render(
+    return template().render(
         title=f"{headline or _names(report)}, gridworld",
         headline=headline or "Which agent solves which task",
         lead=_lead(report),

@@ -23,9 +23,7 @@ def test_all_examples_are_tried() -> None:
 
 @pytest.mark.parametrize("name", TOLD)
 def test_an_example(name: str, tmp_path: Path) -> None:
-    # One in a fork; the others in processes with one thread, with which networks this small take less time.
-    variables = {} if name == "train_and_look.py" else {"OMP_NUM_THREADS": "1"}
-    done = script(str(EXAMPLES / name), *ARGUMENTS.get(name, []), cwd=tmp_path, **variables)
+    done = script(str(EXAMPLES / name), *ARGUMENTS.get(name, []), cwd=tmp_path, OMP_NUM_THREADS="1")
     assert done.returncode == 0, done.stderr
     assert TOLD[name] in done.stdout
     assert list(tmp_path.iterdir()) == []

@@ -17,6 +17,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
+from helpers import forks
 
 _STARTED_WITHIN = 30.0  # seconds
 _DAEMONS = ("munged", "slurmctld", "slurmd")
@@ -103,15 +104,17 @@ def ray_head(folder: Path, variables: dict[str, str]) -> Iterator[dict[str, str]
     token.write_text(secrets.token_hex(32))
     token.chmod(0o600)
     access = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN_PATH": str(token)}
-    quiet = {"RAY_USAGE_STATS_ENABLED": "0", "PYTHONWARNINGS": "ignore", **access}
+    quiet = {"RAY_USAGE_STATS_ENABLED": "0", **access}
     # `ray start` without --block would leave its daemons to whoever takes orphans.
     head = [
         *(str(Path(sys.executable).with_name("ray")), "start", "--head", "--block", "--num-cpus=2"),
         *(f"--port={port}", "--node-ip-address=127.0.0.1", "--include-dashboard=false"),
         *("--object-store-memory=80000000", "--disable-usage-stats", f"--temp-dir={folder}"),
+        *("--no-monitor", "--include-log-monitor=false"),  # nobody asks what they find
     ]
     environment = {"RAY_ADDRESS": f"127.0.0.1:{port}", **quiet}
-    with _daemon(head, folder, {**os.environ, **quiet, **variables}) as process:
+    warnings = {"PYTHONWARNINGS": "ignore"}
+    with _daemon(head, folder, {**os.environ, **quiet, **warnings, **variables}) as process:
         wait_for(lambda: "--block" in (folder / "ray.out").read_text(), "Ray's head", process)
         yield environment
 
@@ -137,7 +140,9 @@ def _daemon(
 
 
 def wait_for(
-    condition: Callable[[], object], what: str, process: subprocess.Popen[bytes] | None = None
+    condition: Callable[[], object],
+    what: str,
+    process: subprocess.Popen[bytes] | forks.Started | None = None,
 ) -> None:
     """Until it holds. Fails after a while."""
     end = time.monotonic() + _STARTED_WITHIN

@@ -87,7 +87,7 @@ def train_in(folder: Path, *overrides: str) -> dict[str, object]:
 
 
 # What Python itself reads when it starts: a fork would not see it.
-_READ_AT_START = re.compile(r"PYTHON(?!PATH$)|LC_|LANG|LD_|OMP_|MKL_|OPENBLAS_")
+_READ_AT_START = re.compile(r"PYTHON(?!PATH$)|LC_|LANG|LD_|MKL_|OPENBLAS_")
 
 
 def script(

@@ -5,10 +5,10 @@
 Whoever connects to the socket FD is served by a fork of its own: a request comes over the connection, and the
 answer goes back over it; `helpers.forks` asks. The process ends with the process OWNER. A fork starts
 with what a process of its own would start with: command line, folder, environment, paths, random numbers.
-Four things differ: everything is imported already, Hydra has composed settings once and composes faster,
-garbage is collected less often, and what Python and the libraries read of the environment while they are
-loaded is that of the first request. And no line says that something takes long, as on a busy machine it may;
-the table of a search is written more often.
+Four things differ: everything is imported already, Hydra has composed settings once and composes faster (and
+a report's template is compiled), garbage is collected less often, and what Python and the libraries read of
+the environment while they are loaded is that of the first request. And no line says that something takes
+long, as on a busy machine it may; the table of a search is written more often, and Slurm is asked more often.
 """
 
 import atexit
@@ -43,11 +43,13 @@ import reserve
 import torch
 from composing import compose_quickly
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 
 import gridworld
 from gridworld.config.composition.compose import compose
 from gridworld.envs.rendering import import_pygame
 from gridworld.process import progress
+from gridworld.report import page
 from gridworld.tune import progress as search_progress
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -65,6 +67,7 @@ _LATE = (
     *("optuna.storages._rdb.storage", "optuna.storages._rdb.models", "sqlalchemy.orm", "joblib"),
     *("sqlalchemy.dialects.sqlite.pysqlite", "alembic.command", "alembic.config", "alembic.migration"),
     "joblib.externals.loky.backend.synchronize",
+    "optuna.importance._fanova",
     *("hydra._internal.hydra", "hydra._internal.logging_config", "hydra.core.plugins", "encodings.cp437"),
     *("matplotlib.backends.backend_svg", "matplotlib.backends.backend_pdf", "fontTools.subset"),
 )
@@ -82,6 +85,12 @@ def _import_everything() -> None:
             with contextlib.suppress(ModuleNotFoundError):  # an extra that is not installed
                 importlib.import_module(name)
     PIL.Image.init()  # its file formats
+
+
+def _wait_less_for_slurm() -> None:
+    """It runs on this machine: it may be asked more often, and files are not late."""
+    if launcher := sys.modules.get("gridworld.sweep.launchers.on_slurm"):  # an extra
+        vars(launcher).update(_POLL_SECONDS=0.2, _FILES_ARRIVE_WITHIN=1.0)
 
 
 def _end_without_finalizers() -> None:
@@ -176,6 +185,8 @@ def _run_as(
     sys.argv = words
     np.random.seed()  # `random` sees to it itself
     torch.default_generator.seed()
+    if threads := environment.get("OMP_NUM_THREADS"):
+        torch.set_num_threads(int(threads))
     tempfile.tempdir = None
     multiprocessing_process.ORIGINAL_DIR = cwd  # type: ignore[attr-defined]
     _end(_exit_code(program))
@@ -254,9 +265,14 @@ if __name__ == "__main__":
     _import_everything()
     progress._SECONDS_BETWEEN_LINES = 600.0
     search_progress._SECONDS_BETWEEN_TABLES = 0.3
+    _wait_less_for_slurm()
     compose_quickly()
     compose(CONF, [])
+    for file in CONF.rglob("*.yaml"):
+        with file.open(encoding="utf-8") as opened:
+            OmegaConf.load(opened)  # which `compose_quickly` keeps
     OverridesParser.create().parse_overrides(list(_WORDS))
+    page.template()
     _end_without_finalizers()
     gc.collect()
     gc.freeze()  # so that a fork shares what is there

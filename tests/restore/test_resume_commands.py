@@ -374,7 +374,7 @@ def test_listening_waits_for_no_import() -> None:
 
 def test_where_no_rest_comes_the_last_checkpoint_counts(tmp_path: Path) -> None:
     """A rollout of many seconds cannot be saved in its middle: it ends soon all the same, and says so."""
-    words = ["agent=a2c", "agent.arguments.n_steps=100000", "total_timesteps=100000000", "hydra.run.dir=run"]
+    words = ["agent=a2c", "agent.arguments.n_steps=30000", "total_timesteps=100000000", "hydra.run.dir=run"]
     with start("train.py", *words, "evaluation.every=1000", cwd=tmp_path) as process:
         curve, deadline = tmp_path / "run" / "curve.csv", time.monotonic() + 60
         while not (curve.exists() and curve.read_text().count("\n") > 2) and time.monotonic() < deadline:

@@ -21,6 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gridworld.commands import jobs as jobs_command
+from gridworld.config.pictures import PICTURES
 from gridworld.errors import InputError
 from gridworld.process.progress import duration
 from gridworld.run.reader import read_run
@@ -31,7 +32,8 @@ from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.job_table import JobRow, JobTable
 from gridworld.sweep.progress import sweep_line
 
-QUICK = ("agent=q_learning", "total_timesteps=500", "recording.frames=false", "recording.gif=false")
+NO_PICTURES = [f"recording.{picture.setting}=false" for picture in PICTURES]
+QUICK = ("agent=q_learning", "total_timesteps=500", *NO_PICTURES)
 FOLDER = "hydra.sweep.dir=sweep"
 WORKERS = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
 FORKS = ("hydra/launcher=forks", "hydra.launcher.n_jobs=2")
@@ -342,7 +344,8 @@ def with_own_classes(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]
     return script(
         "train.py",
         *("-m", "agent=a2c", "total_timesteps=64", "n_envs=4", "evaluation.every=64", FOLDER),
-        *("recording.gif=false", "recording.frames=false", *words),
+        *NO_PICTURES,
+        *words,
         cwd=cwd,
         PYTHONPATH=f"{cwd}{os.pathsep}{os.environ.get('PYTHONPATH', '')}",
     )

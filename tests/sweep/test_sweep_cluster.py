@@ -3,15 +3,15 @@
 import os
 import signal
 import subprocess
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from helpers import forks
 from helpers.clusters import ray_head, slurm, wait_for
-from helpers.support import ROOT, script
+from helpers.support import script, start
 from test_sweep import OWN_CLASSES, QUICK, curve_begun, statuses, table
 
 pytestmark = pytest.mark.slow
@@ -31,14 +31,8 @@ class Cluster:
     def sweep(self, *more: str, cwd: Path) -> subprocess.CompletedProcess[str]:
         return script("train.py", *self.words(*more), cwd=cwd, **self.environment)
 
-    def start(self, *more: str, cwd: Path) -> subprocess.Popen[str]:
-        return subprocess.Popen(
-            [sys.executable, str(ROOT / "scripts" / "train.py"), *self.words(*more)],
-            cwd=cwd,
-            env={**os.environ, **self.environment},
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+    def start(self, *more: str, cwd: Path) -> forks.Started:
+        return start("train.py", *self.words(*more), cwd=cwd, **self.environment)
 
     def slurms(self, *command: str) -> str:
         environment = {**os.environ, **self.environment}
@@ -50,8 +44,8 @@ def cluster(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     own = tmp_path_factory.mktemp("own")
     (own / "own.py").write_text(OWN_CLASSES)
     path = f"{own}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
-    start = {"slurm": slurm, "ray": ray_head}[request.param]
-    with start(tmp_path_factory.mktemp(request.param), {"PYTHONPATH": path}) as found:
+    begin = {"slurm": slurm, "ray": ray_head}[request.param]
+    with begin(tmp_path_factory.mktemp(request.param), {"PYTHONPATH": path}) as found:
         yield Cluster(request.param, {**found, "PYTHONPATH": path})
 
 
@@ -63,8 +57,8 @@ def a_class(*names: str) -> list[str]:
 
 def test_a_small_sweep_comes_to_its_end_and_is_widened(cluster: Cluster, tmp_path: Path) -> None:
     words = a_class("own.Broken", "stable_baselines3.A2C")
-    per_task = ["hydra.launcher.jobs_per_task=2"] if cluster.launcher == "slurm" else []
-    done = cluster.sweep(*words, *per_task, "seed=0,1", cwd=tmp_path)
+    two_per_task = ["hydra.launcher.jobs_per_task=2"] if cluster.launcher == "slurm" else []
+    done = cluster.sweep(*words, *two_per_task, "seed=0,1", cwd=tmp_path)
     assert done.returncode == 1, done.stderr
     rows = table(tmp_path / "sweep")
     assert Counter(row["status"] for row in rows.values()) == {"done": 2, "failed": 2}
@@ -75,7 +69,8 @@ def test_a_small_sweep_comes_to_its_end_and_is_widened(cluster: Cluster, tmp_pat
     first = {path: path.read_bytes() for path in (tmp_path / "sweep").glob("*/manifest.json")}
     assert len(first) == 4
 
-    widened = cluster.sweep(*words, "seed=0,1,2", cwd=tmp_path)
+    one_process = two_per_task or ["hydra.launcher.remote.num_cpus=2"]
+    widened = cluster.sweep(*words, *one_process, "seed=0,1,2", cwd=tmp_path)
     assert "2 done, 2 failed; 2 to run" in widened.stderr
     assert Counter(statuses(tmp_path / "sweep").values()) == {"done": 3, "failed": 3}
     assert all(path.read_bytes() == content for path, content in first.items())

@@ -19,7 +19,7 @@ from gridworld.storage.file_lock import is_locked
 KILLS = int(os.environ.get("GRIDWORLD_KILLS", "4"))
 JOBS = int(os.environ.get("GRIDWORLD_KILLED_JOBS", "12"))
 WORDS = (
-    *("-m", "agent=q_learning,dqn,sarsa", f"seed=range({JOBS // 3})", "total_timesteps=5000"),
+    *("-m", "agent=q_learning,dqn,sarsa", f"seed=range({JOBS // 3})", "total_timesteps=3000"),
     *("recording.gif=false", "hydra.sweep.dir=sweep"),
 )
 OF_THE_CLOCK = ("train_seconds", "evaluation_seconds")

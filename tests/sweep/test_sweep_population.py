@@ -209,7 +209,7 @@ def wait_for(condition: Callable[[], object], seconds: float = 60) -> None:
         time.sleep(0.02)
 
 
-LONG = ("agent=ppo", "seed=range(3)", *SMALL, "total_timesteps=15360", "evaluation.every=5120")
+LONG = ("agent=ppo", "seed=range(3)", *SMALL, "total_timesteps=9216", "evaluation.every=3072")
 
 
 @pytest.fixture(scope="module")

@@ -179,8 +179,15 @@ def test_custom_scalars_group_the_curves(served: str) -> None:
     assert {chart["title"]: chart["multiline"]["tag"] for chart in charts} == CHARTS
 
 
-def test_a_browser_shows_it(served: str, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    with chromium(tmp_path_factory.mktemp("profile")) as started:
+        yield started
+
+
+def test_a_browser_shows_it(served: str, browser: Any, tmp_path: Path) -> None:
     shows(
+        browser,
         served,
         {
             "timeseries": ["dqn_run", "ppo_run", "/mean_reward", "/regret"],
@@ -192,8 +199,9 @@ def test_a_browser_shows_it(served: str, tmp_path: Path) -> None:
     )
 
 
-def test_a_browser_shows_a_sweep(served_sweep: str, tmp_path: Path) -> None:
+def test_a_browser_shows_a_sweep(served_sweep: str, browser: Any, tmp_path: Path) -> None:
     shows(
+        browser,
         served_sweep,
         {
             "timeseries": [*SWEPT, *OVER_SEEDS, "/goal_probability"],
@@ -204,14 +212,17 @@ def test_a_browser_shows_a_sweep(served_sweep: str, tmp_path: Path) -> None:
     )
 
 
-def shows(address: str, pages: dict[str, list[str]], folder: Path) -> None:
-    """Whether a browser comes to show these words on TensorBoard's pages; leaves pictures of them."""
-    with chromium(folder / "profile") as browser:
-        from selenium.webdriver.support.ui import WebDriverWait
+def shows(browser: Any, address: str, pages: dict[str, list[str]], folder: Path) -> None:
+    """Whether it comes to show these words on TensorBoard's pages; leaves a picture where it does not."""
+    from selenium.common.exceptions import TimeoutException
+    from selenium.webdriver.support.ui import WebDriverWait
 
-        for page, expected in pages.items():
-            browser.get(f"{address}#{page}")
+    for page, expected in pages.items():
+        browser.get(f"{address}#{page}")
+        try:
             WebDriverWait(browser, 30).until(
                 lambda b, words=expected: all(word in b.execute_script(PAGE_TEXT) for word in words)
             )
+        except TimeoutException:
             browser.save_screenshot(str(folder / f"{page}.png"))
+            raise

@@ -197,7 +197,7 @@ def populations(draw: Callable[..., Any]) -> list[Words]:
     return members
 
 
-@settings(max_examples=14)
+@settings(max_examples=10)
 @given(runs=populations())
 def test_whatever_their_settings_runs_train_as_alone(runs: list[Words]) -> None:
     assert_as_alone(runs)
