@@ -22,7 +22,7 @@ from torch.nn.functional import max_pool2d, normalize
 
 from gridworld.errors import InputError
 
-_FEATURES, _MOST_FEATURES = 256, 4096
+_FEATURES, _MOST_FEATURES = 144, 4096
 
 
 class FourierFeatures(BaseFeaturesExtractor):
@@ -38,8 +38,8 @@ class FourierFeatures(BaseFeaturesExtractor):
 
     Args:
         observation_space: a Box of shape (d,).
-        orders: n_i of each coordinate; None: the largest with which there are at most 256 features, the same
-            for each. For two coordinates it is 15, enough for grids of 16 x 16.
+        orders: n_i of each coordinate; None: the largest with which there are at most 144 features, the same
+            for each. For two coordinates it is 11, enough for grids of 12 x 12.
 
     Raises:
         InputError: another space, other orders, or more features than 4096.
@@ -52,7 +52,7 @@ class FourierFeatures(BaseFeaturesExtractor):
                 f"{observation_space}"
             )
         (dimensions,) = observation_space.shape
-        largest = int(_FEATURES ** (1 / dimensions) + 1e-9) - 1
+        largest = max(int(_FEATURES ** (1 / dimensions) + 1e-9) - 1, 1)
         self.orders = [largest] * dimensions if orders is None else np.atleast_1d(orders).tolist()
         if len(self.orders) != dimensions or any(type(each) is not int or each < 0 for each in self.orders):
             raise InputError(
@@ -62,7 +62,8 @@ class FourierFeatures(BaseFeaturesExtractor):
         size = math.prod(order + 1 for order in self.orders)
         if size > _MOST_FEATURES:
             raise InputError(
-                f"FourierFeatures: orders={orders}: make {size} features, more than {_MOST_FEATURES}"
+                f"FourierFeatures: {dimensions} coordinates of these orders make {size} features, more than "
+                f"{_MOST_FEATURES}"
             )
         super().__init__(observation_space, size)
 

@@ -45,13 +45,13 @@ def test_they_are_products_of_cosines_of_length_one() -> None:
     assert np.allclose(found, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize(("rows", "cols"), [(5, 6), (12, 12), (16, 16)])
+@pytest.mark.parametrize(("rows", "cols"), [(5, 6), (7, 9), (12, 12)])
 def test_by_default_any_function_of_a_grids_cells_is_linear_in_them(rows: int, cols: int) -> None:
     basis = FourierFeatures(PLANE)
-    assert basis.orders == [15, 15]
+    assert basis.orders == [11, 11]
     features = basis(places(rows, cols)).double()
     assert torch.linalg.svdvals(features)[-1] > 0.5  # of the table's part that is hardest to tell
-    assert FourierFeatures(spaces.Box(0, 1, (3,))).features_dim == 216  # 6 ** 3, the last below 256
+    assert FourierFeatures(spaces.Box(0, 1, (3,))).features_dim == 125  # 5 ** 3, the last below 144
 
 
 @pytest.mark.parametrize("cell_size", [8, 16])
@@ -84,7 +84,10 @@ def test_an_images_cells_are_their_brightest_colours() -> None:
     [
         (lambda: FourierFeatures(spaces.Discrete(3)), "must be coordinates, a Box of shape (d,)"),
         (lambda: FourierFeatures(PLANE, [3, -1]), "orders=[3, -1]: must be 2 whole numbers"),
-        (lambda: FourierFeatures(PLANE, [99, 99]), "make 10000 features, more than 4096"),
+        (
+            lambda: FourierFeatures(PLANE, [99, 99]),
+            "2 coordinates of these orders make 10000 features, more than 4096",
+        ),
         (lambda: ImageCells(PLANE), "must be an image of shape (3, height, width)"),
         (lambda: ImageCells(spaces.Box(0, 255, (3, 8, 9), np.uint8), 10), "from 1 to the image's 8 pixels"),
     ],

@@ -10,6 +10,8 @@ So one forward and one backward pass over the distinct states give the loss and 
 batch, exactly: the same sums as sample by sample, added up in another order. While the parameters stand
 still, the outputs are a table, and acting is looking up.
 
+Features that no parameter has a part in, as those of `features.FIXED`, are a table as well, made once.
+
 A one-hot row times the first layer's weights is a column of these weights. So for one-hot observations that
 layer is a look-up as well, and no matrix of S x S is ever made.
 """
