@@ -18,6 +18,7 @@ CLAIMS: dict[str, tuple[str, list[str]]] = {  # by a part of a command: what it 
     "classic_ppo_sb3_defaults": ("not optimal", []),
     "evaluate.py runs/defaults": ("it walks in circles until the time is out (probability 1)", []),
     "observation=coordinates": ("certified optimal since step", ["evaluation.stop_after=1"]),
+    "observation=image": ("certified optimal since step", ["evaluation.stop_after=1"]),
     "train.py --help": ("Choices:", []),
 }
 

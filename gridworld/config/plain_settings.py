@@ -17,7 +17,10 @@ from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, schema_of
 from gridworld.errors import InputError
 
-_LIBRARIES = ("torch.nn.", "torch.optim.", "stable_baselines3.", "sb3_contrib.")
+_LIBRARIES = (
+    *("torch.nn.", "torch.optim.", "stable_baselines3.", "sb3_contrib."),
+    "gridworld.agents.sb3.features.",
+)
 
 # A run that was made before there was such a setting is read with the setting's default.
 _WITHOUT_RESULT = (Effect.FILES, Effect.NOTHING)

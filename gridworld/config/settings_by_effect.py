@@ -40,6 +40,11 @@ def is_newer(name: str) -> bool:
     return name in _NEWER
 
 
+def is_of_network(name: str) -> bool:
+    """Whether a setting is of an agent's network; such a one may follow from the observation."""
+    return ".policy_kwargs." in name
+
+
 def with_effects(
     effects: Collection[Effect], settings: Mapping[str, Any], section: str = ""
 ) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gridworld.config.effects import Effect
 from gridworld.config.flatten import flat
-from gridworld.config.settings_by_effect import ON_RESULT, with_effects
+from gridworld.config.settings_by_effect import ON_RESULT, is_of_network, with_effects
 from gridworld.envs.intervals import wilson_interval
 from gridworld.errors import InputError
 from gridworld.process.columns import aligned
@@ -61,11 +61,10 @@ def _result(folder: Path) -> tuple[Summary, Settings] | None:
 
 
 def _difference(settings: Settings, alike: Iterable[Settings]) -> str:
-    """In what the settings differ from the others of this agent on this task."""
+    """In what the settings differ from the others of this agent on this task; a network's come last."""
     shared = set(settings).intersection(*alike)
-    told = " ".join(
-        f"{name.removeprefix('agent.')}={value}" for name, value in settings if (name, value) not in shared
-    )
+    own = sorted((each for each in settings if each not in shared), key=lambda each: is_of_network(each[0]))
+    told = " ".join(f"{name.removeprefix('agent.')}={value}" for name, value in own)
     return told if len(told) <= _LONGEST else f"{told[: _LONGEST - 1]}…"
 
 

@@ -85,7 +85,10 @@ TRAIN = [
     ("agent.train_freq=often", "agent.train_freq=often: must be a whole number"),
     ("agent.train_freq=[1,episode]", "SB3 counts episodes with one environment only; set n_envs=1"),
     ("agent.exploration_fraction=0", "agent.exploration_fraction=0.0: must be a positive number"),
-    ("observation=image", "agent.policy=MlpPolicy cannot see images; set agent.policy=CnnPolicy"),
+    (
+        "agent=dqn_sb3_defaults observation=image",
+        "agent.policy=MlpPolicy cannot see images; set agent.policy=CnnPolicy",
+    ),
     ("agent.policy=CnnPolicy", "agent.policy=CnnPolicy sees images only"),
     ("agent=sarsa_max", "agent=sarsa_max: there is no such choice; there are a2c, a2c_sb3_defaults"),
     ("experiment=cliff_qlearning", "there is no such choice; close to it are cliff_q_learning, "),
@@ -178,6 +181,14 @@ TRAIN_WITH_SB3 = [
     ("device=cuda:99", "device=cuda:99: torch finds no CUDA device"),
     ("device=abacus", "device=abacus: must be auto, cpu, cuda or cuda:N"),
     ("observation=image agent.policy=CnnPolicy observation.cell_size=4", "32 x 28 pixels are too small"),
+    (
+        "observation=image observation.cell_size=4",
+        "+agent.policy_kwargs.features_extractor_kwargs.cell_size=4",
+    ),
+    (
+        "observation=coordinates +agent.policy_kwargs.features_extractor_kwargs.orders=[4]",
+        "FourierFeatures: orders=[4]: must be 2 whole numbers, one for each coordinate",
+    ),
 ]
 
 

@@ -28,7 +28,6 @@ COMPLETED = {  # choices that leave something to say
     "enumerated": ["env.id=MiniGrid-Empty-5x5-v0"],
     "arrays": ["env.path=two_rooms.npz"],
     "built": ["env.builder=gridworld.world.sources.classics.river_swim"],
-    "image": ["agent.policy=CnnPolicy"],
     "own": ["env=enumerated", "env.id=MiniGrid-Empty-5x5-v0"],
 }
 FROM_ELSEWHERE = {"self", "env", "seed", "device", "tensorboard_log", "verbose", "_init_setup_model"}

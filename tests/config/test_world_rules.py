@@ -26,6 +26,12 @@ def widths(agent: AgentConfig) -> object:
     return vars(agent)["policy_kwargs"].net_arch
 
 
+def extractor(agent: AgentConfig) -> object:
+    settings = vars(agent) | vars(agent).get("arguments", {})
+    kwargs = settings["policy_kwargs"]
+    return (kwargs if isinstance(kwargs, dict) else vars(kwargs))["features_extractor_class"]
+
+
 @AGENTS
 def test_the_default_world_has_the_settings_that_it_was_tuned_with(agent: str) -> None:
     config = configure(f"agent={agent}")
@@ -62,11 +68,23 @@ def test_the_evaluations_discount_bounds_the_agents(agent: str) -> None:
     assert vars(configure(f"agent={agent}", "evaluation.gamma=0.5").agent)["gamma"] == 0.5
 
 
-def test_two_numbers_take_a_wider_network_and_starts_anywhere() -> None:
-    config = configure("agent=dqn", "observation=coordinates")
-    assert widths(config.agent) == [128, 128]
-    assert config.exploring_starts == 1
-    assert config.total_timesteps == 60_000
+@pytest.mark.parametrize("agent", ["dqn", "ppo", "a2c", "trpo", "qrdqn"])
+def test_what_is_seen_changes_the_features_alone(agent: str) -> None:
+    plain, coordinates, image = (
+        configure(f"agent={agent}", f"observation={kind}") for kind in ("one_hot", "coordinates", "image")
+    )
+    assert [extractor(each.agent) for each in (plain, coordinates, image)] == [
+        None,
+        "gridworld.agents.sb3.features.FourierFeatures",
+        "gridworld.agents.sb3.features.ImageCells",
+    ]
+    names = {"agent", "observation"}
+    settings = [
+        {k: v for k, v in vars(each).items() if k not in names} for each in (plain, coordinates, image)
+    ]
+    assert settings[0] == settings[1] == settings[2]
+    convolutions = configure(f"agent={agent}", "observation=image", "agent.policy=CnnPolicy")
+    assert extractor(convolutions.agent) is None
 
 
 def test_the_command_line_goes_before_them() -> None:

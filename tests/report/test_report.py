@@ -40,6 +40,7 @@ from gridworld.report.charts.overall_charts import overall_charts
 from gridworld.report.charts.style import house_style, line_count, styles, text_width, wrapped_apart
 from gridworld.report.charts.sweep_charts import sweep_charts
 from gridworld.report.charts.task_charts import task_charts
+from gridworld.report.evidence.grouping import labels
 from gridworld.report.evidence.reasons import Reason, reasons
 from gridworld.report.evidence.run_reader import Evidence, read
 from gridworld.report.evidence.tuning_study import find_tunings
@@ -873,6 +874,15 @@ def test_long_labels_are_whole_on_more_lines_and_told_apart() -> None:
         assert (first[-3:], second[-3:]) == (" #1", " #2")
         assert line_count(first) == 6
         assert all(text_width(label, 12) <= 170 for label in (*told, first, second))
+
+
+def test_what_follows_from_the_observation_names_no_group() -> None:
+    features = "agent.policy_kwargs.features_extractor_class"
+    seen = [{features: f"features.{kind}", "observation.kind": kind} for kind in ("coordinates", "image")]
+    assert labels([("ppo", each) for each in seen]) == [
+        "ppo (observation.kind=coordinates)",
+        "ppo (observation.kind=image)",
+    ]
 
 
 def test_figures_of_configurations_have_their_whole_labels(maker: Maker, tmp_path: Path) -> None:

@@ -105,6 +105,7 @@ def test_the_curve_has_a_row_per_evaluation(tmp_path: Path) -> None:
     [
         ["observation=coordinates"],
         ["observation=none"],
+        ["observation=image"],
         ["observation=image", "agent.policy=CnnPolicy", "n_envs=8", "total_timesteps=500"],
         ["env=frozen_lake_4x4", "agent.learning_rate=lin_0.01"],
         ["env=maze", "recording.cell_size=7"],

@@ -34,6 +34,7 @@ _MOST_LAYERS, _WIDEST_LAYER = 16, 4096
 _EXAMPLES: dict[type, str] = {
     BaseAlgorithm: "stable_baselines3.A2C",
     BaseCallback: "stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes",
+    BaseFeaturesExtractor: "gridworld.agents.sb3.features.FourierFeatures",
 }
 _PLAIN_TYPES = (bool, int, float, str)
 _KINDS: dict[str, type] = {

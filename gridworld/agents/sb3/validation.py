@@ -9,7 +9,7 @@ from typing import Any
 from gridworld.agents.sb3.schemas import DQNConfig, PPOConfig, SB3CheckedConfig, SB3ClassConfig, SB3Config
 from gridworld.bounds import MOST_STEPS, above_zero, at_least, at_most, within, within_size
 from gridworld.config.agents import MOST_KEPT, check_exploration, parse_schedule
-from gridworld.config.train import TrainConfig
+from gridworld.config.train import ObservationConfig, TrainConfig
 from gridworld.config.worlds import EnvConfig, MapConfig
 from gridworld.errors import InputError
 
@@ -48,7 +48,7 @@ def check(config: TrainConfig) -> None:
         raise InputError(f"agent.engine={agent.engine}: must be {' or '.join(ENGINES)}")
     for index, entry in enumerate(config.callbacks):
         _check_callback(f"callbacks[{index}]", entry)
-    _check_observation(agent, config.observation.kind)
+    _check_observation(agent, config.observation)
     _check_rewards(config.env)
     if isinstance(agent, SB3ClassConfig):
         _check_class(agent, config.n_envs)
@@ -98,15 +98,30 @@ def _is_judged(name: str, value: Any, default: Any) -> bool:
     return isinstance(value, int) or (isinstance(value, float) and abs(value) <= _ORDINARY)
 
 
-def _check_observation(agent: SB3Config, kind: str) -> None:
-    if kind == "image" and agent.policy == "MlpPolicy":
+def _check_observation(agent: SB3Config, observation: ObservationConfig) -> None:
+    settings = vars(agent) | vars(agent).get("arguments", {})
+    kwargs = settings.get("policy_kwargs") or {}
+    kwargs = kwargs if isinstance(kwargs, dict) else vars(kwargs)
+    extractor = kwargs.get("features_extractor_class")
+    if observation.kind == "image" and agent.policy == "MlpPolicy" and extractor is None:
         raise InputError(
             "observation=image: agent.policy=MlpPolicy cannot see images; set agent.policy=CnnPolicy"
         )
-    if kind != "image" and agent.policy == "CnnPolicy":
+    if observation.kind != "image" and agent.policy == "CnnPolicy":
         raise InputError(
-            f"observation={kind}: agent.policy=CnnPolicy sees images only; "
+            f"observation={observation.kind}: agent.policy=CnnPolicy sees images only; "
             "set observation=image or agent.policy=MlpPolicy"
+        )
+    side = (kwargs.get("features_extractor_kwargs") or {}).get("cell_size", ObservationConfig.cell_size)
+    if (
+        observation.kind == "image"
+        and str(extractor).endswith(".ImageCells")
+        and side > observation.cell_size
+    ):
+        setting = f"{agent.key('policy_kwargs')}.features_extractor_kwargs.cell_size"
+        raise InputError(
+            f"observation.cell_size={observation.cell_size}: features of {side} pixels hold several cells; "
+            f"set +{setting}={observation.cell_size}"
         )
 
 

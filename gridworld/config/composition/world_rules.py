@@ -4,7 +4,7 @@
     ${quadratic_scale:${env},${agent.gamma}}                 see there
     ${for_size:${env},30000}                        30000 up to 30 states, in larger worlds in proportion
     ${if_chance:${env},A,B}                         A where an action may have several outcomes, else B
-    ${if_seen:${observation.kind},coordinates,A,B}  A where that is what the agent sees, else B
+    ${features_class:${observation.kind},${agent.policy}}  of an MLP, for what the agent sees
     ${quarter:${agent.n_steps},${n_envs}}           a quarter of a rollout's steps
 
 They know the worlds of maps of up to 512 cells. Any other world, and settings that make none, get what the
@@ -27,13 +27,17 @@ from gridworld.errors import InputError
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
     from gridworld.world.mdp import Mdp
 
+_FEATURES = {  # by the kind of observation
+    "coordinates": "gridworld.agents.sb3.features.FourierFeatures",
+    "image": "gridworld.agents.sb3.features.ImageCells",
+}
 _DEFAULT_CELLS = 30  # of the default world, whose settings were tuned
 _MOST_CELLS = 512  # the rules solve the world a few times, which takes 0.3 s there
 
 
 def register_world_rules() -> None:
     """Register these functions with OmegaConf."""
-    for rule in (clearest_gamma, for_size, if_chance, if_seen, quadratic_scale, quarter):
+    for rule in (clearest_gamma, features_class, for_size, if_chance, quadratic_scale, quarter):
         OmegaConf.register_new_resolver(rule.__name__, rule, replace=True)
 
 
@@ -44,6 +48,11 @@ def clearest_gamma(env: DictConfig, evaluation_gamma: float, candidates: Sequenc
         return candidates[0] if world is None else _gamma(world, evaluation_gamma, tuple(candidates))
     except InputError:  # of the discount, or a world without a finite optimum
         return candidates[0]
+
+
+def features_class(kind: str, policy: str) -> str | None:
+    """The import path of the features extractor for an observation of this kind; None: the policy's own."""
+    return _FEATURES.get(kind) if policy == "MlpPolicy" else None
 
 
 def for_size(env: DictConfig, number: int) -> int:
@@ -69,12 +78,6 @@ def quadratic_scale(env: DictConfig, gamma: float) -> float | None:
         return None if world is None else scale(world, gamma)
     except InputError:  # of the discount
         return None
-
-
-def if_seen(kind: str, this: str, then: Any, otherwise: Any) -> Any:
-    """`then` where the observation is of the kind `this`."""
-    chosen = then if kind == this else otherwise
-    return OmegaConf.create(chosen) if isinstance(chosen, list) else chosen
 
 
 def quarter(n_steps: int, n_envs: int) -> int:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridworld.config.effects import Effect
-from gridworld.config.settings_by_effect import effect_of
+from gridworld.config.settings_by_effect import effect_of, is_of_network
 from gridworld.report.evidence.run_reader import Evidence, Settings
 from gridworld.storage.safe_read import sha256
 
@@ -135,9 +135,10 @@ def labels(named: Sequence[tuple[str, Settings]], with_unset: bool = True) -> li
 
 
 def differing(settings: Sequence[Settings]) -> list[str]:
-    """Names of the settings that are not the same in all, sorted; the agent's own come first."""
+    """Names of the settings that are not the same in all, the agent's first, a network's last."""
     names = sorted(
-        {name for each in settings for name in each}, key=lambda name: (name[:6] != "agent.", name)
+        {name for each in settings for name in each},
+        key=lambda name: (is_of_network(name), name[:6] != "agent.", name),
     )
     return [name for name in names if len({each.get(name, _UNSET) for each in settings}) > 1]
 

@@ -166,7 +166,7 @@ DIFFERENT: dict[str, list[list[str]]] = {  # of each argument; the empty one is 
         OPTIMIZERS,
     ],
 }
-OBSERVATIONS: list[Words] = [(), ("observation=coordinates",), ("observation=none",)]
+OBSERVATIONS: list[Words] = [(), ("observation=coordinates",), ("observation=none",), ("observation=image",)]
 NETS = ["", "net_arch=[20]", "net_arch=[7,1]", "net_arch=[]", "net_arch=[33,5,16]"]
 SPLIT_NETS = ["net_arch={pi:[9],vf:[4,3]}", "net_arch={pi:[],vf:[20]}"]
 

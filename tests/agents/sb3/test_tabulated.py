@@ -19,6 +19,7 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from gridworld import GridWorldVectorEnv
 from gridworld.agents.sb3 import check
 from gridworld.agents.sb3.constructor_arguments import algorithm_and_arguments
+from gridworld.agents.sb3.features import FourierFeatures, ImageCells
 from gridworld.agents.sb3.schemas import SB3Config
 from gridworld.agents.sb3.tabulated import off_policy
 from gridworld.agents.sb3.tabulated import state_inputs as tabulated
@@ -118,6 +119,9 @@ def share_rollout(ours: Any, theirs: Any, is_moved: bool = True) -> None:
 
 
 SEPARATE = {"policy_kwargs": {"share_features_extractor": False}}
+FOURIER = {"policy_kwargs": {"features_extractor_class": FourierFeatures}}
+CELLS = {"policy_kwargs": {"features_extractor_class": ImageCells, "net_arch": [16]}}
+APART = {"policy_kwargs": {**FOURIER["policy_kwargs"], "share_features_extractor": False}}
 LINEAR = {"policy_kwargs": {"net_arch": []}}
 TWO_SIZES = {"policy_kwargs": {"net_arch": {"pi": [8], "vf": [16, 16]}}}
 RELU = {"activation_fn": torch.nn.ReLU, "optimizer_class": torch.optim.RMSprop}
@@ -133,13 +137,14 @@ FROM_ROLLOUTS: dict[tuple[type, type], list[tuple[str, dict[str, Any]]]] = {
         ("one_hot", {"target_kl": 1e-3}),
         ("one_hot", {"n_epochs": 3, "batch_size": 100}),
         *[("none", LINEAR), ("coordinates", TWO_SIZES), ("coordinates", SEPARATE), ("image", SEPARATE)],
+        *[("coordinates", FOURIER), ("image", CELLS), ("coordinates", APART)],
         ("one_hot", {"policy_kwargs": RELU}),
     ],
     (TabulatedA2C, A2C): [
         *[(kind, {}) for kind in KINDS],
         ("one_hot", {"ent_coef": 0.3, "vf_coef": 0.1, "gae_lambda": 0.9, "normalize_advantage": True}),
         ("one_hot", {"use_rms_prop": False, "max_grad_norm": 0.01}),
-        *[("none", LINEAR), ("coordinates", TWO_SIZES), ("image", SEPARATE)],
+        *[("none", LINEAR), ("coordinates", TWO_SIZES), ("image", SEPARATE), ("coordinates", FOURIER)],
     ],
     (TabulatedTRPO, TRPO): [
         *[(kind, {}) for kind in KINDS if kind != "image"],
@@ -149,7 +154,7 @@ FROM_ROLLOUTS: dict[tuple[type, type], list[tuple[str, dict[str, Any]]]] = {
         ("one_hot", {"target_kl": 0.5, "line_search_shrinking_factor": 0.5}),
         ("one_hot", {"line_search_max_iter": 0}),
         ("one_hot", {"policy_kwargs": {"optimizer_class": torch.optim.AdamW}}),
-        *[("none", LINEAR), ("coordinates", TWO_SIZES)],
+        *[("none", LINEAR), ("coordinates", TWO_SIZES), ("coordinates", FOURIER)],
     ],
 }
 
@@ -323,12 +328,14 @@ FROM_REPLAY: dict[tuple[type, type], list[tuple[str, dict[str, Any]]]] = {
         *[(kind, {}) for kind in KINDS],
         ("one_hot", {"max_grad_norm": 1e-3, "gamma": 0.5}),
         ("one_hot", LINEAR),
+        *[("coordinates", FOURIER), ("image", CELLS)],
         ("none", {"policy_kwargs": {"net_arch": [8], "activation_fn": torch.nn.Tanh}}),
         ("one_hot", {"policy_kwargs": {"activation_fn": torch.nn.PReLU}}),
     ],
     (TabulatedQRDQN, QRDQN): [
         *[(kind, {}) for kind in KINDS],
         ("one_hot", {"max_grad_norm": 1e-3, "gamma": 0.5}),
+        ("coordinates", FOURIER),
         ("one_hot", {"policy_kwargs": {"net_arch": [], "n_quantiles": 7}}),
         ("none", {"policy_kwargs": {"n_quantiles": 1, "optimizer_class": torch.optim.SGD}}),
     ],

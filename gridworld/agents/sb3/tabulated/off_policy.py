@@ -5,6 +5,7 @@ Greedy actions and targets are look-ups in tables, refreshed only when a network
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -79,10 +80,8 @@ class TabulatedOffPolicy(OffPolicyAlgorithm):
             (U, ...), with its graph; (P, S, ...) for `leaves`.
         """
         layers = getattr(network, self.network)
-        observations = self.inputs.observations(states, layers)
-        features = None
-        if observations is not None:
-            features = network.extract_features(observations, network.features_extractor)
+        extract = functools.partial(network.extract_features, features_extractor=network.features_extractor)
+        features = self.inputs.features(states, extract, layers)
         return forward(layers, leaves, features) if leaves else self.inputs.latent(layers, states, features)
 
     def outputs_of_all(self, leaves: Leaves | None = None) -> tuple[Tensor]:

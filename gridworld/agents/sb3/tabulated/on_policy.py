@@ -66,8 +66,7 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         """
         policy, extractor = self.policy, self.policy.mlp_extractor
         nets = (extractor.policy_net, extractor.value_net)
-        observations = self.inputs.observations(states, *nets)
-        features: Any = None if observations is None else policy.extract_features(observations)
+        features = self.inputs.features(states, policy.extract_features, *nets)
         actor, critic = features if isinstance(features, tuple) else (features, features)
         if leaves:
             logits = forward([*nets[0], policy.action_net], leaves, actor)

@@ -10,6 +10,8 @@ So one forward and one backward pass over the distinct states give the loss and 
 batch, exactly: the same sums as sample by sample, added up in another order. While the parameters stand
 still, the outputs are a table, and acting is looking up.
 
+Features that no parameter has a part in, as those of `features.FIXED`, are a table as well, made once.
+
 A one-hot row times the first layer's weights is a column of these weights. So for one-hot observations that
 layer is a look-up as well, and no matrix of S x S is ever made.
 """
@@ -17,7 +19,7 @@ layer is a look-up as well, and no matrix of S x S is ever made.
 from __future__ import annotations
 
 import functools
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any, cast
 
 import numpy as np
@@ -25,8 +27,10 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from torch import Tensor, nn
 
+from gridworld.agents.sb3.features import FIXED
 from gridworld.agents.sb3.schemas import SB3ClassConfig, SB3Config
 from gridworld.agents.sb3.tabulated.flat_optimizer import ELEMENTWISE
 from gridworld.agents.sb3.tabulated.stacked_layers import can_stand
@@ -43,7 +47,7 @@ ACTIVATIONS = (
 # Of a policy's classes: those that are known to fit, and why another one need not.
 _CLASSES: tuple[tuple[str, tuple[type, ...], str], ...] = (
     ("activation_fn", ACTIVATIONS, "is not known to give the same for the same number always"),
-    ("features_extractor_class", (), "may keep more than a function of the state"),
+    ("features_extractor_class", FIXED, "may keep more than a function of the state"),
     ("optimizer_class", ELEMENTWISE, "may look at more than a weight at a time"),
 )
 _FEW_STATES = 1024  # up to here all states are cheaper than finding out which ones a batch holds
@@ -106,8 +110,10 @@ class StateInputs:
         self.num_states = observation.num_states
         self._policy = policy
         self._observation = observation
-        self._one_hot = _is_look_up(observation)
-        self._all: Tensor | None = None  # the observations of all states, once they were asked for
+        extractors = {type(each) for each in policy.modules() if isinstance(each, BaseFeaturesExtractor)}
+        self._one_hot = extractors == {FlattenExtractor} and _is_look_up(observation)
+        self._is_fixed = extractors <= {FlattenExtractor, *FIXED}
+        self._all: Any = None  # of all states, the features if these never change, else the observations
 
     @functools.cached_property
     def kind(self) -> Hashable:
@@ -148,23 +154,29 @@ class StateInputs:
             hidden = layer(hidden)
         return hidden
 
-    def observations(self, states: IntArray | None, *networks: nn.Sequential) -> Tensor | None:
-        """The observations of states, (U, *shape), on the policy's device.
+    def features(
+        self, states: IntArray | None, extract: Callable[[Tensor], Any], *networks: nn.Sequential
+    ) -> Any:
+        """What the networks are run on, of some states; computed once if no parameter has a part in it.
 
         Args:
             states: (U,), integers; None: all.
+            extract: makes features of observations (U, *shape).
             networks: those to run on them.
 
         Returns:
-            None where all these networks begin with a look-up.
+            What `extract` returns; None where all these networks begin with a look-up.
         """
         if self._one_hot and all(len(net) and isinstance(net[0], nn.Linear) for net in networks):
             return None
         if states is not None:
-            return self._tensor(states)
+            return extract(self._tensor(states))
         if self._all is None:
             self._all = self._tensor(np.arange(self.num_states))
-        return self._all
+            if self._is_fixed:
+                with torch.no_grad():
+                    self._all = extract(self._all)
+        return self._all if self._is_fixed else extract(self._all)
 
     def _tensor(self, states: IntArray) -> Tensor:
         tensor, _ = self._policy.obs_to_tensor(self._observation.rows(states))

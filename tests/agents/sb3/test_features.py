@@ -1,0 +1,111 @@
+"""Features extractors without parameters: what they make of coordinates and of images."""
+
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from helpers.support import train_in
+from stable_baselines3 import DQN, PPO
+from torch import Tensor
+
+import gridworld
+from gridworld.agents.sb3.features import FourierFeatures, ImageCells
+from gridworld.envs.observations import make_observation
+from gridworld.errors import InputError
+
+PLANE = spaces.Box(0, 1, (2,), np.float32)
+
+
+def places(rows: int, cols: int) -> Tensor:
+    cells = product(np.linspace(0, 1, rows), np.linspace(0, 1, cols))
+    return torch.tensor(np.array(list(cells)), dtype=torch.float32)
+
+
+@pytest.mark.parametrize(("rows", "cols"), [(5, 6), (2, 2), (1, 7), (12, 9)])
+def test_with_the_grids_own_orders_cells_are_orthonormal(rows: int, cols: int) -> None:
+    features = FourierFeatures(PLANE, [rows - 1, cols - 1])(places(rows, cols))
+    assert features.shape == (rows * cols, rows * cols)
+    assert torch.allclose(features @ features.T, torch.eye(rows * cols), atol=1e-5)
+
+
+def test_they_are_products_of_cosines_of_length_one() -> None:
+    x = torch.rand(9, 2)
+    basis = FourierFeatures(PLANE, [3, 2])
+    found, orders = basis(x), list(product(range(4), range(3)))
+    assert basis.features_dim == found.shape[1] == len(orders)
+    assert torch.allclose(found.norm(dim=1), torch.ones(9))
+    weights = [0.5 ** (((a in (0, 3)) + (b in (0, 2))) / 2) for a, b in orders]
+    naive = [[np.cos(np.pi * a * float(p)) * np.cos(np.pi * b * float(q)) for a, b in orders] for p, q in x]
+    expected = np.array(naive) * weights
+    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+    assert np.allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("rows", "cols"), [(5, 6), (7, 9), (12, 12)])
+def test_by_default_any_function_of_a_grids_cells_is_linear_in_them(rows: int, cols: int) -> None:
+    basis = FourierFeatures(PLANE)
+    assert basis.orders == [11, 11]
+    features = basis(places(rows, cols)).double()
+    assert torch.linalg.svdvals(features)[-1] > 0.5  # of the table's part that is hardest to tell
+    assert FourierFeatures(spaces.Box(0, 1, (3,))).features_dim == 125  # 5 ** 3, the last below 144
+
+
+@pytest.mark.parametrize("cell_size", [8, 16])
+@pytest.mark.parametrize("layout", ["classic", "cliff", "four_rooms"])
+def test_images_of_different_cells_are_far_apart(layout: str, cell_size: int) -> None:
+    mdp = gridworld.compose(f"env={layout}").env.compile()
+    images = make_observation(mdp, "image", cell_size)
+    features = ImageCells(images.space)(torch.tensor(images.table()) / 255)
+    assert torch.allclose(features.norm(dim=1), torch.ones(mdp.num_states))
+    inside = features[~torch.tensor(mdp.absorbing)]
+    distances = torch.cdist(inside, inside) + 9 * torch.eye(len(inside))
+    assert distances.min() > 1  # unit vectors are 1.41 apart
+
+
+def test_an_images_cells_are_their_brightest_colours() -> None:
+    image = torch.zeros(1, 3, 5, 4)
+    image[0, :, 0, 0] = 0.7  # grey
+    image[0, :, 1, 1] = torch.tensor([0.2, 0.3, 0.9])
+    image[0, :, 3, 2] = torch.tensor([0.8, 0.4, 0.0])
+    cells = ImageCells(spaces.Box(0, 255, (3, 5, 4), np.uint8), cell_size=2)
+    found = cells(image).reshape(3, 2, 2) * np.hypot(0.6, 0.4)
+    expected = torch.zeros(3, 2, 2)
+    expected[2, 0, 0], expected[0, 1, 1] = 0.6, 0.4
+    assert torch.allclose(found, expected)
+    assert torch.equal(cells(torch.ones(1, 3, 5, 4)), torch.zeros(1, 12))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: FourierFeatures(spaces.Discrete(3)), "must be coordinates, a Box of shape (d,)"),
+        (lambda: FourierFeatures(PLANE, [3, -1]), "orders=[3, -1]: must be 2 whole numbers"),
+        (
+            lambda: FourierFeatures(PLANE, [99, 99]),
+            "2 coordinates of these orders make 10000 features, more than 4096",
+        ),
+        (lambda: ImageCells(PLANE), "must be an image of shape (3, height, width)"),
+        (lambda: ImageCells(spaces.Box(0, 255, (3, 8, 9), np.uint8), 10), "from 1 to the image's 8 pixels"),
+    ],
+)
+def test_what_they_cannot_take(make: Any, words: str) -> None:
+    with pytest.raises(InputError) as mistake:
+        make()
+    assert words in str(mistake.value)
+
+
+@pytest.mark.parametrize("agent", [DQN, PPO])
+def test_a_runs_model_loads_in_plain_sb3(agent: Any, tmp_path: Path) -> None:
+    words = (f"agent={agent.__name__.lower()}", "n_envs=8", "total_timesteps=2048", "observation=coordinates")
+    words += ("agent.n_steps=32", "agent.batch_size=256") if agent is PPO else ()
+    words += tuple(f"recording.{name}=false" for name in ("gif", "frames", "learning"))
+    summary = train_in(tmp_path, *words)
+    model = agent.load(tmp_path / "model.zip", device="cpu")
+    assert any(isinstance(each, FourierFeatures) for each in model.policy.modules())
+    assert gridworld.evaluate(model, "classic").regret == pytest.approx(summary["regret"], abs=1e-9)
+    model.set_env(gridworld.make_vec_env(observation="coordinates", n_envs=8))
+    model.learn(64)
