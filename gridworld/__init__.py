@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     )
     from gridworld.envs.vector_env import GridWorldVectorEnv
     from gridworld.errors import InputError
-    from gridworld.world.evaluation import Evaluator, Score
+    from gridworld.world.exact.evaluation import Evaluator, Score
     from gridworld.world.grid import compile_mdp
     from gridworld.world.layout import Layout, load, shipped_layouts
     from gridworld.world.mdp import Mdp
@@ -43,7 +43,7 @@ __version__ = "0.1.0"
 _HOME = {
     "CheckResult": "api.checking",
     "CoordinateObservation": "envs.observations",
-    "Evaluator": "world.evaluation",
+    "Evaluator": "world.exact.evaluation",
     "ExactEvalCallback": "agents.sb3.interop.exact_eval_callback",
     "GridWorldEnv": "envs.env",
     "GridWorldVectorEnv": "envs.vector_env",
@@ -53,7 +53,7 @@ _HOME = {
     "Mdp": "world.mdp",
     "OneHotObservation": "envs.observations",
     "RunResult": "api.runs",
-    "Score": "world.evaluation",
+    "Score": "world.exact.evaluation",
     "VectorCoordinateObservation": "envs.observations",
     "VectorImageObservation": "envs.observations",
     "VectorOneHotObservation": "envs.observations",

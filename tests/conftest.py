@@ -15,7 +15,7 @@ from helpers import huge_pages
 from helpers.composing import compose_quickly
 from hypothesis import settings
 
-from gridworld.process import progress
+from gridworld.process.console import progress
 
 # The package and the tests are compiled once, not in every process.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

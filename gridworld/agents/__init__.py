@@ -48,7 +48,9 @@ class PolicySnapshot:
 
     def greedy_policy(self) -> FloatArray:
         """The greedy policy's action probabilities, (S, A)."""
-        from gridworld.world.markov_chain import one_hot_policy  # here, since settings are read without numpy
+        from gridworld.world.exact.markov_chain import (
+            one_hot_policy,  # here, since settings are read without numpy
+        )
 
         return one_hot_policy(self.greedy, self.sampled.shape[1])
 

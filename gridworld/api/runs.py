@@ -27,7 +27,7 @@ from gridworld.report.evidence.curve_reader import read_columns
 from gridworld.restore.resume import train_or_resume
 from gridworld.restore.saved_run import SavedRun, read_visits
 from gridworld.run.claim import check_free, claimed
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
 
 Curve = dict[str, NDArray[Any]]
 

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from gridworld.bounds import discount
 from gridworld.envs.inspection import task_of
 from gridworld.errors import InputError
-from gridworld.world.evaluation import Evaluator, Score
-from gridworld.world.markov_chain import one_hot_policy
+from gridworld.world.exact.evaluation import Evaluator, Score
+from gridworld.world.exact.markov_chain import one_hot_policy
 from gridworld.world.mdp import FloatArray, Mdp
 
 

@@ -21,7 +21,7 @@ from gridworld.benchmark.training import PPO_LARGE
 from gridworld.config.composition.compose import compose
 from gridworld.config.composition.conf_folder import conf_folder
 from gridworld.envs.observations import make_observation
-from gridworld.process.together import run_together
+from gridworld.process.parallel.together import run_together
 from gridworld.training.setup import make_context
 
 _LARGE_ENVS, _LARGE_ROLLOUTS = 1024, 16

@@ -15,9 +15,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env as dummy_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
-from gridworld.agents.sb3.constructor_arguments import algorithm_and_arguments
 from gridworld.agents.sb3.interop.make_vec_env import make_vec_env
-from gridworld.agents.sb3.schemas import SB3Config
+from gridworld.agents.sb3.settings.constructor_arguments import algorithm_and_arguments
+from gridworld.agents.sb3.settings.schemas import SB3Config
 from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
 from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
 from gridworld.benchmark import peers

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from gridworld.checking.training import Trained
-from gridworld.world.bellman import backup
-from gridworld.world.evaluation import Evaluator
-from gridworld.world.markov_chain import Chain
+from gridworld.world.exact.bellman import backup
+from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.exact.markov_chain import Chain
+from gridworld.world.exact.solver import solved
 from gridworld.world.mdp import BoolArray, FloatArray, Mdp
-from gridworld.world.solver import solved
 
 TOLERANCE = 0.1  # of a value, relative to the largest number in the world
 _LEAST_BEST = 0.8  # share of steps with a best action, at the end of training

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from gridworld.agents.sb3.schemas import SB3ClassConfig, SB3Config
+from gridworld.agents.sb3.settings.schemas import SB3ClassConfig, SB3Config
 from gridworld.config.agents import AgentConfig
 from gridworld.errors import InputError
 
@@ -140,7 +140,9 @@ def class_of(config: SB3ClassConfig) -> Any:
     Raises:
         InputError: there is no such class of SB3's kind.
     """
-    from gridworld.agents.sb3.constructor_arguments import algorithm_class  # here, since it imports torch
+    from gridworld.agents.sb3.settings.constructor_arguments import (
+        algorithm_class,  # here, since it imports torch
+    )
 
     return algorithm_class("check", config.algorithm)
 

@@ -7,7 +7,7 @@ import inspect
 from collections.abc import Sequence
 from typing import Any
 
-from gridworld.agents.sb3.schemas import SB3ClassConfig
+from gridworld.agents.sb3.settings.schemas import SB3ClassConfig
 from gridworld.config.agents import AgentConfig
 from gridworld.errors import InputError
 

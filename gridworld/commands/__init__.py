@@ -13,8 +13,8 @@ from pathlib import Path
 
 from gridworld.config.composition.words import digits
 from gridworld.errors import EXIT_CODE, InputError, failure
+from gridworld.process.console.terminal import prepare, printing, tell_error
 from gridworld.process.early_signals import AtWork
-from gridworld.process.terminal import prepare, printing, tell_error
 
 Main = Callable[[Sequence[str]], None]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gridworld.benchmark.measure import FULL, QUICK, ComparisonResult, Workload, lines
 from gridworld.errors import InputError
-from gridworld.process.command_line import program
+from gridworld.process.console.command_line import program
 from gridworld.run.claim import check_inside, check_writable
 from gridworld.storage.atomic_write import write_json
 

@@ -18,8 +18,8 @@ from gridworld.checking.subject import arguments, subject
 from gridworld.checking.table import row, verdict
 from gridworld.commands import whole_number
 from gridworld.errors import InputError
-from gridworld.process.command_line import program
-from gridworld.process.terminal import printable
+from gridworld.process.console.command_line import program
+from gridworld.process.console.terminal import printable
 
 _PROCESSES = 2
 _FAILED = 1  # the exit code

@@ -10,11 +10,11 @@ from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.picture import draw_diagnosis
 from gridworld.diagnosis.verdict import Diagnosis, diagnose
 from gridworld.errors import InputError
-from gridworld.process.columns import aligned
-from gridworld.process.command_line import program
+from gridworld.process.console.columns import aligned
+from gridworld.process.console.command_line import program
+from gridworld.process.console.progress import telling_if_slow
+from gridworld.process.console.terminal import printable, tell
 from gridworld.process.memory_budget import limited
-from gridworld.process.progress import telling_if_slow
-from gridworld.process.terminal import printable, tell
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.folder import shown
 from gridworld.storage.safe_read import check_no_link

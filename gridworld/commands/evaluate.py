@@ -7,17 +7,17 @@ from collections.abc import Sequence
 
 from gridworld.commands import parser_for_a_run, whole_number
 from gridworld.envs.env import GridWorldEnv
-from gridworld.envs.rendering import has_display
+from gridworld.envs.frames.rendering import has_display
 from gridworld.envs.rollout import SampledScores, play_episode, sample_episodes
 from gridworld.errors import InputError
-from gridworld.process.columns import aligned
-from gridworld.process.command_line import program
+from gridworld.process.console.columns import aligned
+from gridworld.process.console.command_line import program
+from gridworld.process.console.progress import telling_if_slow
+from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
-from gridworld.process.progress import telling_if_slow
-from gridworld.process.terminal import printable
 from gridworld.restore.saved_run import SavedRun, choose_policy
 from gridworld.run.summary import circles_text
-from gridworld.world.evaluation import Evaluator, Score
+from gridworld.world.exact.evaluation import Evaluator, Score
 from gridworld.world.mdp import FloatArray
 from gridworld.world.metrics import METRICS, optimal_score
 

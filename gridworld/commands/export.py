@@ -18,10 +18,10 @@ from gridworld.commands import parser_for_runs
 from gridworld.errors import InputError, reason
 from gridworld.export.exported_run import read
 from gridworld.export.targets import TARGETS, check_installed
-from gridworld.process.command_line import program
+from gridworld.process.console.command_line import program
+from gridworld.process.console.progress import telling_if_slow
+from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
-from gridworld.process.progress import telling_if_slow
-from gridworld.process.terminal import printable
 from gridworld.report.evidence.discovery import find_runs
 from gridworld.run.claim import check_inside, check_writable
 from gridworld.storage.safe_read import check_no_link

@@ -11,12 +11,12 @@ from enum import Enum
 
 import numpy as np
 
-from gridworld.envs import rendering as drawing
 from gridworld.envs.env import GridWorldEnv
-from gridworld.envs.rendering import Frame
+from gridworld.envs.frames import rendering as drawing
+from gridworld.envs.frames.rendering import Frame
 from gridworld.storage.rng_state import independent_generator
 from gridworld.visualization.canvas import Canvas
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray
 
 _SAME = 1e-9  # returns that differ by rounding alone

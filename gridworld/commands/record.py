@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from gridworld.commands import parser_for_a_run, whole_number
 from gridworld.config.pictures import PICTURES
-from gridworld.envs.rendering import frame_size
+from gridworld.envs.frames.rendering import frame_size
 from gridworld.envs.rollout import play
 from gridworld.errors import InputError
-from gridworld.process.command_line import program
+from gridworld.process.console.command_line import program
+from gridworld.process.console.progress import telling_if_slow
+from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
-from gridworld.process.progress import telling_if_slow
-from gridworld.process.terminal import printable
 from gridworld.restore.saved_run import SavedRun, choose_policy, read_visits
 from gridworld.run.claim import check_inside, check_writable
 from gridworld.storage.safe_read import check_no_link
@@ -27,7 +27,7 @@ from gridworld.visualization import video
 from gridworld.visualization.animation import Animation
 from gridworld.visualization.episode import film
 from gridworld.visualization.picture import Subject, drawer, save
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 
 MAPS = {picture.name: picture.drawer for picture in PICTURES if picture.is_map}

@@ -16,10 +16,10 @@ from pathlib import Path
 
 from gridworld.commands import parser_for_runs, whole_number
 from gridworld.errors import InputError
-from gridworld.process.command_line import program
+from gridworld.process.console.command_line import program
+from gridworld.process.console.progress import telling_if_slow
+from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
-from gridworld.process.progress import telling_if_slow
-from gridworld.process.terminal import printable
 from gridworld.report.build import Report, gather
 from gridworld.report.evidence.reasons import Reason, reasons
 from gridworld.report.writer import FORMATS, MARKERS, check_markers, check_out, write_readme, write_report

@@ -20,19 +20,19 @@ from typing import Any
 from gridworld.config.pictures import RecordingConfig
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.command_line import program
+from gridworld.process.console.command_line import program
+from gridworld.process.console.progress import telling_if_slow
+from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
-from gridworld.process.progress import telling_if_slow
 from gridworld.process.signals import Interrupted
-from gridworld.process.terminal import printable
 from gridworld.restore.comparison import Finding, check_whole, compare
 from gridworld.restore.repeat import lengths, repeat
 from gridworld.restore.saved_run import settings_of
 from gridworld.run.claim import check_free, check_inside
 from gridworld.run.folder import MANIFEST
-from gridworld.run.provenance import describe, differences, source_differences
+from gridworld.run.identity.provenance import describe, differences, source_differences
+from gridworld.run.identity.stored_world import stored_world
 from gridworld.run.reader import RunReader, open_run, read_run
-from gridworld.run.stored_world import stored_world
 from gridworld.world.mdp import Mdp
 
 DIFFERENT = 1  # exit code

@@ -29,9 +29,9 @@ from gridworld.config.composition.loader import run_hydra
 from gridworld.config.composition.words import refuse_dashes
 from gridworld.config.train import TrainConfig
 from gridworld.errors import EXIT_CODE, FolderLostError, InputError
-from gridworld.process.command_line import called_from
+from gridworld.process.console.command_line import called_from
+from gridworld.process.console.terminal import prepare, printable, printing, result_is_in_files, tell_error
 from gridworld.process.early_signals import AtWork
-from gridworld.process.terminal import prepare, printable, printing, result_is_in_files, tell_error
 from gridworld.run.claim import claimed
 from gridworld.run.folder import SWEEP_JSON, shown
 from gridworld.storage.file_lock import check_ours

@@ -22,8 +22,8 @@ from gridworld.commands.shell.help import choices
 from gridworld.config.composition.conf_folder import conf_folder
 from gridworld.config.composition.words import refuse_dashes
 from gridworld.errors import InputError, install_command
-from gridworld.process.command_line import as_called, command_line, program
-from gridworld.process.terminal import printable, result_is_in_files, tell_error
+from gridworld.process.console.command_line import as_called, command_line, program
+from gridworld.process.console.terminal import printable, result_is_in_files, tell_error
 from gridworld.storage.safe_read import check_yaml
 
 if TYPE_CHECKING:

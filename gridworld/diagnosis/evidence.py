@@ -19,11 +19,11 @@ from gridworld.diagnosis.split import RegretSplit, split_regret
 from gridworld.errors import InputError
 from gridworld.report.evidence.curve_reader import read_columns
 from gridworld.restore.saved_run import SavedRun, read_visits
-from gridworld.world.bellman import backup, pick
-from gridworld.world.evaluation import Evaluator
-from gridworld.world.markov_chain import Chain
+from gridworld.world.exact.bellman import backup, pick
+from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.exact.markov_chain import Chain
+from gridworld.world.exact.solver import Solution, solved
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
-from gridworld.world.solver import Solution, solved
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,9 @@ from functools import lru_cache
 import numpy as np
 
 from gridworld.diagnosis.evidence import Evidence
-from gridworld.world.bellman import backup
-from gridworld.world.evaluation import Evaluator
-from gridworld.world.markov_chain import Chain
+from gridworld.world.exact.bellman import backup
+from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.exact.markov_chain import Chain
 from gridworld.world.mdp import BoolArray, FloatArray, Mdp
 
 _SWEEPS = 1000

@@ -8,8 +8,8 @@ a sum over states of the discounted visits under π times what its action there 
 With γ = 1 a policy that never ends has no such sum. The walk then stops where it cannot end any more, and
 such a state costs its visits times V* - V_π, all that is lost from there on.
 
-As `world.evaluation` has it, value and regret are without a step limit. What an episode of training loses by
-being cut off is therefore no part of the split.
+As `world.exact.evaluation` has it, value and regret are without a step limit. What an episode of training
+loses by being cut off is therefore no part of the split.
 
 Reference: S. Kakade and J. Langford, Approximately optimal approximate reinforcement learning, ICML 2002.
 """
@@ -20,10 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridworld.world.evaluation import Evaluator, Score
-from gridworld.world.markov_chain import Chain
+from gridworld.world.exact.evaluation import Evaluator, Score
+from gridworld.world.exact.markov_chain import Chain
+from gridworld.world.exact.occupancy import discounted_visits, stopping_states
 from gridworld.world.mdp import BoolArray, FloatArray
-from gridworld.world.occupancy import discounted_visits, stopping_states
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from gridworld.diagnosis.causes import CAUSES, PHRASES
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.finding import Finding
 from gridworld.diagnosis.split import RegretSplit
-from gridworld.process.command_line import command
+from gridworld.process.console.command_line import command
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 
 _MOST_CHANGES = 3

@@ -17,8 +17,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from gridworld.bounds import MOST_STEPS, STEP_LIMIT, at_most
+from gridworld.envs.frames.rendering import frame_size
 from gridworld.envs.observations import KINDS, ObservationTable, TableObservation, make_observation
-from gridworld.envs.rendering import frame_size
 from gridworld.errors import InputError
 from gridworld.world.grid import GridMdp, compile_mdp
 from gridworld.world.layout import Layout, load, positive_int

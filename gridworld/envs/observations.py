@@ -27,7 +27,7 @@ from gymnasium.vector import VectorEnv, VectorObservationWrapper
 from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
-from gridworld.envs import rendering as drawing
+from gridworld.envs.frames import rendering as drawing
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import check_memory
 from gridworld.world.layout import positive_int

@@ -17,8 +17,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from gridworld.bounds import STEP_LIMIT
-from gridworld.envs import rendering as drawing
-from gridworld.envs.rendering import CELL_SIZE, Frame
+from gridworld.envs.frames import rendering as drawing
+from gridworld.envs.frames.rendering import CELL_SIZE, Frame
 from gridworld.errors import InputError
 from gridworld.storage.rng_state import generator_state, set_generator_state
 from gridworld.storage.serialization import State, StateError, fill

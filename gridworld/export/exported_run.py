@@ -20,7 +20,7 @@ from gridworld.config.pictures import PICTURES
 from gridworld.config.plain_settings import read_config
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.terminal import plain
+from gridworld.process.console.terminal import plain
 from gridworld.report.evidence.curve_reader import ONLINE, read_columns
 from gridworld.report.evidence.run_reader import Evidence, Unusable
 from gridworld.report.evidence.run_reader import read as read_evidence

@@ -161,7 +161,8 @@ def _set_alarm(seconds: float) -> None:
 class StopRequest:
     """Whether SIGINT or SIGTERM has asked training to stop.
 
-    Of trainings that run together (`process.together`) each has its own, and a signal asks all of them.
+    Of trainings that run together (`process.parallel.together`) each has its own, and a signal asks all of
+    them.
 
     Attributes:
         number: of the signal; None as long as there was none.

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from os import PathLike
 from typing import BinaryIO
 
-from gridworld.process.command_line import users_folder
+from gridworld.process.console.command_line import users_folder
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import Any
 import jinja2
 from markupsafe import Markup, escape
 
-from gridworld.process.terminal import plain
+from gridworld.process.console.terminal import plain
 from gridworld.report import tables
 from gridworld.report.analysis.analyse import Result, TaskAnalysis
 from gridworld.report.analysis.statistics import RESAMPLES, Share

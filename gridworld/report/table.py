@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from gridworld.process.terminal import plain
+from gridworld.process.console.terminal import plain
 from gridworld.report.analysis.statistics import Interval, Share
 
 NOTHING = "\N{EN DASH}"

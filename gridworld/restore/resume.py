@@ -20,16 +20,16 @@ from gridworld.config.flatten import flat
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import BuiltConfig, EnvConfig, GymnasiumConfig, MapConfig
 from gridworld.errors import InputError
-from gridworld.process.progress import telling_if_slow
-from gridworld.process.terminal import printable, tell
+from gridworld.process.console.progress import telling_if_slow
+from gridworld.process.console.terminal import printable, tell
 from gridworld.restore.saved_run import settings_of
 from gridworld.run.checkpoints import MOST_STEPS, Checkpoints, steps_of
-from gridworld.run.fingerprint import environment, identity, settings
 from gridworld.run.folder import CHECKPOINTS, CURVE, MANIFEST
-from gridworld.run.provenance import git, source_differences
+from gridworld.run.identity.fingerprint import environment, identity, settings
+from gridworld.run.identity.provenance import git, source_differences
+from gridworld.run.identity.stored_world import stored_world
 from gridworld.run.reader import RunReader
 from gridworld.run.recovery import is_started, run_to_resume
-from gridworld.run.stored_world import stored_world
 from gridworld.run.summary import Summary
 from gridworld.run.train_log import TrainLog
 from gridworld.run.writer import RunWriter

@@ -22,10 +22,10 @@ from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import MapConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
+from gridworld.run.identity.stored_world import stored_world
 from gridworld.run.reader import RunReader, open_run
-from gridworld.run.stored_world import stored_world
 from gridworld.training.setup import make_context
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.grid import GridMdp
 from gridworld.world.layout import CLASSIC, Layout, load
 from gridworld.world.mdp import FloatArray, Mdp

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import BudgetError
-from gridworld.process.together import clock
+from gridworld.process.parallel.together import clock
 from gridworld.run.folder import CHECKPOINTS
 from gridworld.storage.atomic_write import replacing, sync_folder
 from gridworld.storage.file_lock import check_ours

@@ -29,8 +29,8 @@ import shlex
 from pathlib import Path
 
 from gridworld.config import pictures
-from gridworld.process.command_line import command, users_folder
-from gridworld.process.terminal import printable
+from gridworld.process.console.command_line import command, users_folder
+from gridworld.process.console.terminal import printable
 
 MANIFEST = "manifest.json"
 SOURCE_DIFF = "source.diff"

@@ -12,7 +12,7 @@ import stat
 from pathlib import Path
 
 from gridworld.errors import InputError
-from gridworld.process.terminal import tell
+from gridworld.process.console.terminal import tell
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.folder import MANIFEST, RunFolder
 from gridworld.run.manifest import check_manifest

@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from gridworld.process.columns import aligned
+from gridworld.process.console.columns import aligned
+from gridworld.process.console.terminal import printable
 from gridworld.process.signals import Interrupted
-from gridworld.process.terminal import printable
 from gridworld.run.folder import EVENTS, RunFolder, shown
 from gridworld.run.reader import read_run
 from gridworld.world.metrics import METRICS

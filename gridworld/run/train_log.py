@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Any, ClassVar, Self, TextIO
 
 from gridworld.errors import FolderLostError
-from gridworld.process.terminal import TOLD, plain
+from gridworld.process.console.terminal import TOLD, plain
 from gridworld.storage.file_lock import check_ours
 from gridworld.storage.system_calls import open_carefully
 
@@ -24,8 +24,8 @@ class TrainLog(logging.Handler):
     """Takes Python's warnings, what is logged as one, and what is told on standard error, inside its block.
 
     The lines are kept until there is a file. What goes to the terminal is the same as without it. Of runs
-    that train together (`process.together`), each has its own, which takes what comes while its run is at
-    work.
+    that train together (`process.parallel.together`), each has its own, which takes what comes while its
+    run is at work.
     """
 
     _all: ClassVar[list[TrainLog]] = []  # inside whose blocks the process is

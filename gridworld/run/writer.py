@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, Self
 
 from gridworld.errors import InputError
-from gridworld.process.command_line import recorded_command_line
-from gridworld.run import provenance
+from gridworld.process.console.command_line import recorded_command_line
 from gridworld.run.folder import CHECKPOINTS, OUTPUTS, PICTURES, WORLD, RunFolder
-from gridworld.run.provenance import describe, source_differences
+from gridworld.run.identity import provenance
+from gridworld.run.identity.provenance import describe, source_differences
 from gridworld.run.reader import LARGEST_RESULT, RunReader
 from gridworld.storage.atomic_write import json_text, sync, sync_folder, tidy, write_bytes, write_json
 from gridworld.storage.safe_read import check_no_link, file_sha256

@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.errors import InputError
-from gridworld.process.command_line import recorded_command_line
-from gridworld.process.terminal import printable
+from gridworld.process.console.command_line import recorded_command_line
+from gridworld.process.console.terminal import printable
 from gridworld.run.claim import check_writable
 from gridworld.run.folder import HYDRA, LOCK, MANIFEST, SWEEP_JSON
-from gridworld.run.provenance import versions
+from gridworld.run.identity.provenance import versions
 from gridworld.run.recovery import find_run, is_started
 from gridworld.storage.atomic_write import make_folder, tidy, write_json
 from gridworld.storage.file_lock import locked

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.errors import InputError
-from gridworld.process.terminal import plain
+from gridworld.process.console.terminal import plain
 from gridworld.run.folder import LOCK
 from gridworld.run.reader import RunReader
 from gridworld.run.recovery import find_run

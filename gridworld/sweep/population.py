@@ -2,7 +2,7 @@
 
 A launcher gets one job for each population: the first of its jobs, with the names of all in
 `hydra.sweeper.together`. Where that runs, `PopulationTask` runs them all, each as it would run alone, with
-files and a folder of its own; `process.together` has them meet where the networks are updated.
+files and a folder of its own; `process.parallel.together` has them meet where the networks are updated.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from omegaconf import DictConfig
 
 from gridworld.config.sweep import SweepConfig
 from gridworld.errors import InputError
-from gridworld.process.forks import can_fork
-from gridworld.process.machine import free_memory, worker_count
-from gridworld.process.together import LARGEST, run_together
+from gridworld.process.parallel.forks import can_fork
+from gridworld.process.parallel.machine import free_memory, worker_count
+from gridworld.process.parallel.together import LARGEST, run_together
 from gridworld.sweep.folder import JobEntry, SweepFolder
 from gridworld.sweep.plan import Job
 

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
-from gridworld.process.progress import ProgressLine, time_left
+from gridworld.process.console.progress import ProgressLine, time_left
 from gridworld.sweep.job_table import DONE, FAILED, RUNNING, JobTable
 
 _SECONDS_BETWEEN_READS = 0.5

@@ -20,8 +20,8 @@ from gridworld.config.composition.words import with_whole_numbers
 from gridworld.config.sweep import SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.errors import EXIT_CODE, FolderLostError, InputError, reason
+from gridworld.process.console.terminal import tell, tell_error
 from gridworld.process.signals import exiting, signal_name
-from gridworld.process.terminal import tell, tell_error
 from gridworld.sweep import console
 from gridworld.sweep.config_loader import SweepLoader
 from gridworld.sweep.folder import JobEntry, SweepFolder

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gridworld.storage.serialization import State
-from gridworld.world.evaluation import Score
+from gridworld.world.exact.evaluation import Score
 
 
 class BestModel:

@@ -19,11 +19,11 @@ from gridworld.agents import Agent, PolicySnapshot
 from gridworld.config.train import TrainConfig
 from gridworld.envs.statistics_env import NO_EPISODES, Returns, StatisticsVectorEnv
 from gridworld.errors import InputError
-from gridworld.process.together import clock
+from gridworld.process.parallel.together import clock
 from gridworld.storage.serialization import State
 from gridworld.training.best_model import BestModel
 from gridworld.training.certificate import Certificate
-from gridworld.world.evaluation import Evaluator, Score
+from gridworld.world.exact.evaluation import Evaluator, Score
 
 
 @dataclass(frozen=True, eq=False)

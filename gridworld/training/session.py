@@ -16,13 +16,13 @@ from dataclasses import dataclass
 from gridworld.agents import Agent, TrainingContext
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.progress import Progress
+from gridworld.process.console.progress import Progress
+from gridworld.process.parallel.together import clock
 from gridworld.process.signals import StopRequest
-from gridworld.process.together import clock
 from gridworld.run.checkpoints import Checkpoints, Pace
 from gridworld.run.evaluations_file import NEEDED, write_evaluations
-from gridworld.run.fingerprint import environment, identity
 from gridworld.run.folder import CURVE, EVENTS
+from gridworld.run.identity.fingerprint import environment, identity
 from gridworld.run.summary import Summary
 from gridworld.run.writer import RunWriter
 from gridworld.storage.append_log import AppendLog
@@ -33,7 +33,7 @@ from gridworld.training.pictures import Pictures
 from gridworld.training.sinks import CHARTS, CurveFile, CurveScalars, ProgressLine, read_curve
 from gridworld.training.summary import CLOCK, as_json, summarise
 from gridworld.training.tensorboard import EventWriter, as_markdown, hparams
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
 
 _log = logging.getLogger("gridworld")
 

@@ -9,14 +9,14 @@ from gridworld.agents import TrainingContext, WriteScalars, family
 from gridworld.config.pictures import PICTURES
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
+from gridworld.envs.frames.rendering import frame_size
 from gridworld.envs.observations import ObservationTable
-from gridworld.envs.rendering import frame_size
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
 from gridworld.visualization.picture import drawer
 from gridworld.visualization.video import require_video
 from gridworld.world.discounts import fitting_discounts, score_of_optimum
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 
 _QUICKLY_SOLVED = 6000  # outcomes of all states and actions

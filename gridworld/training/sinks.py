@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.process.progress import Progress
+from gridworld.process.console.progress import Progress
 from gridworld.storage.append_log import AppendLog
 from gridworld.training.learning_curve import Evaluation
 from gridworld.training.tensorboard import EventWriter
-from gridworld.world.evaluation import Evaluator, Score
+from gridworld.world.exact.evaluation import Evaluator, Score
 from gridworld.world.metrics import METRICS, TRAINING_METRICS, Metric, numbers, optimal_score
 
 # TensorBoard sorts its groups by name and opens with the first: the greedy policy's learning curve. Behind it

@@ -8,7 +8,7 @@ from typing import Any
 from gridworld.config.train import TrainConfig
 from gridworld.run.summary import Summary
 from gridworld.training.learning_curve import Evaluation, LearningCurve
-from gridworld.world.evaluation import Score
+from gridworld.world.exact.evaluation import Score
 from gridworld.world.mdp import EXACT
 from gridworld.world.metrics import numbers, optimal_numbers
 

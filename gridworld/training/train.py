@@ -14,9 +14,9 @@ from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import ObservationTable, make_observation
 from gridworld.errors import FolderLostError, InputError, MachineError, reason
-from gridworld.process.command_line import recorded_command_line
+from gridworld.process.console.command_line import recorded_command_line
+from gridworld.process.console.terminal import tell
 from gridworld.process.signals import Interrupted
-from gridworld.process.terminal import tell
 from gridworld.run.folder import RunFolder, shown
 from gridworld.run.reader import RunReader
 from gridworld.run.summary import Summary, interruption_text
@@ -28,7 +28,7 @@ from gridworld.storage.serialization import State, StateError
 from gridworld.training.session import Session
 from gridworld.training.setup import check_settings, make_context, objective_note
 from gridworld.training.tensorboard import EventWriter
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 
 OnBuilt = Callable[[Agent], None]

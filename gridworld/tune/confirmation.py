@@ -20,8 +20,8 @@ import numpy as np
 
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.terminal import printable
-from gridworld.process.together import LARGEST
+from gridworld.process.console.terminal import printable
+from gridworld.process.parallel.together import LARGEST
 from gridworld.report.analysis import statistics
 from gridworld.report.table import number, steps_up_to
 from gridworld.run.recovery import find_run

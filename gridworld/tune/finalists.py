@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from gridworld.process.together import LARGEST
+from gridworld.process.parallel.together import LARGEST
 from gridworld.tune.search.objective import SEEDS, Objective, SeedScore, Stopped, learn, read_score, score
 from gridworld.tune.search.worker import StudyContext, become_worker, is_stopped, run_all, study_of
 from gridworld.tune.search.worker_pool import share

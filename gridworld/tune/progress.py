@@ -7,7 +7,7 @@ import time
 
 import optuna
 
-from gridworld.process.progress import ProgressLine, time_left
+from gridworld.process.console.progress import ProgressLine, time_left
 from gridworld.sweep.console import shell_path
 from gridworld.tune.search.storage import count_trials
 from gridworld.tune.study_folder import write_trials

@@ -17,8 +17,8 @@ import optuna
 from gridworld.config.composition.recipe_file import TRUST, overrides
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.command_line import command
-from gridworld.process.terminal import printable
+from gridworld.process.console.command_line import command
+from gridworld.process.console.terminal import printable
 from gridworld.report.writer import write_over_seeds
 from gridworld.sweep.console import shell_path
 from gridworld.training.tensorboard import hparams

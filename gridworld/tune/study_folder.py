@@ -28,11 +28,11 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from gridworld.errors import InputError
-from gridworld.process.command_line import recorded_command_line
+from gridworld.process.console.command_line import recorded_command_line
 from gridworld.report.evidence.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
 from gridworld.run.claim import check_writable
 from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON
-from gridworld.run.provenance import versions
+from gridworld.run.identity.provenance import versions
 from gridworld.storage.atomic_write import make_folder, tidy, write_json, write_text
 from gridworld.storage.file_lock import locked
 from gridworld.storage.safe_read import LARGEST_CSV, file_sha256

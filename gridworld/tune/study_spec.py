@@ -31,8 +31,8 @@ from gridworld.config.composition.recipe_file import CHOSEN, with_recipe
 from gridworld.config.train import TrainConfig
 from gridworld.config.tune import TuneConfig
 from gridworld.errors import InputError
-from gridworld.process.command_line import program
-from gridworld.process.machine import core_count
+from gridworld.process.console.command_line import program
+from gridworld.process.parallel.machine import core_count
 from gridworld.sweep.plan import shape
 from gridworld.training.setup import check_settings
 from gridworld.tune.search.search_space import SearchSpace

@@ -9,17 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
-from gridworld.envs.board import board_of
-from gridworld.envs.rendering import fitting_cell_size
+from gridworld.envs.frames.board import board_of
+from gridworld.envs.frames.rendering import fitting_cell_size
 from gridworld.storage.serialization import State
 from gridworld.visualization.animation import Animation, animation_of_frames
 from gridworld.visualization.canvas import shown
 from gridworld.visualization.colormaps import VIRIDIS, linear
+from gridworld.visualization.maps.policy_map import caption_at, draw_policy_map, explored_by
+from gridworld.visualization.maps.state_table import Numbers, draw_policy_table, table_states
 from gridworld.visualization.picture import Draw, Subject
-from gridworld.visualization.policy_map import caption_at, draw_policy_map, explored_by
 from gridworld.visualization.sheet import PAPER, Sheet
-from gridworld.visualization.state_table import Numbers, draw_policy_table, table_states
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.mdp import BoolArray
 
 TENSORBOARD_SIDE: int | None = None

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridworld.world.evaluation import Evaluator, Score
-from gridworld.world.markov_chain import one_hot_policy
-from gridworld.world.solver import solved
+from gridworld.world.exact.evaluation import Evaluator, Score
+from gridworld.world.exact.markov_chain import one_hot_policy
+from gridworld.world.exact.solver import solved
 
 _USUAL = (0.8, 0.9, 0.95, 0.97, 0.99)
 _QUICKLY_SOLVED = 20_000  # outcomes of all states and actions: a few tenths of a second

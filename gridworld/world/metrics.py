@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from gridworld.world.evaluation import Evaluator, Score
+from gridworld.world.exact.evaluation import Evaluator, Score
 
 
 def _rounded(number: float) -> str:

@@ -16,11 +16,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gridworld.world.evaluation import REGRET_TOLERANCE
-from gridworld.world.markov_chain import Chain
+from gridworld.world.exact.evaluation import REGRET_TOLERANCE
+from gridworld.world.exact.markov_chain import Chain
+from gridworld.world.exact.occupancy import discounted_visits, stopping_states
+from gridworld.world.exact.solver import Solution, solved
 from gridworld.world.mdp import BoolArray, FloatArray, Mdp
-from gridworld.world.occupancy import discounted_visits, stopping_states
-from gridworld.world.solver import Solution, solved
 
 _SAMPLES = 4000  # of a state and action that a run sees
 _NETWORK_ERROR = 0.01  # of a value

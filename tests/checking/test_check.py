@@ -22,8 +22,8 @@ from gridworld.checking.settings import settings
 from gridworld.checking.subject import arguments, subject
 from gridworld.checking.training import Trained, train
 from gridworld.errors import InputError
-from gridworld.world.markov_chain import one_hot_policy
-from gridworld.world.solver import solved
+from gridworld.world.exact.markov_chain import one_hot_policy
+from gridworld.world.exact.solver import solved
 
 PLANT_ALL = os.environ.get("GRIDWORLD_BUGS") == "all"
 FEW = [bugs.WrongSign, bugs.NoTargetNetwork, bugs.EpsilonNeverFalls, bugs.ReplayOffByOne]

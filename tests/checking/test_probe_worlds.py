@@ -5,7 +5,7 @@ import pytest
 
 from gridworld.checking import worlds
 from gridworld.checking.probes import PROBES
-from gridworld.world.solver import solved
+from gridworld.world.exact.solver import solved
 
 
 def q(mdp, gamma):  # type: ignore[no-untyped-def]

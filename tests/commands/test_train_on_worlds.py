@@ -9,8 +9,8 @@ from helpers.support import script
 
 from gridworld.errors import InputError
 from gridworld.restore.saved_run import SavedRun
+from gridworld.run.identity.stored_world import stored_world
 from gridworld.run.reader import read_run
-from gridworld.run.stored_world import stored_world
 from gridworld.world.sources.gymnasium_table import compile_gymnasium
 
 TRAINED = ("agent=q_learning", "env=frozen_lake_v1", "env.kwargs.is_slippery=false", "evaluation.every=1000")

@@ -12,7 +12,7 @@ from helpers.support import CONF, configure, train_in
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from gridworld.agents import family
-from gridworld.agents.sb3.constructor_arguments import algorithm_and_arguments
+from gridworld.agents.sb3.settings.constructor_arguments import algorithm_and_arguments
 from gridworld.commands.shell.help import manual
 from gridworld.config.composition.recipe_file import with_recipe
 from gridworld.config.train import check

@@ -16,10 +16,10 @@ from helpers.sabotage import CATALOGUE, HELD_OUT, MADE_ON, SOUND, Sabotage, rand
 import gridworld
 from gridworld.agents.sb3.ancestor import of_library
 from gridworld.agents.sb3.oracle_fit import one_state_fit
-from gridworld.agents.sb3.schemas import SB3ClassConfig
+from gridworld.agents.sb3.settings.schemas import SB3ClassConfig
 from gridworld.diagnosis.causes import PHRASES
 from gridworld.diagnosis.verdict import Diagnosis
-from gridworld.world.solver import solved
+from gridworld.world.exact.solver import solved
 
 ALL = os.environ.get("GRIDWORLD_SABOTAGES") == "all"
 _MAP, _SEED = MADE_ON[0]

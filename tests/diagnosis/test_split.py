@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gridworld.diagnosis.split import split_regret
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.exact.markov_chain import one_hot_policy
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
-from gridworld.world.markov_chain import one_hot_policy
 
 _SETTINGS = st.fixed_dictionaries(
     {

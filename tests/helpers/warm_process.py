@@ -47,8 +47,8 @@ from omegaconf import OmegaConf
 
 import gridworld
 from gridworld.config.composition.compose import compose
-from gridworld.envs.rendering import import_pygame
-from gridworld.process import progress
+from gridworld.envs.frames.rendering import import_pygame
+from gridworld.process.console import progress
 from gridworld.report import page
 from gridworld.tune import progress as search_progress
 

@@ -12,10 +12,10 @@ from gridworld.benchmark.measure import ComparisonResult, lines
 from gridworld.commands import evaluate
 from gridworld.commands import jobs as jobs_command
 from gridworld.envs.rollout import sample_episodes
-from gridworld.process.columns import aligned
+from gridworld.process.console.columns import aligned
 from gridworld.run.summary import summary_text
 from gridworld.sweep.job_table import JobRow, JobTable
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import classic
 

@@ -14,8 +14,8 @@ from helpers.support import SHORT, train_in
 
 from gridworld.commands import evaluate, jobs, record, report, reproduce, run
 from gridworld.commands import resume as resume_command
+from gridworld.process.console.terminal import prepare
 from gridworld.process.signals import Interrupted
-from gridworld.process.terminal import prepare
 from gridworld.report.evidence.tuning_study import find_tunings
 from gridworld.report.table import Table, to_captioned_markdown, to_csv, to_markdown
 from gridworld.run.folder import RunFolder, shown

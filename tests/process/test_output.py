@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from helpers.support import ROOT, SHORT, script, train_in
 
-from gridworld.process.terminal import printable
+from gridworld.process.console.terminal import printable
 
 NO_UTF8 = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 ASCII = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii"}
@@ -49,8 +49,8 @@ def test_a_run_ends_well_whoever_reads_its_output(line: str, tmp_path: Path) -> 
 
 def test_progress_that_nobody_reads_is_no_reason_to_stop(tmp_path: Path) -> None:
     code = (
-        "import os, sys; from gridworld.process import terminal; terminal.prepare();"
-        "from gridworld.process import progress; progress._SECONDS_BETWEEN_LINES = 0;"
+        "import os, sys; from gridworld.process.console import terminal; terminal.prepare();"
+        "from gridworld.process.console import progress; progress._SECONDS_BETWEEN_LINES = 0;"
         "read, write = os.pipe(); os.close(read); os.dup2(write, 2);"
         "p = progress.Progress(10, 'x'); [p.update(i, 'y') for i in range(10)]; print('done')"
     )

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 import torch
 
-from gridworld.process import signals, together
+from gridworld.process import signals
+from gridworld.process.parallel import together
+from gridworld.process.parallel.together import by_itself, chance, clock, meet, run_together
 from gridworld.process.signals import Interrupted, StopRequest
-from gridworld.process.together import by_itself, chance, clock, meet, run_together
 
 NAME: ContextVar[str] = ContextVar("name", default="outside")
 met: list[list[Any]] = []

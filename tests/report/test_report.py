@@ -27,7 +27,7 @@ from tensorboard.plugins.custom_scalar import layout_pb2
 
 from gridworld.commands import report as command
 from gridworld.errors import InputError
-from gridworld.process.terminal import plain
+from gridworld.process.console.terminal import plain
 from gridworld.report import tables
 from gridworld.report.analysis.analyse import Comparison, Overall, TaskAnalysis
 from gridworld.report.analysis.curves import on_grid
@@ -49,7 +49,7 @@ from gridworld.report.tensorboard_export import BANDS
 from gridworld.report.writer import MARKERS
 from gridworld.run.folder import PICTURES
 from gridworld.storage.sealed_json import sealed
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
 
 FORMATS = ("png", "pdf", "svg")  # more words of `--formats`
 NO_CACHE = {"MPLCONFIGDIR": "/proc/nowhere"}  # what matplotlib has to say of that is not for the user

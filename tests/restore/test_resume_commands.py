@@ -14,11 +14,11 @@ from helpers.support import ROOT, SHORT, configure, script, start
 
 from gridworld.errors import InputError
 from gridworld.restore.resume import open_unfinished
-from gridworld.run import fingerprint as identity
-from gridworld.run import provenance
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.folder import LOCK
-from gridworld.run.provenance import Source
+from gridworld.run.identity import fingerprint as identity
+from gridworld.run.identity import provenance
+from gridworld.run.identity.provenance import Source
 from gridworld.storage import file_lock as lock
 from gridworld.storage.append_log import AppendLog
 from gridworld.storage.atomic_write import write_json

@@ -19,7 +19,7 @@ from helpers.support import SHORT, configure
 from gridworld.errors import InputError
 from gridworld.restore.resume import _why_not
 from gridworld.run.checkpoints import Checkpoints, Pace
-from gridworld.run.fingerprint import identity
+from gridworld.run.identity.fingerprint import identity
 from gridworld.storage.serialization import State, StateError, decode, encode, same
 
 CORRUPTIONS = int(os.environ.get("GRIDWORLD_CORRUPTIONS", "200"))

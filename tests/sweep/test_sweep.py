@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from gridworld.commands import jobs as jobs_command
 from gridworld.config.pictures import PICTURES
 from gridworld.errors import InputError
-from gridworld.process.progress import duration
+from gridworld.process.console.progress import duration
 from gridworld.run.reader import read_run
 from gridworld.run.writer import RunWriter
 from gridworld.storage.append_log import AppendLog

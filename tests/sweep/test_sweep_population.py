@@ -20,8 +20,8 @@ from helpers.support import script, start
 from helpers.sweeps import differing, logged, rows
 
 from gridworld.errors import InputError
-from gridworld.process.terminal import TOLD
-from gridworld.process.together import run_together
+from gridworld.process.console.terminal import TOLD
+from gridworld.process.parallel.together import run_together
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.storage.append_log import AppendLog
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from helpers.support import train_in
 
-from gridworld.process.together import run_together
+from gridworld.process.parallel.together import run_together
 
 QUIET = (
     "recording.frames=false",

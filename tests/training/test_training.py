@@ -18,8 +18,8 @@ from gridworld.errors import InputError
 from gridworld.restore.saved_run import SavedRun
 from gridworld.storage.sealed_json import sealed
 from gridworld.training.learning_curve import LearningCurve
-from gridworld.world.evaluation import Evaluator
-from gridworld.world.markov_chain import one_hot_policy
+from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.exact.markov_chain import one_hot_policy
 
 FILES = {
     *("manifest.json", "curve.csv", "model.zip", "summary.json", "visits.npy"),

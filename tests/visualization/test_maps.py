@@ -10,21 +10,21 @@ from PIL import Image
 
 from gridworld.agents import PolicySnapshot
 from gridworld.config.pictures import PICTURES
-from gridworld.envs.rendering import AGENT, CLIFF, GOAL, TRAP, WALL, Frame
+from gridworld.envs.frames.rendering import AGENT, CLIFF, GOAL, TRAP, WALL, Frame
 from gridworld.visualization.canvas import Canvas
 from gridworld.visualization.colormaps import BLUES, ORANGES, VIRIDIS, Scale, counting, linear
-from gridworld.visualization.greedy_path import explored, greedy_paths
+from gridworld.visualization.maps.greedy_path import explored, greedy_paths
+from gridworld.visualization.maps.policy_map import DISAGREES, UNKNOWN, draw_policy_map
+from gridworld.visualization.maps.q_error_map import draw_error_map, value_error
+from gridworld.visualization.maps.visit_map import draw_visit_map
 from gridworld.visualization.picture import drawer
 from gridworld.visualization.policy_history import PolicyHistory
-from gridworld.visualization.policy_map import DISAGREES, UNKNOWN, draw_policy_map
-from gridworld.visualization.q_error_map import draw_error_map, value_error
 from gridworld.visualization.sheet import short
-from gridworld.visualization.visit_map import draw_visit_map
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.exact.solver import value_iteration
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
 from gridworld.world.mdp import Mdp
-from gridworld.world.solver import value_iteration
 
 CLASSIC = compile_mdp(load("classic"))
 WORLDS = ["classic", "four_rooms", "maze", "cliff", "cliff_walking", "aima_4x3"]

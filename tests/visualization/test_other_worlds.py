@@ -14,33 +14,42 @@ from gridworld.agents import PolicySnapshot
 from gridworld.config.pictures import PICTURES
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, GymnasiumConfig
-from gridworld.envs.board import Kind, Panel, board_of
-from gridworld.envs.real_env import RealEnvFrames
-from gridworld.envs.rendering import AGENT, GOAL, TRAP, UNKNOWN, Frame, ansi, draw_frame, fitting_cell_size
+from gridworld.envs.frames.board import Kind, Panel, board_of
+from gridworld.envs.frames.real_env import RealEnvFrames
+from gridworld.envs.frames.rendering import (
+    AGENT,
+    GOAL,
+    TRAP,
+    UNKNOWN,
+    Frame,
+    ansi,
+    draw_frame,
+    fitting_cell_size,
+)
 from gridworld.envs.rollout import Episode, play
 from gridworld.visualization.animation import Animation, animation_of_rendered
 from gridworld.visualization.canvas import Canvas, shown
 from gridworld.visualization.colormaps import BLUES, ORANGES, linear
-from gridworld.visualization.directions import directions, moving_actions
 from gridworld.visualization.episode import film
-from gridworld.visualization.picture import Subject, drawer, save
-from gridworld.visualization.policy_history import PolicyHistory
-from gridworld.visualization.policy_map import draw_policy_map
-from gridworld.visualization.q_error_map import draw_error_map
-from gridworld.visualization.sheet import DISAGREES
-from gridworld.visualization.state_table import (
+from gridworld.visualization.maps.directions import directions, moving_actions
+from gridworld.visualization.maps.policy_map import draw_policy_map
+from gridworld.visualization.maps.q_error_map import draw_error_map
+from gridworld.visualization.maps.state_table import (
     StateTable,
     draw_policy_table,
     draw_visit_table,
     held,
     table_states,
 )
-from gridworld.world.evaluation import Evaluator
+from gridworld.visualization.picture import Subject, drawer, save
+from gridworld.visualization.policy_history import PolicyHistory
+from gridworld.visualization.sheet import DISAGREES
+from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.exact.solver import value_iteration
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load
 from gridworld.world.mdp import IntArray, Mdp
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
-from gridworld.world.solver import value_iteration
 
 DIRECTIONS = {"up": (-1, 0), "right": (0, 1), "down": (1, 0), "left": (0, -1)}
 

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from helpers.support import configure
 
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.exact.markov_chain import Chain, one_hot_policy
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import parse
-from gridworld.world.markov_chain import Chain, one_hot_policy
 
 REWARDS = {"step_reward": -1.0, "goal_reward": 0.0, "trap_reward": -99.0}
 START, GOAL = 36, 47

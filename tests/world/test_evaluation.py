@@ -19,10 +19,10 @@ from gridworld.envs.rollout import play_episode, sample_episodes
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.training.setup import make_context
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.exact.markov_chain import one_hot_policy
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse, shipped_layouts
-from gridworld.world.markov_chain import one_hot_policy
 from gridworld.world.mdp import Mdp
 
 CLASSIC = Evaluator(compile_mdp(load("classic")), 0.99, 100)

@@ -10,7 +10,7 @@ from helpers.oracle import World, maps
 from hypothesis import given
 
 from gridworld import GridWorldEnv, InputError, Layout, shipped_layouts
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.layout import classic, load, parse
 
 SHIPPED = (

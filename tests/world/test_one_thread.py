@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from helpers.support import configure
 
-from gridworld.world.markov_chain import Chain
-from gridworld.world.one_thread import _openblas
+from gridworld.world.exact.markov_chain import Chain
+from gridworld.world.exact.one_thread import _openblas
 
 
 @pytest.mark.parametrize("env", ["four_rooms", "maze"])

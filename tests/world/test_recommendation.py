@@ -5,10 +5,10 @@ import pytest
 
 from gridworld.config.worlds import MapConfig
 from gridworld.errors import InputError
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.exact.solver import solved
 from gridworld.world.mdp import Mdp
 from gridworld.world.recommendation import clarity, clearest_gamma, has_chance, quadratic_scale
-from gridworld.world.solver import solved
 
 GAMMAS = (0.9, 0.95, 0.97, 0.98, 0.99)
 WORLDS = [

@@ -14,12 +14,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gridworld import InputError
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.exact.markov_chain import Chain, one_hot_policy
+from gridworld.world.exact.solver import value_iteration
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
-from gridworld.world.markov_chain import Chain, one_hot_policy
 from gridworld.world.mdp import Mdp
-from gridworld.world.solver import value_iteration
 
 SLIPS = [Fraction(0), Fraction(1, 10), Fraction(1, 1000), Fraction(1, 10**7), Fraction(1)]
 INFINITE = Fraction(10**9)
@@ -174,7 +174,7 @@ def test_large_worlds_are_as_exact_as_small_ones_near_one(monkeypatch):
     for gamma in (1 - 1e-7, 1.0):
         dense, optimum = Chain(mdp, policy).value(gamma), value_iteration(mdp, gamma)
         with monkeypatch.context() as patch:
-            patch.setattr("gridworld.world.markov_chain.DENSE_STATES", 0)
+            patch.setattr("gridworld.world.exact.markov_chain.DENSE_STATES", 0)
             assert Chain(mdp, policy).value(gamma) == pytest.approx(dense, rel=1e-9)
             sparse = value_iteration(mdp, gamma)
         assert sparse.v == pytest.approx(optimum.v, rel=1e-11)

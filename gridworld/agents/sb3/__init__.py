@@ -8,8 +8,8 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING
 
-from gridworld.agents.sb3.schemas import SCHEMAS, SB3CheckedConfig, SB3Config
-from gridworld.agents.sb3.validation import check, left_to_the_class
+from gridworld.agents.sb3.settings.schemas import SCHEMAS, SB3CheckedConfig, SB3Config
+from gridworld.agents.sb3.settings.validation import check, left_to_the_class
 from gridworld.errors import InputError
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def schemas() -> dict[str, type[AgentConfig]]:
 def import_for(config: AgentConfig) -> None:
     """See `gridworld.agents.Family.import_for`. Nothing is computed, which would keep torch from forking."""
     from gridworld.agents.sb3 import agent  # noqa: F401
-    from gridworld.agents.sb3.constructor_arguments import algorithm_and_arguments
+    from gridworld.agents.sb3.settings.constructor_arguments import algorithm_and_arguments
 
     assert isinstance(config, SB3Config)
     with contextlib.suppress(InputError):

@@ -13,11 +13,11 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.save_util import recursive_getattr
 
 from gridworld.agents import PolicySnapshot, TrainingContext, WriteScalars
-from gridworld.agents.sb3.callbacks import make_callbacks
 from gridworld.agents.sb3.factory import make_model
 from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters, reason
 from gridworld.agents.sb3.policy_outputs import Reading, epsilon_greedy, of_q, read, read_states
-from gridworld.agents.sb3.schemas import SB3Config, reward_scale
+from gridworld.agents.sb3.settings.callbacks import make_callbacks
+from gridworld.agents.sb3.settings.schemas import SB3Config, reward_scale
 from gridworld.agents.sb3.snapshot.callback import CheckpointCallback, check_finite, diverged
 from gridworld.agents.sb3.tabulated.off_policy import TabulatedOffPolicy
 from gridworld.agents.sb3.tabulated.on_policy import TabulatedOnPolicy

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import inspect
 
-from gridworld.agents.sb3.constructor_arguments import algorithm_class
-from gridworld.agents.sb3.schemas import SB3ClassConfig
+from gridworld.agents.sb3.settings.constructor_arguments import algorithm_class
+from gridworld.agents.sb3.settings.schemas import SB3ClassConfig
 from gridworld.config.agents import AgentConfig
 
 _LIBRARIES = ("stable_baselines3", "sb3_contrib")

@@ -10,10 +10,10 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from gridworld.agents import TrainingContext
-from gridworld.agents.sb3.constructor_arguments import Arguments, algorithm_and_arguments
 from gridworld.agents.sb3.memory_size import NoBuffer, check_model, weighed
 from gridworld.agents.sb3.policy_outputs import why_unreadable
-from gridworld.agents.sb3.schemas import SB3Config, reward_scale
+from gridworld.agents.sb3.settings.constructor_arguments import Arguments, algorithm_and_arguments
+from gridworld.agents.sb3.settings.schemas import SB3Config, reward_scale
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.envs.observations import ObservationTable
 from gridworld.errors import InputError

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from gridworld.agents.sb3.memory_size import CHUNK
 from gridworld.envs.observations import ObservationTable
-from gridworld.world.markov_chain import one_hot_policy
+from gridworld.world.exact.markov_chain import one_hot_policy
 from gridworld.world.mdp import FloatArray, IntArray
 
 _ASKED = 512  # states

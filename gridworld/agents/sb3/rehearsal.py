@@ -23,14 +23,14 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from gridworld.agents import TrainingContext
-from gridworld.agents.sb3.constructor_arguments import algorithm_and_arguments
 from gridworld.agents.sb3.factory import UnfitError, make_model, said
 from gridworld.agents.sb3.policy_outputs import why_no_table
 from gridworld.agents.sb3.rollback import rolled_back
-from gridworld.agents.sb3.schemas import SB3CheckedConfig, SB3ClassConfig, SB3Config
+from gridworld.agents.sb3.settings.constructor_arguments import algorithm_and_arguments
+from gridworld.agents.sb3.settings.schemas import SB3CheckedConfig, SB3ClassConfig, SB3Config
+from gridworld.agents.sb3.settings.validation import left_to_the_class
 from gridworld.agents.sb3.snapshot.callback import not_finite
 from gridworld.agents.sb3.snapshot.class_state import is_known
-from gridworld.agents.sb3.validation import left_to_the_class
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 

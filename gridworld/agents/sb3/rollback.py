@@ -21,8 +21,8 @@ from typing import Any
 
 from gridworld.agents.sb3.snapshot.callback import set_torch_state, torch_state
 from gridworld.agents.sb3.snapshot.class_state import is_known
-from gridworld.process.terminal import TOLD
-from gridworld.process.together import by_itself
+from gridworld.process.console.terminal import TOLD
+from gridworld.process.parallel.together import by_itself
 from gridworld.storage.rng_state import global_state, set_global_state
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import textwrap
 from pathlib import Path
 
-from gridworld.process.command_line import as_called
+from gridworld.process.console.command_line import as_called
 
 EXPERIMENTS = "experiment"  # the group of recipes
 SPACES = "tune"  # the group of search spaces, which is tune.py's

@@ -18,7 +18,7 @@ from matplotlib.patheffects import Normal
 from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
 
-from gridworld.process.terminal import plain
+from gridworld.process.console.terminal import plain
 from gridworld.report.charts import style
 from gridworld.report.charts.style import LIGHT, SMALL, clipped, house_style, text_width
 

@@ -18,7 +18,7 @@ from matplotlib import style
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
 
-from gridworld.process.terminal import plain
+from gridworld.process.console.terminal import plain
 
 _COLOURS = {  # on a light page, on a dark one
     "paper": ("#ffffff", "#171b22"),

@@ -10,9 +10,9 @@ import numpy as np
 
 from gridworld.config.worlds import schema_of
 from gridworld.report.evidence.run_reader import Evidence
+from gridworld.run.identity.stored_world import stored_world
 from gridworld.run.reader import read_run
-from gridworld.run.stored_world import stored_world
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
 
 _MOST_CELLS = 100_000  # beyond, solving the world again would take longer than the report
 _TOLERANCE = 1e-6  # relative

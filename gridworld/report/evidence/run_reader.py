@@ -14,7 +14,7 @@ import numpy as np
 from gridworld.config.flatten import flat
 from gridworld.config.settings_by_effect import is_newer
 from gridworld.errors import InputError
-from gridworld.process.terminal import printable
+from gridworld.process.console.terminal import printable
 from gridworld.report.evidence.curve_reader import read_curve
 from gridworld.run.folder import CURVE, SUMMARY
 from gridworld.run.reader import RunReader, read_run

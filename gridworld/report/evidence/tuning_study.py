@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.errors import InputError
+from gridworld.process.console.terminal import plain
 from gridworld.process.memory_budget import check_memory
-from gridworld.process.terminal import plain
 from gridworld.report.evidence.discovery import real_folders
 from gridworld.report.table import Cell
 from gridworld.storage.safe_read import LARGEST_CSV, as_table, read_bytes, sha256

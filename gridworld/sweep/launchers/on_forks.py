@@ -13,8 +13,8 @@ from typing import Any
 from hydra.core.utils import JobReturn, JobStatus
 
 from gridworld.config.composition.compose import without_hydra
-from gridworld.process.forks import can_fork, run_in_forks
-from gridworld.process.machine import worker_count
+from gridworld.process.parallel.forks import can_fork, run_in_forks
+from gridworld.process.parallel.machine import worker_count
 from gridworld.sweep.launchers import in_process
 from gridworld.sweep.launchers.worker import JobRunner
 from gridworld.sweep.population import goes_in_fork

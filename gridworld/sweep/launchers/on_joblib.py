@@ -14,7 +14,7 @@ from typing import Any
 from hydra.core.utils import JobReturn
 from joblib import Parallel, delayed
 
-from gridworld.process.parent_watch import end_with, parent_died
+from gridworld.process.parallel.parent_watch import end_with, parent_died
 from gridworld.storage.file_lock import Held, held, work_for
 from gridworld.sweep.launchers.worker import JobRunner, unpack
 

@@ -25,7 +25,7 @@ from omegaconf import OmegaConf
 
 from gridworld.config.sweep import SlurmConfig
 from gridworld.errors import InputError
-from gridworld.process.terminal import printable
+from gridworld.process.console.terminal import printable
 from gridworld.storage.atomic_write import replacing
 from gridworld.storage.symlinks import make_inside, remove_inside
 from gridworld.sweep.folder import STOP

@@ -29,12 +29,12 @@ from typing import TYPE_CHECKING, Any
 from gridworld.agents import family
 from gridworld.config.train import TrainConfig
 from gridworld.envs.observations import make_observation
-from gridworld.process.together import run_together
+from gridworld.process.parallel.together import run_together
 from gridworld.sweep.plan import shape
 from gridworld.training.learning_curve import LearningCurve
 from gridworld.training.setup import check_settings, make_context
 from gridworld.tune.search.search_space import SearchSpace, Values, with_values
-from gridworld.world.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator
 
 if TYPE_CHECKING:
     from optuna.trial import Trial

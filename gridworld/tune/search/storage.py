@@ -28,7 +28,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from gridworld.config.tune import TuneConfig
 from gridworld.errors import InputError
-from gridworld.process.command_line import program
+from gridworld.process.console.command_line import program
 from gridworld.tune.search.objective import ERROR
 from gridworld.tune.search.worker_pool import StorageLostError
 

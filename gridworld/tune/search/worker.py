@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from gridworld.errors import reason
-from gridworld.process.parent_watch import end_with
+from gridworld.process.parallel.parent_watch import end_with
+from gridworld.process.parallel.together import run_together
 from gridworld.process.signals import set_on
-from gridworld.process.together import run_together
 from gridworld.storage.file_lock import locked
 from gridworld.sweep.job_table import one_line
 from gridworld.tune.search.objective import ERROR, Objective, Stopped

@@ -12,8 +12,8 @@ from multiprocessing.context import SpawnProcess
 from typing import Any, TypeVar
 
 from gridworld.errors import FolderLostError
+from gridworld.process.console.terminal import tell_error
 from gridworld.process.signals import StopRequest, blocking, signal_name
-from gridworld.process.terminal import tell_error
 from gridworld.storage.file_lock import Held, held, work_for
 
 # What a worker's process runs: (what it needs to know, the worker's number, its parent's process id). It ends

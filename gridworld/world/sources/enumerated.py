@@ -23,8 +23,8 @@ import gymnasium as gym
 import numpy as np
 
 from gridworld.errors import InputError
+from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.memory_budget import check_memory
-from gridworld.process.progress import telling_if_slow
 from gridworld.world.mdp import IntArray, Mdp
 from gridworld.world.outcomes import MOST_STATES, Outcomes, mdp_from_outcomes
 from gridworld.world.sources.enumeration.elapsed_time import (

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gridworld.errors import InputError
-from gridworld.world.bellman import backup
+from gridworld.world.exact.bellman import backup
 from gridworld.world.mdp import IntArray, Mdp
 from gridworld.world.outcomes import Outcomes
 

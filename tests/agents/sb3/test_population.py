@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from gridworld.agents import family
 from gridworld.agents.sb3.tabulated import side_by_side, state_inputs
 from gridworld.envs.observations import make_observation
-from gridworld.process.together import run_together
+from gridworld.process.parallel.together import run_together
 from gridworld.training.setup import check_settings, make_context
 
 Words = tuple[str, ...]

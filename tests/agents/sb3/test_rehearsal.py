@@ -13,7 +13,7 @@ from helpers.support import DEEP, SHORT, configure, train_in
 
 from gridworld.agents import TrainingContext, family
 from gridworld.agents.sb3 import rehearsal
-from gridworld.agents.sb3.validation import left_to_the_class
+from gridworld.agents.sb3.settings.validation import left_to_the_class
 from gridworld.config.train import TrainConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError

@@ -18,9 +18,9 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from gridworld import GridWorldVectorEnv
 from gridworld.agents.sb3 import check
-from gridworld.agents.sb3.constructor_arguments import algorithm_and_arguments
 from gridworld.agents.sb3.features import FourierFeatures, ImageCells
-from gridworld.agents.sb3.schemas import SB3Config
+from gridworld.agents.sb3.settings.constructor_arguments import algorithm_and_arguments
+from gridworld.agents.sb3.settings.schemas import SB3Config
 from gridworld.agents.sb3.tabulated import off_policy
 from gridworld.agents.sb3.tabulated import state_inputs as tabulated
 from gridworld.agents.sb3.tabulated.a2c import TabulatedA2C

@@ -23,8 +23,8 @@ from gridworld.agents.tabular.epsilon_greedy import draw_actions, epsilon_greedy
 from gridworld.agents.tabular.settings import TabularConfig
 from gridworld.agents.tabular.td_control import TabularControl, TabularControlConfig
 from gridworld.envs.observations import make_observation
+from gridworld.world.exact.solver import value_iteration
 from gridworld.world.layout import shipped_layouts
-from gridworld.world.solver import value_iteration
 
 CONTROL = [QLearningConfig, SarsaConfig, ExpectedSarsaConfig]
 

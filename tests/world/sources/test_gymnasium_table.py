@@ -10,7 +10,7 @@ from gymnasium import spaces
 from scipy.stats import chi2
 
 from gridworld import GridWorldVectorEnv, InputError
-from gridworld.world.solver import value_iteration
+from gridworld.world.exact.solver import value_iteration
 from gridworld.world.sources import gymnasium_table, table_walk
 from gridworld.world.sources.gymnasium_table import compile_gymnasium, compile_table
 

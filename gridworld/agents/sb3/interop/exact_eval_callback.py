@@ -17,7 +17,7 @@ from gridworld.envs.observations import KINDS, ObservationTable
 from gridworld.run.evaluations_file import write_evaluations
 from gridworld.run.folder import BEST_MODEL, EVALUATIONS
 from gridworld.storage.atomic_write import replacing
-from gridworld.world.evaluation import Evaluator, Score
+from gridworld.world.exact.evaluation import Evaluator, Score
 from gridworld.world.mdp import Mdp
 from gridworld.world.metrics import numbers
 

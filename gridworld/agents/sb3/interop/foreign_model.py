@@ -31,7 +31,7 @@ from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.envs.inspection import is_discrete, observation_like, observation_of, tabulated
 from gridworld.envs.observations import ObservationTable
 from gridworld.errors import InputError
-from gridworld.world.markov_chain import one_hot_policy
+from gridworld.world.exact.markov_chain import one_hot_policy
 from gridworld.world.mdp import FloatArray, Mdp
 
 

@@ -26,7 +26,7 @@ from gridworld.agents.sb3.snapshot.object_graph import ObjectGraph
 from gridworld.agents.sb3.snapshot.value_codec import ValueCodec
 from gridworld.envs.observations import ObservationTable
 from gridworld.errors import InputError
-from gridworld.process.terminal import tell
+from gridworld.process.console.terminal import tell
 from gridworld.storage.rng_state import global_state, set_global_state
 from gridworld.storage.serialization import State, StateError, fitting, same
 

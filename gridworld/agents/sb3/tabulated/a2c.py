@@ -23,7 +23,7 @@ from gridworld.agents.sb3.tabulated.on_policy import (
     weights_of,
 )
 from gridworld.agents.sb3.tabulated.side_by_side import SideBySide, update_together
-from gridworld.process.together import meet
+from gridworld.process.parallel.together import meet
 
 
 class TabulatedA2C(TabulatedOnPolicy, A2C):

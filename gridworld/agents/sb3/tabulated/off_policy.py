@@ -29,7 +29,7 @@ from gridworld.agents.sb3.tabulated.stacked_layers import Leaves, forward
 from gridworld.agents.sb3.tabulated.state_buffers import Float32Array, StateReplayBuffer
 from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.process.together import chance, meet
+from gridworld.process.parallel.together import chance, meet
 from gridworld.world.mdp import FloatArray, IntArray
 
 _DRAWN_AT_ONCE = 2**13  # transitions of a model

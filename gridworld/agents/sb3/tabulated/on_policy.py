@@ -28,7 +28,7 @@ from gridworld.agents.sb3.tabulated.state_buffers import Float32Array, StateRoll
 from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv, StateStep
 from gridworld.envs.joint_rollout import Rollout, roll, shape_of
-from gridworld.process.together import meet
+from gridworld.process.parallel.together import meet
 from gridworld.world.mdp import FloatArray, IntArray
 
 

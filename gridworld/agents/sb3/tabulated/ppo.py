@@ -25,7 +25,7 @@ from gridworld.agents.sb3.tabulated.on_policy import (
     weights_of,
 )
 from gridworld.agents.sb3.tabulated.side_by_side import SideBySide, update_together
-from gridworld.process.together import chance, meet
+from gridworld.process.parallel.together import chance, meet
 from gridworld.world.mdp import FloatArray, IntArray
 
 

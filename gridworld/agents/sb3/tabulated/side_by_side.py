@@ -1,9 +1,9 @@
 """Networks of one shape side by side: P of them make a step in the time that one takes.
 
-While several runs train together (`process.together`), an update is made for all of them at once: their
-weights stand in one matrix (P, N), the networks run at once (`tabulated.stacked_layers`), and each row is
-clipped and stepped as it would be alone. That each network's numbers are then the same to the last bit
-depends on the processor and on the build of torch; `agree` tries it out on the networks at hand.
+While several runs train together (`process.parallel.together`), an update is made for all of them at once:
+their weights stand in one matrix (P, N), the networks run at once (`tabulated.stacked_layers`), and each
+row is clipped and stepped as it would be alone. That each network's numbers are then the same to the last
+bit depends on the processor and on the build of torch; `agree` tries it out on the networks at hand.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer, clipping, joint_step, run_backward
 from gridworld.agents.sb3.tabulated.stacked_layers import ALIGNMENT, Leaves
-from gridworld.process.terminal import tell
+from gridworld.process.console.terminal import tell
 
 
 class Tabulated(Protocol):

@@ -31,7 +31,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from torch import Tensor, nn
 
 from gridworld.agents.sb3.features import FIXED
-from gridworld.agents.sb3.schemas import SB3ClassConfig, SB3Config
+from gridworld.agents.sb3.settings.schemas import SB3ClassConfig, SB3Config
 from gridworld.agents.sb3.tabulated.flat_optimizer import ELEMENTWISE
 from gridworld.agents.sb3.tabulated.stacked_layers import can_stand
 from gridworld.agents.sb3.vec_env import StateStep

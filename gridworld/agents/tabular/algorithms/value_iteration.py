@@ -1,7 +1,7 @@
 """The exact optimum as an agent, for comparison with agents that learn.
 
-It is solved for when it is built (`gridworld.world.solver`), so training takes no environment step, and the
-run's certificate stands at step 0.
+It is solved for when it is built (`gridworld.world.exact.solver`), so training takes no environment step,
+and the run's certificate stands at step 0.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from gridworld.agents.tabular.model_file import model_bytes, read_model
 from gridworld.agents.tabular.settings import TabularConfig
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State
+from gridworld.world.exact.solver import value_iteration
 from gridworld.world.mdp import BoolArray, FloatArray
-from gridworld.world.solver import value_iteration
 
 
 @dataclass

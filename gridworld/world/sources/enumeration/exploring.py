@@ -17,9 +17,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError
+from gridworld.process.console.progress import ProgressLine
+from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import check_memory
-from gridworld.process.progress import ProgressLine
-from gridworld.process.terminal import printable
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 from gridworld.world.outcomes import MOST_ACTIONS
 from gridworld.world.sources.enumeration.snapshots import Snapshots, key_of, random_states

@@ -17,8 +17,8 @@ function of the state. Their slopes at the network's outputs are as short:
     ∂ squares   / ∂ V(s)       =  2/B n_s (V(s) - m_s)
 
 and a slope g in log π is g - π Σ_a g in the logits.
-All arrays have a leading axis P, of the runs that train together (`process.together`): whatever adds up
-over samples or states does so per run, in the order in which it does for one run alone.
+All arrays have a leading axis P, of the runs that train together (`process.parallel.together`): whatever
+adds up over samples or states does so per run, in the order in which it does for one run alone.
 J. Schulman et al., Proximal Policy Optimization Algorithms, 2017, has the losses.
 """
 

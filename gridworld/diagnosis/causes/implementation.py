@@ -1,0 +1,69 @@
+"""The cause in a class of one's own, told by the class that it is derived from.
+
+A setting that is wrong is wrong for both. So Stable-Baselines3's own class trains in the place of the derived
+one, with the same settings on the same world: where that is certified, the difference is in the class.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+from gridworld.agents import family
+from gridworld.agents.sb3.settings.schemas import SB3ClassConfig
+from gridworld.diagnosis.evidence import Evidence
+from gridworld.diagnosis.finding import Finding
+from gridworld.envs.observations import make_observation
+from gridworld.errors import InputError
+from gridworld.training.setup import make_context
+
+_SEEDS = 2  # its own and the next, as one that was certified may have been lucky
+_SECONDS = 2.5  # of the processor
+
+
+def faulty_class(run: Evidence) -> Finding | None:
+    """The library's own class is certified with the same settings."""
+    if run.config.agent.family != "sb3":
+        return None
+    from gridworld.agents.sb3.ancestor import of_library  # imports torch
+
+    sound = of_library(run.config.agent)
+    if sound is None:
+        return None
+    until, steps = time.process_time() + _SECONDS, []
+    lost = bool(run.curve["certified"].any())
+    for seed in range(run.config.seed, run.config.seed + _SEEDS):
+        if (found := _certified_after(run, sound, seed, until, lost)) is None:
+            return None
+        steps.append(f"{found:,}")
+    own, seed = run.config.agent.algorithm, run.config.seed
+    when = f"{'still at' if lost else 'at'} steps {' and '.join(steps)} (seeds {seed} and {seed + 1})"
+    why = (
+        f"its class is at fault: {sound.algorithm} in the place of {own}, with the same settings, is "
+        f"certified {when}; check.py {own} tells what is wrong"
+    )
+    return Finding("implementation", run.split.wrong, why, (f"agent.algorithm={sound.algorithm}",))
+
+
+def _certified_after(
+    run: Evidence, agent: SB3ClassConfig, seed: int, until: float, to_the_end: bool
+) -> int | None:
+    """The steps until a certificate, the first or that at the end; None: there is none, or not in time."""
+    config = replace(run.config, agent=agent, seed=seed, callbacks=[])
+    observation = make_observation(run.mdp, config.observation.kind, config.observation.cell_size)
+    every, due, found = config.evaluation.every, 0, None
+
+    def watch(step: int) -> bool:
+        nonlocal due, found
+        if step >= min(due, config.total_timesteps):
+            due = (step // every + 1) * every
+            certified = run.evaluator.score(learner.snapshot().greedy_policy()).certified
+            found = step if certified else None
+        return (to_the_end or found is None) and time.process_time() < until
+
+    try:
+        learner = family(agent).build(agent, make_context(config, run.mdp, observation))
+        learner.learn(config.total_timesteps, watch)
+    except InputError:  # it diverged
+        return None
+    return found if time.process_time() < until else None

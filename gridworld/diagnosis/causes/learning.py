@@ -1,0 +1,158 @@
+"""Causes in how a run learns: too slowly, too fast, or not for long enough."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gridworld.diagnosis.evidence import Evidence, entropy
+from gridworld.diagnosis.experiments import entropy_optimum, sweeps_missing
+from gridworld.diagnosis.finding import Finding, costliest, faster, longer, slower
+from gridworld.world.exact.bellman import backup
+from gridworld.world.mdp import BoolArray
+
+_SPREAD = 0.5  # of the entropy of a uniform policy: above, it has hardly made up its mind
+_FORGOTTEN = 0.05  # of a first value
+_MOVES = 0.1  # Adam moves a weight by about the learning rate an update: less than this in all is nothing
+_REFRESHES = 2  # of the target network, for each step of the way to the goal
+
+
+def lost_again(run: Evidence) -> Finding | None:
+    """The curve has a certificate that the end has not."""
+    certified = np.flatnonzero(run.curve["certified"])
+    if not certified.size:
+        return None
+    steps, last = run.curve["step"], int(certified[-1])
+    after = int(steps[min(last + 1, len(steps) - 1)])
+    why = f"it was certified at step {int(steps[last]):,} and had lost that again at step {after:,}"
+    linear = run.change("learning_rate", f"lin_{run.setting('learning_rate'):g}")
+    return Finding("lost", run.split.wrong, why, (linear, "evaluation.stop_after=3", slower(run)[0]))
+
+
+def diverged(run: Evidence) -> Finding | None:
+    """A network's values are higher than those of any policy, by more than two rewards."""
+    known = run.mdp.acting & (run.visits.sum(axis=1) > 0)
+    if run.is_tabular or not known.any():
+        return None
+    highest, possible = float(run.values[known].max()), float(run.own.v[known].max())
+    if highest <= possible + 2 * run.largest_reward:
+        return None
+    why = f"its values diverged: they reach {highest:.3g} where no policy earns more than {possible:.3g}"
+    interval = run.setting("target_update_interval")
+    seldom = (run.change("target_update_interval", 4 * interval),) if interval else ()
+    return Finding("diverged", run.split.wrong, why, (slower(run)[0], *seldom))
+
+
+def hardly_moved(run: Evidence) -> Finding | None:
+    """All updates together are too small to have moved a network's weights."""
+    rate = run.setting("learning_rate")
+    has_own_step = run.setting("cg_max_steps") > 0  # TRPO's, whatever the rate
+    if run.is_tabular or has_own_step or _too_short(run) or run.updates * rate >= _MOVES:
+        return None
+    why = f"{run.updates:,.0f} updates at a learning rate of {rate:g} cannot move a weight far{_behind(run)}"
+    late = run.setting("learning_starts") > run.config.total_timesteps / 2
+    starts = (run.change("learning_starts", 100),) if late else ()
+    return Finding("slow", run.split.wrong, why, (*starts, *faster(run)))
+
+
+def overshot(run: Evidence) -> Finding | None:
+    """A policy that is far more decided than its entropy bonus would leave it."""
+    bonus = run.setting("ent_coef")
+    if not run.is_actor_critic or bonus <= 0:
+        return None
+    aim = entropy(entropy_optimum(run, bonus))
+    states = run.split.wrong & (2 * run.spread + 0.1 < aim)
+    if not states.any():
+        return None
+    worst = costliest(run, states)
+    why = (
+        f"its updates overshoot: in {run.mdp.state_name(worst)} its policy has {run.spread[worst]:.2g} of a "
+        f"uniform one's entropy, where its bonus of {bonus:g} aims at {aim[worst]:.2g}"
+    )
+    return Finding("rate", states, why, slower(run))
+
+
+def not_there_yet(run: Evidence) -> Finding | None:
+    """Its values lag behind: a backup is nearer to the truth, or changes little, as those ahead lag too.
+
+    Of an actor-critic it is the policy that lags: it has hardly made up its mind.
+    """
+    if run.is_actor_critic:
+        states = run.split.wrong & (run.spread > _SPREAD)
+    else:
+        ahead = backup(run.mdp, np.where(run.mdp.terminal, 0.0, run.q.max(axis=1)), run.gamma)
+        now, then = (np.abs(each - run.own.q).max(axis=1) for each in (run.q, ahead))
+        residual = np.abs(ahead - run.q).max(axis=1)
+        states = run.split.wrong & ((then < now) | (residual < now / 2))
+    if not states.any():
+        return None
+    if _too_short(run):
+        return _of_a_short_run(run, states)
+    if run.is_tabular:
+        return _slow_table(run, states)
+    interval = run.setting("target_update_interval")
+    refreshed = run.config.total_timesteps / max(interval, 1.0) if run.setting("tau", 1.0) == 1 else np.inf
+    path = run.evaluator.optimum.expected_length
+    if interval and refreshed < _REFRESHES * path:
+        why = (
+            f"its target network was refreshed {refreshed:.0f} times, and a value needs {path:.0f} to come "
+            f"from the goal to the start{_behind(run)}"
+        )
+        often = max(1.0, round(run.config.total_timesteps / (8 * path)))
+        return Finding("target", states, why, (run.change("target_update_interval", often), longer(run, 4)))
+    why = f"it was still learning: {run.updates:,.0f} updates were too few{_behind(run)}"
+    return Finding("slow", states, why, faster(run)[::-1])
+
+
+def _too_short(run: Evidence) -> bool:
+    """Whether a run is too short at any rate: a random walk needs longer to meet the goal."""
+    return run.config.total_timesteps < run.steps_to_goal < np.inf
+
+
+def _of_a_short_run(run: Evidence, states: BoolArray) -> Finding:
+    why = f"it was still learning after {run.config.total_timesteps:,} steps"
+    told = f"{why}; a random walk meets the goal once in {run.steps_to_goal:,.0f}"
+    return Finding("budget", states, told, (longer(run, 10),))
+
+
+def _behind(run: Evidence) -> str:
+    missing = sweeps_missing(run)
+    return f"; {missing} sweeps of its own values are missing" if missing > 1 else ""
+
+
+def _slow_table(run: Evidence, states: BoolArray) -> Finding | None:
+    """What its step sizes have left of the first value; None where that is nothing."""
+    first, possible = run.setting("initial_value"), float(run.own.v[run.mdp.acting].max())
+    worst = costliest(run, states)
+    where, expects = run.mdp.state_name(worst), float(run.q[worst].max())
+    if first > possible and expects > possible * (1 + 1e-9):
+        why = (
+            f"it is still optimistic: in {where} it expects {expects:.3g}, and no policy earns {possible:.3g}"
+        )
+        return Finding("slow", states, why, (run.change("initial_value", possible), longer(run, 4)))
+    rate, power = run.setting("learning_rate"), run.setting("learning_rate_power")
+    tried = int(run.visits[worst][run.own.optimal[worst]].max())
+    sizes = rate * np.arange(1, tried + 1, dtype=np.float64) ** -power
+    left = float(np.prod(1 - np.minimum(sizes, 1.0)))
+    if left < _FORGOTTEN:
+        return None
+    why = (
+        f"its values have not got there: in {where}, {tried:,} updates left {left:.2g} of what it began with"
+    )
+    changes = [run.change("learning_rate_power", 0.0)] if power else []
+    if rate < 0.5:
+        changes.append(run.change("learning_rate", min(10 * rate, 0.5)))
+    return Finding("slow", states, f"{why}{_behind(run)}", (*changes, longer(run, 4)))
+
+
+def unsettled(run: Evidence) -> Finding:
+    """What remains: its values err by more than what the right action is worth."""
+    if _too_short(run):
+        return _of_a_short_run(run, run.split.wrong)
+    worst = costliest(run, run.split.wrong)
+    error = float(np.abs(run.q - run.own.q)[worst].max())
+    why = (
+        f"its values do not settle: in {run.mdp.state_name(worst)} they err by {error:.2g} where the right "
+        f"action is worth {run.gap[worst]:.2g} more"
+    )
+    linear = run.change("learning_rate", f"lin_{run.setting('learning_rate'):g}")
+    return Finding("rate", run.split.wrong, why, (slower(run)[0], linear, longer(run, 4)))

@@ -1,0 +1,90 @@
+"""Causes in a network, told by the oracle ablation: the same network, fitted to the exact answer.
+
+Of all states at once, with new weights or its own, and of the costliest one alone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gridworld.diagnosis.evidence import Evidence
+from gridworld.diagnosis.finding import Finding, costliest, slower
+from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.exact.markov_chain import one_hot_policy
+from gridworld.world.mdp import IntArray
+
+_FEW = 4  # transitions of a state in a replay buffer
+_OFTEN = 10  # times as many visits
+
+
+def cannot_represent(run: Evidence) -> Finding | None:
+    """The same network with new weights cannot be fitted."""
+    if _fits(run, fresh=True) is not False:
+        return None
+    worst = costliest(run, run.split.wrong)
+    told_apart, _ = _alone(run, worst)
+    alone = "; its own can learn {} alone" if told_apart else "; its own cannot even tell {} from the others"
+    why = (
+        "its network cannot hold the answer: with new weights and fitted to the exact one, it still errs"
+        f"{alone.format(run.mdp.state_name(worst))}"
+    )
+    wide = f"{run.config.agent.key('policy_kwargs.net_arch')}=[64,64]"
+    kinds = () if run.config.observation.kind == "one_hot" else ("observation=one_hot",)
+    return Finding("network", run.split.wrong, why, (wide, *kinds))
+
+
+def forgets(run: Evidence) -> Finding | None:
+    """States that were met often are hardly in the replay buffer, and to learn others spoils them."""
+    size, total = run.setting("buffer_size"), run.config.total_timesteps
+    if run.is_tabular or not 0 < size < total / _OFTEN:
+        return None
+    met = run.visits.sum(axis=1)
+    kept = met / max(met.sum(), 1) * size
+    states = run.split.wrong & (kept < _FEW) & (met >= _OFTEN * np.maximum(kept, 1.0))
+    if not states.any():
+        return None
+    worst = costliest(run, states)
+    _, spoilt = _alone(run, worst)
+    if not len(spoilt):
+        return None
+    where = run.mdp.state_name(worst)
+    why = (
+        f"it forgets: {where} was met {met[worst]:,} times, of which {kept[worst]:.1g} are in its replay "
+        f"buffer, and to learn that state alone makes {len(spoilt)} others wrong"
+    )
+    return Finding("forgetting", states, why, (run.change("buffer_size", total),))
+
+
+def spoilt_policy(run: Evidence) -> Finding | None:
+    """As `spoilt`, of a policy that explores by itself: what it did not try follows from its weights."""
+    return spoilt(run) if run.is_actor_critic else None
+
+
+def spoilt(run: Evidence) -> Finding | None:
+    """Its own weights cannot be fitted any more, where new ones can."""
+    if _fits(run, fresh=False) is not False:
+        return None
+    why = "its weights are spoilt: fitted to the exact answer from them it still errs, from new ones not"
+    return Finding("rate", run.split.wrong, why, slower(run))
+
+
+def _fits(run: Evidence, fresh: bool) -> bool | None:
+    """Whether a network learns the exact optimum of its own objective; None: none, or too large to try."""
+    if run.config.agent.family != "sb3" or run.own.gamma > 0.9999:  # where actions hardly differ
+        return None
+    from gridworld.agents.sb3.oracle_fit import oracle_fit  # imports torch
+
+    judge = Evaluator(run.mdp, run.own.gamma, 1)
+
+    def is_optimal(greedy: IntArray) -> bool:
+        return judge.score(one_hot_policy(greedy, run.mdp.num_actions)).certified
+
+    return oracle_fit(run.agent, run.own, np.flatnonzero(run.mdp.acting), is_optimal, fresh)
+
+
+def _alone(run: Evidence, state: int) -> tuple[bool, IntArray]:
+    """Whether a network can learn one state and keep the others, and which it loses if nothing holds them."""
+    from gridworld.agents.sb3.oracle_fit import one_state_fit  # imports torch
+
+    found = one_state_fit(run.agent, run.own, np.flatnonzero(run.mdp.acting), state)
+    return (True, np.empty(0, np.int64)) if found is None else found

@@ -1,0 +1,116 @@
+"""Frames of a world that was made from a Gymnasium environment, rendered by that environment itself."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from PIL import Image
+
+from gridworld.envs.frames.rendering import Frame, import_pygame
+from gridworld.errors import InputError
+from gridworld.world.mdp import Mdp
+from gridworld.world.sources.making import make_env
+
+_MOST_PIXELS = 512 * 512
+_OFF_SCREEN = {"SDL_VIDEODRIVER": "dummy", "SDL_AUDIODRIVER": "dummy"}
+
+
+class RealEnvFrames:
+    """Renders episodes.
+
+    An environment with a transition table is put into each state. Others are enumerated: from a reset on, the
+    actions that lead through the states are taken.
+
+    Args:
+        env_id: the registered id.
+        kwargs: the arguments of `gymnasium.make`.
+        max_pixels: larger frames are made smaller.
+    """
+
+    def __init__(
+        self, env_id: str, kwargs: Mapping[str, Any] | None = None, max_pixels: int = _MOST_PIXELS
+    ) -> None:
+        self._env_id, self._kwargs, self._max_pixels = env_id, dict(kwargs or {}), max_pixels
+
+    def episode(self, mdp: Mdp, states: Sequence[int]) -> list[Frame]:
+        """Render the states of an episode.
+
+        Args:
+            mdp: the world that was made from the environment.
+            states: n, of which the first is a start.
+
+        Returns:
+            n frames (height, width, 3), uint8, RGB.
+
+        Raises:
+            InputError: the environment cannot be made or rendered, or no action leads from one of the states
+                to the next.
+        """
+        with _off_screen():
+            env = make_env(self._env_id, self._kwargs, render_mode="rgb_array")
+            try:
+                env.reset(seed=0)
+                walk = _set_states if hasattr(env.unwrapped, "P") else _replayed
+                return [self._frame(env) for _ in walk(env, mdp, states)]
+            finally:
+                env.close()
+
+    def _frame(self, env: gym.Env[Any, Any]) -> Frame:
+        try:
+            frame = np.asarray(env.render(), dtype=np.uint8)
+        except Exception as error:  # whatever it raises
+            raise InputError(f"env.id={self._env_id}: cannot be rendered: {error}") from error
+        height, width = frame.shape[:2]
+        if height * width <= self._max_pixels:
+            return frame.copy()
+        scale = (self._max_pixels / (height * width)) ** 0.5
+        size = max(1, int(width * scale)), max(1, int(height * scale))
+        return np.asarray(Image.fromarray(frame).resize(size, Image.Resampling.BOX))
+
+
+def _set_states(env: gym.Env[Any, Any], mdp: Mdp, states: Sequence[int]) -> Iterator[None]:
+    for state in states:
+        env.unwrapped.s = int(mdp.number[state])  # type: ignore[attr-defined]
+        env.unwrapped.lastaction = None  # type: ignore[attr-defined]
+        yield
+
+
+def _replayed(env: gym.Env[Any, Any], mdp: Mdp, states: Sequence[int]) -> Iterator[None]:
+    yield
+    for state, following in itertools.pairwise(states):
+        leading = np.flatnonzero(mdp.next_state[state, :, 0] == following)
+        if not leading.size:
+            raise InputError(
+                f"{mdp.name}: no action leads from {mdp.state_name(state)} to {mdp.state_name(following)}"
+            )
+        env.step(int(leading[0]))
+        yield
+
+
+@contextmanager
+def _off_screen() -> Iterator[None]:
+    """Without a display and a sound card, unless pygame has opened a display already.
+
+    Environments start pygame as a whole, which would look for both. Afterwards it is as if it never had been.
+    """
+    pygame = import_pygame()
+    if pygame.display.get_init():
+        yield
+        return
+    before = {name: os.environ.get(name) for name in _OFF_SCREEN}
+    os.environ.update(_OFF_SCREEN)
+    try:
+        yield
+    finally:
+        pygame.quit()
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name)
+            else:
+                os.environ[name] = value

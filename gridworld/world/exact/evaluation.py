@@ -1,0 +1,115 @@
+"""How good a policy is, exactly: by solving for its value.
+
+Two horizons stand side by side. Value and regret are without a step limit, as in the theory that the
+certificate rests on. What becomes of an episode (goal, trap and time-out probability, return, length) is
+within the step limit, as training and sampling see it. The discounted return within the limit links the two:
+it is what sampled episodes (`envs.rollout`) estimate, and comes near to the value where few of them are cut.
+
+The exact scores carry no sampling noise and cannot hang: a policy that walks in circles has a time-out
+probability of 1, whatever its number of steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gridworld.process.console.progress import telling_if_slow
+from gridworld.world.exact.markov_chain import Chain, Outcome, one_hot_policy
+from gridworld.world.exact.solver import Solution, solved
+from gridworld.world.mdp import FloatArray, Mdp
+
+REGRET_TOLERANCE = 1e-6  # relative; a detour of one step costs at least 1 % at the default discount
+
+
+@dataclass(frozen=True)
+class Score:
+    """Exact scores of one policy, in expectation over starts."""
+
+    value: float  # discounted, without a step limit
+    regret: float  # optimal value - value, at least 0 up to rounding
+    certified: bool  # no policy is better
+    outcome: Outcome  # of an episode within the step limit
+
+    @property
+    def shortfall(self) -> float:
+        """The regret without its rounding: 0 where no policy is better. By it policies are ranked."""
+        return 0.0 if self.certified else self.regret
+
+
+class Evaluator:
+    """Scores policies of one world under one discount and step limit. Solves the world when it is built,
+    unless this process has.
+
+    Args:
+        mdp: the world.
+        gamma: the discount of value and regret.
+        max_episode_steps: the step limit of an episode's outcome.
+
+    Attributes:
+        solution: the optimum under the discount.
+        optimal_value: its value, in expectation over starts.
+        optimum: the outcome of an episode of `optimal_policy`.
+
+    Raises:
+        InputError: no finite optimum, see `value_iteration`.
+    """
+
+    def __init__(self, mdp: Mdp, gamma: float, max_episode_steps: int) -> None:
+        self.mdp = mdp
+        self.max_episode_steps = max_episode_steps
+        with telling_if_slow(f"solving the world, {mdp.num_states:,} states"):
+            self.solution: Solution = solved(mdp, gamma)
+        self.optimal_value = self._at_start(self.solution.v)
+        with telling_if_slow(f"following the optimum for up to {max_episode_steps:,} steps"):
+            self.optimum: Outcome = Chain(mdp, self.optimal_policy()).outcome(max_episode_steps)
+
+    def optimal_policy(self) -> FloatArray:
+        """The policy (S, A) that takes the first of the optimal actions."""
+        return one_hot_policy(np.argmax(self.solution.optimal, axis=1), self.mdp.num_actions)
+
+    def score(self, policy: FloatArray) -> Score:
+        """Score a policy exactly.
+
+        Args:
+            policy: (S, A), action probabilities.
+
+        Raises:
+            InputError: it is no policy of this world.
+        """
+        chain = Chain(self.mdp, policy)
+        value = self._at_start(chain.value(self.solution.gamma))
+        regret = 0.0 if value == self.optimal_value else self.optimal_value - value  # both may be -inf
+        certified = regret <= REGRET_TOLERANCE * self._at_start(self.solution.scale)
+        return Score(value, regret, certified, chain.outcome(self.max_episode_steps))
+
+    def discounted_return(self, policy: FloatArray) -> float:
+        """The exact expected discounted return of an episode within the step limit.
+
+        Args:
+            policy: (S, A), action probabilities.
+
+        Raises:
+            InputError: it is no policy of this world.
+        """
+        return Chain(self.mdp, policy).discounted_return(self.max_episode_steps, self.solution.gamma)
+
+    def endless_cells(self, policy: FloatArray) -> list[tuple[int, ...]]:
+        """The states in which a policy may walk for ever.
+
+        Args:
+            policy: (S, A), action probabilities.
+
+        Returns:
+            Of each, by state, (row, column) on a map, else (number,); empty for a policy that always ends.
+
+        Raises:
+            InputError: it is no policy of this world.
+        """
+        states = Chain(self.mdp, policy).endless_states()
+        return [self.mdp.coordinates(int(state)) for state in states if not self.mdp.absorbing[state]]
+
+    def _at_start(self, values: FloatArray) -> float:
+        starts = self.mdp.start_states
+        return float(values[starts] @ self.mdp.start[starts])

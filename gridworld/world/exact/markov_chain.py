@@ -1,0 +1,357 @@
+"""The Markov chain that a policy makes of the world, and what can be known of it exactly.
+
+The value of a policy π solves the linear system V = r_π + γ P_π V; what becomes of an episode follows from
+its distribution over states, step by step. A policy is a table (S, A) of action probabilities. Small worlds
+are dense matrices, large ones sparse.
+
+Without discount (γ = 1) the value is the expected total reward. A policy may then go on for ever. Where it
+comes to walk among states without earning anything, nothing is added any more; where it goes on earning, its
+gains or its losses are infinite.
+
+Reference: M. L. Puterman, Markov Decision Processes, 1994, chapters 6 and 7 and appendix A.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from gridworld.bounds import discount
+from gridworld.errors import InputError
+from gridworld.world.exact.absorption import Absorption, factor
+from gridworld.world.exact.one_thread import in_one_thread
+from gridworld.world.layout import positive_int
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+
+ORDINARY_GAMMA = 0.9999  # up to here a plain solution of the linear system is accurate
+DENSE_STATES = 512  # up to here a dense matrix is both faster and small
+_STEPS_AT_ONCE = 32  # of an episode, before looking whether it can still go on
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one episode of a policy comes to, in expectation over starts, slips and the policy's own draws."""
+
+    goal: float  # probabilities; goal + trap + timeout = 1
+    trap: float
+    timeout: float
+    expected_return: float  # undiscounted sum of rewards
+    expected_length: float  # steps
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Of one policy under one discount.
+
+    Attributes:
+        value: (S,), V_π = E Σ γ^t r_t.
+        scale: (S,), E Σ γ^t |r_t|, what a relative error is relative to.
+        slope: (S,), dV_π/dγ = E Σ t γ^(t-1) r_t: of equal values, the sooner has the smaller.
+        slope_scale: (S,), the same of |r_t|.
+    """
+
+    value: FloatArray
+    scale: FloatArray
+    slope: FloatArray | None = None
+    slope_scale: FloatArray | None = None
+
+
+class Chain:
+    """States under one policy.
+
+    Args:
+        mdp: the world.
+        policy: (S, A), action probabilities.
+
+    Attributes:
+        policy: (S, A), float64, rows sum to 1.
+        reward: (S,), r_π, the expected reward of a step.
+        transition: (S, S), P_π, a numpy array, or in large worlds a scipy CSR array.
+
+    Raises:
+        InputError: a table that is no policy of this world.
+    """
+
+    def __init__(self, mdp: Mdp, policy: ArrayLike) -> None:
+        self.mdp = mdp
+        self.policy = check_policy(mdp, policy)
+        self._weight = self.policy[:, :, None] * mdp.probability  # (S, A, K)
+        self.reward: FloatArray = (self._weight * mdp.reward).sum(axis=(1, 2))
+        self.transition = self._transition()
+
+    def _transition(self) -> Any:
+        size, weight = self.mdp.num_states, self._weight
+        rows = np.broadcast_to(np.arange(size)[:, None, None], weight.shape)
+        if size <= DENSE_STATES:
+            index = (rows * size + self.mdp.next_state).ravel()
+            return np.bincount(index, weight.ravel(), size * size).reshape(size, size)
+        from scipy.sparse import csr_array
+
+        used = weight > 0
+        return csr_array((weight[used], (rows[used], self.mdp.next_state[used])), shape=(size, size))
+
+    @in_one_thread
+    def value(self, gamma: float) -> FloatArray:
+        """The expected discounted sum of rewards, without a step limit.
+
+        Args:
+            gamma: the discount γ, from 0 to 1.
+
+        Returns:
+            (S,), V_π. With γ = 1 it is ±inf where a policy may go on earning or paying for ever, NaN where
+            it goes on doing both.
+
+        Raises:
+            InputError: another discount.
+        """
+        gamma = check_gamma(gamma)
+        if gamma > ORDINARY_GAMMA:
+            return self.evaluation(gamma).value
+        states = np.flatnonzero(self._in_play)
+        if not isinstance(self.transition, np.ndarray):
+            return self._sums(self.reward[:, None], gamma)[:, 0]
+        value = np.zeros(self.mdp.num_states)
+        matrix = np.eye(len(states)) - gamma * self.transition[np.ix_(states, states)]
+        value[states] = np.linalg.solve(matrix, self.reward[states])
+        return value
+
+    @in_one_thread
+    def evaluation(self, gamma: float, with_slope: bool = False) -> Evaluation:
+        """The value and what else policy iteration needs, in which tiny values are accurate too.
+
+        Gains and losses are solved for apart, as sums of non-negative numbers, whose error is small beside
+        each state's own scale, not only beside the largest one.
+
+        Args:
+            gamma: the discount γ, from 0 to 1.
+            with_slope: whether to compute the slopes too.
+        """
+        signs = (np.maximum(self.mdp.reward, 0), np.maximum(-self.mdp.reward, 0))
+        paid = np.stack([(self._weight * part).sum(axis=(1, 2)) for part in signs], axis=1)
+        sums = self._sums(paid, gamma)
+        if not with_slope:
+            return Evaluation(*_value_and_scale(sums))
+        finite = np.isfinite(sums)
+        slopes = self._sums(self.transition @ np.where(finite, sums, 0.0), gamma)
+        return Evaluation(*_value_and_scale(sums), *_value_and_scale(np.where(finite, slopes, np.inf)))
+
+    @in_one_thread
+    def outcome(self, max_steps: int) -> Outcome:
+        """The outcome of an episode of at most `max_steps` steps, exact.
+
+        Raises:
+            InputError: `max_steps` is no whole number of at least 1.
+        """
+        positive_int("max_steps", max_steps)
+        live = ~self.mdp.terminal
+        counted = np.stack([live, self.reward], axis=1)  # summed over an episode: its length and return
+        mass: FloatArray = self.mdp.start
+        total, steps = np.zeros(2), 0
+        while steps < max_steps and mass[live].any():
+            visits = self._visits(mass, min(_STEPS_AT_ONCE, max_steps - steps))
+            total += visits[:-1].sum(axis=0) @ counted
+            steps += len(visits) - 1
+            mass = visits[-1]
+        goal, trap = float(mass[self.mdp.goal].sum()), float(mass[self.mdp.trap].sum())
+        return Outcome(goal, trap, float(mass[live].sum()), float(total[1]), float(total[0]))
+
+    @in_one_thread
+    def discounted_return(self, max_steps: int, gamma: float) -> float:
+        """The expected discounted sum of rewards of an episode of at most `max_steps` steps, exact.
+
+        Raises:
+            InputError: `max_steps` is no whole number of at least 1.
+        """
+        positive_int("max_steps", max_steps)
+        total, mass = 0.0, self.mdp.start
+        for first in range(0, max_steps, _STEPS_AT_ONCE):
+            visits = self._visits(mass, min(_STEPS_AT_ONCE, max_steps - first))
+            discounts = gamma ** np.arange(first, first + len(visits) - 1)
+            total += float(discounts @ (visits[:-1] @ self.reward))
+            mass = visits[-1]
+        return total
+
+    def _visits(self, mass: FloatArray, steps: int) -> FloatArray:
+        """(steps + 1, S), the distribution over states from `mass` on, step by step."""
+        visits = np.empty((steps + 1, len(mass)))
+        visits[0] = mass
+        if isinstance(self.transition, np.ndarray):
+            for before, after in itertools.pairwise(visits):
+                before.dot(self.transition, out=after)
+        else:
+            backwards = self.transition.T
+            for before, after in itertools.pairwise(visits):
+                after[:] = backwards @ before
+        return visits
+
+    def endless_states(self) -> IntArray:
+        """The states that an episode may come to walk in for ever.
+
+        For a deterministic policy in a world without slip these are the cells of its cycle.
+
+        Returns:
+            (n,), ascending; empty for a policy that always ends.
+        """
+        mdp, taken = self.mdp, self._weight > 0
+        reached = np.zeros(mdp.num_states, dtype=np.bool_)
+        frontier: IntArray = mdp.start_states
+        while frontier.size:
+            reached[frontier] = True
+            following = np.unique(mdp.next_state[frontier][taken[frontier]])
+            frontier = following[~reached[following]]
+        states: IntArray = np.flatnonzero(reached & ~can_reach(mdp, taken, mdp.terminal))
+        while True:  # what lies on the way into a cycle has no predecessor here and drops out
+            following = np.unique(mdp.next_state[states][taken[states]])
+            if following.size == states.size:
+                return states
+            states = following
+
+    @cached_property
+    def _in_play(self) -> BoolArray:
+        return ~self.mdp.absorbing
+
+    def _sums(self, right: FloatArray, gamma: float) -> FloatArray:
+        """x = right + γ P_π x for each column, x = 0 where nothing moves any more.
+
+        With γ = 1 the columns must not be negative; x is infinite where it does not stop growing.
+        """
+        sums = np.zeros_like(right)
+        playing = self._in_play
+        if gamma == 1:
+            sums[self._growing(right)] = np.inf
+            playing = playing & ~(self._recurrent > 0) & np.isfinite(sums).all(axis=1)
+        states = np.flatnonzero(playing)
+        if states.size:
+            sums[states] = self._system(gamma, states).solve(right[states])
+        return sums
+
+    def _system(self, gamma: float, states: IntArray) -> Absorption:
+        outside = np.flatnonzero(~np.isin(np.arange(self.mdp.num_states), states))
+        leak = (1 - gamma) + gamma * self.transition[states][:, outside].sum(axis=1)
+        return factor(gamma * self.transition[states][:, states], leak)
+
+    def _growing(self, right: FloatArray) -> BoolArray:
+        """(S, columns), states from which a column is collected for ever with some probability."""
+        growing = np.zeros(right.shape, dtype=np.bool_)
+        for column, collected in zip(growing.T, right.T, strict=True):
+            paying = np.unique(self._recurrent[(self._recurrent > 0) & (collected > 0)])
+            if paying.size:
+                column[:] = can_reach(self.mdp, self._weight > 0, np.isin(self._recurrent, paying))
+        return growing
+
+    @cached_property
+    def _recurrent(self) -> IntArray:
+        """(S,), a number from 1 on for each class of states that it never leaves, 0 for all other states."""
+        recurrent = np.zeros(self.mdp.num_states, dtype=np.int64)
+        endless = np.flatnonzero(self._in_play & ~can_reach(self.mdp, self._weight > 0, self.mdp.terminal))
+        if endless.size:
+            from scipy.sparse import coo_array
+            from scipy.sparse.csgraph import connected_components
+
+            among = coo_array(self.transition[endless][:, endless])
+            _, label = connected_components(among, directed=True, connection="strong")
+            leaving = label[among.row][label[among.row] != label[among.col]]
+            recurrent[endless] = np.where(np.isin(label, leaving), 0, label + 1)
+        return recurrent
+
+
+def check_gamma(gamma: float) -> float:
+    """Check a discount.
+
+    Returns:
+        It as a float from 0 to 1.
+
+    Raises:
+        InputError: it is anything else, or so near to 1 that the cost of a step gets lost in rounding.
+    """
+    if isinstance(gamma, bool) or not isinstance(gamma, int | float | np.number) or not 0 <= gamma <= 1:
+        raise InputError(f"gamma={gamma!r}: a discount must be a number from 0 to 1")
+    discount("gamma", float(gamma))
+    return float(gamma)
+
+
+def one_hot_policy(actions: IntArray, num_actions: int) -> FloatArray:
+    """The policy (S, A), float64, that takes one action (S,) in every state."""
+    policy = np.zeros((len(actions), num_actions))
+    policy[np.arange(len(actions)), actions] = 1.0
+    return policy
+
+
+def check_policy(mdp: Mdp, policy: ArrayLike) -> FloatArray:
+    """Check a policy.
+
+    Args:
+        mdp: the world that it is for.
+        policy: (S, A), action probabilities.
+
+    Returns:
+        (S, A), float64; rows sum to 1.
+
+    Raises:
+        InputError: it is no policy of this world.
+    """
+    try:
+        table: FloatArray = np.asarray(policy, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"policy={policy!r}: must be a table of action probabilities") from None
+    if table.shape != (mdp.num_states, mdp.num_actions):
+        raise InputError(
+            f"policy of shape {table.shape}: this world needs ({mdp.num_states}, {mdp.num_actions}), "
+            "a row of action probabilities per state"
+        )
+    total = table.sum(axis=1, keepdims=True)
+    wrong = ~((table >= 0).all(axis=1) & (np.abs(total[:, 0] - 1) <= 1e-4))
+    if wrong.any():
+        state = int(np.argmax(wrong))
+        raise InputError(f"policy: row {state} is {table[state].tolist()}, not a probability distribution")
+    normalised: FloatArray = table / total
+    return normalised
+
+
+def can_reach(mdp: Mdp, taken: BoolArray, targets: BoolArray) -> BoolArray:
+    """The states from which others can be reached.
+
+    Args:
+        mdp: the world.
+        taken: (S, A, K), the outcomes that may be taken.
+        targets: (S,), the states to reach, which reach themselves.
+
+    Returns:
+        (S,), True where a target can be reached.
+    """
+    return steps_to(mdp, taken, targets) >= 0
+
+
+def steps_to(mdp: Mdp, taken: BoolArray, targets: BoolArray) -> IntArray:
+    """The fewest steps to some states.
+
+    Args:
+        mdp: the world.
+        taken: (S, A, K), the outcomes that may be taken.
+        targets: (S,), the states to reach.
+
+    Returns:
+        (S,), integers; -1 where no target can be reached.
+    """
+    steps = np.where(targets, 0, -1)
+    frontier: IntArray = np.flatnonzero(targets)
+    distance = 0
+    while frontier.size:
+        distance += 1
+        around = np.unique(mdp.predecessors(frontier))
+        around = around[steps[around] < 0]
+        leads = ((steps[mdp.next_state[around]] >= 0) & taken[around]).any(axis=(1, 2))
+        frontier = around[leads]
+        steps[frontier] = distance
+    return steps
+
+
+def _value_and_scale(sums: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gains - losses and gains + losses."""
+    with np.errstate(invalid="ignore"):  # inf - inf is no value
+        return sums[:, 0] - sums[:, 1], sums.sum(axis=1)
