@@ -15,7 +15,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from gridworld.errors import InputError
 from gridworld.tune.finalists import FINAL
-from gridworld.tune.search.objective import ERROR, SEEDS, read_score
+from gridworld.tune.search.objective import ERROR, SEEDS, WORKER, read_score
 from gridworld.tune.search.search_space import SearchSpace
 
 _NOT_OURS = (
@@ -84,7 +84,7 @@ def _check_complete(trial: FrozenTrial, space: SearchSpace) -> None:
 
 
 def _check_attributes(own: Mapping[str, Any], optunas: Mapping[str, Any]) -> None:
-    for key in (ERROR, "worker"):
+    for key in (ERROR, WORKER):
         if not isinstance(own.get(key, ""), str):
             raise ValueError(f"{key} must be a text")
     for seed in own.get(SEEDS, []):

@@ -40,7 +40,7 @@ from gridworld.storage.sealed_json import read_sealed, sealed
 from gridworld.storage.symlinks import check_no_links
 from gridworld.tune.confirmation import CONFIRM
 from gridworld.tune.recipe import EXPERIMENT
-from gridworld.tune.search.objective import ERROR, SEEDS
+from gridworld.tune.search.objective import ERROR, SEEDS, WORKER
 from gridworld.tune.search.search_space import SearchSpace
 from gridworld.tune.search.storage import check_same_search, is_lost
 from gridworld.tune.study_spec import StudySpec
@@ -158,7 +158,7 @@ def _row(trial: FrozenTrial) -> dict[str, Any]:
         "regret": f"{fmean(seed['regret'] for seed in seeds):.6g}" if seeds else "",
         "seconds": "" if ended is None else f"{ended:.2f}",
         "repeats": history[-1] if history else "",
-        "worker": trial.user_attrs.get("worker", ""),
+        "worker": trial.user_attrs.get(WORKER, ""),
         "error": trial.user_attrs.get(ERROR, ""),
     }
 

@@ -22,6 +22,7 @@ from gridworld.report.analysis import statistics
 from gridworld.training.setup import check_settings
 from gridworld.tune.confirmation import HeldOutResults, held_out_runs, verdict_on
 from gridworld.tune.existing_study import check_study, legible
+from gridworld.tune.search import storage, worker
 from gridworld.tune.search.objective import Objective, SeedScore, Stopped, score
 from gridworld.tune.search.search_space import SearchSpace, with_values
 from gridworld.tune.search.storage import StudyStorage, count_trials, is_lost
@@ -218,6 +219,37 @@ def test_the_pruner_sees_at_once_what_its_process_has_ended(tmp_path: Path) -> N
         pass
     pruned = [trial.number for trial in study.trials if trial.state == optuna.trial.TrialState.PRUNED]
     assert pruned == [6, 8]  # the medians before them are 0.475 and 0.45
+
+
+@pytest.mark.filterwarnings("ignore:Heartbeat of storage")  # of `ask`
+def test_a_trial_whose_worker_is_lost_before_its_first_sign_of_life_is_run_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study, context = study_of(tmp_path, lambda trial, is_stopped: 0.0, 1)
+    lost = study.ask()  # and nothing more: Optuna takes it for alive
+    monkeypatch.setattr(worker._stopped, "wait", lambda seconds: None)
+    for _ in range(3):
+        assert _run_next(study, context, set())  # it may still be about to begin
+    assert [trial.number for trial in study.trials] == [lost.number]
+    monkeypatch.setattr(storage, "_SILENT_BEATS", 0)
+    while _run_next(study, context, set()):
+        pass
+    states = optuna.trial.TrialState
+    assert [trial.state for trial in study.trials] == [states.FAIL, states.COMPLETE]
+    assert is_lost(study.trials[0])
+
+
+@pytest.mark.filterwarnings("ignore:Heartbeat of storage")  # of `ask`
+def test_who_runs_a_trial_is_known_after_a_sign_of_life(tmp_path: Path) -> None:
+    def objective(trial: optuna.Trial, is_stopped: object) -> float:
+        with contextlib.closing(sqlite3.connect(tmp_path / "study.db")) as database:
+            return float(database.execute("SELECT COUNT(*) FROM trial_heartbeats").fetchone()[0])
+
+    study, _ = study_of(tmp_path, objective, 1)
+    trial = study.ask()  # without the thread that Optuna has for it
+    with contextlib.ExitStack() as turn:
+        assert worker._run(trial, objective, turn, [], set()) == 1
+    assert study.trials[0].user_attrs.keys() >= {"worker"}
 
 
 @pytest.mark.parametrize("sampler", ["tpe", "random"])

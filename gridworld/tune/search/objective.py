@@ -39,7 +39,7 @@ from gridworld.world.exact.evaluation import Evaluator
 if TYPE_CHECKING:
     from optuna.trial import Trial
 
-SEEDS, ERROR = "seeds", "error"  # a trial's attributes in the storage
+SEEDS, ERROR, WORKER = "seeds", "error", "worker"  # a trial's attributes in the storage
 _MOST_STEPS = 2**63
 
 

@@ -2,7 +2,9 @@
 
 A worker that runs a trial leaves a sign of life every few seconds. A trial without one for three times as
 long is failed by the next worker that begins one, and put into the queue again. Optuna has that for its
-relational storages, SQLite among them, but not for its journal files and Redis; so those are refused.
+relational storages, SQLite among them, but not for its journal files and Redis; so those are refused. It
+takes a trial that was begun and never left a sign for alive; so a worker leaves one before its name, and a
+trial without a name is failed when it has been running for as long.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import warnings
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -29,7 +32,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from gridworld.config.tune import TuneConfig
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import program
-from gridworld.tune.search.objective import ERROR
+from gridworld.tune.search.objective import ERROR, WORKER
 from gridworld.tune.search.worker_pool import StorageLostError
 
 _ABOUT = "gridworld"  # the study's attribute that says what is searched
@@ -200,10 +203,22 @@ def is_lost(trial: FrozenTrial) -> bool:
     return trial.state == TrialState.FAIL and not trial.user_attrs.get(ERROR)
 
 
-def give_up_stale(study: optuna.Study) -> None:
+def sign_on(trial: optuna.Trial, worker: str) -> None:
+    """Leave a trial's first sign of life, and then the name of the worker that runs it."""
+    cast(Any, trial.storage).record_heartbeat(trial._trial_id)
+    trial.set_user_attr(WORKER, worker)
+
+
+def give_up_stale(study: optuna.Study, settings: TuneConfig) -> None:
     """Put the trials of workers that are gone into the queue again."""
     with _quiet():
         fail_stale_trials(study)
+    latest = datetime.now() - timedelta(seconds=_SILENT_BEATS * settings.heartbeat)
+    for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+        began = trial.datetime_start
+        if WORKER not in trial.user_attrs and began is not None and began < latest:
+            study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
+            put_back(study, trial.number)
 
 
 def put_back(study: optuna.Study, number: int) -> None:

@@ -122,7 +122,7 @@ def _run_next(study: Study, context: StudyContext, own: set[int]) -> bool:
     settings = context.storage.settings
     with ExitStack() as turn:
         turn.enter_context(locked(context.folder / TURN))
-        give_up_stale(study)
+        give_up_stale(study, settings)
         counts = count_trials(study)
         if counts.ended >= settings.trials:
             return False
@@ -150,10 +150,12 @@ def _run(trial: Trial, objective: Objective, turn: ExitStack, begun: list[int], 
     """Evaluate the objective; note the reason where it fails."""
     import optuna
 
+    from gridworld.tune.search.storage import sign_on
+
     begun.append(trial.number)
     own.add(trial.number)
+    sign_on(trial, f"{socket.gethostname()}:{os.getpid()}")
     turn.close()
-    trial.set_user_attr("worker", f"{socket.gethostname()}:{os.getpid()}")
     try:
         value = objective(trial, is_stopped)
     except optuna.TrialPruned:
