@@ -189,6 +189,15 @@ TRAIN_WITH_SB3 = [
         "observation=coordinates +agent.policy_kwargs.features_extractor_kwargs.orders=[4]",
         "FourierFeatures: orders=[4]: must be 2 whole numbers, one for each coordinate",
     ),
+    (
+        "observation=image +agent.policy_kwargs.features_extractor_kwargs.cell_size=abc",
+        "ImageCells: cell_size=abc: must be from 1 to the image's",
+    ),
+    ("agent=a2c agent.arguments.policy_kwargs=3", "agent.arguments.policy_kwargs=3: must be settings"),
+    (
+        "agent=a2c observation=image +agent.arguments.policy_kwargs.features_extractor_kwargs=3",
+        "agent.arguments.policy_kwargs.features_extractor_kwargs=3: stable_baselines3.A2C cannot be built",
+    ),
 ]
 
 

@@ -10,10 +10,9 @@ unit vectors of `one_hot` are. They work in any model of Stable-Baselines3:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -31,7 +30,8 @@ class FourierFeatures(BaseFeaturesExtractor):
     The features are the products of cos(pi c_i x_i), c_i = 0, ..., n_i, divided by the length of all. Factors
     with c_i = 0 or n_i are multiplied by the root of 1/2, as in the discrete cosine transform of type I. With
     orders of rows - 1 and columns - 1 the features of a grid's cells are orthonormal. With these or larger
-    ones, linear functions of them are all functions of the cell.
+    ones, linear functions of them are all functions of the cell. A state without a place, whose coordinates
+    are negative, has zeros.
 
     G. Konidaris, S. Osentoski, P. Thomas: Value Function Approximation in Reinforcement Learning using the
     Fourier Basis, AAAI 2011. R. Sutton, A. Barto: Reinforcement Learning, section 9.5.2.
@@ -53,7 +53,8 @@ class FourierFeatures(BaseFeaturesExtractor):
             )
         (dimensions,) = observation_space.shape
         largest = max(int(_FEATURES ** (1 / dimensions) + 1e-9) - 1, 1)
-        self.orders = [largest] * dimensions if orders is None else np.atleast_1d(orders).tolist()
+        given = orders if isinstance(orders, Iterable) else [orders]
+        self.orders: Any = [largest] * dimensions if orders is None else list(given)
         if len(self.orders) != dimensions or any(type(each) is not int or each < 0 for each in self.orders):
             raise InputError(
                 f"FourierFeatures: orders={orders}: must be {dimensions} whole numbers, one for each "
@@ -74,7 +75,7 @@ class FourierFeatures(BaseFeaturesExtractor):
             waves = torch.cos(math.pi * torch.arange(order + 1, device=x.device) * x[:, None])
             waves[:, [0, order]] *= math.sqrt(0.5)
             features = (features[:, :, None] * waves[:, None]).flatten(1)
-        return normalize(features)
+        return normalize(features) * (observations >= 0).all(dim=1, keepdim=True)
 
     def extra_repr(self) -> str:
         """Its settings, by which networks are told apart."""
@@ -102,7 +103,7 @@ class ImageCells(BaseFeaturesExtractor):
                 "ImageCells: the observation must be an image of shape (3, height, width); it is "
                 f"{observation_space}"
             )
-        if not (isinstance(cell_size, int) and 0 < cell_size <= min(shape[1:])):
+        if not (type(cell_size) is int and 0 < cell_size <= min(shape[1:])):
             raise InputError(
                 f"ImageCells: cell_size={cell_size}: must be from 1 to the image's {min(shape[1:])} pixels"
             )

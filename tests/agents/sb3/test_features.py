@@ -54,6 +54,12 @@ def test_by_default_any_function_of_a_grids_cells_is_linear_in_them(rows: int, c
     assert FourierFeatures(spaces.Box(0, 1, (3,))).features_dim == 125  # 5 ** 3, the last below 144
 
 
+def test_a_state_without_a_place_is_none_of_the_cells() -> None:
+    shown = torch.tensor([[-1.0, -1.0], [1.0, 1.0], [0.0, 0.0], [-1.0, -1.0]])
+    features = FourierFeatures(PLANE)(shown)
+    assert torch.equal(features.norm(dim=1) > 0, torch.tensor([False, True, True, False]))
+
+
 @pytest.mark.parametrize("cell_size", [8, 16])
 @pytest.mark.parametrize("layout", ["classic", "cliff", "four_rooms"])
 def test_images_of_different_cells_are_far_apart(layout: str, cell_size: int) -> None:
@@ -88,6 +94,9 @@ def test_an_images_cells_are_their_brightest_colours() -> None:
             lambda: FourierFeatures(PLANE, [99, 99]),
             "2 coordinates of these orders make 10000 features, more than 4096",
         ),
+        (lambda: FourierFeatures(PLANE, [[1, 2], 3]), "orders=[[1, 2], 3]: must be 2 whole numbers"),
+        (lambda: FourierFeatures(PLANE, [True, 2]), "orders=[True, 2]: must be 2 whole numbers"),
+        (lambda: ImageCells(spaces.Box(0, 255, (3, 8, 9), np.uint8), True), "cell_size=True: must be from 1"),
         (lambda: ImageCells(PLANE), "must be an image of shape (3, height, width)"),
         (lambda: ImageCells(spaces.Box(0, 255, (3, 8, 9), np.uint8), 10), "from 1 to the image's 8 pixels"),
     ],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from dataclasses import is_dataclass
 from typing import Any
 
 from gridworld.agents.sb3.settings.schemas import (
@@ -105,9 +106,10 @@ def _is_judged(name: str, value: Any, default: Any) -> bool:
 
 
 def _check_observation(agent: SB3Config, observation: ObservationConfig) -> None:
-    settings = vars(agent) | vars(agent).get("arguments", {})
-    kwargs = settings.get("policy_kwargs") or {}
-    kwargs = kwargs if isinstance(kwargs, dict) else vars(kwargs)
+    given = (vars(agent) | vars(agent).get("arguments", {})).get("policy_kwargs", {})
+    if not (isinstance(given, dict) or is_dataclass(given)):
+        raise InputError(f"{agent.key('policy_kwargs')}={given}: must be settings, e.g. {{net_arch:[64,64]}}")
+    kwargs = given if isinstance(given, dict) else vars(given)
     extractor = kwargs.get("features_extractor_class")
     if observation.kind == "image" and agent.policy == "MlpPolicy" and extractor is None:
         raise InputError(
@@ -118,12 +120,10 @@ def _check_observation(agent: SB3Config, observation: ObservationConfig) -> None
             f"observation={observation.kind}: agent.policy=CnnPolicy sees images only; "
             "set observation=image or agent.policy=MlpPolicy"
         )
-    side = (kwargs.get("features_extractor_kwargs") or {}).get("cell_size", ObservationConfig.cell_size)
-    if (
-        observation.kind == "image"
-        and str(extractor).endswith(".ImageCells")
-        and side > observation.cell_size
-    ):
+    own = kwargs.get("features_extractor_kwargs")
+    side = own.get("cell_size", ObservationConfig.cell_size) if isinstance(own, dict) else None
+    is_one_of_cells = observation.kind == "image" and str(extractor).endswith(".ImageCells")
+    if is_one_of_cells and type(side) is int and side > observation.cell_size:
         setting = f"{agent.key('policy_kwargs')}.features_extractor_kwargs.cell_size"
         raise InputError(
             f"observation.cell_size={observation.cell_size}: features of {side} pixels hold several cells; "
