@@ -193,6 +193,10 @@ TRAIN_WITH_SB3 = [
         "observation=image +agent.policy_kwargs.features_extractor_kwargs.cell_size=abc",
         "ImageCells: cell_size=abc: must be from 1 to the image's",
     ),
+    (
+        "agent=a2c observation=image observation.cell_size=4",
+        "+agent.arguments.policy_kwargs.features_extractor_kwargs.cell_size=4",
+    ),
     ("agent=a2c agent.arguments.policy_kwargs=3", "agent.arguments.policy_kwargs=3: must be settings"),
     (
         "agent=a2c observation=image +agent.arguments.policy_kwargs.features_extractor_kwargs=3",

@@ -19,6 +19,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor
 from torch.nn.functional import max_pool2d, normalize
 
+from gridworld.envs.observations import IMAGE_CELL_SIZE
 from gridworld.errors import InputError
 
 _FEATURES, _MOST_FEATURES = 144, 4096
@@ -96,7 +97,7 @@ class ImageCells(BaseFeaturesExtractor):
         InputError: another space, or squares that are larger than the image.
     """
 
-    def __init__(self, observation_space: spaces.Space[Any], cell_size: int = 8) -> None:
+    def __init__(self, observation_space: spaces.Space[Any], cell_size: int = IMAGE_CELL_SIZE) -> None:
         shape = observation_space.shape or ()
         if len(shape) != 3 or shape[0] != 3:
             raise InputError(

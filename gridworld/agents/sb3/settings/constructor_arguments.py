@@ -16,7 +16,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import LinearSchedule
 
-from gridworld.agents.sb3.settings.schemas import SB3CheckedConfig, SB3ClassConfig, SB3Config
+from gridworld.agents.sb3.settings.schemas import SB3CheckedConfig, SB3ClassConfig, SB3Config, as_dict
 from gridworld.agents.sb3.settings.validation import SCHEDULES
 from gridworld.agents.sb3.tabulated.state_inputs import why_not
 from gridworld.agents.sb3.tabulated.versions import tabulated_version
@@ -142,8 +142,7 @@ def _convert(given: Arguments, where: str) -> Arguments:
 
 def _policy_kwargs(given: Any, where: str) -> Arguments:
     """What was given, the classes imported."""
-    given = dict(given if isinstance(given, dict) else vars(given))
-    arguments = _convert({key: v for key, v in given.items() if v is not None and v != {}}, where)
+    arguments = _convert({key: v for key, v in as_dict(given).items() if v is not None and v != {}}, where)
     if not _is_net_arch(arguments.get("net_arch", [])):
         raise InputError(
             f"{where}net_arch={arguments['net_arch']}: must be layer widths, e.g. [64,64]; at most "

@@ -69,6 +69,11 @@ class ActorCriticPolicyKwargs(PolicyKwargs):
     share_features_extractor: Optional[bool] = None  # noqa: UP045
 
 
+def as_dict(group: Any) -> dict[str, Any]:
+    """The settings of a group, which is a dict or has a schema of its own."""
+    return group if isinstance(group, dict) else vars(group)
+
+
 @dataclass
 class SB3Config(AgentConfig):
     """An algorithm with Stable-Baselines3's interface: `algorithm` is its class."""
@@ -97,8 +102,7 @@ class SB3Config(AgentConfig):
     def memory(self, num_states: int, num_envs: int, total_timesteps: int) -> int:
         """See `AgentConfig.memory`: its networks with their copies, and what it keeps of its steps."""
         settings = vars(self) | vars(self).get("arguments", {})
-        kwargs = settings.get("policy_kwargs") or {}
-        nets = (kwargs if isinstance(kwargs, dict) else vars(kwargs)).get("net_arch") or [64, 64]
+        nets = as_dict(settings.get("policy_kwargs") or {}).get("net_arch") or [64, 64]
         widths = [num_states, *(nets if isinstance(nets, list) else max(nets.values(), key=sum)), 1]
         weights = 2 * sum(above * below for above, below in itertools.pairwise(widths))
         kept = min(settings.get("buffer_size", settings.get("n_steps", 2048) * num_envs), total_timesteps)

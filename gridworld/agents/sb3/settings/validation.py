@@ -13,6 +13,7 @@ from gridworld.agents.sb3.settings.schemas import (
     SB3CheckedConfig,
     SB3ClassConfig,
     SB3Config,
+    as_dict,
 )
 from gridworld.bounds import MOST_STEPS, above_zero, at_least, at_most, within, within_size
 from gridworld.config.agents import MOST_KEPT, check_exploration, parse_schedule
@@ -109,7 +110,7 @@ def _check_observation(agent: SB3Config, observation: ObservationConfig) -> None
     given = (vars(agent) | vars(agent).get("arguments", {})).get("policy_kwargs", {})
     if not (isinstance(given, dict) or is_dataclass(given)):
         raise InputError(f"{agent.key('policy_kwargs')}={given}: must be settings, e.g. {{net_arch:[64,64]}}")
-    kwargs = given if isinstance(given, dict) else vars(given)
+    kwargs = as_dict(given)
     extractor = kwargs.get("features_extractor_class")
     if observation.kind == "image" and agent.policy == "MlpPolicy" and extractor is None:
         raise InputError(
@@ -120,7 +121,7 @@ def _check_observation(agent: SB3Config, observation: ObservationConfig) -> None
             f"observation={observation.kind}: agent.policy=CnnPolicy sees images only; "
             "set observation=image or agent.policy=MlpPolicy"
         )
-    own = kwargs.get("features_extractor_kwargs")
+    own = kwargs.get("features_extractor_kwargs") or {}
     side = own.get("cell_size", ObservationConfig.cell_size) if isinstance(own, dict) else None
     is_one_of_cells = observation.kind == "image" and str(extractor).endswith(".ImageCells")
     if is_one_of_cells and type(side) is int and side > observation.cell_size:

@@ -31,7 +31,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from torch import Tensor, nn
 
 from gridworld.agents.sb3.features import FIXED
-from gridworld.agents.sb3.settings.schemas import SB3ClassConfig, SB3Config
+from gridworld.agents.sb3.settings.schemas import SB3ClassConfig, SB3Config, as_dict
 from gridworld.agents.sb3.tabulated.flat_optimizer import ELEMENTWISE
 from gridworld.agents.sb3.tabulated.stacked_layers import can_stand
 from gridworld.agents.sb3.vec_env import StateStep
@@ -73,8 +73,7 @@ def why_not(config: SB3Config, algorithm: type[BaseAlgorithm], arguments: Mappin
         return f"agent.policy={config.policy} may compute more than a function of the state"
     for name, known, reason in _CLASSES:
         if name in classes and classes[name] not in known:
-            kwargs = given["policy_kwargs"]
-            path = (kwargs if isinstance(kwargs, dict) else vars(kwargs))[name]
+            path = as_dict(given["policy_kwargs"])[name]
             return f"{where}.policy_kwargs.{name}={path} {reason}"
     for name in ("replay_buffer", "rollout_buffer"):
         if arguments.get(f"{name}_class") is not None or arguments.get(f"{name}_kwargs"):
