@@ -96,6 +96,7 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         began = np.atleast_2d(cast(Any, self._last_episode_starts))
         starts = np.concatenate([began, over])  # whether an episode starts, step by step
         is_read, noted = getattr(callback, "reads_locals", True), cast(Any, self.ep_info_buffer)
+        reached = n_rollout_steps
         for step in range(n_rollout_steps):
             env.envs.passed(rolled, step + 1)
             self.num_timesteps += env.num_envs
@@ -105,15 +106,16 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
                 done = env.told(rolled.step(step), episodes)
                 callback.update_locals({**locals(), **_told(done, env.num_envs)})
             if not callback.on_step():
-                env.envs.catch_up()
-                noted.extend([] if is_read else self._episodes(rolled, step))
-                self._last_episode_starts = starts[step]
-                return False
+                reached = step
+                break
             if is_read:
                 noted.extend(episodes)
         env.envs.catch_up()
-        noted.extend([] if is_read else self._episodes(rolled, n_rollout_steps))
-        self._last_episode_starts = dones = starts[-1]
+        if not is_read:
+            noted.extend(self._episodes(rolled, reached))
+        self._last_episode_starts = dones = starts[reached]
+        if reached < n_rollout_steps:
+            return False
 
         states = rolled.final_states
         rollout_buffer.observations, rollout_buffer.actions = rolled.states, rolled.actions
@@ -180,9 +182,8 @@ def _roll_together(requests: Sequence[_Request]) -> list[Exception | None]:
         _set_tables(same)
     thresholds = [np.exp(model.old.log_prob).cumsum(axis=1).T[:-1] for model in models]  # (A - 1, S)
     draws = np.stack([each.draws for each in requests])
-    for request, rolled in zip(
-        requests, roll([model.env.envs for model in models], thresholds, draws), strict=True
-    ):
+    rollouts = roll([model.env.envs for model in models], thresholds, draws)
+    for request, rolled in zip(requests, rollouts, strict=True):
         request.rolled = rolled
     return [None] * len(requests)
 
