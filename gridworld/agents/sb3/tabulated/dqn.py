@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 from stable_baselines3 import DQN
 
+from gridworld.agents.sb3.tabulated.losses.products import products
 from gridworld.agents.sb3.tabulated.off_policy import TabulatedOffPolicy
 from gridworld.agents.sb3.tabulated.state_buffers import Float32Array
 from gridworld.world.mdp import FloatArray, IntArray
@@ -35,5 +36,5 @@ class TabulatedDQN(TabulatedOffPolicy, DQN):
         error = outputs.ravel()[pair] - targets
         slope = np.maximum(np.minimum(error, 1), -1)
         slopes = np.bincount(pair.ravel(), slope.ravel(), outputs.size) / count
-        losses = slope[:, None] @ (error - slope / 2)[:, :, None]  # a product of vectors for each run
-        return (losses.ravel().astype(np.float64) / count).tolist(), slopes
+        losses = products(slope, error - slope / 2)
+        return (losses.astype(np.float64) / count).tolist(), slopes

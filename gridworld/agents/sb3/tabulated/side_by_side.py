@@ -130,9 +130,8 @@ class SideBySide:
         if len(self._optimizers) == 1:
             return self
         self._weights, self.leaves = stacked(self._optimizers)
-        self._gradients = torch.zeros(len(self._weights), self._weights.stride(0))[
-            :, : self._weights.shape[1]
-        ]
+        runs, count = self._weights.shape
+        self._gradients = torch.zeros(runs, self._weights.stride(0))[:, :count]
         for each, weights, gradient in zip(self._optimizers, self._weights, self._gradients, strict=True):
             each.work_on(weights, gradient)
         return self

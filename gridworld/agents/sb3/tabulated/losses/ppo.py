@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gridworld.agents.sb3.tabulated.losses.products import products
 from gridworld.world.mdp import FloatArray, IntArray
 
 
@@ -139,7 +140,7 @@ def sum_up(
     total = np.bincount(state, returns.ravel(), of_states.size).reshape(of_states.shape)
     mean_return = total / np.maximum(of_states * count, 1)
     apart = returns - mean_return.ravel().take(states)
-    deviation = _products(apart, apart) / count
+    deviation = products(apart, apart) / count
     return Sums(positive, negative, share, of_states, mean_return, deviation)
 
 
@@ -184,8 +185,8 @@ def losses_and_slopes(
     policy_loss, approx_kl, clip_fraction = (
         each.reshape(len(each), -1).sum(axis=1).tolist() for each in (-gains, kl, clipped)
     )
-    entropy_loss = _products(sums.states, negative_entropy).tolist()
-    square = _products(pull, error).tolist()
+    entropy_loss = products(sums.states, negative_entropy).tolist()
+    square = products(pull, error).tolist()
     ent_coefs, vf_coefs = weights.ent_coef.ravel().tolist(), weights.vf_coef.ravel().tolist()
     found = []
     for run, deviation in enumerate(sums.deviation.tolist()):
@@ -195,9 +196,3 @@ def losses_and_slopes(
             Losses(loss, policy_loss[run], value_loss, entropy_loss[run], approx_kl[run], clip_fraction[run])
         )
     return found, slope, moves * pull
-
-
-def _products(these: NDArray[Any], those: NDArray[Any]) -> NDArray[Any]:
-    """The product of two vectors for each of P runs, (P,) of (P, n), each as one alone is made."""
-    products: NDArray[Any] = (these[:, None] @ those[:, :, None]).ravel()
-    return products
