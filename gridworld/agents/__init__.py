@@ -48,9 +48,8 @@ class PolicySnapshot:
 
     def greedy_policy(self) -> FloatArray:
         """The greedy policy's action probabilities, (S, A)."""
-        from gridworld.world.exact.markov_chain import (
-            one_hot_policy,  # here, since settings are read without numpy
-        )
+        # here, since settings are read without numpy
+        from gridworld.world.exact.markov_chain import one_hot_policy
 
         return one_hot_policy(self.greedy, self.sampled.shape[1])
 

@@ -30,7 +30,7 @@ _BLOCK = re.compile(
 _SEEDS = re.compile(r"seed=(?:range\(\d+\)|[\d,]+,\d+)$")
 # Words that make a command short, where the page's claims need no more.
 _FEW_STEPS = ["total_timesteps=1000", "evaluation.every=500"]
-_NO_PICTURES = [f"recording.{picture.setting}=false" for picture in PICTURES]
+NO_PICTURES = [f"recording.{picture.setting}=false" for picture in PICTURES]
 _FEW_TRIALS = [
     "tune.trials=2",
     "tune.seeds=1",
@@ -75,7 +75,7 @@ def shortened(words: list[str]) -> list[str]:
         return [program, *_replaced(rest, ["total_timesteps=10000"])]
     few = _FEW_STEPS[1:] if any(re.match(r"total_timesteps=.*,", word) for word in rest) else _FEW_STEPS
     looked_at = any(word.startswith("hydra.run.dir=") for word in rest)  # by another line
-    return [program, *_replaced(rest, few if looked_at else [*few, *_NO_PICTURES])]
+    return [program, *_replaced(rest, few if looked_at else [*few, *NO_PICTURES])]
 
 
 def _replaced(words: list[str], others: list[str]) -> list[str]:

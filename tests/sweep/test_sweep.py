@@ -16,12 +16,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
+from helpers.pages import NO_PICTURES
 from helpers.support import ROOT, configure, script, start, train_on_full_disk
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gridworld.commands import jobs as jobs_command
-from gridworld.config.pictures import PICTURES
 from gridworld.errors import InputError
 from gridworld.process.console.progress import duration
 from gridworld.run.reader import read_run
@@ -32,7 +32,6 @@ from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.job_table import JobRow, JobTable
 from gridworld.sweep.progress import sweep_line
 
-NO_PICTURES = [f"recording.{picture.setting}=false" for picture in PICTURES]
 QUICK = ("agent=q_learning", "total_timesteps=500", *NO_PICTURES)
 FOLDER = "hydra.sweep.dir=sweep"
 WORKERS = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
