@@ -62,7 +62,8 @@ def main(arguments: Sequence[str]) -> None:
         told = ", ".join(f"{length:,}" for length in shorter)
         print(f"  made longer: to {told} steps first, then on to {config.total_timesteps:,}", flush=True)
     if members:
-        print(f"  its numbers depend on {len(members) - 1} other runs, which train again with it", flush=True)
+        told = ", ".join(run.folder.name for run in members)
+        print(f"  its numbers depend on all runs of its population, which train again: {told}", flush=True)
     try:
         if options.keep is not None:
             options.keep.mkdir(parents=True, exist_ok=True)

@@ -103,7 +103,7 @@ def _member(then: RunReader, folder: Path, digest: str) -> RunReader:
     if settings_hash(settings, "\n".join(run.manifest["layout"])) != digest:
         raise InputError(f"{why} has other settings now; put back the one that was trained with it")
     if any(str(again.get("at")) < str(then.manifest.get("ended")) for again in run.resumptions):
-        raise InputError(f"{why} was interrupted and went on meanwhile, which cannot be repeated")
+        raise InputError(f"{why} went on from a checkpoint meanwhile; that cannot be repeated")
     return run
 
 

@@ -70,7 +70,7 @@ def _are_sums(value: Any) -> bool:
 
 def _are_runs(value: Any) -> bool:
     return _are_sums(value) and all(
-        name.isprintable() and PurePath(name).name == name != ".." for name in value
+        name.isprintable() and PurePath(name).name == name not in ("", "..") for name in value
     )
 
 
