@@ -85,8 +85,8 @@ def population(then: RunReader) -> list[RunReader]:
     folder = then.folder.resolve()
     if depends_on and folder.name not in depends_on:
         raise InputError(
-            f"{then.folder}: its numbers depend on the runs {', '.join(depends_on)}, and it has the name of "
-            "none of them; give it back its name, beside the others"
+            f"{then.folder}: its numbers depend on {len(depends_on)} runs that its manifest names, and its "
+            "folder has the name of none of them; give it its own name again, beside the others"
         )
     return [_member(then, folder.parent / name, digest) for name, digest in depends_on.items()]
 

@@ -19,16 +19,21 @@ from helpers.pages import NO_PICTURES
 from helpers.resuming import differences, go_on, left_behind, stopped_after
 from helpers.stand_in_cuda import stand_in
 from helpers.support import ROOT, configure, script
+from omegaconf import OmegaConf
 from stable_baselines3.common.policies import BasePolicy
 
 from gridworld.agents import family
 from gridworld.agents.sb3.tabulated.side_by_side import SideBySide
 from gridworld.commands import reproduce as command
+from gridworld.config.sweep import SweepConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.process.parallel.together import mixing
 from gridworld.restore.repeat import population
 from gridworld.run.reader import read_run
+from gridworld.sweep.folder import JobEntry
+from gridworld.sweep.plan import Job
+from gridworld.sweep.population import populations
 from gridworld.training.setup import check_settings, make_context
 
 SMALL = (
@@ -163,7 +168,7 @@ def test_what_another_run_did_later_is_no_matter(sweeps: Path, tmp_path: Path) -
 
 def test_a_run_with_another_name_is_none_of_those(sweeps: Path, tmp_path: Path) -> None:
     shutil.copytree(sweeps / "asked" / "seed=0", tmp_path / "mine")
-    with pytest.raises(InputError, match=r"mine: .* seed=0, seed=1, seed=2, and it has the name of none"):
+    with pytest.raises(InputError, match=r"mine: .* on 3 runs .* has the name of none of them"):
         population(read_run(tmp_path / "mine"))
 
 
@@ -190,6 +195,21 @@ def test_a_run_that_went_on_says_with_whom_and_cannot_be_repeated(tmp_path: Path
         assert content["resumed"][0].get("numbers_depend_on") == (None if how == "alone" else runs)
         with pytest.raises(InputError, match=rf"it went on after step 512 {how}, which cannot be repeated"):
             population(read_run(folder))
+
+
+@pytest.mark.parametrize(
+    ("population", "in_fork", "sizes"), [(8, False, [5, 5]), ("auto", False, [4, 3, 3]), (8, True, [4, 3, 3])]
+)
+def test_runs_that_no_fork_takes_are_not_divided_among_forks(
+    population: int | str, in_fork: bool, sizes: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gridworld.sweep.population.can_fork", lambda: True)
+    job = Job((), (), "", None, False, shape="", in_fork=in_fork)
+    jobs = [(JobEntry(str(number), "", ()), job) for number in range(10)]
+    launcher = {"_target_": "ForksLauncher", "n_jobs": 4}
+    hydra = OmegaConf.create({"launcher": launcher, "job": {"chdir": None, "env_set": {}}})
+    groups = populations(jobs, SweepConfig(population=population), hydra)
+    assert sorted(map(len, groups), reverse=True) == sizes
 
 
 # What cannot be tried out without the device
