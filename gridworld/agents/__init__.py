@@ -141,6 +141,9 @@ class Family(Protocol):
     def import_for(self, config: AgentConfig) -> None:
         """Import what training takes; settings that cannot work are left for the run to refuse."""
 
+    def on_processor(self, device: str) -> bool:
+        """Whether a run with this `device` computes on the processor, not on a GPU."""
+
     def rehearse(self, config: TrainConfig, make_context: Callable[[int], TrainingContext]) -> None:
         """Try out the settings that `check` cannot judge.
 

@@ -2,14 +2,14 @@
 
 First it tells what differs between then and now: commit and uncommitted changes, versions, processor,
 environment variables. Then it trains again, in a temporary folder, and compares the learning curve, the final
-weights, visits, summary and TensorBoard's points. A run that was made longer is made longer again. The exit
-code is 0 if all are identical, 1 if any is not, 2 if that cannot be told.
+weights, visits, summary and TensorBoard's points. A run that was made longer is made longer again; one whose
+numbers depend on other runs of its sweep is trained together with these. The exit code is 0 if all are
+identical, 1 if any is not, 2 if that cannot be told.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import importlib
 import sys
 import tempfile
@@ -17,7 +17,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gridworld.config.pictures import RecordingConfig
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import program
@@ -26,7 +25,7 @@ from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
 from gridworld.process.signals import Interrupted
 from gridworld.restore.comparison import Finding, check_whole, compare
-from gridworld.restore.repeat import lengths, repeat
+from gridworld.restore.repeat import lengths, population, repeat, without_pictures
 from gridworld.restore.saved_run import settings_of
 from gridworld.run.claim import check_free, check_inside
 from gridworld.run.folder import MANIFEST
@@ -52,6 +51,7 @@ def main(arguments: Sequence[str]) -> None:
     with telling_if_slow(f"reading {options.run}"):
         check_whole(then, config)  # training may take hours
     *shorter, _ = lengths(then, config)
+    members = population(then)
     if options.keep is not None:
         check_inside(options.keep, "--keep")
         check_free(options.keep, "--keep")
@@ -61,14 +61,17 @@ def main(arguments: Sequence[str]) -> None:
     if shorter:
         told = ", ".join(f"{length:,}" for length in shorter)
         print(f"  made longer: to {told} steps first, then on to {config.total_timesteps:,}", flush=True)
+    if members:
+        told = ", ".join(run.folder.name for run in members)
+        print(f"  its numbers depend on all runs of its population, which train again: {told}", flush=True)
     try:
         if options.keep is not None:
             options.keep.mkdir(parents=True, exist_ok=True)
-            same = _again(then, options.keep, config, mdp, options.trust)
+            same = _again(then, options.keep, config, mdp, options.trust, members)
         else:
             with tempfile.TemporaryDirectory(prefix="gridworld-") as folder:
-                plain = _without_pictures(config)
-                same = _again(then, Path(folder), plain, mdp, options.trust)
+                plain = without_pictures(config)
+                same = _again(then, Path(folder), plain, mdp, options.trust, members)
     except Interrupted as interruption:
         print(str(interruption), file=sys.stderr)
         sys.exit(interruption.exit_code)
@@ -96,10 +99,17 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _again(then: RunReader, folder: Path, config: TrainConfig, mdp: Mdp, trust: bool) -> bool | None:
+def _again(
+    then: RunReader,
+    folder: Path,
+    config: TrainConfig,
+    mdp: Mdp,
+    trust: bool,
+    members: Sequence[RunReader],
+) -> bool | None:
     """Train again and compare: whether all is identical; None: all that can be compared is."""
     try:
-        repeat(then, folder, config, mdp, trust)
+        repeat(then, folder, config, mdp, trust, members)
     except InputError as error:
         if not (folder / MANIFEST).exists():  # these settings cannot be run here at all
             raise
@@ -119,16 +129,6 @@ def _here(manifest: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(processor, dict) and processor.get("torch") is not None:
         importlib.import_module("torch")
     return describe()
-
-
-def _without_pictures(config: TrainConfig) -> TrainConfig:
-    """Pictures are not compared; drawing them takes time, or an extra that may be missing here."""
-    wanted = {field.name: False for field in dataclasses.fields(RecordingConfig) if field.type == "bool"}
-    return dataclasses.replace(
-        config,
-        recording=dataclasses.replace(config.recording, **wanted),
-        logging=dataclasses.replace(config.logging, policy_map_every=0),
-    )
 
 
 def _tell_environment(differences: Sequence[str]) -> None:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 from gridworld.errors import InputError
 from gridworld.storage.safe_read import LARGEST_JSON, read_object
 from gridworld.storage.sealed_json import check_seal
 
+# Runs that were updated at once, this one among them, so that the numbers of each depend on all: a hash of
+# the settings of each (`fingerprint.settings_hash`) by its folder's name, in their order.
+NUMBERS_DEPEND_ON = "numbers_depend_on"
 _FIRST_SEAL = ("config", "layout", "resumed")  # the entries that a seal of the first format covers
 _NEEDED = ("status", "config", "layout")
 
@@ -65,6 +68,12 @@ def _are_sums(value: Any) -> bool:
     return isinstance(value, dict) and all(isinstance(digest, str) for digest in value.values())
 
 
+def _are_runs(value: Any) -> bool:
+    return _are_sums(value) and all(
+        name.isprintable() and PurePath(name).name == name not in ("", "..") for name in value
+    )
+
+
 def _are_continuations(value: Any) -> bool:
     return _is_list_of(dict)(value) and all(
         type(again.get("step")) is int and again["step"] >= 0 for again in value if "total_timesteps" in again
@@ -84,6 +93,7 @@ _KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
         _are_continuations,
         "a list of when the run went on, with the step after which it was made longer",
     ),
+    NUMBERS_DEPEND_ON: (_are_runs, "a hash for each run, by the name of a folder beside this one"),
     "reached": (_is_count, "a number of steps"),
     "checkpoint": (_is_count, "a number of steps"),
     "versions": (_is(dict), "a version for each package"),

@@ -9,9 +9,11 @@ from typing import Any, Self
 
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import recorded_command_line
+from gridworld.process.parallel.together import mixed
 from gridworld.run.folder import CHECKPOINTS, OUTPUTS, PICTURES, WORLD, RunFolder
 from gridworld.run.identity import provenance
 from gridworld.run.identity.provenance import describe, source_differences
+from gridworld.run.manifest import NUMBERS_DEPEND_ON
 from gridworld.run.reader import LARGEST_RESULT, RunReader
 from gridworld.storage.atomic_write import json_text, sync, sync_folder, tidy, write_bytes, write_json
 from gridworld.storage.safe_read import check_no_link, file_sha256
@@ -67,6 +69,7 @@ class RunWriter(RunFolder):
             "overrides": overrides,
             "seed": config["seed"],
             "threads": config["threads"],
+            **_mixed_runs(),
             **describe(),
             "layout": world.text().split("\n"),
             "config": config,
@@ -92,6 +95,7 @@ class RunWriter(RunFolder):
             differs: How the environment differs from the one that the run was started in.
         """
         again: dict[str, Any] = {"at": _now(), "step": step, "command": recorded_command_line()}
+        again |= _mixed_runs()
         if differs:
             again["differs"] = differs
         tree = provenance.git(f"source-{step}.diff")
@@ -186,6 +190,10 @@ def _remove_partial_files(folder: Path) -> None:
     check_no_link(folder / CHECKPOINTS)  # what it leads to is not the run's
     for each in (folder, folder / CHECKPOINTS):
         tidy(each)
+
+
+def _mixed_runs() -> dict[str, Any]:
+    return {NUMBERS_DEPEND_ON: dict(mixed())} if mixed() else {}
 
 
 def _now() -> str:

@@ -24,6 +24,7 @@ from gridworld.process.console.command_line import recorded_command_line
 from gridworld.process.console.terminal import printable
 from gridworld.run.claim import check_writable
 from gridworld.run.folder import HYDRA, LOCK, MANIFEST, SWEEP_JSON
+from gridworld.run.identity.fingerprint import settings_hash
 from gridworld.run.identity.provenance import versions
 from gridworld.run.recovery import find_run, is_started
 from gridworld.storage.atomic_write import make_folder, tidy, write_json
@@ -31,7 +32,7 @@ from gridworld.storage.file_lock import locked
 from gridworld.storage.safe_read import LARGEST_JSON, read_bytes
 from gridworld.storage.sealed_json import read_sealed, sealed
 from gridworld.storage.symlinks import check_no_links, links_in
-from gridworld.sweep.plan import Job, folder_name, settings_hash
+from gridworld.sweep.plan import Job, folder_name
 
 STOP = ".stop"  # in the sweep's folder: no more jobs begin, wherever they wait
 _JOB = re.compile(r"[\w=+,-][\w.,=+-]*", re.ASCII)  # as `folder_name` makes them: no other folder

@@ -18,13 +18,13 @@ from typing import Any
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import plain
 from gridworld.run.folder import LOCK
+from gridworld.run.identity.fingerprint import settings_hash
 from gridworld.run.reader import RunReader
 from gridworld.run.recovery import find_run
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.file_lock import is_locked, locked
 from gridworld.storage.safe_read import read_table
 from gridworld.sweep.folder import JobEntry
-from gridworld.sweep.plan import settings_hash
 
 JOBS_CSV = "jobs.csv"
 TABLE_LOCK = ".jobs.lock"

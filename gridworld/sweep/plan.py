@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import json
 import math
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -22,11 +21,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
 from gridworld.config.plain_settings import foreign_imports
-from gridworld.config.settings_by_effect import ON_RESULT, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig
 from gridworld.errors import InputError
-from gridworld.storage.safe_read import sha256
+from gridworld.run.identity.fingerprint import settings_hash
 from gridworld.training.setup import check_settings, objective_note
 from gridworld.world.mdp import Mdp
 
@@ -219,12 +217,6 @@ def shape(config: TrainConfig) -> str | None:
             config.callbacks,
         )
     )
-
-
-def settings_hash(settings: dict[str, Any], layout: str) -> str:
-    """A hash of a run's settings and its map's text; the same for settings read from a manifest."""
-    text = json.dumps([with_effects(ON_RESULT, settings), layout], sort_keys=True, default=str)
-    return sha256(text.encode())[:32]
 
 
 def folder_name(job: Job, taken: Collection[str], common: Collection[str] = ()) -> str:

@@ -2,14 +2,15 @@
 
 A launcher gets one job for each population: the first of its jobs, with the names of all in
 `hydra.sweeper.together`. Where that runs, `PopulationTask` runs them all, each as it would run alone, with
-files and a folder of its own; `process.parallel.together` has them meet where the networks are updated.
+files and a folder of its own; `process.parallel.together` has them meet where the networks are updated. On
+CUDA they are updated at once only if a number of runs is asked for: there their numbers depend on each other.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,11 +22,13 @@ from hydra.core.utils import JobReturn
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
+from gridworld.agents import family
+from gridworld.config.composition.compose import to_config
 from gridworld.config.sweep import SweepConfig
 from gridworld.errors import InputError
 from gridworld.process.parallel.forks import can_fork
 from gridworld.process.parallel.machine import free_memory, worker_count
-from gridworld.process.parallel.together import LARGEST, run_together
+from gridworld.process.parallel.together import LARGEST, mixing, run_together
 from gridworld.sweep.folder import JobEntry, SweepFolder
 from gridworld.sweep.plan import Job
 
@@ -65,7 +68,10 @@ class PopulationTask:
             return self.task(settings)
         before, folder = shared.cfg, Path(own.sweep.dir)
         try:
-            results = self._run_all(folder, {name: int(number) for number, name in together})
+            entries = {entry.job: entry for entry in SweepFolder(folder).entries.values()}
+            jobs = [(int(number), entries[name]) for number, name in together]
+            with mixing(self._mixed(settings, [entry for _, entry in jobs])):
+                results = self._run_all(folder, jobs)
         finally:
             shared.cfg = before
         for result in results:
@@ -74,16 +80,24 @@ class PopulationTask:
             _ = result.return_value  # raises what the job did
         return None
 
-    def _run_all(self, folder: Path, numbers: Mapping[str, int]) -> list[JobReturn | Exception]:
+    def _mixed(self, settings: DictConfig, entries: Sequence[JobEntry]) -> dict[str, str]:
+        """The jobs whose numbers come to depend on each other, as `mixing` takes them."""
+        if len(entries) == 1 or self.config.hydra.sweeper.population == AUTO:
+            return {}
+        config = to_config(settings)  # the first one's; all have one device
+        if family(config.agent).on_processor(config.device):
+            return {}
+        return {entry.job: entry.hash for entry in entries}
+
+    def _run_all(self, folder: Path, jobs: Sequence[tuple[int, JobEntry]]) -> list[JobReturn | Exception]:
         # Here, since most jobs are planned without it.
         from gridworld.sweep.launchers.worker import JobRunner
 
-        entries = {entry.job: entry for entry in SweepFolder(folder).entries.values()}
         runner = JobRunner(self.context, self.task, self.config)
         return run_together(
             [
-                partial(runner.run, line(folder, entries[name]), number, configures_logging=False)
-                for name, number in numbers.items()
+                partial(runner.run, line(folder, entry), number, configures_logging=False)
+                for number, entry in jobs
             ]
         )
 
@@ -160,7 +174,8 @@ def populations(
         most = 1
     found = []
     for members in shapes.values():
-        share = math.ceil(len(members) / workers)
+        in_this_process = _forks(hydra.launcher) and not any(job.in_fork for _, job in members)
+        share = len(members) if most and in_this_process else math.ceil(len(members) / workers)
         bounds = [most or LARGEST, max(share, _FEWEST) if _forks(hydra.launcher) else share]
         if most is None:
             bounds.append(int(memory / (_RUNS_BYTES + max(job.memory for _, job in members))))

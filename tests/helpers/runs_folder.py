@@ -14,12 +14,13 @@ import numpy as np
 from helpers.support import configure
 
 from gridworld.report.evidence import tuning_study as tuning
+from gridworld.run.identity.fingerprint import settings_hash
 from gridworld.run.reader import read_run
 from gridworld.storage.safe_read import sha256
 from gridworld.storage.sealed_json import sealed
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.job_table import FAILED, JobTable
-from gridworld.sweep.plan import Job, settings_hash
+from gridworld.sweep.plan import Job
 from gridworld.tune.study_folder import SEARCH_JSON
 from gridworld.world.exact.evaluation import Evaluator
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gridworld.config.agents import AgentConfig
     from gridworld.config.train import TrainConfig
 
-__all__ = ["build", "check", "import_for", "rehearse", "schemas", "weights"]
+__all__ = ["build", "check", "import_for", "on_processor", "rehearse", "schemas", "weights"]
 
 
 def schemas() -> dict[str, type[AgentConfig]]:
@@ -39,6 +39,16 @@ def import_for(config: AgentConfig) -> None:
     assert isinstance(config, SB3Config)
     with contextlib.suppress(InputError):
         algorithm_and_arguments(config)
+
+
+def on_processor(device: str) -> bool:
+    """See `gridworld.agents.Family.on_processor`; true of names that `build` refuses."""
+    from stable_baselines3.common.utils import get_device
+
+    try:
+        return get_device(device).type == "cpu"
+    except RuntimeError:
+        return True
 
 
 def rehearse(config: TrainConfig, make_context: Callable[[int], TrainingContext]) -> None:

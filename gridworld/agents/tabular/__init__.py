@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gridworld.config.agents import AgentConfig
     from gridworld.config.train import TrainConfig
 
-__all__ = ["build", "check", "import_for", "rehearse", "schemas", "weights"]
+__all__ = ["build", "check", "import_for", "on_processor", "rehearse", "schemas", "weights"]
 
 
 def schemas() -> dict[str, type[AgentConfig]]:
@@ -53,6 +53,11 @@ def check(config: TrainConfig) -> None:
 
 def import_for(config: AgentConfig) -> None:
     """See `gridworld.agents.Family.import_for`. There is nothing that takes time."""
+
+
+def on_processor(device: str) -> bool:
+    """See `gridworld.agents.Family.on_processor`."""
+    return True
 
 
 def rehearse(config: TrainConfig, make_context: Callable[[int], TrainingContext]) -> None:

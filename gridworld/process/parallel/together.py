@@ -19,8 +19,9 @@ import random
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -34,6 +35,9 @@ LARGEST = 32  # runs that train together unless more are asked for; larger popul
 _GLOBAL: Any = np.random  # numpy's stubs do not know all of its functions
 Work = Callable[[Sequence[M]], Sequence[Exception | None]]
 _is_by_itself: contextvars.ContextVar[bool] = contextvars.ContextVar("is_by_itself", default=False)
+_mixed: contextvars.ContextVar[Mapping[str, str]] = contextvars.ContextVar(
+    "mixed", default=MappingProxyType({})
+)
 
 
 @dataclass(frozen=True)
@@ -207,6 +211,26 @@ def by_itself() -> Iterator[None]:
         yield
     finally:
         _is_by_itself.reset(token)
+
+
+@contextlib.contextmanager
+def mixing(runs: Mapping[str, str]) -> Iterator[None]:
+    """Let the runs in the block be updated side by side even where their numbers then depend on each other.
+
+    Args:
+        runs: a hash of the settings of each by its folder's name, in their order; none: where their numbers
+            are those of each alone.
+    """
+    token = _mixed.set(runs)
+    try:
+        yield
+    finally:
+        _mixed.reset(token)
+
+
+def mixed() -> Mapping[str, str]:
+    """The runs of `mixing`, this one among them; none outside of such a block."""
+    return _mixed.get()
 
 
 def chance() -> np.random.RandomState:

@@ -12,7 +12,7 @@ from typing import Any
 
 from gridworld.config.agents import AgentConfig
 from gridworld.config.effects import Effect
-from gridworld.config.settings_by_effect import with_effects
+from gridworld.config.settings_by_effect import ON_RESULT, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.run.identity.provenance import code, processor, versions
 from gridworld.storage.safe_read import sha256
@@ -38,6 +38,12 @@ def identity(config: TrainConfig, layout: str) -> str:
     """
     text = json.dumps([settings(config), layout], sort_keys=True, default=str)
     return sha256(text.encode())
+
+
+def settings_hash(settings: dict[str, Any], layout: str) -> str:
+    """A hash of a run's settings and its map's text; the same for settings read from a manifest."""
+    text = json.dumps([with_effects(ON_RESULT, settings), layout], sort_keys=True, default=str)
+    return sha256(text.encode())[:32]
 
 
 def environment(agent: AgentConfig) -> dict[str, str]:

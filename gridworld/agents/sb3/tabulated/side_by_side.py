@@ -3,7 +3,8 @@
 While several runs train together (`process.parallel.together`), an update is made for all of them at once:
 their weights stand in one matrix (P, N), the networks run at once (`tabulated.stacked_layers`), and each
 row is clipped and stepped as it would be alone. That each network's numbers are then the same to the last
-bit depends on the processor and on the build of torch; `agree` tries it out on the networks at hand.
+bit depends on the processor and on the build of torch; `agree` tries it out on the networks at hand. Only
+runs that are to be mixed, as may be asked for on CUDA, are updated at once whatever comes of it.
 """
 
 from __future__ import annotations
@@ -64,10 +65,12 @@ _agreed: dict[Hashable, bool] = {}
 
 
 def agree(models: Sequence[Tabulated]) -> bool:
-    """Whether these models side by side give the numbers of each alone, to the last bit.
+    """Whether these models side by side give the numbers of each alone, to the last bit, or need not.
 
     It is tried out once in a process for each kind and number of them and of threads, forwards and backwards.
     """
+    if models[0].inputs.mixes:
+        return True
     key = models[0].inputs.kind, len(models), torch.get_num_threads()
     if key not in _agreed:
         was_told = not all(_agreed.values())
@@ -102,7 +105,7 @@ def stacked(optimizers: Sequence[FlatOptimizer]) -> tuple[Tensor, Leaves]:
     own = [each.weights for each in optimizers]
     # Each row begins where a vector of its own would: products with vectors add up by alignment.
     width = -(-len(own[0]) // ALIGNMENT) * ALIGNMENT
-    weights = torch.stack(own, out=torch.empty(len(own), width)[:, : len(own[0])])
+    weights = torch.stack(own, out=own[0].new_empty(len(own), width)[:, : len(own[0])])
     first = optimizers[0]
     leaves = [view.detach().requires_grad_() for view in first.cut(weights)]
     return weights, {id(of): leaf for of, leaf in zip(first.parameters, leaves, strict=True)}
@@ -131,7 +134,7 @@ class SideBySide:
             return self
         self._weights, self.leaves = stacked(self._optimizers)
         runs, count = self._weights.shape
-        self._gradients = torch.zeros(runs, self._weights.stride(0))[:, :count]
+        self._gradients = self._weights.new_zeros(runs, self._weights.stride(0))[:, :count]
         for each, weights, gradient in zip(self._optimizers, self._weights, self._gradients, strict=True):
             each.work_on(weights, gradient)
         return self
@@ -173,7 +176,7 @@ class SideBySide:
         pairs = zip(norms, max_grad_norms, strict=True)
         scales = [min(1.0, clipping(norm, most)) for norm, most in pairs]  # 1 where it is NaN
         if min(scales) < 1:
-            self._gradients *= torch.tensor(scales)[:, None]
+            self._gradients *= self._gradients.new_tensor(scales)[:, None]
         finite = [norms[row] < math.inf for row in rows]
         self._advance(tuple(row for row, goes in zip(rows, finite, strict=True) if goes))
         return finite

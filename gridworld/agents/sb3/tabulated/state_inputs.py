@@ -36,6 +36,7 @@ from gridworld.agents.sb3.tabulated.flat_optimizer import ELEMENTWISE
 from gridworld.agents.sb3.tabulated.stacked_layers import can_stand
 from gridworld.agents.sb3.vec_env import StateStep
 from gridworld.envs.observations import ObservationTable
+from gridworld.process.parallel.together import mixed
 from gridworld.world.mdp import IntArray
 
 # Of torch.nn, what maps every number by itself, in training as in evaluation, and never draws at random.
@@ -103,10 +104,14 @@ class StateInputs:
     Args:
         policy: the policy.
         observation: what it sees of a state.
+
+    Attributes:
+        mixes: whether it is run side by side with others of its kind whatever that does to its numbers.
     """
 
     def __init__(self, policy: BasePolicy, observation: ObservationTable) -> None:
         self.num_states = observation.num_states
+        self.mixes = bool(mixed())
         self._policy = policy
         self._observation = observation
         extractors = {type(each) for each in policy.modules() if isinstance(each, BaseFeaturesExtractor)}
@@ -117,7 +122,8 @@ class StateInputs:
     @functools.cached_property
     def kind(self) -> Hashable:
         """Equal for policies that can be run side by side: of one shape, with the same inputs."""
-        if self.num_states > _FEW_STATES or self._policy.device.type != "cpu" or not can_stand(self._policy):
+        may_agree = self._policy.device.type == "cpu"
+        if self.num_states > _FEW_STATES or not (may_agree or self.mixes) or not can_stand(self._policy):
             return id(self)
         rows = b"" if self._one_hot else self._observation.rows(np.arange(self.num_states)).tobytes()
         return type(self._policy), repr(self._policy), self.num_states, self._observation.kind, rows

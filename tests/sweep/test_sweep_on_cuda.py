@@ -1,0 +1,261 @@
+"""A sweep on CUDA whose runs train at once, as asked for: their numbers depend on each other.
+
+The processor stands in for the device, with runs side by side that do lean on each other.
+"""
+
+import contextlib
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from helpers.hostile import manifest
+from helpers.pages import NO_PICTURES
+from helpers.resuming import differences, go_on, left_behind, stopped_after
+from helpers.stand_in_cuda import stand_in
+from helpers.support import ROOT, configure, script
+from omegaconf import OmegaConf
+from stable_baselines3.common.policies import BasePolicy
+
+from gridworld.agents import family
+from gridworld.agents.sb3.tabulated.side_by_side import SideBySide
+from gridworld.commands import reproduce as command
+from gridworld.config.sweep import SweepConfig
+from gridworld.envs.observations import make_observation
+from gridworld.errors import InputError
+from gridworld.process.parallel.together import mixing
+from gridworld.restore.repeat import population
+from gridworld.run.reader import read_run
+from gridworld.sweep.folder import JobEntry
+from gridworld.sweep.plan import Job
+from gridworld.sweep.population import populations
+from gridworld.training.setup import check_settings, make_context
+
+SMALL = (
+    *("agent=ppo", "device=cuda", "n_envs=16", "total_timesteps=1536", "evaluation.every=768"),
+    *("agent.n_steps=32", "agent.batch_size=128", "agent.n_epochs=2", "logging.progress=false"),
+    *NO_PICTURES,
+)
+NAMES = ["seed=0", "seed=1", "seed=2"]
+
+
+def sweep(cwd: Path, name: str, *words: str) -> subprocess.CompletedProcess[str]:
+    device = "+hydra.callbacks.device._target_=helpers.stand_in_cuda.StandIn"
+    return script(
+        *("train.py", "-m", *SMALL, "seed=range(3)", *words, f"hydra.sweep.dir={name}", device),
+        cwd=cwd,
+        PYTHONPATH=str(ROOT / "tests"),
+    )
+
+
+def manifest_of(run: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((run / "manifest.json").read_text())
+    return content
+
+
+@pytest.fixture(scope="module")
+def sweeps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one sweep that trained as asked for, one by default, and one run by run."""
+    cwd = tmp_path_factory.mktemp("cuda")
+    sizes = {"asked": "3", "default": "auto", "alone": "1"}
+    for name, size in sizes.items():
+        done = sweep(cwd, name, f"hydra.sweeper.population={size}")
+        assert done.returncode == 0, done.stderr
+    return cwd
+
+
+def test_the_manifests_of_runs_that_were_asked_for_at_once_name_them(sweeps: Path) -> None:
+    for number, name in enumerate(NAMES):
+        content = manifest_of(sweeps / "asked" / name)["numbers_depend_on"]
+        assert list(content) == NAMES
+        hashes = [job["hash"] for job in json.loads((sweeps / "asked" / "sweep.json").read_text())["jobs"]]
+        assert list(content.values()) == hashes
+        assert content[name] == hashes[number]
+
+
+def test_by_default_each_is_the_run_alone(sweeps: Path) -> None:
+    for name in NAMES:
+        default, alone, asked = (left_behind(sweeps / each / name) for each in ("default", "alone", "asked"))
+        assert differences(default, alone) == []
+        assert differences(asked, alone) != []
+        for each in ("default", "alone"):
+            assert "numbers_depend_on" not in manifest_of(sweeps / each / name)
+
+
+def test_on_the_processor_each_is_the_run_alone_whatever_is_asked_for(tmp_path: Path) -> None:
+    done = sweep(tmp_path, "cpu", "device=cpu", "hydra.sweeper.population=3")
+    assert done.returncode == 0, done.stderr
+    assert "such runs train one by one" in done.stderr  # since they lean on each other here
+    assert all("numbers_depend_on" not in manifest_of(tmp_path / "cpu" / name) for name in NAMES)
+
+
+@pytest.fixture
+def device(monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(monkeypatch.setattr)
+
+
+def reproduce(run: Path, capsys: pytest.CaptureFixture[str], code: int = 0) -> str:
+    capsys.readouterr()
+    with pytest.raises(SystemExit, match=str(code)) if code else contextlib.nullcontext():
+        command.main([str(run)])
+    return capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("device")
+def test_a_run_is_repeated_together_with_those_that_it_depends_on(
+    sweeps: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = reproduce(sweeps / "asked" / "seed=1", capsys)
+    assert "depend on all runs of its population, which train again: seed=0, seed=1, seed=2\n" in shown
+    assert shown.endswith("\nidentical\n")
+    assert "DIFFERENT" not in shown
+    assert "depend" not in reproduce(sweeps / "alone" / "seed=1", capsys)
+    monkeypatch.setattr(command, "population", lambda then: [])
+    assert reproduce(sweeps / "asked" / "seed=1", capsys, code=1).endswith("\ndifferent\n")
+
+
+def missing(run: Path) -> None:
+    shutil.rmtree(run)
+
+
+def other_settings(run: Path) -> None:
+    manifest(run, lambda content: content["config"]["agent"].update(gamma=0.5))
+
+
+def went_on(run: Path) -> None:
+    again = {"at": manifest_of(run)["started"], "step": 512, "command": []}
+    manifest(run, lambda content: content.update(resumed=[again]))
+
+
+def made_longer_later(run: Path) -> None:
+    again = {"at": "9", "step": 1536, "command": [], "total_timesteps": 3072, "instead_of": 1536}
+    manifest(run, lambda content: content.update(resumed=[again]))
+    manifest(run, lambda content: content["config"].update(total_timesteps=3072))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (missing, r"is not in .*/asked any more; put its folder back"),
+        (other_settings, r"has other settings now; put back the one that was trained with it"),
+        (went_on, r"went on from a checkpoint meanwhile; that cannot be repeated"),
+    ],
+)
+def test_what_became_of_another_run_is_told_before_training(
+    change: Callable[[Path], None], told: str, sweeps: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(sweeps / "asked", tmp_path / "asked")
+    change(tmp_path / "asked" / "seed=2")
+    done = script("reproduce.py", "asked/seed=0", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert re.fullmatch(
+        rf"error: asked/seed=0: its numbers depend on the run seed=2, which {told}\n", done.stderr
+    )
+
+
+def test_what_another_run_did_later_is_no_matter(sweeps: Path, tmp_path: Path) -> None:
+    shutil.copytree(sweeps / "asked", tmp_path / "asked")
+    made_longer_later(tmp_path / "asked" / "seed=2")
+    members = population(read_run(tmp_path / "asked" / "seed=0"))
+    assert [member.folder.name for member in members] == NAMES
+
+
+def test_a_run_with_another_name_is_none_of_those(sweeps: Path, tmp_path: Path) -> None:
+    shutil.copytree(sweeps / "asked" / "seed=0", tmp_path / "mine")
+    with pytest.raises(InputError, match=r"mine: .* on 3 runs .* has the name of none of them"):
+        population(read_run(tmp_path / "mine"))
+
+
+@pytest.mark.parametrize("name", ["../seed=1", "..", "a/b", ".", "", "a\n"])
+def test_a_name_that_leads_elsewhere_is_refused(name: str, sweeps: Path, tmp_path: Path) -> None:
+    shutil.copytree(sweeps / "asked" / "seed=0", tmp_path / "seed=0")
+    manifest(tmp_path / "seed=0", lambda content: content["numbers_depend_on"].update({name: ""}))
+    with pytest.raises(InputError, match="numbers_depend_on must be a hash for each run"):
+        read_run(tmp_path / "seed=0")
+
+
+@pytest.mark.usefixtures("device")
+def test_a_run_that_went_on_says_with_whom_and_cannot_be_repeated(tmp_path: Path) -> None:
+    runs = {"run": "0", "other": "0"}
+    words = [*SMALL, "checkpoint.every=512"]
+    with mixing(runs):
+        stopped_after(1, tmp_path / "run", *words)
+        shutil.copytree(tmp_path / "run", tmp_path / "again" / "run")
+        go_on(tmp_path / "again" / "run")
+    go_on(tmp_path / "run")
+    for folder, how in ((tmp_path / "run", "alone"), (tmp_path / "again" / "run", "together with others")):
+        content = manifest_of(folder)
+        assert content["numbers_depend_on"] == runs
+        assert content["resumed"][0].get("numbers_depend_on") == (None if how == "alone" else runs)
+        with pytest.raises(InputError, match=rf"it went on after step 512 {how}, which cannot be repeated"):
+            population(read_run(folder))
+
+
+@pytest.mark.parametrize(
+    ("population", "in_fork", "sizes"), [(8, False, [5, 5]), ("auto", False, [4, 3, 3]), (8, True, [4, 3, 3])]
+)
+def test_runs_that_no_fork_takes_are_not_divided_among_forks(
+    population: int | str, in_fork: bool, sizes: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gridworld.sweep.population.can_fork", lambda: True)
+    job = Job((), (), "", None, False, shape="", in_fork=in_fork)
+    jobs = [(JobEntry(str(number), "", ()), job) for number in range(10)]
+    launcher = {"_target_": "ForksLauncher", "n_jobs": 4}
+    hydra = OmegaConf.create({"launcher": launcher, "job": {"chdir": None, "env_set": {}}})
+    groups = populations(jobs, SweepConfig(population=population), hydra)
+    assert sorted(map(len, groups), reverse=True) == sizes
+
+
+# What cannot be tried out without the device
+
+
+def agents(count: int, *words: str) -> list[Any]:
+    config = configure(*(words or ["agent=ppo"]))
+    mdp = check_settings(config)
+    contexts = [
+        make_context(config, mdp, make_observation(mdp, config.observation.kind)) for _ in range(count)
+    ]
+    return [family(config.agent).build(config.agent, context).model for context in contexts]
+
+
+def test_on_cuda_networks_are_of_one_kind_only_where_that_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    plain = agents(2)
+    with mixing({"a": "", "b": ""}):
+        asked = agents(2)
+    monkeypatch.setattr(BasePolicy, "device", torch.device("cuda"))
+    assert len({model.inputs.kind for model in plain}) == 2
+    assert len({model.inputs.kind for model in asked}) == 1
+
+
+@pytest.mark.parametrize("words", [["agent=ppo"], ["agent=dqn", "observation=coordinates"], ["agent=qrdqn"]])
+def test_all_tensors_are_made_where_the_weights_are(words: list[str]) -> None:
+    """A tensor that is made on torch's default device instead has no numbers here, and mixes with none."""
+    models = agents(2, *words)
+    optimizers = [model.descent for model in models]
+    for optimizer in optimizers:
+        optimizer.gradient.fill_(1)
+        optimizer.advance()  # makes the optimiser's own state
+    models[0].outputs_of_all()  # and the features
+    before = [optimizer.weights.clone() for optimizer in optimizers]
+    with torch.device("meta"), SideBySide(optimizers) as rows:
+        outputs = models[0].outputs_of_all(rows.leaves)
+        slopes = [output.detach().numpy() for output in outputs]
+        assert rows.step(outputs, slopes, [1e-3, 1e-3], [0, 1]) == [True, True]
+    for optimizer, weights in zip(optimizers, before, strict=True):
+        assert optimizer.weights.device.type == "cpu"
+        assert not torch.equal(optimizer.weights, weights)
+
+
+@pytest.mark.parametrize(("device", "found"), [("cpu", True), ("cuda", False), ("auto", False), ("?", True)])
+def test_the_device_is_found_by_its_name(device: str, found: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert family(configure("agent=ppo").agent).on_processor(device) is found
+    assert family(configure("agent=sarsa").agent).on_processor(device)
