@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # before pygame is imported
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # a second thread waits busily for the next product
 
 import pytest
 from helpers import huge_pages
@@ -82,6 +83,14 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return (os.cpu_count() or 1) + 1
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """While modules are imported there is no garbage to look for."""
+    gc.disable()
+    yield
+    gc.enable()
+
+
 def pytest_collection_finish() -> None:
     """What was imported stays, and need not be looked through each time that garbage is collected."""
     if "torch" in sys.modules:
@@ -89,7 +98,6 @@ def pytest_collection_finish() -> None:
     if "gridworld.agents.sb3.factory" in sys.modules:
         sys.modules["gridworld.agents.sb3.factory"].keep_compiler_out()
     compose_quickly()
-    gc.collect()
     gc.freeze()
     gc.set_threshold(50_000)  # 700 is Python's own
     huge_pages.collapse()

@@ -15,6 +15,7 @@ from gridworld.config.composition.words import digits
 from gridworld.errors import EXIT_CODE, InputError, failure
 from gridworld.process.console.terminal import prepare, printing, tell_error
 from gridworld.process.early_signals import AtWork
+from gridworld.process.garbage import collect_less_often
 
 Main = Callable[[Sequence[str]], None]
 
@@ -81,6 +82,7 @@ def run(main: Main) -> None:
 
     So does output that could not be written, whatever exit code `main` ends with.
     """
+    collect_less_often()
     prepare()
     try:
         with AtWork(), printing():

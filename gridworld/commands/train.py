@@ -32,6 +32,7 @@ from gridworld.errors import EXIT_CODE, FolderLostError, InputError
 from gridworld.process.console.command_line import called_from
 from gridworld.process.console.terminal import prepare, printable, printing, result_is_in_files, tell_error
 from gridworld.process.early_signals import AtWork
+from gridworld.process.garbage import collect_less_often
 from gridworld.run.claim import claimed
 from gridworld.run.folder import SWEEP_JSON, shown
 from gridworld.storage.file_lock import check_ours
@@ -90,6 +91,7 @@ def _claim_run_folder(config: DictConfig) -> None:
 def main() -> None:
     """Run the command line in `sys.argv`."""
     conf = conf_folder()
+    collect_less_often()
     prepare()
     if {"--help", "-h"} & set(sys.argv[1:]):
         run(lambda _: print(manual(conf)))

@@ -21,6 +21,8 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf._utils import get_omega_conf_dumper
 
+from gridworld.process.garbage import collect_less_often
+
 _MOST_ENTRIES = 4096
 
 _jobs = itertools.count()  # that began in this process
@@ -50,6 +52,7 @@ def run_job(
         What it came to; an `Exception` that it raised is in there. It has no configurations, which would fill
         the memory of a long sweep.
     """
+    collect_less_often()  # in a worker too
     if not config.hydra.sweeper.get("together"):  # which stands for several, and begins before them
         _spare_the_collector()
     shared, folder_before = cast("Any", HydraConfig.instance()), Path.cwd()

@@ -262,6 +262,7 @@ def _megabytes(field: str) -> float:
 
 if __name__ == "__main__":
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    gc.disable()
     _import_everything()
     progress._SECONDS_BETWEEN_LINES = 600.0
     search_progress._SECONDS_BETWEEN_TABLES = 0.3
@@ -274,10 +275,10 @@ if __name__ == "__main__":
     OverridesParser.create().parse_overrides(list(_WORDS))
     page.template()
     _end_without_finalizers()
-    gc.collect()
     gc.freeze()  # so that a fork shares what is there
     huge_pages.collapse()
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
+    gc.enable()
     listener = socket.socket(fileno=int(sys.argv[1]))
     listener.set_inheritable(False)
     _listen(listener, int(sys.argv[2]))
