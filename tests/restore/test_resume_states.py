@@ -123,7 +123,6 @@ def test_a_hostile_state_is_refused(tree: str) -> None:
 # What may be anything, since it follows from the rest or is not looked at again; all else must be missed.
 DERIVED = {
     "agent.model.values._current_progress_remaining": "set again at the first step, before anybody asks",
-    "agent.model.values._last_obs": "the tabulated engines ask the environments for their states",
     "agent.model.values._last_episode_starts": "one row of the buffer, which the advantages do not need",
     "agent.model.values.start_time": "the clock's",
     "agent.seconds": "the clock's",

@@ -37,7 +37,7 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
 
     env: GridWorldVecEnv
     policy: ActorCriticPolicy
-    derived: tuple[str, ...] = ("descent", "inputs", "old")  # from the rest: no part of a checkpoint
+    derived: tuple[str, ...] = ("descent", "inputs", "old", "_last_obs")  # no part of a checkpoint
     learns_all_at_once = True  # whether `descent` steps on all of the network's weights
 
     def _setup_model(self) -> None:
@@ -124,7 +124,7 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         rollout_buffer.values = values[rolled.states]
         rollout_buffer.log_probs = log_prob[rolled.states, rolled.actions]
         rollout_buffer.full = True
-        self._last_obs = env.observation.rows(states)
+        self._last_obs = env.observation.rows(states[:0])  # SB3 asks only whether there was a reset
         rollout_buffer.compute_returns_and_advantage(torch.as_tensor(values[states]), dones)
         callback.update_locals(locals())
         callback.on_rollout_end()
