@@ -8,6 +8,13 @@ from helpers.support import SHORT
 
 CASES = {
     "dqn": [*SHORT["dqn"], "agent.learning_rate=lin_0.003"],
+    **{
+        f"dqn that counts{stock}": [
+            *(*SHORT["dqn"], "agent.replay_buffer_class=gridworld.agents.sb3.replay_counts.ReplayCounts"),
+            *("agent.engine=stock", "agent.gradient_steps=4")[: 2 * bool(stock)],
+        ]
+        for stock in ("", " stock")
+    },
     "dqn stock": [
         *(*SHORT["dqn"], "agent.engine=stock", "n_envs=8"),
         *("agent.buffer_size=2000", "agent.gradient_steps=4"),

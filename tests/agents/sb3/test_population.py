@@ -20,11 +20,14 @@ from gridworld.training.setup import check_settings, make_context
 Words = tuple[str, ...]
 Learned = dict[str, Any]  # all that learning leaves
 
+DQN = (
+    *("agent=dqn", "n_envs=2", "total_timesteps=240", "agent.learning_starts=60", "agent.train_freq=4"),
+    *("agent.gradient_steps=3", "agent.batch_size=24", "agent.buffer_size=150", "agent.log_interval=2"),
+)
+COUNTS = "gridworld.agents.sb3.replay_counts.ReplayCounts"
 SMALL: dict[str, Words] = {
-    "dqn": (
-        *("agent=dqn", "n_envs=2", "total_timesteps=240", "agent.learning_starts=60", "agent.train_freq=4"),
-        *("agent.gradient_steps=3", "agent.batch_size=24", "agent.buffer_size=150", "agent.log_interval=2"),
-    ),
+    "dqn": (*DQN, "agent.replay_buffer_class=null"),
+    "dqn that counts": (*DQN, f"agent.replay_buffer_class={COUNTS}"),
     "qrdqn": (
         *("agent=qrdqn", "total_timesteps=160", "n_envs=4", "+agent.arguments.learning_starts=40"),
         *("agent.arguments.gradient_steps=2", "agent.arguments.batch_size=16"),
@@ -129,18 +132,20 @@ OF_ALL: list[list[Words]] = [
 OPTIMIZERS = [f"policy_kwargs.optimizer_class=torch.optim.{name}" for name in ("AdamW", "SGD", "RMSprop")] + [
     ""
 ]
+OF_DQN = [
+    ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
+    ["gamma=0.5", "gamma=1", ""],
+    ["exploration_fraction=0.3", "exploration_final_eps=0.5", "exploration_initial_eps=0.2"],
+    ["target_update_interval=2", "target_update_interval=37", ""],
+    ["tau=0.5", "", ""],
+    ["max_grad_norm=0.01", "max_grad_norm=1000", ""],
+    ["learning_starts=0", "learning_starts=100", ""],
+    ["buffer_size=40", "buffer_size=1000", ""],
+    OPTIMIZERS,
+]
 DIFFERENT: dict[str, list[list[str]]] = {  # of each argument; the empty one is the agent's own
-    "dqn": [
-        ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
-        ["gamma=0.5", "gamma=1", ""],
-        ["exploration_fraction=0.3", "exploration_final_eps=0.5", "exploration_initial_eps=0.2"],
-        ["target_update_interval=2", "target_update_interval=37", ""],
-        ["tau=0.5", "", ""],
-        ["max_grad_norm=0.01", "max_grad_norm=1000", ""],
-        ["learning_starts=0", "learning_starts=100", ""],
-        ["buffer_size=40", "buffer_size=1000", ""],
-        OPTIMIZERS,
-    ],
+    "dqn": OF_DQN,
+    "dqn that counts": OF_DQN,
     "qrdqn": [
         ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
         ["gamma=0.5", "gamma=1", ""],
@@ -185,7 +190,7 @@ def populations(draw: Callable[..., Any]) -> list[Words]:
     shapes = []
     for _ in range(draw(st.sampled_from([1, 1, 2]))):
         agent = draw(st.sampled_from(sorted(SMALL)))
-        nets = NETS if agent in ("dqn", "qrdqn") else NETS + SPLIT_NETS
+        nets = NETS if "dqn" in agent else NETS + SPLIT_NETS
         net = word(agent, draw(st.sampled_from(nets)), "policy_kwargs.")
         shapes.append((agent, (*SMALL[agent], *draw(st.sampled_from(OBSERVATIONS)), *net)))
     members = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Optional
 
@@ -69,6 +70,11 @@ class ActorCriticPolicyKwargs(PolicyKwargs):
     share_features_extractor: Optional[bool] = None  # noqa: UP045
 
 
+def counts_transitions(settings: Mapping[str, Any]) -> bool:
+    """Whether an agent with these arguments keeps counts of transitions, `replay_counts.ReplayCounts`."""
+    return str(settings.get("replay_buffer_class")).endswith(".ReplayCounts")
+
+
 def as_dict(group: Any) -> dict[str, Any]:
     """The settings of a group, which is a dict or has a schema of its own."""
     return group if isinstance(group, dict) else vars(group)
@@ -106,6 +112,8 @@ class SB3Config(AgentConfig):
         widths = [num_states, *(nets if isinstance(nets, list) else max(nets.values(), key=sum)), 1]
         weights = 2 * sum(above * below for above, below in itertools.pairwise(widths))
         kept = min(settings.get("buffer_size", settings.get("n_steps", 2048) * num_envs), total_timesteps)
+        if counts_transitions(settings):
+            kept = num_envs
         return int(_COPIES * _NUMBER * weights + _BYTES_OF_A_STEP * kept)
 
 

@@ -14,6 +14,7 @@ from gridworld.agents.sb3.settings.schemas import (
     SB3ClassConfig,
     SB3Config,
     as_dict,
+    counts_transitions,
 )
 from gridworld.bounds import MOST_STEPS, above_zero, at_least, at_most, within, within_size
 from gridworld.config.agents import MOST_KEPT, check_exploration, parse_schedule
@@ -168,6 +169,11 @@ def _check_dqn(agent: DQNConfig, config: TrainConfig) -> None:
         raise InputError(
             f"agent.buffer_size={agent.buffer_size}: smaller than a batch; "
             f"must be at least agent.batch_size={agent.batch_size}"
+        )
+    if counts_transitions(vars(agent)) and agent.n_steps > 1:
+        raise InputError(
+            f"agent.n_steps={agent.n_steps}: agent.replay_buffer_class={agent.replay_buffer_class} counts "
+            "single steps; must be 1, or set agent.replay_buffer_class=null"
         )
     at_least("agent.learning_starts", agent.learning_starts, 0)
     if agent.learning_starts >= config.total_timesteps:

@@ -23,25 +23,27 @@ from stable_baselines3.common.utils import should_collect_more_steps
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
+from gridworld.agents.sb3.replay_counts import ReplayCounts
 from gridworld.agents.sb3.tabulated.flat_optimizer import FlatOptimizer, not_finite
 from gridworld.agents.sb3.tabulated.side_by_side import SideBySide, update_together
 from gridworld.agents.sb3.tabulated.stacked_layers import Leaves, forward
-from gridworld.agents.sb3.tabulated.state_buffers import Float32Array, StateReplayBuffer
+from gridworld.agents.sb3.tabulated.state_buffers import Float32Array, StateReplayBuffer, StateReplayCounts
 from gridworld.agents.sb3.tabulated.state_inputs import StateInputs, infos_of
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.process.parallel.together import chance, meet
 from gridworld.world.mdp import FloatArray, IntArray
 
 _DRAWN_AT_ONCE = 2**13  # transitions of a model
+_BUFFERS: dict[Any, type[ReplayBuffer]] = {None: StateReplayBuffer, ReplayCounts: StateReplayCounts}
 
 
 class TabulatedOffPolicy(OffPolicyAlgorithm):
     """An off-policy algorithm of SB3's kind on a `GridWorldVecEnv`; comes before SB3's class."""
 
     env: GridWorldVecEnv
-    replay_buffer: StateReplayBuffer
+    replay_buffer: StateReplayBuffer | StateReplayCounts
     # From the rest: no part of a checkpoint.
-    derived = ("descent", "inputs", "_online", "_greedy", "_target_values")
+    derived = ("descent", "inputs", "_online", "_greedy", "_target_values", "_last_obs")
     # Of the online network here and, with "_target", of the target network; and of the layers in either.
     network: str
     exploration_rate: float
@@ -51,7 +53,7 @@ class TabulatedOffPolicy(OffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         observation = self.env.observation
-        self.replay_buffer_class = self.replay_buffer_class or StateReplayBuffer
+        self.replay_buffer_class = _BUFFERS.get(self.replay_buffer_class, self.replay_buffer_class)
         self.replay_buffer_kwargs = {"num_states": observation.num_states}
         super()._setup_model()
         self.policy.set_training_mode(False)  # SB3's networks know no difference; switching takes time
@@ -117,7 +119,7 @@ class TabulatedOffPolicy(OffPolicyAlgorithm):
     ) -> RolloutReturn:
         """See SB3's `OffPolicyAlgorithm.collect_rollouts`."""
         assert isinstance(env, GridWorldVecEnv)
-        assert isinstance(replay_buffer, StateReplayBuffer)
+        assert isinstance(replay_buffer, StateReplayBuffer | StateReplayCounts)
         steps, episodes = 0, 0
         callback.on_rollout_start()
         states = env.states
@@ -140,7 +142,7 @@ class TabulatedOffPolicy(OffPolicyAlgorithm):
                 self._episode_num += 1
                 if log_interval is not None and self._episode_num % log_interval == 0:
                     self.dump_logs()
-        self._last_obs = env.observation.rows(states)
+        self._last_obs = env.observation.rows(states[:0])  # SB3 asks only whether there was a reset
         callback.on_rollout_end()
         return RolloutReturn(steps * env.num_envs, episodes, continue_training=True)
 
@@ -174,11 +176,16 @@ class TabulatedOffPolicy(OffPolicyAlgorithm):
         """See SB3's `DQN.train`."""
         self._update_learning_rate(self.policy.optimizer)
         member = _Member(self, chance(), gradient_steps, batch_size)
-        meet(_train_together, member, (self.inputs.kind, gradient_steps, batch_size))
+        key = self.inputs.kind, type(self.replay_buffer), gradient_steps, batch_size
+        meet(_train_together, member, key)
 
     @staticmethod
     def losses_and_slopes(
-        outputs: Float32Array, index: IntArray, actions: IntArray, targets: Float32Array
+        outputs: Float32Array,
+        index: IntArray,
+        actions: IntArray,
+        targets: Float32Array,
+        shares: FloatArray | None = None,
     ) -> tuple[list[float], FloatArray]:
         """Compute the losses of P minibatches and their slopes at the networks' outputs.
 
@@ -187,6 +194,7 @@ class TabulatedOffPolicy(OffPolicyAlgorithm):
             index: (P, B), which of the U states each transition begins in.
             actions: (P, B), integers.
             targets: (P, ..., B), float32.
+            shares: (P, B), what part of its minibatch each transition makes up; None: all the same.
 
         Returns:
             P, the losses; the slopes, as many as there are outputs, in their order.
@@ -219,9 +227,10 @@ class _Member:
     def draw(self, count: int) -> tuple[NDArray[Any], ...]:
         """Draw n minibatches (n, B) for `Update.minibatches`, (n, ...) each."""
         model = self.model
-        states, actions, following, *others = model.replay_buffer.draw(count, self.batch_size, self.chance)
+        drawn = model.replay_buffer.draw(count, self.batch_size, self.chance)
+        states, actions, following, rewards, ends, *shares = drawn
         best = model.best_values().take(following, axis=-1)
-        return states, actions, *others, np.moveaxis(best, -2, 0)
+        return states, actions, rewards, ends, np.moveaxis(best, -2, 0), *shares
 
 
 def _train_together(members: Sequence[_Member]) -> list[Exception | None]:
@@ -237,7 +246,7 @@ def _train(members: Sequence[_Member]) -> list[Exception | None]:
         update = Update([member.model for member in members], rows)
         for first in range(0, steps, at_once):
             drawn = [member.draw(min(at_once, steps - first)) for member in members]
-            together = [np.stack(arrays, axis=1) for arrays in zip(*drawn, strict=True)]
+            together = [_stacked(arrays) for arrays in zip(*drawn, strict=True)]
             for batch in update.minibatches(*together):
                 if any(finite):
                     found, finite = update.descend(*batch)
@@ -250,6 +259,16 @@ def _train(members: Sequence[_Member]) -> list[Exception | None]:
             model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
             model.logger.record("train/loss", np.mean(own))
     return [None if is_finite else not_finite() for is_finite in finite]
+
+
+def _stacked(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """(n, P, ..., B), of minibatches (n, ..., B) of P models; shorter ones end in transitions of no share."""
+    longest = max(array.shape[-1] for array in arrays)
+    widths = ([*[(0, 0)] * (array.ndim - 1), (0, longest - array.shape[-1])] for array in arrays)
+    padded = [
+        np.pad(array, width) if width[-1][1] else array for array, width in zip(arrays, widths, strict=True)
+    ]
+    return np.stack(padded, axis=1)
 
 
 class Update:
@@ -274,19 +293,22 @@ class Update:
         rewards: Float32Array,
         ends: Float32Array,
         best: Float32Array,
-    ) -> Iterator[tuple[IntArray, IntArray, Float32Array]]:
+        *shares: FloatArray,
+    ) -> Iterator[tuple[Any, ...]]:
         """The states, actions and targets of n minibatches of each model, for `descend`.
 
         Args:
             states: (n, P, B), and so all others.
             best: (n, P, ..., B), what the target network says of the best action in the next state.
+            shares: (n, P, B), of what counts transitions.
         """
         shape = (*rewards.shape[:2], *(1,) * (best.ndim - 3), -1)
         discounts = (1 - ends) * self._gammas
-        return zip(states, actions, rewards.reshape(shape) + discounts.reshape(shape) * best, strict=True)
+        targets = rewards.reshape(shape) + discounts.reshape(shape) * best
+        return zip(states, actions, targets, *shares, strict=True)
 
     def descend(
-        self, states: IntArray, actions: IntArray, targets: Float32Array
+        self, states: IntArray, actions: IntArray, targets: Float32Array, shares: FloatArray | None = None
     ) -> tuple[list[float], list[bool]]:
         """Make one step of each optimiser.
 
@@ -294,6 +316,7 @@ class Update:
             states: (P, B), integers.
             actions: (P, B), likewise.
             targets: (P, ..., B), float32, of the outputs for these actions.
+            shares: see `TabulatedOffPolicy.losses_and_slopes`.
 
         Returns:
             P, the losses before the step; P, which gradients have been finite so far.
@@ -302,7 +325,7 @@ class Update:
         numbers = outputs.detach().cpu().numpy()
         if len(self._models) == 1:
             numbers = numbers[None]
-        losses, slopes = self._models[0].losses_and_slopes(numbers, index, actions, targets)
+        losses, slopes = self._models[0].losses_and_slopes(numbers, index, actions, targets, shares)
         going = np.flatnonzero(self._finite)
         self._finite[going] = self._rows.step([outputs], [slopes], self._norms, going.tolist())
         for model in self._models:

@@ -43,9 +43,14 @@ class TabulatedQRDQN(TabulatedOffPolicy, QRDQN):  # type: ignore[misc]
 
     @staticmethod
     def losses_and_slopes(
-        outputs: Float32Array, index: IntArray, actions: IntArray, targets: Float32Array
+        outputs: Float32Array,
+        index: IntArray,
+        actions: IntArray,
+        targets: Float32Array,
+        shares: FloatArray | None = None,
     ) -> tuple[list[float], FloatArray]:
-        """See `TabulatedOffPolicy.losses_and_slopes`; the quantile Huber loss."""
+        """See `TabulatedOffPolicy.losses_and_slopes`; the quantile Huber loss, of single transitions only."""
+        assert shares is None
         runs, num_states, count, num_actions = outputs.shape
         state = index + num_states * np.arange(runs)[:, None]
         first = state * count * num_actions + actions

@@ -24,6 +24,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -31,6 +32,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from torch import Tensor, nn
 
 from gridworld.agents.sb3.features import FIXED
+from gridworld.agents.sb3.replay_counts import ReplayCounts
 from gridworld.agents.sb3.settings.schemas import SB3ClassConfig, SB3Config, as_dict
 from gridworld.agents.sb3.tabulated.flat_optimizer import ELEMENTWISE
 from gridworld.agents.sb3.tabulated.stacked_layers import can_stand
@@ -76,8 +78,10 @@ def why_not(config: SB3Config, algorithm: type[BaseAlgorithm], arguments: Mappin
         if name in classes and classes[name] not in known:
             path = as_dict(given["policy_kwargs"])[name]
             return f"{where}.policy_kwargs.{name}={path} {reason}"
+    counts = arguments.get("replay_buffer_class") is ReplayCounts and issubclass(algorithm, DQN)
     for name in ("replay_buffer", "rollout_buffer"):
-        if arguments.get(f"{name}_class") is not None or arguments.get(f"{name}_kwargs"):
+        is_known = arguments.get(f"{name}_class") is None or (counts and name == "replay_buffer")
+        if not is_known or arguments.get(f"{name}_kwargs"):
             return f"{where}.{name}_class is not the plain {name.replace('_', ' ')}"
     if arguments.get("optimize_memory_usage"):
         return f"{where}.optimize_memory_usage changes what the replay buffer samples"

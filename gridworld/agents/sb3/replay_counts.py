@@ -1,0 +1,143 @@
+"""A replay buffer for finite worlds: how often each transition was met.
+
+A finite world has few transitions, and a buffer holds each again and again. Here each stands once, with a
+count, so nothing is forgotten, in little memory. A minibatch is drawn by systematic sampling: of a transition
+with the share p of all that was met, it has B p, rounded up or down by chance. The mean is that of uniform
+sampling, the noise far smaller. It works in any model of Stable-Baselines3 that replays:
+
+    DQN("MlpPolicy", env, replay_buffer_class=ReplayCounts)
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+from gridworld.errors import InputError
+from gridworld.storage.serialization import State, fill
+from gridworld.world.mdp import IntArray
+
+_ROOM = 256  # transitions, at first
+_COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "counts")
+
+
+def systematic_sample(counts: IntArray, size: int, chance: NDArray[np.float64]) -> IntArray:
+    """Draw minibatches from what was met: every N/B-th of all in a row, from a random one on.
+
+    G. Kitagawa, Monte Carlo Filter and Smoother for Non-Gaussian Nonlinear State Space Models, 1996.
+
+    Args:
+        counts: (R,), how often each transition was met, N times in all.
+        size: B, of a minibatch.
+        chance: (n,), numbers from [0, 1), where each of n minibatches begins.
+
+    Returns:
+        (n, R), how often each transition is in each minibatch, B in all.
+    """
+    ends = np.cumsum(counts)
+    before = np.ceil(size * (ends / ends[-1]) - chance[:, None])  # points before each end
+    before[:, -1] = size  # whatever was rounded
+    times: IntArray = np.diff(before, prepend=0).astype(np.int64)
+    return times
+
+
+class ReplayCounts(ReplayBuffer):
+    """SB3's replay buffer with counts of distinct transitions; their rewards count as a part of them.
+
+    Args:
+        buffer_size: has no effect.
+        observation_space: SB3's, as all the others.
+
+    Raises:
+        InputError: `optimize_memory_usage` is set, which stores no transitions but sequences of them.
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        device: Any = "auto",
+        n_envs: int = 1,
+        **options: Any,
+    ) -> None:
+        if options.get("optimize_memory_usage"):
+            raise InputError(
+                "optimize_memory_usage=true: ReplayCounts stores each transition once; set it to false, or "
+                "replay_buffer_class to null"
+            )
+        super().__init__(_ROOM, observation_space, action_space, device, 1, **options)
+        self.counts: IntArray = np.zeros(self.buffer_size, dtype=np.int64)
+        self._rows: dict[bytes, int] = {}
+
+    def add(
+        self,
+        obs: NDArray[Any],
+        next_obs: NDArray[Any],
+        action: NDArray[Any],
+        reward: NDArray[Any],
+        done: NDArray[Any],
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """See SB3's `ReplayBuffer.add`."""
+        for index, info in enumerate(infos):
+            truncated = self.handle_timeout_termination and info.get("TimeLimit.truncated", False)
+            ends = done[index] and not truncated
+            self._make_room()
+            for name, number in zip(_COLUMNS, (obs, next_obs, action, reward), strict=False):
+                getattr(self, name)[self.pos, 0] = number[index]
+            self.dones[self.pos, 0] = ends
+            row = self._rows.setdefault(self._key(self.pos), self.pos)
+            self.pos = len(self._rows)
+            self.counts[row] += 1
+
+    def _make_room(self) -> None:
+        if self.pos < self.buffer_size:
+            return
+        self.buffer_size *= 2
+        for name in _COLUMNS:
+            array = getattr(self, name)
+            setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
+
+    def _key(self, row: int) -> bytes:
+        return b"".join(getattr(self, name)[row].tobytes() for name in _COLUMNS[:-1])
+
+    def get_state(self) -> State:
+        """What was met, for a checkpoint."""
+        return {name: getattr(self, name)[: self.pos] for name in _COLUMNS}
+
+    def set_state(self, state: State) -> None:
+        """Go on with what `get_state` said.
+
+        Raises:
+            StateError: it is of other transitions.
+        """
+        count = len(state["counts"])
+        for name in _COLUMNS:
+            now = getattr(self, name)
+            column = np.zeros((max(count, self.buffer_size), *now.shape[1:]), dtype=now.dtype)
+            fill(column[:count], state[name], name)
+            setattr(self, name, column)
+        self.pos, self.buffer_size = count, len(self.counts)
+        self._rows = {self._key(row): row for row in range(count)}
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """See SB3's `ReplayBuffer.sample`; the transitions are in the order in which they were met first."""
+        (times,) = systematic_sample(self.counts[: self.pos], batch_size, np.random.random_sample(1))
+        return self._get_samples(np.repeat(np.arange(self.pos), times), env)
+
+    def _get_samples(self, batch_inds: IntArray, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        data = (
+            self._normalize_obs(self.observations[batch_inds, 0], env),
+            self.actions[batch_inds, 0],
+            self._normalize_obs(self.next_observations[batch_inds, 0], env),
+            self.dones[batch_inds],
+            self._normalize_reward(self.rewards[batch_inds], env),
+        )
+        return ReplayBufferSamples(*map(self.to_torch, data))
