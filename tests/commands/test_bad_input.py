@@ -166,6 +166,10 @@ TRAIN_WITH_SB3 = [
         "agent.policy_kwargs.net_arch=[100000]",
         "must be layer widths, e.g. [64,64]; at most 16 of at most 4096",
     ),
+    (
+        "agent.n_steps=3 agent.replay_buffer_class=gridworld.agents.sb3.replay_counts.ReplayCounts",
+        "ReplayCounts counts single steps; must be 1, or set agent.replay_buffer_class=null",
+    ),
     ("agent.replay_buffer_class=torch.nn.ReLU", "must be the import path of a BaseBuffer class"),
     (
         "agent=a2c agent.algorithm=nowhere.Mine",

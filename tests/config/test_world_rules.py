@@ -63,6 +63,24 @@ def test_they_follow_the_world_and_the_observation(agent: str) -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("words", "counts", "batch"),
+    [
+        ([], False, 128),
+        (["env.slip=0.1"], True, 65_536),
+        (["env.slip=0.1", "exploration_bonus=0.1"], False, 4096),
+        (["env.slip=0.1", "agent.n_steps=3"], False, 4096),
+        (["env.slip=0.1", "agent.replay_buffer_class=null"], False, 4096),
+    ],
+)
+def test_transitions_are_counted_where_actions_have_chances(
+    words: list[str], counts: bool, batch: int
+) -> None:
+    agent = vars(configure("agent=dqn", *words).agent)
+    assert str(agent["replay_buffer_class"]).endswith(".ReplayCounts") == counts
+    assert agent["batch_size"] == batch
+
+
 @AGENTS
 def test_the_evaluations_discount_bounds_the_agents(agent: str) -> None:
     assert vars(configure(f"agent={agent}", "evaluation.gamma=0.5").agent)["gamma"] == 0.5
@@ -123,7 +141,7 @@ def test_the_command_line_shows_rules_and_values(tmp_path: Path) -> None:
     values = script("train.py", "--cfg", "job", "--resolve", "env.slip=0.2", cwd=tmp_path).stdout
     assert "gamma: ${clearest_gamma:${env}" in rules
     assert "gamma: 0.98" in values
-    assert "n_envs: 4096" in values
+    assert "n_envs: 16000" in values
 
 
 def test_a_small_world_with_chances_is_certified(tmp_path: Path) -> None:

@@ -5,7 +5,11 @@
     ${for_size:${env},30000}                        30000 up to 30 states, in larger worlds in proportion
     ${if_chance:${env},A,B}                         A where an action may have several outcomes, else B
     ${features_class:${observation.kind},${agent.policy}}  of an MLP, for what the agent sees
+    ${divided:${total_timesteps},600}               as a whole number, at least 1
+    ${times:4,${n_envs}}                            the product
     ${quarter:${agent.n_steps},${n_envs}}           a quarter of a rollout's steps
+    ${replay_class:${env},${exploration_bonus},${agent.n_steps}}  a buffer that counts, with chances
+    ${if_set:${agent.replay_buffer_class},A,B}      A where the setting is not null, else B
 
 They know the worlds of maps of up to 512 cells. Any other world, and settings that make none, get what the
 default world gets; the check before training says what is wrong with the settings.
@@ -31,13 +35,25 @@ _FEATURES = {  # by the kind of observation
     "coordinates": "gridworld.agents.sb3.features.FourierFeatures",
     "image": "gridworld.agents.sb3.features.ImageCells",
 }
+_REPLAY_COUNTS = "gridworld.agents.sb3.replay_counts.ReplayCounts"
 _DEFAULT_CELLS = 30  # of the default world, whose settings were tuned
 _MOST_CELLS = 512  # the rules solve the world a few times, which takes 0.3 s there
 
 
 def register_world_rules() -> None:
     """Register these functions with OmegaConf."""
-    for rule in (clearest_gamma, features_class, for_size, if_chance, quadratic_scale, quarter):
+    for rule in (
+        clearest_gamma,
+        divided,
+        features_class,
+        for_size,
+        if_chance,
+        if_set,
+        quadratic_scale,
+        quarter,
+        replay_class,
+        times,
+    ):
         OmegaConf.register_new_resolver(rule.__name__, rule, replace=True)
 
 
@@ -48,6 +64,11 @@ def clearest_gamma(env: DictConfig, evaluation_gamma: float, candidates: Sequenc
         return candidates[0] if world is None else _gamma(world, evaluation_gamma, tuple(candidates))
     except InputError:  # of the discount, or a world without a finite optimum
         return candidates[0]
+
+
+def divided(number: int, by: int) -> int:
+    """A number divided by another, rounded down, at least 1."""
+    return max(1, number // by)
 
 
 def features_class(kind: str, policy: str) -> str | None:
@@ -69,6 +90,11 @@ def if_chance(env: DictConfig, then: Any, otherwise: Any) -> Any:
     return then if world is not None and has_chance(world) else otherwise
 
 
+def if_set(setting: Any, then: Any, otherwise: Any) -> Any:
+    """`then` where a setting is not null."""
+    return otherwise if setting is None else then
+
+
 def quadratic_scale(env: DictConfig, gamma: float) -> float | None:
     """What rewards are multiplied with in the world of the section `env`; None: they stay as they are."""
     from gridworld.world.recommendation import quadratic_scale as scale
@@ -84,6 +110,20 @@ def quarter(n_steps: int, n_envs: int) -> int:
     """A quarter of a rollout, or all of it where four do not divide it."""
     whole = n_steps * n_envs
     return whole if whole % 4 else whole // 4
+
+
+def replay_class(env: DictConfig, exploration_bonus: float, n_steps: int) -> str | None:
+    """The import path of a replay buffer that counts, for the world of the section `env`; None: SB3's own.
+
+    It is of use where an action has several outcomes. Its transitions are single steps, whose rewards do not
+    change from visit to visit.
+    """
+    return if_chance(env, _REPLAY_COUNTS, None) if not exploration_bonus and n_steps == 1 else None
+
+
+def times(number: int, by: int) -> int:
+    """The product."""
+    return number * by
 
 
 def _world(env: DictConfig) -> Mdp | None:
