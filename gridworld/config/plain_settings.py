@@ -20,6 +20,7 @@ from gridworld.errors import InputError
 _LIBRARIES = (
     *("torch.nn.", "torch.optim.", "stable_baselines3.", "sb3_contrib."),
     "gridworld.agents.sb3.features.",
+    "gridworld.agents.sb3.replay_counts.",
 )
 
 # A run that was made before there was such a setting is read with the setting's default.

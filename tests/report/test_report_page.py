@@ -20,7 +20,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A study with everything in it: pictures, on-line returns, split configurations, a run that failed."""
     runs = sweep(tmp_path_factory.mktemp("study") / "runs", 6)
     for seed in (0, 1):
-        train_in(runs / f"real{seed}", *SHORT["ppo"], "env=aima_4x3", f"seed={seed}")
+        train_in(runs / f"real{seed}", *SHORT["ppo"], "env=aima_4x3", "evaluation.every=2000", f"seed={seed}")
     other = Maker("agent=ppo", "env=four_rooms")
     for seed in range(6):
         other.write(runs / f"faster{seed}", seed, 2000, agent__learning_rate=0.0123)
