@@ -102,6 +102,8 @@ def _is_judged(name: str, value: Any, default: Any) -> bool:
         return True
     if name == "policy":
         return "." not in value
+    if counts_transitions({name: value}):
+        return True
     if name in SCHEDULES:
         return parse_schedule(name, value)[0] <= _ORDINARY
     return isinstance(value, int) or (isinstance(value, float) and abs(value) <= _ORDINARY)
