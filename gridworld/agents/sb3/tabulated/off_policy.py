@@ -239,8 +239,9 @@ def _train_together(members: Sequence[_Member]) -> list[Exception | None]:
 
 def _train(members: Sequence[_Member]) -> list[Exception | None]:
     """Make an update of each of P models of one kind; returns what is to be raised in each."""
-    steps, batch_size = members[0].gradient_steps, members[0].batch_size
-    at_once = max(1, _DRAWN_AT_ONCE // batch_size)
+    steps = members[0].gradient_steps
+    widest = max(member.model.replay_buffer.width(member.batch_size) for member in members)
+    at_once = max(1, _DRAWN_AT_ONCE // widest)
     losses, finite = [], [True] * len(members)
     with SideBySide([member.model.descent for member in members]) as rows:
         update = Update([member.model for member in members], rows)

@@ -62,6 +62,10 @@ class StateReplayBuffer(ReplayBuffer):
         self.pos = (at + 1) % self.buffer_size
         self.full |= self.pos == 0
 
+    def width(self, batch_size: int) -> int:
+        """How many transitions stand in what `draw` returns of a minibatch."""
+        return batch_size
+
     def draw(
         self, count: int, batch_size: int, chance: np.random.RandomState
     ) -> tuple[IntArray, IntArray, IntArray, Float32Array, Float32Array]:
@@ -124,6 +128,10 @@ class StateReplayCounts(ReplayCounts):
         states, actions = np.divmod(pairs, self._num_actions)
         rewards, ends = met.imag.astype(np.float32), (numbers % 2).astype(np.float32)
         self._transitions = states, actions, following, rewards, ends
+
+    def width(self, batch_size: int) -> int:
+        """See `StateReplayBuffer.width`; R."""
+        return len(self.counts)
 
     def draw(
         self, count: int, batch_size: int, chance: np.random.RandomState
