@@ -22,6 +22,8 @@ MISSING = "???"  # OmegaConf's sign for a value that has to be given
 MOST_KEPT = 10**9  # episodes that a mean is taken over
 LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end, as RL Zoo writes it
 
+REPLAY_COUNTS = "gridworld.agents.sb3.replay_counts.ReplayCounts"  # a replay buffer that counts transitions
+
 # OmegaConf reads these annotations at run time and knows no `X | None`.
 Schedule = Union[int, float, str]  # noqa: UP007
 WholeNumbers = Annotated[Any, "a whole number, or lists and dicts of them"]  # OmegaConf reads it as Any

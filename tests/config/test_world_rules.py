@@ -6,7 +6,7 @@ import pytest
 from helpers.support import configure, script, train_in
 
 import gridworld
-from gridworld.config.agents import AgentConfig
+from gridworld.config.agents import REPLAY_COUNTS, AgentConfig
 
 DEFAULT = {
     "dqn": {"gamma": 0.9, "learning_rate": 0.001, "batch_size": 128, "buffer_size": 50_000}
@@ -70,6 +70,11 @@ def test_they_follow_the_world_and_the_observation(agent: str) -> None:
         (["env.slip=0.1"], True, 65_536),
         (["env.slip=0.1", "exploration_bonus=0.1"], False, 4096),
         (["env.slip=0.1", "agent.n_steps=3"], False, 4096),
+        (["env.slip=0.1", "agent.engine=stock"], False, 4096),
+        (["env.slip=0.1", "callbacks=[{_target_: mine.Own}]"], False, 4096),
+        (["env.slip=0.1", "callbacks=[{_target_: stable_baselines3.common.callbacks.X}]"], True, 65_536),
+        (["env.slip=0.1", "agent.buffer_size=5000"], True, 65_536),
+        (["env.slip=0.1", "agent.replay_buffer_class=mine.ReplayCounts"], False, 4096),
         (["env.slip=0.1", "agent.replay_buffer_class=null"], False, 4096),
     ],
 )
@@ -77,7 +82,7 @@ def test_transitions_are_counted_where_actions_have_chances(
     words: list[str], counts: bool, batch: int
 ) -> None:
     agent = vars(configure("agent=dqn", *words).agent)
-    assert str(agent["replay_buffer_class"]).endswith(".ReplayCounts") == counts
+    assert (agent["replay_buffer_class"] == REPLAY_COUNTS) == counts
     assert agent["batch_size"] == batch
 
 

@@ -3,7 +3,7 @@
 A finite world has few transitions, and a buffer holds each again and again. Here each stands once, with a
 count, so nothing is forgotten, in little memory. A minibatch is drawn by systematic sampling: of a transition
 with the share p of all that was met, it has B p, rounded up or down by chance. The mean is that of uniform
-sampling, the noise far smaller. It works in any model of Stable-Baselines3 that replays:
+sampling, the noise far smaller. It works in any model of Stable-Baselines3 that replays single steps:
 
     DQN("MlpPolicy", env, replay_buffer_class=ReplayCounts)
 """
@@ -75,6 +75,12 @@ class ReplayCounts(ReplayBuffer):
         super().__init__(_ROOM, observation_space, action_space, device, 1, **options)
         self.counts: IntArray = np.zeros(self.buffer_size, dtype=np.int64)
         self._rows: dict[bytes, int] = {}
+
+    def reset(self) -> None:
+        """Forget all transitions."""
+        super().reset()
+        self.counts[:] = 0
+        self._rows = {}
 
     def add(
         self,

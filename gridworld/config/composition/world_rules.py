@@ -8,8 +8,8 @@
     ${divided:${total_timesteps},600}               as a whole number, at least 1
     ${times:4,${n_envs}}                            the product
     ${quarter:${agent.n_steps},${n_envs}}           a quarter of a rollout's steps
-    ${replay_class:${env},${exploration_bonus},${agent.n_steps}}  a buffer that counts, with chances
-    ${if_set:${agent.replay_buffer_class},A,B}      A where the setting is not null, else B
+    ${replay_class:${env},${exploration_bonus},${callbacks},${agent.engine},${agent.n_steps}}  one that counts
+    ${if_counts:${agent.replay_buffer_class},A,B}   A where transitions are counted, else B
 
 They know the worlds of maps of up to 512 cells. Any other world, and settings that make none, get what the
 default world gets; the check before training says what is wrong with the settings.
@@ -23,8 +23,10 @@ from collections.abc import Sequence
 from dataclasses import astuple
 from typing import TYPE_CHECKING, Any, cast
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from gridworld.config.agents import REPLAY_COUNTS
+from gridworld.config.plain_settings import foreign_imports
 from gridworld.config.worlds import MapConfig
 from gridworld.errors import InputError
 
@@ -35,7 +37,6 @@ _FEATURES = {  # by the kind of observation
     "coordinates": "gridworld.agents.sb3.features.FourierFeatures",
     "image": "gridworld.agents.sb3.features.ImageCells",
 }
-_REPLAY_COUNTS = "gridworld.agents.sb3.replay_counts.ReplayCounts"
 _DEFAULT_CELLS = 30  # of the default world, whose settings were tuned
 _MOST_CELLS = 512  # the rules solve the world a few times, which takes 0.3 s there
 
@@ -48,7 +49,7 @@ def register_world_rules() -> None:
         features_class,
         for_size,
         if_chance,
-        if_set,
+        if_counts,
         quadratic_scale,
         quarter,
         replay_class,
@@ -90,9 +91,9 @@ def if_chance(env: DictConfig, then: Any, otherwise: Any) -> Any:
     return then if world is not None and has_chance(world) else otherwise
 
 
-def if_set(setting: Any, then: Any, otherwise: Any) -> Any:
-    """`then` where a setting is not null."""
-    return otherwise if setting is None else then
+def if_counts(replay_buffer_class: str | None, then: Any, otherwise: Any) -> Any:
+    """`then` with a replay buffer that counts transitions."""
+    return then if replay_buffer_class == REPLAY_COUNTS else otherwise
 
 
 def quadratic_scale(env: DictConfig, gamma: float) -> float | None:
@@ -112,13 +113,17 @@ def quarter(n_steps: int, n_envs: int) -> int:
     return whole if whole % 4 else whole // 4
 
 
-def replay_class(env: DictConfig, exploration_bonus: float, n_steps: int) -> str | None:
+def replay_class(
+    env: DictConfig, exploration_bonus: float, callbacks: ListConfig, engine: str, n_steps: int
+) -> str | None:
     """The import path of a replay buffer that counts, for the world of the section `env`; None: SB3's own.
 
-    It is of use where an action has several outcomes. Its transitions are single steps, whose rewards do not
-    change from visit to visit.
+    It is of use where an action has several outcomes, and large minibatches of it cost nothing in the
+    tabulated engine. Its transitions are single steps, whose rewards do not change from visit to visit.
     """
-    return if_chance(env, _REPLAY_COUNTS, None) if not exploration_bonus and n_steps == 1 else None
+    own_loop = engine != "tabulated" or any(foreign_imports(OmegaConf.to_container(callbacks)))
+    fits = not (exploration_bonus or own_loop or n_steps != 1)
+    return if_chance(env, REPLAY_COUNTS, None) if fits else None
 
 
 def times(number: int, by: int) -> int:

@@ -1,5 +1,6 @@
 """A replay buffer that counts transitions: what it keeps, what it draws, and the engine's version of it."""
 
+import copy
 from collections import Counter
 from collections.abc import Callable
 from fractions import Fraction
@@ -97,8 +98,11 @@ def test_in_sb3s_own_loop_every_transition_is_counted() -> None:
     drawn = buffer.sample(500)
     assert drawn.observations.shape == (500, 72)
     assert len(drawn.actions.unique()) == 4
+    state = copy.deepcopy(buffer.get_state())
+    buffer.reset()
+    assert (buffer.size(), buffer.counts.sum()) == (0, 0)
     other = ReplayCounts(1, model.observation_space, model.action_space, n_envs=NUM_ENVS)
-    other.set_state(buffer.get_state())
+    other.set_state(state)
     assert kept(other) == model.told
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Optional
 
-from gridworld.config.agents import AgentConfig, Schedule, WholeNumbers
+from gridworld.config.agents import REPLAY_COUNTS, AgentConfig, Schedule, WholeNumbers
 from gridworld.config.effects import Effect, affects
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
@@ -71,8 +71,8 @@ class ActorCriticPolicyKwargs(PolicyKwargs):
 
 
 def counts_transitions(settings: Mapping[str, Any]) -> bool:
-    """Whether an agent with these arguments keeps counts of transitions, `replay_counts.ReplayCounts`."""
-    return str(settings.get("replay_buffer_class")).endswith(".ReplayCounts")
+    """Whether an agent with these arguments keeps counts of transitions, not the transitions."""
+    return settings.get("replay_buffer_class") == REPLAY_COUNTS
 
 
 def as_dict(group: Any) -> dict[str, Any]:

@@ -167,7 +167,7 @@ def _check_fields(agent: SB3CheckedConfig, config: TrainConfig) -> None:
 
 def _check_dqn(agent: DQNConfig, config: TrainConfig) -> None:
     at_least("agent.buffer_size", agent.buffer_size, 1)
-    if agent.buffer_size < agent.batch_size:
+    if agent.buffer_size < agent.batch_size and not counts_transitions(vars(agent)):
         raise InputError(
             f"agent.buffer_size={agent.buffer_size}: smaller than a batch; "
             f"must be at least agent.batch_size={agent.batch_size}"

@@ -103,6 +103,11 @@ class StateReplayCounts(ReplayCounts):
     ) -> None:
         super().__init__(buffer_size, spaces.Discrete(1), action_space, *arguments, **options)
         self._num_states, self._num_actions = num_states, int(action_space.n)
+        self.reset()
+
+    def reset(self) -> None:
+        """See `ReplayCounts.reset`."""
+        super().reset()
         self._set(np.empty(0, dtype=np.complex128), np.empty(0, dtype=np.int64))
 
     def store(self, states: IntArray, actions: IntArray, step: StateStep) -> None:
