@@ -17,6 +17,7 @@ from helpers.composing import compose_quickly
 from hypothesis import settings
 
 from gridworld.process.console import progress
+from gridworld.process.garbage import collect_less_often
 
 # The package and the tests are compiled once, not in every process.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -99,7 +100,7 @@ def pytest_collection_finish() -> None:
         sys.modules["gridworld.agents.sb3.factory"].keep_compiler_out()
     compose_quickly()
     gc.freeze()
-    gc.set_threshold(50_000)  # 700 is Python's own
+    collect_less_often()
     huge_pages.collapse()
 
 

@@ -49,6 +49,7 @@ import gridworld
 from gridworld.config.composition.compose import compose
 from gridworld.envs.frames.rendering import import_pygame
 from gridworld.process.console import progress
+from gridworld.process.garbage import collect_less_often
 from gridworld.report import page
 from gridworld.tune import progress as search_progress
 
@@ -73,7 +74,6 @@ _LATE = (
 )
 _NOT_FOR_FORKS = ".on_ray"  # Ray has threads as soon as it is imported
 _IN_RESERVE = 6  # two workers, joblib's watch over resources, and some for workers that are killed
-_OBJECTS_BETWEEN_COLLECTIONS = 50_000  # 700 is Python's own: a tenth of the time of a short script
 _WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 
 
@@ -277,7 +277,7 @@ if __name__ == "__main__":
     _end_without_finalizers()
     gc.freeze()  # so that a fork shares what is there
     huge_pages.collapse()
-    gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
+    collect_less_often()
     gc.enable()
     listener = socket.socket(fileno=int(sys.argv[1]))
     listener.set_inheritable(False)

@@ -264,12 +264,12 @@ def _train(members: Sequence[_Member]) -> list[Exception | None]:
 
 def _stacked(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """(n, P, ..., B), of minibatches (n, ..., B) of P models; shorter ones end in transitions of no share."""
+    first = arrays[0]
     longest = max(array.shape[-1] for array in arrays)
-    widths = ([*[(0, 0)] * (array.ndim - 1), (0, longest - array.shape[-1])] for array in arrays)
-    padded = [
-        np.pad(array, width) if width[-1][1] else array for array, width in zip(arrays, widths, strict=True)
-    ]
-    return np.stack(padded, axis=1)
+    stacked = np.zeros((first.shape[0], len(arrays), *first.shape[1:-1], longest), dtype=first.dtype)
+    for model, array in enumerate(arrays):
+        stacked[:, model, ..., : array.shape[-1]] = array
+    return stacked
 
 
 class Update:

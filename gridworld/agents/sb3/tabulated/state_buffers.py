@@ -124,7 +124,7 @@ class StateReplayCounts(ReplayCounts):
             self._set(all_of_them, counts)
             rows = np.searchsorted(self._met, met)
         self.counts += np.bincount(rows, minlength=len(self.counts))
-        self.pos = int(self.counts.sum())
+        self.pos += len(rows)
 
     def _set(self, met: NDArray[np.complex128], counts: IntArray) -> None:
         self._met, self.counts = met, counts
