@@ -1,14 +1,17 @@
 """Networks of one shape run at once: a layer is a batched product of (P, U, in) with (P, in, out).
 
-A batched product calls, for each of its matrices, the routine that a single one calls. So each network's
-numbers are the same to the last bit, as far as its own numbers lie in memory as they do alone.
+A batched product of matrices calls, for each of them, the routine that a single one calls. So each network's
+numbers are the same to the last bit, as far as its own numbers lie in memory as they do alone. Of products
+with vectors this is tried out (`_batch_is_as_single`), and they are made one by one where it is not so.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -46,8 +49,9 @@ def forward(network: Iterable[nn.Module], leaves: Leaves, features: Tensor | Non
 class _Linear(torch.autograd.Function):
     """P linear layers, with the products that torch makes for a single one, in both directions.
 
-    A layer with one output is a product with a vector, which adds up in an order that depends on where its
-    numbers lie. Where they do not lie as those of a single layer do, it is made run by run, of copies.
+    A layer with one output is a product with a vector, which some processors add up in another order than a
+    batch of such products, and all in an order that depends on where its numbers lie. Where the batch would
+    not do, it is made run by run, of copies that lie as those of a single layer.
     """
 
     @staticmethod
@@ -55,7 +59,7 @@ class _Linear(torch.autograd.Function):
         ctx.save_for_backward(inputs, weight)
         if weight.shape[1] > 1:
             return torch.baddbmm(bias, inputs, weight.transpose(1, 2))
-        if _lies_as_alone(inputs):
+        if _adds_up_as_alone(inputs):
             return torch.bmm(weight, inputs.transpose(1, 2)).transpose(1, 2) + bias
         rows = zip(bias, inputs, weight, strict=True)
         return torch.stack([torch.addmm(own, x.clone(), w.t()) for own, x, w in rows])
@@ -68,7 +72,7 @@ class _Linear(torch.autograd.Function):
             of_inputs = torch.bmm(weight.transpose(1, 2), slope.transpose(1, 2)).transpose(1, 2)
         elif ctx.needs_input_grad[0]:
             of_inputs = torch.bmm(slope, weight)
-        if weight.shape[1] > 1 or _lies_as_alone(inputs):
+        if weight.shape[1] > 1 or _adds_up_as_alone(inputs):
             of_weight = torch.bmm(slope.transpose(1, 2), inputs)
         else:
             rows = zip(slope, inputs, strict=True)
@@ -80,8 +84,27 @@ def _is_transposed(inputs: Tensor) -> bool:
     return inputs.stride()[1:] == (1, inputs.shape[1])
 
 
-def _lies_as_alone(inputs: Tensor) -> bool:
-    return not _is_transposed(inputs) and inputs.stride(0) % ALIGNMENT == 0
+def _adds_up_as_alone(inputs: Tensor) -> bool:
+    lies_so = not _is_transposed(inputs) and inputs.stride(0) % ALIGNMENT == 0
+    return lies_so and (not inputs.is_cpu or _batch_is_as_single(*inputs.shape[1:], torch.get_num_threads()))
+
+
+@functools.lru_cache(maxsize=256)
+def _batch_is_as_single(rows: int, width: int, threads: int) -> bool:
+    """Whether two products with vectors add up in a batch as each does alone, in both directions."""
+    numbers = np.random.default_rng(0)
+    inputs, weight, slope = (
+        torch.from_numpy(numbers.normal(size=(2, *shape)).astype(np.float32))
+        for shape in ((rows, width), (width, 1), (rows, 1))
+    )
+    outputs, slopes = torch.bmm(weight.transpose(1, 2), inputs.transpose(1, 2)), slope.transpose(1, 2)
+    return all(
+        torch.equal(own_output[0], torch.mm(x.clone(), w.clone())[:, 0])
+        and torch.equal(own_slope, torch.mm(g.clone().t(), x.clone()))
+        for own_output, own_slope, x, w, g in zip(
+            outputs, torch.bmm(slopes, inputs), inputs, weight, slope, strict=True
+        )
+    )
 
 
 _linear: Any = _Linear.apply
