@@ -15,7 +15,7 @@ import numpy as np
 from stable_baselines3 import PPO
 
 from gridworld.agents.sb3.tabulated.flat_optimizer import not_finite
-from gridworld.agents.sb3.tabulated.losses.ppo import Losses, Outputs, losses_and_slopes, sum_up
+from gridworld.agents.sb3.tabulated.losses.ppo import Losses, Outputs, Sums, losses_and_slopes, sum_up
 from gridworld.agents.sb3.tabulated.on_policy import (
     Rollouts,
     TabulatedOnPolicy,
@@ -102,6 +102,7 @@ class _Update:
         self._batch = Rollouts(self._models, rows)
         self._going = np.arange(len(runs))  # those that have not ended their epochs
         self._all_going = True
+        self._whole: tuple[IntArray | None, Sums] | None = None  # of a minibatch that is the whole rollout
         self._old = Outputs(*map(np.stack, zip(*(model.old for model in self._models), strict=True)))
         clip_ranges, of_values = zip(*(model.clip_ranges() for model in self._models), strict=True)
         self._weights = weights_of(self._models, clip_ranges, None if of_values[0] is None else of_values)
@@ -115,15 +116,24 @@ class _Update:
             self._runs[run].last_epoch = len(self._runs[run].logged)
             self._runs[run].epochs += 1
         count, size = self._batch.states.shape[1], self._models[0].batch_size
+        if size >= count:  # whatever their order
+            if len(self._going):
+                self._whole = self._whole or self._summed_up(np.tile(np.arange(count), (len(self._going), 1)))
+                self._make_step(*self._whole)
+            return
         order = np.zeros((len(self._runs), count), dtype=np.int64)
         for run in going:
             order[run] = self._runs[run].chance.permutation(count)
         for start in range(0, count, size):
             if len(self._going):
-                self._make_step(order[self._going, start : start + size])
+                self._make_step(*self._summed_up(order[self._going, start : start + size]))
 
-    def _make_step(self, batch: IntArray) -> None:
-        """Make a step on the samples (R, B) of those R runs that go on."""
+    def _summed_up(self, batch: IntArray) -> tuple[IntArray | None, Sums]:
+        """Find the states to run the network on, None for all, and the sums there.
+
+        Args:
+            batch: (R, B), samples of those R runs that go on.
+        """
         taken = batch + self._going[:, None] * self._batch.states.shape[1]
         states, pairs, advantages, returns = (
             getattr(self._batch, name).take(taken) for name in ("states", "pairs", "advantages", "returns")
@@ -131,8 +141,13 @@ class _Update:
         if self._models[0].normalize_advantage and batch.shape[1] > 1:
             advantages = normalized(advantages)
         which, states, pairs = self._batch.distinct(states, pairs)
+        num_runs, num_states, num_actions = self._old.log_prob.shape
+        shape = num_runs, num_states if which is None else len(which), num_actions
+        return which, sum_up(states, pairs, advantages, returns, shape)
+
+    def _make_step(self, which: IntArray | None, sums: Sums) -> None:
+        """Make a step of those runs that go on; see `_summed_up`."""
         old = self._old if which is None else Outputs(*(table[:, which] for table in self._old))
-        sums = sum_up(states, pairs, advantages, returns, old.log_prob.shape)
         outputs = self._batch.outputs(which)
         new, weights = tables_of_runs(*outputs), self._weights
         if not self._all_going:
@@ -158,6 +173,7 @@ class _Update:
     def _end(self, goes_on: list[bool]) -> None:
         if not all(goes_on):
             self._going, self._all_going = self._going[goes_on], False
+            self._whole = None
 
     def _of_all(self, slopes: FloatArray) -> FloatArray:
         """Slopes of those that go on, and 0 for the others."""
