@@ -15,7 +15,9 @@ from gridworld.config.effects import EFFECTS, Effect
 from gridworld.config.train import TrainConfig
 
 # Where one of these is empty, a run is as those that were made before there was such a setting.
-_NEWER = frozenset({"callbacks", "exploration_bonus", "exploring_starts", "agent.reward_scale"})
+_NEWER = frozenset(
+    {"callbacks", "exploration_bonus", "exploring_starts", "stratified_draws", "agent.reward_scale"}
+)
 
 ON_RESULT = frozenset(Effect) - {Effect.FILES, Effect.NOTHING}
 

@@ -69,6 +69,8 @@ class TrainConfig:
     # b of b / sqrt(N), added to a reward of training for an action that was taken there N times; 0 for none
     exploration_bonus: float = 0.0
     exploring_starts: float = 0.0  # share of training episodes that begin in a state drawn uniformly
+    # whether environments in one state share out an action's outcomes evenly, see `gridworld.envs.stratified`
+    stratified_draws: bool = False
     device: str = field(default="cpu", metadata=affects(Effect.MACHINE))
     threads: int = field(default=1, metadata=affects(Effect.MACHINE))  # of torch
     # of SB3: each a mapping of `_target_`, the import path of a class, and its arguments

@@ -180,8 +180,9 @@ class _Joint:
 
     def _draw_outcomes(self, pairs: StateArray) -> StateArray:
         moving = np.flatnonzero(~self._still.take(self.states + self._first_state))
-        draws = self._draws(moving)
-        thresholds = self._thresholds.take(pairs[moving], axis=1)
+        situations = pairs[moving]
+        draws = self._draws(moving, situations)
+        thresholds = self._thresholds.take(situations, axis=1)
         drawn = (draws >= thresholds[0]).astype(np.int64)
         for each in thresholds[1:]:
             drawn += draws >= each
@@ -199,12 +200,10 @@ class _Joint:
                 starts[start:end] = batch.draw_starts(end - start)
         return starts
 
-    def _draws(self, where: StateArray) -> FloatArray:
+    def _draws(self, where: StateArray, situations: StateArray) -> FloatArray:
         """A number for each of these places, from the generators of their batches."""
-        cuts = self._cuts(where)
-        counts = [end - start for start, end in itertools.pairwise(cuts)]
-        pairs = zip(self._batches, counts, strict=True)
-        return np.concatenate([batch.np_random.random(count) for batch, count in pairs])
+        parts = zip(self._batches, itertools.pairwise(self._cuts(where)), strict=True)
+        return np.concatenate([batch.draw_numbers(situations[start:end]) for batch, (start, end) in parts])
 
     def _cuts(self, where: StateArray) -> list[int]:
         """Of ascending places, the first of each batch; and their number."""

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from gridworld.bounds import STEP_LIMIT
 from gridworld.envs.frames import rendering as drawing
 from gridworld.envs.frames.rendering import CELL_SIZE, Frame
+from gridworld.envs.stratified import stratified_numbers
 from gridworld.errors import InputError
 from gridworld.storage.rng_state import generator_state, set_generator_state
 from gridworld.storage.serialization import State, StateError, fill
@@ -79,6 +80,10 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
     Episodes are truncated after `max_episode_steps` (None: never). The other arguments are those of
     `GridWorldEnv`; `render_mode="rgb_array"` gives one frame per environment.
 
+    With `stratified`, environments that take the same action in the same state at the same time share out its
+    outcomes evenly, and those that start at the same time the starts: see `envs.stratified`. The episodes of
+    each have the same probabilities as without.
+
     Raises:
         InputError: a setting that makes no world or no batch.
     """
@@ -105,6 +110,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         trap_reward: float = -1.0,
         cell_size: int = CELL_SIZE,
         mdp: Mdp | None = None,
+        stratified: bool = False,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise InputError(f"render_mode={render_mode!r}: a batch can be drawn as rgb_array only (or None)")
@@ -124,6 +130,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         self.render_mode = render_mode
         self.cell_size = positive_int("cell_size", cell_size)
         self.metadata = {**self.metadata, "autoreset_mode": self._autoreset}
+        self._stratified = stratified
         self.single_observation_space = spaces.Discrete(self.mdp.num_states)
         self.single_action_space = spaces.Discrete(self.mdp.num_actions)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -305,7 +312,22 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
     def draw_starts(self, count: int) -> Any:
         """The states in which so many new episodes begin, (count,), or the one in which all do."""
         starts = self.mdp.start_states
-        return starts[0] if len(starts) == 1 else starts[self.mdp.start_index(self.np_random.random(count))]
+        if len(starts) == 1:
+            return starts[0]
+        return starts[self.mdp.start_index(self.draw_numbers(np.zeros(count, dtype=np.int64)))]
+
+    def draw_numbers(self, situations: StateArray) -> FloatArray:
+        """A number from [0, 1) for each of some environments, to draw what happens to it.
+
+        Args:
+            situations: (n,), the same number where the same may happen with the same probabilities.
+
+        Returns:
+            (n,), evenly spread over each situation where the batch is stratified, else independent.
+        """
+        if self._stratified:
+            return stratified_numbers(situations, self.np_random)
+        return self.np_random.random(len(situations))
 
     def _restart(self, which: NDArray[np.intp]) -> None:
         self._state[which] = self.draw_starts(len(which))
@@ -319,7 +341,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         if starting is not None:
             still[starting] = True
         moving = np.flatnonzero(~still)
-        draws = self.np_random.random(len(moving))
+        draws = self.draw_numbers(pairs[moving])
         outcomes = np.zeros(self.num_envs, dtype=np.int64)
         thresholds = self._thresholds
         if thresholds.ndim == 2:

@@ -45,6 +45,7 @@ def make_context(
         exploration_bonus=config.exploration_bonus,
         max_episode_steps=config.env.step_limit(mdp),
         mdp=_with_exploring_starts(mdp, share) if share else mdp,
+        stratified=config.stratified_draws,
     )
     return TrainingContext(
         envs, observation, config.seed, config.device, config.threads, write_scalars, config.callbacks

@@ -78,7 +78,7 @@ def test_every_field_affects_what_is_declared() -> None:
     learning = found.pop(Effect.LEARNING)
     assert found == DECLARED
     others = {key for key in learning if not key.startswith("agent.")}
-    exploring = {"exploration_bonus", "exploring_starts"}
+    exploring = {"exploration_bonus", "exploring_starts", "stratified_draws"}
     assert others == exploring | {"callbacks", "n_envs", "observation.kind", "observation.cell_size"}
 
 
@@ -158,8 +158,8 @@ def test_what_a_run_is_known_by_leaves_out_what_it_may_change_on_its_way() -> No
     config = configure("agent=a2c_sb3_defaults", "env=maze")
     content = dataclasses.asdict(config)
     del content["checkpoint"], content["total_timesteps"], content["logging"]["progress"]
-    newer = ("callbacks", "exploration_bonus", "exploring_starts")
-    assert [content.pop(key) for key in newer] == [[], 0, 0]  # as if there were none
+    newer = ("callbacks", "exploration_bonus", "exploring_starts", "stratified_draws")
+    assert [content.pop(key) for key in newer] == [[], 0, 0, False]  # as if there were none
     assert (
         with_effects(frozenset(Effect) - {Effect.LENGTH, Effect.NOTHING}, dataclasses.asdict(config))
         == content

@@ -1,0 +1,145 @@
+"""Draws that environments share out evenly: each environment's own chances stay what they are."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from gridworld import GridWorldEnv
+from gridworld.envs.joint_rollout import roll
+from gridworld.envs.statistics_env import StatisticsVectorEnv
+from gridworld.envs.stratified import stratified_numbers
+from gridworld.envs.vector_env import GridWorldVectorEnv
+from gridworld.world.mdp import FloatArray, IntArray
+
+GROUPS = st.lists(st.integers(0, 9), min_size=1, max_size=60).map(np.array)
+
+
+def by_hand(groups: IntArray, rng: np.random.Generator) -> FloatArray:
+    """Group by group, member by member."""
+    numbers = np.empty(len(groups))
+    for group in sorted(set(groups.tolist())):
+        shift = rng.random()
+        members = [place for place, other in enumerate(groups) if other == group]
+        for rank, place in enumerate(members):
+            numbers[place] = (rank / len(members) + shift) % 1.0
+    return numbers
+
+
+@given(GROUPS, st.integers(0, 2**32 - 1), st.sampled_from([0, 70_000]))
+def test_the_numbers_are_those_of_a_loop_over_groups(groups: IntArray, seed: int, first: int) -> None:
+    found, expected = np.random.default_rng(seed), np.random.default_rng(seed)
+    assert np.array_equal(stratified_numbers(groups + first, found), by_hand(groups, expected))
+    assert found.bit_generator.state == expected.bit_generator.state
+
+
+@given(GROUPS, st.integers(0, 2**32 - 1), st.floats(0, 1), st.floats(0, 1))
+def test_a_part_of_the_interval_gets_its_share_of_a_group_rounded_down_or_up(
+    groups: IntArray, seed: int, first: float, last: float
+) -> None:
+    low, high = min(first, last), max(first, last)
+    numbers = stratified_numbers(groups, np.random.default_rng(seed))
+    assert ((numbers >= 0) & (numbers < 1)).all()
+    for group in np.unique(groups):
+        of_group = numbers[groups == group]
+        met, share = int(((of_group >= low) & (of_group < high)).sum()), len(of_group) * (high - low)
+        assert math.floor(share - 1e-9) <= met <= math.ceil(share + 1e-9)
+
+
+def test_nobody_draws_nothing() -> None:
+    rng = np.random.default_rng(0)
+    before = rng.bit_generator.state
+    assert stratified_numbers(np.empty(0, dtype=np.int64), rng).shape == (0,)
+    assert rng.bit_generator.state == before
+
+
+def test_the_numbers_of_a_place_are_uniform_and_independent() -> None:
+    """Whatever the groups are: of 400 places, as many fail a test as should."""
+    rng, draws = np.random.default_rng(5), np.random.default_rng(6)
+    groups = draws.integers(0, 12, (2000, 400))
+    numbers = np.stack([stratified_numbers(row, rng) for row in groups])
+    uniform = stats.kstest(numbers, "uniform").pvalue
+    steps = np.floor(numbers * 4).astype(int)
+    pairs = steps[:-1:2] * 4 + steps[1::2]  # of consecutive draws
+    counts = np.stack([np.bincount(column, minlength=16) for column in pairs.T])
+    independent = stats.chisquare(counts, axis=1).pvalue
+    for values in (uniform, independent):
+        assert stats.binomtest(int((values < 0.05).sum()), 400, 0.05).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.1, 0.7])
+def test_a_batch_of_one_takes_the_single_environments_walk(slip: float) -> None:
+    single = GridWorldEnv(slip=slip)
+    batch = GridWorldVectorEnv(
+        1, slip=slip, autoreset_mode="Disabled", max_episode_steps=None, stratified=True
+    )
+    actions = np.random.default_rng(0).integers(0, 4, 300)
+    state, _ = single.reset(seed=3)
+    states, _ = batch.reset(seed=3)
+    for action in actions:
+        assert states[0] == state
+        state, reward, terminated, truncated, _ = single.step(int(action))
+        states, *found, _ = batch.step(np.array([action]))
+        assert [each[0] for each in found] == [reward, terminated, truncated]
+        if terminated or truncated:
+            state, _ = single.reset()
+            states, _ = batch.reset()
+
+
+def outcomes(stratified: bool, steps: int, num_envs: int) -> tuple[IntArray, IntArray]:
+    """Where steps led to that all environments began in one state, (steps, num_envs)."""
+    envs = GridWorldVectorEnv(num_envs, slip=0.2, autoreset_mode="Disabled", stratified=stratified)
+    envs.reset(seed=1)
+    start, _, _ = envs.under_way
+    start = start.copy()
+    led = np.empty((steps, num_envs), dtype=np.int64)
+    for step in range(steps):
+        envs.go_on_from(start, np.zeros(num_envs, dtype=np.int64), np.zeros(num_envs))
+        led[step] = envs.step(np.full(num_envs, 2))[0]
+    return start, led
+
+
+def test_the_shares_of_a_batch_have_hardly_any_noise_and_the_same_mean() -> None:
+    _, even = outcomes(True, 2000, 25)
+    _, independent = outcomes(False, 2000, 25)
+    for state in np.unique(independent):
+        counts, others = (even == state).sum(axis=1), (independent == state).sum(axis=1)
+        share = others.mean()
+        assert np.ptp(counts) <= 2 < np.ptp(others)  # a state that two outcomes lead to rounds twice
+        assert abs(counts.mean() - share) < 5 * others.std() / math.sqrt(len(others))
+
+
+def test_the_starts_are_spread_over_the_states() -> None:
+    mdp = GridWorldEnv().mdp.with_exploring_starts(1.0)
+    envs = GridWorldVectorEnv(len(mdp.start_states) * 7, mdp=mdp, stratified=True)
+    states, _ = envs.reset(seed=0)
+    assert (np.bincount(states)[mdp.start_states] == 7).all()
+
+
+@pytest.mark.parametrize("num_envs", [1, 3, 40])
+def test_rollouts_of_several_batches_draw_what_each_would_alone(num_envs: int) -> None:
+    mdp = GridWorldEnv(slip=0.3).mdp.with_exploring_starts(0.5)
+    other = GridWorldEnv(slip=0.1, num_rows=7).mdp.with_exploring_starts(0.5)
+
+    def batches() -> list[StatisticsVectorEnv]:
+        made = [
+            StatisticsVectorEnv(num_envs, mdp=world, stratified=True, max_episode_steps=20)
+            for world in (mdp, other, mdp)
+        ]
+        for seed, each in enumerate(made):
+            each.reset(seed=seed)
+        return made
+
+    draws = np.random.default_rng(2).random((3, 60, num_envs), dtype=np.float32)
+    together, alone = batches(), batches()
+    thresholds = [np.tile([[0.25], [0.5], [0.75]], (1, each.mdp.num_states)) for each in together]
+    rollouts = roll(together, thresholds, draws)
+    for rolled, batch, own in zip(rollouts, alone, draws, strict=True):
+        for step in range(60):
+            assert np.array_equal(batch.states, rolled.states[step])
+            found = batch.advance(np.floor(own[step] * 4).astype(np.int64))
+            assert np.array_equal(found[1], rolled.rewards[step])
+        assert np.array_equal(batch.states, rolled.final_states)
