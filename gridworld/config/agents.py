@@ -70,6 +70,11 @@ def agent_schemas() -> dict[str, type[AgentConfig]]:
     return found
 
 
+def falls(value: object) -> bool:
+    """Whether a setting's value is written as a rate that falls, `lin_NUMBER`."""
+    return isinstance(value, str) and value.startswith(LINEAR)
+
+
 def parse_schedule(key: str, value: Schedule) -> tuple[float, bool]:
     """Read a rate that may fall over training.
 
@@ -83,9 +88,9 @@ def parse_schedule(key: str, value: Schedule) -> tuple[float, bool]:
     Raises:
         InputError: `value` is neither.
     """
-    linear = isinstance(value, str) and value.startswith(LINEAR)
+    linear = falls(value)
     try:
-        number = float(value.removeprefix(LINEAR) if isinstance(value, str) and linear else value)
+        number = float(value.removeprefix(LINEAR) if isinstance(value, str) else value)
     except (ValueError, OverflowError):
         number = math.nan
     if not 0 <= number < math.inf or (isinstance(value, str) and not linear):

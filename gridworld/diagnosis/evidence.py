@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot
-from gridworld.config.agents import parse_schedule
+from gridworld.config.agents import falls, parse_schedule
 from gridworld.config.train import TrainConfig
 from gridworld.diagnosis.split import RegretSplit, split_regret
 from gridworld.errors import InputError
@@ -157,6 +157,12 @@ class Evidence:
         if isinstance(given, list | tuple):
             given = given[0]
         return float(given) if isinstance(given, int | float) else default
+
+    def last_setting(self, name: str) -> float:
+        """The same, but of a schedule its last value."""
+        agent = self.config.agent
+        given = vars(agent).get(name, vars(agent).get("arguments", {}).get(name))
+        return 0.0 if falls(given) else self.setting(name)
 
     def change(self, name: str, value: float | str) -> str:
         """The word that sets one of the agent's settings on a command line."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gridworld.config.agents import LINEAR, AgentConfig, parse_schedule
+from gridworld.config.agents import AgentConfig, falls, parse_schedule
 from gridworld.config.flatten import flat
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import BuiltConfig, EnvConfig, GymnasiumConfig, MapConfig
@@ -316,9 +316,7 @@ def _what_changes(config: TrainConfig, steps: int, old_total: int) -> str:
 def _schedules(config: TrainConfig, progress: float) -> dict[str, float]:
     agent = getattr(config.agent, "arguments", None) or vars(config.agent)
     found = {
-        key: parse_schedule(key, value)[0] * (1 - progress)
-        for key, value in agent.items()
-        if isinstance(value, str) and value.startswith(LINEAR)
+        key: parse_schedule(key, value)[0] * (1 - progress) for key, value in agent.items() if falls(value)
     }
     fraction = agent.get("exploration_fraction")
     if fraction:

@@ -78,7 +78,7 @@ TRAIN = [
     ("agent=ppo agent.batch_size=1000", "agent.batch_size=1000: must divide the rollout"),
     ("agent=ppo agent.use_sde=true", "agent.use_sde=true: gSDE explores continuous actions"),
     ("agent=ppo agent.clip_range=-0.1", "agent.clip_range=-0.1: must be"),
-    ("agent=ppo agent.ent_coef=nan", "agent.ent_coef=nan: must be at least 0"),
+    ("agent=ppo agent.ent_coef=nan", "agent.ent_coef=nan: must be a number of at least 0, or lin_NUMBER"),
     ("agent=ppo agent.target_kl=0", "agent.target_kl=0.0: must be a positive number"),
     ("agent.buffer_size=10", "agent.buffer_size=10: smaller than a batch"),
     ("agent.learning_starts=100000", "must be below total_timesteps="),

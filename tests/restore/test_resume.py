@@ -19,7 +19,7 @@ CASES = {
         *(*SHORT["dqn"], "agent.engine=stock", "n_envs=8"),
         *("agent.buffer_size=2000", "agent.gradient_steps=4"),
     ],
-    "ppo": SHORT["ppo"],
+    "ppo": [*SHORT["ppo"], "agent.ent_coef=lin_0.5", "stratified_draws=true", "env.slip=0.1"],
     "ppo stock": [*SHORT["ppo"], "agent.engine=stock", "agent.log_interval=2"],
     **{f"{name} stock": [*SHORT[name], "agent.engine=stock"] for name in ("a2c", "qrdqn", "trpo")},
     **{name: SHORT[name] for name in ("a2c", "qrdqn", "trpo", "q_learning", "sarsa", "expected_sarsa")},

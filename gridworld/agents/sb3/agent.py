@@ -13,6 +13,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.save_util import recursive_getattr
 
 from gridworld.agents import PolicySnapshot, TrainingContext, WriteScalars
+from gridworld.agents.sb3.entropy_schedule import entropy_schedules
 from gridworld.agents.sb3.factory import make_model
 from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters, reason
 from gridworld.agents.sb3.policy_outputs import Reading, epsilon_greedy, of_q, read, read_states
@@ -51,7 +52,7 @@ class SB3Agent:
         self.observation = context.observation
         self._loaded = False
         self.model = make_model(config, context)
-        self._callbacks = make_callbacks(context.callbacks)
+        self._callbacks = [*make_callbacks(context.callbacks), *entropy_schedules(config)]
         writers = [] if context.write_scalars is None else [_ScalarsOnly(context.write_scalars)]
         self.model.set_logger(Logger(folder=None, output_formats=list(writers)))
 

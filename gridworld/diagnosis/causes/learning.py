@@ -56,7 +56,7 @@ def hardly_moved(run: Evidence) -> Finding | None:
 
 def overshot(run: Evidence) -> Finding | None:
     """A policy that is far more decided than its entropy bonus would leave it."""
-    bonus = run.setting("ent_coef")
+    bonus = run.last_setting("ent_coef")
     if not run.is_actor_critic or bonus <= 0:
         return None
     aim = entropy(entropy_optimum(run, bonus))

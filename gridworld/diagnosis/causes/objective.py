@@ -77,7 +77,7 @@ def clearest_gamma(run: Evidence, states: BoolArray) -> float:
 
 def too_much_entropy(run: Evidence) -> Finding | None:
     """The policy that its entropy bonus aims at is itself poor."""
-    bonus = run.setting("ent_coef")
+    bonus = run.last_setting("ent_coef")
     if not run.is_actor_critic or bonus <= 0:
         return None
     aim = entropy_optimum(run, bonus)

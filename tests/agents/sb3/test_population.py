@@ -128,6 +128,7 @@ def test_seeds_train_as_alone(agent: str, meetings: list[int]) -> None:
 OF_ALL: list[list[Words]] = [
     [(), ("env.slip=0.3",), ("env.slip=0.1", "env.max_episode_steps=7"), ("env.step_reward=-0.5",)],
     [(), ("total_timesteps=110",), ("total_timesteps=300",)],
+    [("env.slip=0.1", f"stratified_draws={value}") for value in ("true", "false")],
 ]
 OPTIMIZERS = [f"policy_kwargs.optimizer_class=torch.optim.{name}" for name in ("AdamW", "SGD", "RMSprop")] + [
     ""
@@ -162,6 +163,7 @@ DIFFERENT: dict[str, list[list[str]]] = {  # of each argument; the empty one is 
         ["clip_range_vf=0.01", "clip_range_vf=lin_1", ""],
         ["max_grad_norm=0.01", "max_grad_norm=1000", ""],
         OPTIMIZERS,
+        ["ent_coef=lin_0.3", ""],
     ],
     "a2c": [
         ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
@@ -233,6 +235,7 @@ WRITTEN = {
         ("agent.n_steps=2", "agent.batch_size=1", "total_timesteps=24", "agent.normalize_advantage=false"),
     ),
     "ppo whole batch": ("ppo", ("agent.batch_size=32", "agent.normalize_advantage=false")),
+    "ppo whole rollout": ("ppo", ("agent.batch_size=32", "agent.n_epochs=4", "agent.target_kl=0.002")),
     "ppo one environment": ("ppo", ("n_envs=1", "agent.n_steps=15", "agent.batch_size=5")),
     "a2c one step": ("a2c", ("agent.arguments.n_steps=1", "total_timesteps=24")),
     "a2c scaled": ("a2c", ("++agent.arguments.normalize_advantage=true",)),

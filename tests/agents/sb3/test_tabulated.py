@@ -136,6 +136,7 @@ FROM_ROLLOUTS: dict[tuple[type, type], list[tuple[str, dict[str, Any]]]] = {
         ("one_hot", {"max_grad_norm": 0.01}),
         ("one_hot", {"target_kl": 1e-3}),
         ("one_hot", {"n_epochs": 3, "batch_size": 100}),
+        ("one_hot", {"n_epochs": 3, "batch_size": 10_000}),
         *[("none", LINEAR), ("coordinates", TWO_SIZES), ("coordinates", SEPARATE), ("image", SEPARATE)],
         *[("coordinates", FOURIER), ("image", CELLS), ("coordinates", APART)],
         ("one_hot", {"policy_kwargs": RELU}),

@@ -17,10 +17,10 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import LinearSchedule
 
 from gridworld.agents.sb3.settings.schemas import SB3CheckedConfig, SB3ClassConfig, SB3Config, as_dict
-from gridworld.agents.sb3.settings.validation import SCHEDULES
+from gridworld.agents.sb3.settings.validation import ENTROPY_BONUS, SCHEDULES
 from gridworld.agents.sb3.tabulated.state_inputs import why_not
 from gridworld.agents.sb3.tabulated.versions import tabulated_version
-from gridworld.config.agents import parse_schedule
+from gridworld.config.agents import falls, parse_schedule
 from gridworld.config.plain_settings import foreign_imports
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import tell
@@ -104,6 +104,8 @@ def _check_arguments(config: SB3ClassConfig, algorithm: type[BaseAlgorithm]) -> 
                 f"agent.arguments.{name}: {config.algorithm} has no such argument; it has {known}"
             )
         wanted = parameters[name].annotation if name in parameters else None
+        if name == ENTROPY_BONUS and falls(value):
+            continue
         if wanted in _PLAIN_TYPES and not _is_a(value, wanted):
             raise InputError(f"agent.arguments.{name}={value}: must be {wanted.__name__}")
 
@@ -130,6 +132,8 @@ def _convert(given: Arguments, where: str) -> Arguments:
     for name, value in given.items():
         if name in SCHEDULES and isinstance(value, str):
             value = LinearSchedule(parse_schedule(where + name, value)[0], 0.0, 1.0)
+        elif name == ENTROPY_BONUS and falls(value):
+            value = parse_schedule(where + name, value)[0]
         elif name == "train_freq" and isinstance(value, list):
             value = tuple(value)
         elif name.endswith(("_class", "_fn")) and value is not None:

@@ -193,7 +193,7 @@ class PPOConfig(SB3CheckedConfig):
     clip_range: Schedule = 0.2
     clip_range_vf: Optional[Schedule] = None  # noqa: UP045
     normalize_advantage: bool = True
-    ent_coef: float = 0.0
+    ent_coef: Schedule = 0.0
     vf_coef: float = 0.5
     max_grad_norm: float = 0.5
     use_sde: bool = False

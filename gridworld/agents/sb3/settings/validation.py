@@ -28,6 +28,7 @@ _COUNTS = (
     *("buffer_size", "target_update_interval", "stats_window_size", "n_quantiles"),
 )
 SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
+ENTROPY_BONUS = "ent_coef"  # a number in SB3; as a schedule, see `gridworld.agents.sb3.entropy_schedule`
 _ORDINARY = 1e3  # a rate or a coefficient; beyond, numbers of 32 bits may come to their end
 _LEAST_REWARD, _MOST_RETURN = 1e-30, 1e15
 # Those that are a share or a probability.
@@ -104,7 +105,7 @@ def _is_judged(name: str, value: Any, default: Any) -> bool:
         return "." not in value
     if counts_transitions({name: value}):
         return True
-    if name in SCHEDULES:
+    if name in (*SCHEDULES, ENTROPY_BONUS):
         return parse_schedule(name, value)[0] <= _ORDINARY
     return isinstance(value, int) or (isinstance(value, float) and abs(value) <= _ORDINARY)
 
@@ -238,7 +239,7 @@ def _check_ppo(agent: PPOConfig, config: TrainConfig) -> None:
         value = getattr(agent, name)
         if value is not None:
             at_most(f"agent.{name}", parse_schedule(f"agent.{name}", value)[0], _MOST_RETURN)
-    at_least("agent.ent_coef", agent.ent_coef, 0)
+    parse_schedule("agent.ent_coef", agent.ent_coef)
     at_least("agent.vf_coef", agent.vf_coef, 0)
     above_zero("agent.max_grad_norm", agent.max_grad_norm)
     if agent.use_sde:

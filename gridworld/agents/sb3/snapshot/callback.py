@@ -42,7 +42,7 @@ class CheckpointCallback(BaseCallback):
         on_safe_point: takes the steps so far; None: nothing is to be saved.
         observation: of the model's environments.
         root: the code of the function that calls `learn()`.
-        others: callbacks of the user's.
+        others: callbacks of the user's, and then those that the agent's settings ask for.
 
     Attributes:
         state: to go on from, set before training; None: from the start.
@@ -68,7 +68,8 @@ class CheckpointCallback(BaseCallback):
         self._classes = ClassState()
         self.state: State | None = None
         self.goes_on = True
-        self.reads_locals = bool(others)  # whether anybody reads the variables of SB3's loop
+        # whether anybody reads the variables of SB3's loop
+        self.reads_locals = any(getattr(other, "reads_locals", True) for other in others)
 
     def _init_callback(self) -> None:
         for index, other in enumerate(self._others):
