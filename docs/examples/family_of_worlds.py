@@ -125,6 +125,8 @@ def main() -> None:
     parser.add_argument("--samples", type=float, help="plan on so many transitions, in place of training")
     parser.add_argument("--observations", nargs="+", default=["one_hot", "coordinates", "image"])
     options = parser.parse_args()
+    if options.samples is not None and options.samples < 1:
+        parser.error(f"--samples {options.samples:g}: must be at least 1")
     results = []
     with tempfile.TemporaryDirectory() as maps:
         for number, (kind, words) in enumerate(draw(options.seed, options.pairs, Path(maps))):

@@ -40,12 +40,10 @@ def test_the_default_world_has_the_settings_that_it_was_tuned_with(agent: str) -
     assert (config.n_envs, config.exploring_starts, widths(config.agent)) == (128, 0.0, None)
 
 
-@pytest.mark.parametrize(("envs", "batch"), [(1024, 8192), (128, 1024), (1, 8)])
-def test_a_minibatch_divides_the_rollout_of_any_number_of_environments(envs: int, batch: int) -> None:
-    config = configure("agent=ppo", "env.slip=0.1", f"n_envs={envs}")
-    assert vars(config.agent)["batch_size"] == batch
-    odd = configure("agent=ppo", "env.slip=0.1", "n_envs=1", "agent.n_steps=5")
-    assert vars(odd.agent)["batch_size"] == 5
+@pytest.mark.parametrize("envs", [1024, 128, 1])
+def test_with_chances_a_minibatch_is_the_rollout_of_any_number_of_environments(envs: int) -> None:
+    config = configure("agent=ppo", "env.slip=0.1", f"n_envs={envs}", "agent.n_steps=5")
+    assert vars(config.agent)["batch_size"] == 5 * envs
 
 
 @AGENTS
@@ -54,6 +52,7 @@ def test_they_follow_the_world_and_the_observation(agent: str) -> None:
     assert random.total_timesteps > plain.total_timesteps
     assert random.n_envs > plain.n_envs
     assert random.exploring_starts == 1
+    assert (plain.stratified_draws, random.stratified_draws) == (False, True)
     assert vars(random.agent)["gamma"] == 0.95
     assert vars(configure(f"agent={agent}", "env.slip=0.2").agent)["gamma"] == 0.98
     large = configure(f"agent={agent}", "env.num_rows=12", "env.num_cols=12")
@@ -67,13 +66,13 @@ def test_they_follow_the_world_and_the_observation(agent: str) -> None:
     ("words", "counts", "batch"),
     [
         ([], False, 128),
-        (["env.slip=0.1"], True, 65_536),
+        (["env.slip=0.1"], True, 1_048_576),
         (["env.slip=0.1", "exploration_bonus=0.1"], False, 4096),
         (["env.slip=0.1", "agent.n_steps=3"], False, 4096),
         (["env.slip=0.1", "agent.engine=stock"], False, 4096),
         (["env.slip=0.1", "callbacks=[{_target_: mine.Own}]"], False, 4096),
-        (["env.slip=0.1", "callbacks=[{_target_: stable_baselines3.common.callbacks.X}]"], True, 65_536),
-        (["env.slip=0.1", "agent.buffer_size=5000"], True, 65_536),
+        (["env.slip=0.1", "callbacks=[{_target_: stable_baselines3.common.callbacks.X}]"], True, 1_048_576),
+        (["env.slip=0.1", "agent.buffer_size=5000"], True, 1_048_576),
         (["env.slip=0.1", "agent.replay_buffer_class=mine.ReplayCounts"], False, 4096),
         (["env.slip=0.1", "agent.replay_buffer_class=null"], False, 4096),
     ],

@@ -7,7 +7,6 @@
     ${features_class:${observation.kind},${agent.policy}}  of an MLP, for what the agent sees
     ${divided:${total_timesteps},600}               as a whole number, at least 1
     ${times:4,${n_envs}}                            the product
-    ${quarter:${agent.n_steps},${n_envs}}           a quarter of a rollout's steps
     ${replay_class:${env},${exploration_bonus},${callbacks},${agent.engine},${agent.n_steps}}  one that counts
     ${if_counts:${agent.replay_buffer_class},A,B}   A where transitions are counted, else B
 
@@ -51,7 +50,6 @@ def register_world_rules() -> None:
         if_chance,
         if_counts,
         quadratic_scale,
-        quarter,
         replay_class,
         times,
     ):
@@ -105,12 +103,6 @@ def quadratic_scale(env: DictConfig, gamma: float) -> float | None:
         return None if world is None else scale(world, gamma)
     except InputError:  # of the discount
         return None
-
-
-def quarter(n_steps: int, n_envs: int) -> int:
-    """A quarter of a rollout, or all of it where four do not divide it."""
-    whole = n_steps * n_envs
-    return whole if whole % 4 else whole // 4
 
 
 def replay_class(

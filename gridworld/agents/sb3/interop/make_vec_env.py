@@ -40,7 +40,7 @@ def make_vec_env(
             another one at every call.
         cell_size: pixels a cell, of the images.
         world: other arguments of `GridWorldVectorEnv`: `slip`, `step_reward`, `goal_reward`, `trap_reward`,
-            `max_episode_steps`, `num_rows`, `num_cols`, `mdp`, `render_mode`.
+            `max_episode_steps`, `num_rows`, `num_cols`, `mdp`, `render_mode`, `stratified`.
 
     Returns:
         An SB3 `VecEnv`, which reports episodes as SB3's `Monitor` does.

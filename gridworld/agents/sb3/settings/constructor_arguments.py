@@ -33,8 +33,10 @@ _OWN_FIELDS = {"name", "family", "algorithm", "engine", "log_interval", "reward_
 _MOST_LAYERS, _WIDEST_LAYER = 16, 4096
 _EXAMPLES: dict[type, str] = {
     BaseAlgorithm: "stable_baselines3.A2C",
+    BaseBuffer: "stable_baselines3.common.buffers.ReplayBuffer",
     BaseCallback: "stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes",
     BaseFeaturesExtractor: "gridworld.agents.sb3.features.FourierFeatures",
+    torch.optim.Optimizer: "torch.optim.AdamW",
 }
 _PLAIN_TYPES = (bool, int, float, str)
 _KINDS: dict[str, type] = {
