@@ -57,6 +57,7 @@ def test_they_follow_the_world_and_the_observation(agent: str) -> None:
     assert vars(configure(f"agent={agent}", "env.slip=0.2").agent)["gamma"] == 0.98
     large = configure(f"agent={agent}", "env.num_rows=12", "env.num_cols=12")
     assert large.total_timesteps == plain.total_timesteps * 144 // 30
+    assert large.exploring_starts == (0.2 if agent == "ppo" else 0)
     assert (
         configure(f"agent={agent}", "env.num_rows=4", "env.num_cols=4").total_timesteps == LENGTHS[agent][0]
     )

@@ -4,6 +4,7 @@
     ${quadratic_scale:${env},${agent.gamma}}                 see there
     ${for_size:${env},30000}                        30000 up to 30 states, in larger worlds in proportion
     ${if_chance:${env},A,B}                         A where an action may have several outcomes, else B
+    ${if_larger:${env},A,B}                         A where there are more than 30 states, else B
     ${features_class:${observation.kind},${agent.policy}}  of an MLP, for what the agent sees
     ${divided:${total_timesteps},600}               as a whole number, at least 1
     ${times:4,${n_envs}}                            the product
@@ -49,6 +50,7 @@ def register_world_rules() -> None:
         for_size,
         if_chance,
         if_counts,
+        if_larger,
         quadratic_scale,
         replay_class,
         times,
@@ -92,6 +94,12 @@ def if_chance(env: DictConfig, then: Any, otherwise: Any) -> Any:
 def if_counts(replay_buffer_class: str | None, then: Any, otherwise: Any) -> Any:
     """`then` with a replay buffer that counts transitions."""
     return then if replay_buffer_class == REPLAY_COUNTS else otherwise
+
+
+def if_larger(env: DictConfig, then: Any, otherwise: Any) -> Any:
+    """`then` where the world of the section `env` is larger than the default one."""
+    world = _world(env)
+    return then if world is not None and world.num_states > _DEFAULT_CELLS else otherwise
 
 
 def quadratic_scale(env: DictConfig, gamma: float) -> float | None:
