@@ -49,6 +49,7 @@ def environment_rows() -> list[Row]:
     told |= {
         "num_envs": "`make_vec` alone: environments that step together",
         "autoreset_mode": "`make_vec` alone: what follows an episode's end, see `GridWorldVectorEnv`",
+        "stratified": "`make_vec` alone: whether environments share out outcomes, see `GridWorldVectorEnv`",
         "max_episode_steps": "`make` and `make_vec`: the step limit of an episode",
     }
     defaults: dict[str, Any] = {}
