@@ -47,6 +47,7 @@ def deep(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("deep") / "run"
     few = ["n_envs=128", "agent.batch_size=128", "agent.exploration_final_eps=0.05", "exploring_starts=0"]
     few += ["agent.target_update_interval=512", "agent.learning_rate=0.01", "agent.gamma=0.9"]
+    few += ["stratified_draws=false"]
     begin(folder, *SHORT["dqn"], "env=frozen_lake_4x4", "evaluation.every=200", *few)
     return folder
 
