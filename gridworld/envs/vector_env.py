@@ -119,6 +119,8 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         except ValueError:
             known = ", ".join(mode.value for mode in AutoresetMode)
             raise InputError(f"autoreset_mode={autoreset_mode!r}: must be one of {known}") from None
+        if not isinstance(stratified, bool):
+            raise InputError(f"stratified={stratified!r}: must be True or False")
         self.num_envs = positive_int("num_envs", num_envs)
         self.max_episode_steps = (
             None if max_episode_steps is None else positive_int("max_episode_steps", max_episode_steps)

@@ -50,14 +50,30 @@ def write_recipe(
     values = _difference(_relevant(bare), _relevant(config))
     lines = ["# @package _global_", f"# {about}", "defaults:"]
     lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
-    lines += ["  - _self_", "", OmegaConf.to_yaml(OmegaConf.create(values)) if values else ""]
+    lines += ["  - _self_", ""]
     path = make_inside(folder, EXPERIMENT) / _FILE
-    write_text(path, "\n".join(lines), durable=True)
     own = dataclasses.replace(folders, own=(*folders.own, folder))
-    for words in ([f"experiment={RECIPE}"], overrides(path, trust=True)):
-        again = without_hydra(compose_in(own, "train", words))
+    words = [f"experiment={RECIPE}"]
+    while True:  # a rule may give another value beside the values than it did without them
+        text = OmegaConf.to_yaml(OmegaConf.create(values)) if values else ""
+        write_text(path, "\n".join([*lines, text]), durable=True)
+        left = _difference(_relevant(without_hydra(compose_in(own, "train", words))), _relevant(config))
+        merged = _merged(values, left)
+        if merged == values:
+            break
+        values = merged
+    for each in (words, overrides(path, trust=True)):
+        again = without_hydra(compose_in(own, "train", each))
         assert _relevant(again) == _relevant(config), f"{path} does not say what the winner is"
     return path
+
+
+def _merged(values: dict[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
+    found = dict(values)
+    for key, value in more.items():
+        both = isinstance(value, Mapping) and isinstance(found.get(key), dict)
+        found[key] = _merged(found[key], value) if both else value
+    return found
 
 
 def _relevant(config: TrainConfig) -> dict[str, Any]:

@@ -43,7 +43,23 @@ def test_the_default_world_has_the_settings_that_it_was_tuned_with(agent: str) -
 @pytest.mark.parametrize("envs", [1024, 128, 1])
 def test_with_chances_a_minibatch_is_the_rollout_of_any_number_of_environments(envs: int) -> None:
     config = configure("agent=ppo", "env.slip=0.1", f"n_envs={envs}", "agent.n_steps=5")
-    assert vars(config.agent)["batch_size"] == 5 * envs
+    agent = vars(config.agent)
+    assert (agent["batch_size"], agent["n_epochs"]) == (5 * envs, 40)
+
+
+@pytest.mark.parametrize(
+    ("words", "batch", "epochs"),
+    [
+        (["agent.engine=stock"], 1024, 5),
+        (["callbacks=[{_target_: mine.Own}]"], 1024, 5),
+        (["agent.batch_size=64"], 64, 5),
+        (["agent.n_epochs=3"], 4096, 3),
+        (["env.slip=0", "agent.batch_size=4096"], 4096, 5),
+    ],
+)
+def test_epochs_are_many_where_they_cost_little(words: list[str], batch: int, epochs: int) -> None:
+    agent = vars(configure("agent=ppo", "env.slip=0.1", "n_envs=128", *words).agent)
+    assert (agent["batch_size"], agent["n_epochs"]) == (batch, epochs)
 
 
 @AGENTS

@@ -127,7 +127,6 @@ DERIVED = {
     "agent.model.values.start_time": "the clock's",
     "agent.seconds": "the clock's",
     "agent.model.values.ent_coef": "of a bonus that falls: set anew before each update",
-    "agent.model.values.callbacks[0].num_timesteps": "set anew at each step; it is the model's",
     "agent.model.values._logger.name_to_value": "told to TensorBoard only, which is off here",
     "agent.model.values._logger.name_to_excluded": "told to TensorBoard only, which is off here",
 }

@@ -52,7 +52,7 @@ class SB3Agent:
         self.observation = context.observation
         self._loaded = False
         self.model = make_model(config, context)
-        self._callbacks = [*make_callbacks(context.callbacks), *entropy_schedules(config)]
+        self._callbacks = make_callbacks(context.callbacks)
         writers = [] if context.write_scalars is None else [_ScalarsOnly(context.write_scalars)]
         self.model.set_logger(Logger(folder=None, output_formats=list(writers)))
 
@@ -65,7 +65,9 @@ class SB3Agent:
     ) -> None:
         """See `gridworld.agents.Agent.learn`."""
         root = SB3Agent.learn.__code__
-        self._callback = CheckpointCallback(on_step, on_safe_point, self.observation, root, self._callbacks)
+        self._callback = CheckpointCallback(
+            on_step, on_safe_point, self.observation, root, self._callbacks, entropy_schedules(self.config)
+        )
         self._callback.state = state
         try:
             self.model.learn(total_timesteps, callback=self._callback, log_interval=self.config.log_interval)

@@ -21,8 +21,6 @@ class FallingEntropyBonus(BaseCallback):
         initial: what it falls from, linearly, to 0 at the end of training.
     """
 
-    reads_locals = False
-
     def __init__(self, initial: float) -> None:
         super().__init__()
         self._initial = initial

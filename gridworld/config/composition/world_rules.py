@@ -8,6 +8,8 @@
     ${features_class:${observation.kind},${agent.policy}}  of an MLP, for what the agent sees
     ${divided:${total_timesteps},600}               as a whole number, at least 1
     ${times:4,${n_envs}}                            the product
+    ${minibatch:${agent.n_steps},${n_envs},${agent.engine},${callbacks}}  the rollout, or a part of it
+    ${if_whole:${agent.batch_size},${agent.n_steps},${n_envs},A,B}  A where that is the rollout, else B
     ${replay_class:${env},${exploration_bonus},${callbacks},${agent.engine},${agent.n_steps}}  one that counts
     ${if_counts:${agent.replay_buffer_class},A,B}   A where transitions are counted, else B
 
@@ -51,6 +53,8 @@ def register_world_rules() -> None:
         if_chance,
         if_counts,
         if_larger,
+        if_whole,
+        minibatch,
         quadratic_scale,
         replay_class,
         times,
@@ -102,6 +106,17 @@ def if_larger(env: DictConfig, then: Any, otherwise: Any) -> Any:
     return then if world is not None and world.num_states > _DEFAULT_CELLS else otherwise
 
 
+def if_whole(batch_size: int, n_steps: int, n_envs: int, then: Any, otherwise: Any) -> Any:
+    """`then` where a minibatch is the whole rollout, so that the tabulated engine sums it up once."""
+    return then if batch_size == n_steps * n_envs else otherwise
+
+
+def minibatch(n_steps: int, n_envs: int, engine: str, callbacks: ListConfig) -> int:
+    """The samples of a rollout; of one that SB3's own loop learns from, a quarter if four divide it."""
+    whole = n_steps * n_envs
+    return whole // 4 if _is_own_loop(engine, callbacks) and whole % 4 == 0 else whole
+
+
 def quadratic_scale(env: DictConfig, gamma: float) -> float | None:
     """What rewards are multiplied with in the world of the section `env`; None: they stay as they are."""
     from gridworld.world.recommendation import quadratic_scale as scale
@@ -121,14 +136,18 @@ def replay_class(
     It is of use where an action has several outcomes, and large minibatches of it cost nothing in the
     tabulated engine. Its transitions are single steps, whose rewards do not change from visit to visit.
     """
-    own_loop = engine != "tabulated" or any(foreign_imports(OmegaConf.to_container(callbacks)))
-    fits = not (exploration_bonus or own_loop or n_steps != 1)
+    fits = not (exploration_bonus or _is_own_loop(engine, callbacks) or n_steps != 1)
     return if_chance(env, REPLAY_COUNTS, None) if fits else None
 
 
 def times(number: int, by: int) -> int:
     """The product."""
     return number * by
+
+
+def _is_own_loop(engine: str, callbacks: ListConfig) -> bool:
+    """Whether SB3's own loop trains, which runs the network on every sample."""
+    return engine != "tabulated" or any(foreign_imports(OmegaConf.to_container(callbacks)))
 
 
 def _world(env: DictConfig) -> Mdp | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gridworld.config.agents import LINEAR
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.experiments import best_of_what_was_tried
 from gridworld.diagnosis.finding import Finding, longer
@@ -36,7 +37,7 @@ def collapsed(run: Evidence) -> Finding | None:
         return None
     decided = run.split.wrong & (run.spread < _DECIDED)
     if goal[-1] > 0.5 * best:  # it gets there, by a detour
-        states = decided if run.setting("ent_coef") <= 0 else decided & False
+        states = decided if run.last_setting("ent_coef") <= 0 else decided & False
     else:
         states = decided | (run.split.wrong & (goal[-1] < _LEFT * goal[0]))
     if not states.any():
@@ -85,7 +86,9 @@ def _explore(run: Evidence) -> tuple[str, ...]:
     if run.is_actor_critic:
         bonus = min(max(10 * run.setting("ent_coef"), 0.1), 1.0)
         wider = (f"n_envs={_WIDE}",) if run.config.n_envs < _WIDE else ()
-        entropy = (run.change("ent_coef", bonus),) if run.takes("ent_coef") else visits
+        falls = run.last_setting("ent_coef") < run.setting("ent_coef")
+        value = f"{LINEAR}{bonus:g}" if falls else bonus
+        entropy = (run.change("ent_coef", value),) if run.takes("ent_coef") else visits
         return *entropy, *wider
     names = ("exploration_initial_eps", "exploration_fraction")
     changes = tuple(run.change(name, 1.0) for name in names if run.setting(name) < 1)

@@ -157,6 +157,8 @@ def _check_class(agent: SB3ClassConfig, n_envs: int) -> None:
 
 def _check_fields(agent: SB3CheckedConfig, config: TrainConfig) -> None:
     parse_schedule("agent.learning_rate", agent.learning_rate)
+    if isinstance(agent, PPOConfig):
+        at_least("agent.n_steps", agent.n_steps, 1)  # the minibatch may follow from it
     at_least("agent.batch_size", agent.batch_size, 1)
     within("agent.gamma", agent.gamma, 0, 1)
     within("agent.stats_window_size", agent.stats_window_size, 1, MOST_KEPT)
@@ -221,7 +223,6 @@ def _check_train_freq(key: str, value: Any, n_envs: int) -> None:
 
 
 def _check_ppo(agent: PPOConfig, config: TrainConfig) -> None:
-    at_least("agent.n_steps", agent.n_steps, 1)
     at_least("agent.n_epochs", agent.n_epochs, 1)
     rollout = agent.n_steps * config.n_envs
     if rollout % agent.batch_size:
@@ -232,7 +233,7 @@ def _check_ppo(agent: PPOConfig, config: TrainConfig) -> None:
     if agent.normalize_advantage and agent.batch_size < 2:
         raise InputError(
             "agent.batch_size=1: an advantage cannot be normalised alone; "
-            "must be at least 2, or set agent.normalize_advantage=false"
+            "must be at least 2 and divide the rollout, or set agent.normalize_advantage=false"
         )
     within("agent.gae_lambda", agent.gae_lambda, 0, 1)
     for name in ("clip_range", "clip_range_vf"):

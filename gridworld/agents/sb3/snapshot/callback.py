@@ -42,7 +42,8 @@ class CheckpointCallback(BaseCallback):
         on_safe_point: takes the steps so far; None: nothing is to be saved.
         observation: of the model's environments.
         root: the code of the function that calls `learn()`.
-        others: callbacks of the user's, and then those that the agent's settings ask for.
+        others: callbacks of the user's.
+        schedules: callbacks without a state, which set a setting before each update, and so before `others`.
 
     Attributes:
         state: to go on from, set before training; None: from the start.
@@ -55,6 +56,7 @@ class CheckpointCallback(BaseCallback):
         observation: ObservationTable,
         root: types.CodeType,
         others: Sequence[BaseCallback] = (),
+        schedules: Sequence[BaseCallback] = (),
     ) -> None:
         super().__init__()
         self._hook = on_step
@@ -63,15 +65,17 @@ class CheckpointCallback(BaseCallback):
         self._observation = observation
         self._root = root
         self._others = others
+        self._schedules = schedules
         self._loop: LearnLocals | None = None
         self._objects: dict[str, str] = {}
         self._classes = ClassState()
         self.state: State | None = None
         self.goes_on = True
-        # whether anybody reads the variables of SB3's loop
-        self.reads_locals = any(getattr(other, "reads_locals", True) for other in others)
+        self.reads_locals = bool(others)  # whether anybody reads the variables of SB3's loop
 
     def _init_callback(self) -> None:
+        for schedule in self._schedules:
+            schedule.init_callback(self.model)
         for index, other in enumerate(self._others):
             with _beginning(index, other):
                 other.init_callback(self.model)
@@ -119,7 +123,7 @@ class CheckpointCallback(BaseCallback):
             other.on_rollout_start()
 
     def _on_rollout_end(self) -> None:
-        for other in self._others:
+        for other in (*self._schedules, *self._others):
             other.on_rollout_end()
 
     def _on_training_end(self) -> None:

@@ -91,10 +91,11 @@ def _adds_up_as_alone(inputs: Tensor) -> bool:
 
 @functools.lru_cache(maxsize=256)
 def _batch_is_as_single(rows: int, width: int, threads: int) -> bool:
-    """Whether two products with vectors add up in a batch as each does alone, in both directions."""
+    """Whether products with vectors add up in a batch as each does alone, in both directions."""
+    count = max(2, 256 // rows)  # enough numbers to tell, also where there are few rows
     numbers = np.random.default_rng(0)
     inputs, weight, slope = (
-        torch.from_numpy(numbers.normal(size=(2, *shape)).astype(np.float32))
+        torch.from_numpy(numbers.normal(size=(count, *shape)).astype(np.float32))
         for shape in ((rows, width), (width, 1), (rows, 1))
     )
     outputs, slopes = torch.bmm(weight.transpose(1, 2), inputs.transpose(1, 2)), slope.transpose(1, 2)
