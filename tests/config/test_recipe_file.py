@@ -27,7 +27,10 @@ WINNERS = {
         *("agent.policy_kwargs.activation_fn=torch.nn.ReLU", "agent.batch_size=64", "agent.gamma=1e-5"),
         "+agent.policy_kwargs.optimizer_kwargs={eps: 1e-8, betas: [0.5, 0.9], amsgrad: true, fused: null}",
     ],
-    "ppo": ["agent.policy_kwargs.net_arch={pi: [8], vf: [16, 16]}", "agent.target_kl=0.1", "env.slip=0.25"],
+    "ppo": [
+        *("agent.policy_kwargs.net_arch={pi: [8], vf: [16, 16]}", "agent.target_kl=0.1", "env.slip=0.25"),
+        *("agent.n_epochs=5", "agent.ent_coef=0.5"),  # what the rules say without slip, and not with it
+    ],
     "qrdqn": [
         *("agent.arguments.policy_kwargs.n_quantiles=5", "+agent.arguments.policy_kwargs.net_arch=[4]"),
         *("+agent.arguments.tau=1", "~agent.arguments.batch_size", "+agent.arguments.batch_size=7"),

@@ -13,6 +13,7 @@ from gridworld.envs.joint_rollout import roll
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.stratified import stratified_numbers
 from gridworld.envs.vector_env import GridWorldVectorEnv
+from gridworld.errors import InputError
 from gridworld.world.mdp import FloatArray, IntArray
 
 GROUPS = st.lists(st.integers(0, 9), min_size=1, max_size=60).map(np.array)
@@ -87,6 +88,12 @@ def test_a_batch_of_one_takes_the_single_environments_walk(slip: float) -> None:
         if terminated or truncated:
             state, _ = single.reset()
             states, _ = batch.reset()
+
+
+@pytest.mark.parametrize("value", ["false", None, 2])
+def test_another_value_than_true_or_false_is_refused(value: object) -> None:
+    with pytest.raises(InputError, match=rf"stratified={value!r}: must be True or False"):
+        GridWorldVectorEnv(2, stratified=value)  # type: ignore[arg-type]
 
 
 def outcomes(stratified: bool, steps: int, num_envs: int) -> tuple[IntArray, IntArray]:
