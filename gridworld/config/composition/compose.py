@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from gridworld.config.agents import agent_schemas
 from gridworld.config.composition.hydra_errors import refuse_added_keys
+from gridworld.config.composition.interpolations import parse_each_text_once
 from gridworld.config.composition.loader import composing_from
 from gridworld.config.composition.world_rules import register_world_rules
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig
@@ -44,7 +45,7 @@ def compose(conf: Path, overrides: list[str]) -> TrainConfig:
     """
     with _leaving_hydra_as_it_was():
         _store_schemas()
-        register_world_rules()
+        _prepare_interpolations()
         with composing_from(conf):
             settings = hydra.compose(config_name="train", overrides=overrides)
     return to_config(settings)
@@ -86,10 +87,15 @@ def to_config(settings: DictConfig) -> TrainConfig:
 def register_schemas() -> None:
     """Register the schemas with Hydra, and with OmegaConf the functions by which `conf/` names folders."""
     _store_schemas()
-    register_world_rules()
+    _prepare_interpolations()
     OmegaConf.register_new_resolver("slug", slug, replace=True)
     OmegaConf.register_new_resolver("world", _world_name, replace=True)
     OmegaConf.register_new_resolver("token", lambda: secrets.token_hex(3), use_cache=True, replace=True)
+
+
+def _prepare_interpolations() -> None:
+    parse_each_text_once()
+    register_world_rules()
 
 
 @functools.cache  # they stay in Hydra's store
