@@ -51,6 +51,13 @@ def test_a_text_is_parsed_once(texts: list[str]) -> None:
     assert texts == ["goal-${number}-only-here"]
 
 
+def test_a_long_text_takes_no_memory(texts: list[str]) -> None:
+    values = {"number": 4, "name": "goal-${number}-" + 1000 * "o"}
+    for _ in range(2):
+        assert OmegaConf.create(values).name == "goal-4-" + 1000 * "o"
+    assert len(texts) == 2
+
+
 def test_composing_again_parses_nothing(texts: list[str]) -> None:
     compose("agent=ppo", "env.slip=0.1")
     texts.clear()

@@ -15,16 +15,20 @@ import omegaconf._utils
 import omegaconf.base
 from omegaconf import grammar_parser
 
-_MOST_TEXTS = 1024  # a few kilobytes each
+_MOST_TEXTS, _LONGEST = 256, 400  # of n characters about n / 2 kilobytes are kept
 
 
 def parse_each_text_once() -> None:
     """Have OmegaConf keep what it parsed, in the whole process."""
     users: tuple[Any, ...] = omegaconf.base, omegaconf._utils
     for module in users:
-        module.parse = _parsed
+        module.parse = _parse
+
+
+def _parse(value: str) -> Any:
+    return _kept(value) if len(value) <= _LONGEST else grammar_parser.parse(value)
 
 
 @functools.lru_cache(maxsize=_MOST_TEXTS)
-def _parsed(value: str) -> Any:
+def _kept(value: str) -> Any:
     return grammar_parser.parse(value)
