@@ -12,9 +12,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from gridworld.config.composition.compose import without_hydra
 from gridworld.config.composition.recipe_file import IN_A_STUDY, overrides
@@ -47,33 +47,24 @@ def write_recipe(
     """
     chosen = [f"{group}={choice}" for group, choice in choices.items()]
     bare = without_hydra(compose_in(folders, "train", chosen))
-    values = _difference(_relevant(bare), _relevant(config))
+    values = OmegaConf.create(_difference(_relevant(bare), _relevant(config)))
     lines = ["# @package _global_", f"# {about}", "defaults:"]
     lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
     lines += ["  - _self_", ""]
     path = make_inside(folder, EXPERIMENT) / _FILE
     own = dataclasses.replace(folders, own=(*folders.own, folder))
-    words = [f"experiment={RECIPE}"]
     while True:  # a rule may give another value beside the values than it did without them
-        text = OmegaConf.to_yaml(OmegaConf.create(values)) if values else ""
+        text = OmegaConf.to_yaml(values) if values else ""
         write_text(path, "\n".join([*lines, text]), durable=True)
-        left = _difference(_relevant(without_hydra(compose_in(own, "train", words))), _relevant(config))
-        merged = _merged(values, left)
+        again = without_hydra(compose_in(own, "train", [f"experiment={RECIPE}"]))
+        left = _difference(_relevant(again), _relevant(config))
+        merged = cast(DictConfig, OmegaConf.merge(values, left))
         if merged == values:
             break
         values = merged
-    for each in (words, overrides(path, trust=True)):
-        again = without_hydra(compose_in(own, "train", each))
-        assert _relevant(again) == _relevant(config), f"{path} does not say what the winner is"
+    for found in (again, without_hydra(compose_in(own, "train", overrides(path, trust=True)))):
+        assert _relevant(found) == _relevant(config), f"{path} does not say what the winner is"
     return path
-
-
-def _merged(values: dict[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
-    found = dict(values)
-    for key, value in more.items():
-        both = isinstance(value, Mapping) and isinstance(found.get(key), dict)
-        found[key] = _merged(found[key], value) if both else value
-    return found
 
 
 def _relevant(config: TrainConfig) -> dict[str, Any]:
