@@ -176,7 +176,11 @@ class StopRequest:
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Take the signals for the block. Outside the main thread, where none arrive, it does nothing."""
+        """Take the signals for the block. Outside the main thread, where none arrive, it does nothing.
+
+        Raises:
+            Interrupted: the block was interrupted, also where a cleanup inside it failed because of that.
+        """
         if threading.current_thread() is not threading.main_thread():
             yield
             return
@@ -187,6 +191,11 @@ class StopRequest:
         listeners.add(self)
         try:
             yield
+        except Exception as error:
+            interruption = _interruption_behind(error)
+            if interruption is None:
+                raise
+            raise interruption from None
         finally:
             _inside.reset(token)
             listeners.remove(self)
@@ -253,6 +262,13 @@ class _Listeners:
     def _stop(self, number: int) -> None:
         self.at_once = Interrupted(number)
         raise self.at_once
+
+
+def _interruption_behind(error: BaseException | None) -> Interrupted | None:
+    """The interruption that an error came of: `torch.save`, interrupted, fails to close its file."""
+    while error is not None and not isinstance(error, Interrupted):
+        error = error.__context__
+    return error
 
 
 _inside: ContextVar[StopRequest | None] = ContextVar("inside", default=None)
