@@ -21,6 +21,7 @@ from gridworld.errors import InputError
 MISSING = "???"  # OmegaConf's sign for a value that has to be given
 MOST_KEPT = 10**9  # episodes that a mean is taken over
 LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end, as RL Zoo writes it
+_POWERS = {LINEAR: 1, "quad_": 2}  # of what is left of training, by how a schedule is written
 
 REPLAY_COUNTS = "gridworld.agents.sb3.replay_counts.ReplayCounts"  # a replay buffer that counts transitions
 
@@ -71,33 +72,53 @@ def agent_schemas() -> dict[str, type[AgentConfig]]:
 
 
 def falls(value: object) -> bool:
-    """Whether a setting's value is written as a rate that falls, `lin_NUMBER`."""
-    return isinstance(value, str) and value.startswith(LINEAR)
+    """Whether a setting's value is written as a rate that falls, as `lin_NUMBER` and `quad_NUMBER` are."""
+    return isinstance(value, str) and value.startswith(tuple(_POWERS))
 
 
-def parse_schedule(key: str, value: Schedule) -> tuple[float, bool]:
+@dataclass(frozen=True)
+class Decay:
+    """A rate over training.
+
+    Attributes:
+        initial: at the start, finite and not negative.
+        power: of the share of training that is left, with which it falls to 0; with 0 it stays.
+    """
+
+    initial: float
+    power: int
+
+    def at(self, progress: float) -> float:
+        """The rate after this share of training, from 0 to 1."""
+        return float(self.initial * (1 - progress) ** self.power)
+
+
+def parse_schedule(key: str, value: Schedule, linear_only: bool = False) -> Decay:
     """Read a rate that may fall over training.
 
     Args:
         key: the setting's dotted name, for the message.
-        value: a number, or `lin_NUMBER`.
-
-    Returns:
-        The initial rate, finite and not negative; whether it falls linearly to 0.
+        value: a number, `lin_NUMBER` or `quad_NUMBER`.
+        linear_only: whether `quad_NUMBER` is refused, for what SB3 itself schedules: it has a linear decay,
+            which any SB3 can read from a model's file.
 
     Raises:
-        InputError: `value` is neither.
+        InputError: `value` is none of these.
     """
-    linear = falls(value)
+    powers = {LINEAR: 1} if linear_only else _POWERS
+    text = value if isinstance(value, str) else None
+    form = next((form for form in powers if text is not None and text.startswith(form)), "")
     try:
-        number = float(value.removeprefix(LINEAR) if isinstance(value, str) else value)
+        number = float(value if text is None else text.removeprefix(form))
     except (ValueError, OverflowError):
         number = math.nan
-    if not 0 <= number < math.inf or (isinstance(value, str) and not linear):
+    is_written_so = text is None or (form and "_" not in text.removeprefix(form))  # Python reads 0_3 as 3
+    if not (0 <= number < math.inf and is_written_so):
+        quadratic = "" if linear_only else ", or quad_NUMBER for a quadratic one"
         raise InputError(
-            f"{key}={value}: must be a number of at least 0, or {LINEAR}NUMBER for a linear decay"
+            f"{key}={value}: must be a number of at least 0, or {LINEAR}NUMBER for a linear decay{quadratic}"
         )
-    return number, linear
+    return Decay(number, powers.get(form, 0))
 
 
 class EpsilonSchedule(Protocol):

@@ -152,7 +152,7 @@ class Evidence:
         if given is None and not self.is_tabular:
             given = getattr(self.agent.model, name, None)
         if isinstance(given, str):
-            return parse_schedule(name, given)[0]
+            return parse_schedule(name, given).initial
         given = getattr(given, "frequency", given)  # of SB3's TrainFreq
         if isinstance(given, list | tuple):
             given = given[0]

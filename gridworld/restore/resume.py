@@ -315,9 +315,7 @@ def _what_changes(config: TrainConfig, steps: int, old_total: int) -> str:
 
 def _schedules(config: TrainConfig, progress: float) -> dict[str, float]:
     agent = getattr(config.agent, "arguments", None) or vars(config.agent)
-    found = {
-        key: parse_schedule(key, value)[0] * (1 - progress) for key, value in agent.items() if falls(value)
-    }
+    found = {key: parse_schedule(key, value).at(progress) for key, value in agent.items() if falls(value)}
     fraction = agent.get("exploration_fraction")
     if fraction:
         start, end = agent.get("exploration_initial_eps", 1.0), agent.get("exploration_final_eps", 0.05)

@@ -63,7 +63,7 @@ def test_composing_again_parses_nothing(texts: list[str]) -> None:
     texts.clear()
     again = compose("agent=ppo", "env.slip=0.2", "seed=3")
     assert texts == []
-    assert again.total_timesteps == 12_000_000
+    assert again.total_timesteps == 24_000_000
 
 
 def test_a_mistake_is_told_every_time(texts: list[str]) -> None:

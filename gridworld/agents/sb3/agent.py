@@ -13,8 +13,8 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.save_util import recursive_getattr
 
 from gridworld.agents import PolicySnapshot, TrainingContext, WriteScalars
-from gridworld.agents.sb3.entropy_schedule import entropy_schedules
 from gridworld.agents.sb3.factory import make_model
+from gridworld.agents.sb3.falling_setting import falling_settings
 from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters, reason
 from gridworld.agents.sb3.policy_outputs import Reading, epsilon_greedy, of_q, read, read_states
 from gridworld.agents.sb3.settings.callbacks import make_callbacks
@@ -66,7 +66,7 @@ class SB3Agent:
         """See `gridworld.agents.Agent.learn`."""
         root = SB3Agent.learn.__code__
         self._callback = CheckpointCallback(
-            on_step, on_safe_point, self.observation, root, self._callbacks, entropy_schedules(self.config)
+            on_step, on_safe_point, self.observation, root, self._callbacks, falling_settings(self.config)
         )
         self._callback.state = state
         try:

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 class TabularControlConfig(TabularConfig):
     """Temporal-difference control. Where Stable-Baselines3 has the same setting, it has the same name."""
 
-    learning_rate: Schedule = 0.1  # step size; a number, or lin_NUMBER to fall linearly to 0
+    learning_rate: Schedule = 0.1  # step size; a number, or lin_NUMBER or quad_NUMBER to fall to 0
     learning_rate_power: float = 0.0  # times (visits of the state and action) ** -power
     initial_value: float = 0.0  # of every action in every state that is no end
     exploration_fraction: float = 1.0  # of training, in which epsilon falls linearly
@@ -58,7 +58,7 @@ class TabularControlConfig(TabularConfig):
     def check(self) -> None:
         """See `TabularConfig.check`."""
         super().check()
-        size, _ = parse_schedule("agent.learning_rate", self.learning_rate)
+        size = parse_schedule("agent.learning_rate", self.learning_rate).initial
         if not 0 < size <= 1:
             raise InputError(
                 f"agent.learning_rate={self.learning_rate}: a step towards the target must be "
@@ -90,7 +90,7 @@ class TabularControl(ABC):
         self.visits: IntArray = np.zeros(self.q.shape, dtype=np.int64)
         self.exploration_rate = config.exploration_initial_eps
         self._context = context
-        self._rate, self._rate_falls = parse_schedule("agent.learning_rate", config.learning_rate)
+        self._rate = parse_schedule("agent.learning_rate", config.learning_rate)
         self._random = independent_generator(context.seed)  # the environments take the seed's own
         self._steps = 0
         self._actions: IntArray = np.zeros(context.envs.num_envs, dtype=np.int64)  # chosen, not yet taken
@@ -194,8 +194,7 @@ class TabularControl(ABC):
         return start + (end - start) * min(progress / self.config.exploration_fraction, 1.0)
 
     def _step_size(self, progress: float) -> StepSize:
-        rate = self._rate * (1 - progress) if self._rate_falls else self._rate
-        return StepSize(rate, self.config.learning_rate_power)
+        return StepSize(self._rate.at(progress), self.config.learning_rate_power)
 
     def snapshot(self) -> PolicySnapshot:
         """Of equally good actions, the first is the greedy one; the sampled policy takes any of them."""

@@ -163,11 +163,11 @@ DIFFERENT: dict[str, list[list[str]]] = {  # of each argument; the empty one is 
         ["clip_range_vf=0.01", "clip_range_vf=lin_1", ""],
         ["max_grad_norm=0.01", "max_grad_norm=1000", ""],
         OPTIMIZERS,
-        ["ent_coef=lin_0.3", ""],
+        ["ent_coef=quad_0.3", "gae_lambda=lin_0.9", ""],
     ],
     "a2c": [
         ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
-        ["gamma=0.5", "gae_lambda=0.5", ""],
+        ["gamma=0.5", "gae_lambda=0.5", "gae_lambda=lin_0.5", ""],
         ["ent_coef=0.3", "vf_coef=2", ""],
         ["max_grad_norm=0.01", ""],
         OPTIMIZERS,

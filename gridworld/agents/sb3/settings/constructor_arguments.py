@@ -17,7 +17,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import LinearSchedule
 
 from gridworld.agents.sb3.settings.schemas import SB3CheckedConfig, SB3ClassConfig, SB3Config, as_dict
-from gridworld.agents.sb3.settings.validation import ENTROPY_BONUS, SCHEDULES
+from gridworld.agents.sb3.settings.validation import FALLING, SCHEDULES
 from gridworld.agents.sb3.tabulated.state_inputs import why_not
 from gridworld.agents.sb3.tabulated.versions import tabulated_version
 from gridworld.config.agents import falls, parse_schedule
@@ -106,7 +106,7 @@ def _check_arguments(config: SB3ClassConfig, algorithm: type[BaseAlgorithm]) -> 
                 f"agent.arguments.{name}: {config.algorithm} has no such argument; it has {known}"
             )
         wanted = parameters[name].annotation if name in parameters else None
-        if name == ENTROPY_BONUS and falls(value):
+        if name in FALLING and falls(value):
             continue
         if wanted in _PLAIN_TYPES and not _is_a(value, wanted):
             raise InputError(f"agent.arguments.{name}={value}: must be {wanted.__name__}")
@@ -133,9 +133,9 @@ def _convert(given: Arguments, where: str) -> Arguments:
     converted = {}
     for name, value in given.items():
         if name in SCHEDULES and isinstance(value, str):
-            value = LinearSchedule(parse_schedule(where + name, value)[0], 0.0, 1.0)
-        elif name == ENTROPY_BONUS and falls(value):
-            value = parse_schedule(where + name, value)[0]
+            value = LinearSchedule(parse_schedule(where + name, value, linear_only=True).initial, 0.0, 1.0)
+        elif name in FALLING and falls(value):
+            value = parse_schedule(where + name, value).initial
         elif name == "train_freq" and isinstance(value, list):
             value = tuple(value)
         elif name.endswith(("_class", "_fn")) and value is not None:

@@ -189,7 +189,7 @@ class PPOConfig(SB3CheckedConfig):
     learning_rate: Schedule = 3e-4
     n_steps: int = 2048
     n_epochs: int = 10
-    gae_lambda: float = 0.95
+    gae_lambda: Schedule = 0.95
     clip_range: Schedule = 0.2
     clip_range_vf: Optional[Schedule] = None  # noqa: UP045
     normalize_advantage: bool = True

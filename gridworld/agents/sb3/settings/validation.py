@@ -17,7 +17,7 @@ from gridworld.agents.sb3.settings.schemas import (
     counts_transitions,
 )
 from gridworld.bounds import MOST_STEPS, above_zero, at_least, at_most, within, within_size
-from gridworld.config.agents import MOST_KEPT, check_exploration, parse_schedule
+from gridworld.config.agents import MOST_KEPT, check_exploration, falls, parse_schedule
 from gridworld.config.train import ObservationConfig, TrainConfig
 from gridworld.config.worlds import EnvConfig, MapConfig
 from gridworld.errors import InputError
@@ -28,7 +28,7 @@ _COUNTS = (
     *("buffer_size", "target_update_interval", "stats_window_size", "n_quantiles"),
 )
 SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
-ENTROPY_BONUS = "ent_coef"  # a number in SB3; as a schedule, see `gridworld.agents.sb3.entropy_schedule`
+FALLING = ("ent_coef", "gae_lambda")  # numbers in SB3; as schedules, see `agents.sb3.falling_setting`
 _ORDINARY = 1e3  # a rate or a coefficient; beyond, numbers of 32 bits may come to their end
 _LEAST_REWARD, _MOST_RETURN = 1e-30, 1e15
 # Those that are a share or a probability.
@@ -105,8 +105,8 @@ def _is_judged(name: str, value: Any, default: Any) -> bool:
         return "." not in value
     if counts_transitions({name: value}):
         return True
-    if name in (*SCHEDULES, ENTROPY_BONUS):
-        return parse_schedule(name, value)[0] <= _ORDINARY
+    if name in (*SCHEDULES, *FALLING):
+        return parse_schedule(name, value).initial <= _ORDINARY
     return isinstance(value, int) or (isinstance(value, float) and abs(value) <= _ORDINARY)
 
 
@@ -150,13 +150,15 @@ def _check_class(agent: SB3ClassConfig, n_envs: int) -> None:
     if "train_freq" in agent.arguments:
         _check_train_freq("agent.arguments.train_freq", agent.arguments["train_freq"], n_envs)
     for name in sorted(agent.arguments.keys() & _SHARES):
-        value = agent.arguments[name]
+        given = value = agent.arguments[name]
+        if name in FALLING and falls(given):
+            value = parse_schedule(f"agent.arguments.{name}", given).initial
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
-            raise InputError(f"agent.arguments.{name}={value}: must be from 0 to 1")
+            raise InputError(f"agent.arguments.{name}={given}: must be from 0 to 1")
 
 
 def _check_fields(agent: SB3CheckedConfig, config: TrainConfig) -> None:
-    parse_schedule("agent.learning_rate", agent.learning_rate)
+    parse_schedule("agent.learning_rate", agent.learning_rate, linear_only=True)
     if isinstance(agent, PPOConfig):
         at_least("agent.n_steps", agent.n_steps, 1)  # the minibatch may follow from it
     at_least("agent.batch_size", agent.batch_size, 1)
@@ -235,11 +237,13 @@ def _check_ppo(agent: PPOConfig, config: TrainConfig) -> None:
             "agent.batch_size=1: an advantage cannot be normalised alone; "
             "must be at least 2 and divide the rollout, or set agent.normalize_advantage=false"
         )
-    within("agent.gae_lambda", agent.gae_lambda, 0, 1)
+    if parse_schedule("agent.gae_lambda", agent.gae_lambda).initial > 1:
+        raise InputError(f"agent.gae_lambda={agent.gae_lambda}: must be from 0 to 1")
     for name in ("clip_range", "clip_range_vf"):
         value = getattr(agent, name)
         if value is not None:
-            at_most(f"agent.{name}", parse_schedule(f"agent.{name}", value)[0], _MOST_RETURN)
+            clip_range = parse_schedule(f"agent.{name}", value, linear_only=True)
+            at_most(f"agent.{name}", clip_range.initial, _MOST_RETURN)
     parse_schedule("agent.ent_coef", agent.ent_coef)
     at_least("agent.vf_coef", agent.vf_coef, 0)
     above_zero("agent.max_grad_norm", agent.max_grad_norm)

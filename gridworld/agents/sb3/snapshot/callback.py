@@ -43,7 +43,7 @@ class CheckpointCallback(BaseCallback):
         observation: of the model's environments.
         root: the code of the function that calls `learn()`.
         others: callbacks of the user's.
-        schedules: callbacks without a state, which set a setting before each update, and so before `others`.
+        schedules: callbacks without a state, which set settings before rollouts or updates, before `others`.
 
     Attributes:
         state: to go on from, set before training; None: from the start.
@@ -119,7 +119,7 @@ class CheckpointCallback(BaseCallback):
             self._loop.check(2)
         if self._on_safe_point is not None:
             self._on_safe_point(self.model.num_timesteps)
-        for other in self._others:
+        for other in (*self._schedules, *self._others):
             other.on_rollout_start()
 
     def _on_rollout_end(self) -> None:
