@@ -21,7 +21,7 @@ from gridworld.errors import InputError
 MISSING = "???"  # OmegaConf's sign for a value that has to be given
 MOST_KEPT = 10**9  # episodes that a mean is taken over
 LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end, as RL Zoo writes it
-_POWERS = {LINEAR: 1, "quad_": 2}  # of what is left of training, by how a schedule is written
+_POWERS = {LINEAR: 1.0, "sqrt_": 0.5, "quad_": 2.0}  # of what is left of training, by a schedule's prefix
 
 REPLAY_COUNTS = "gridworld.agents.sb3.replay_counts.ReplayCounts"  # a replay buffer that counts transitions
 
@@ -72,7 +72,7 @@ def agent_schemas() -> dict[str, type[AgentConfig]]:
 
 
 def falls(value: object) -> bool:
-    """Whether a setting's value is written as a rate that falls, as `lin_NUMBER` and `quad_NUMBER` are."""
+    """Whether a setting's value is written as a rate that falls, as `lin_NUMBER` is."""
     return isinstance(value, str) and value.startswith(tuple(_POWERS))
 
 
@@ -86,7 +86,7 @@ class Decay:
     """
 
     initial: float
-    power: int
+    power: float
 
     def at(self, progress: float) -> float:
         """The rate after this share of training, from 0 to 1."""
@@ -98,14 +98,13 @@ def parse_schedule(key: str, value: Schedule, linear_only: bool = False) -> Deca
 
     Args:
         key: the setting's dotted name, for the message.
-        value: a number, `lin_NUMBER` or `quad_NUMBER`.
-        linear_only: whether `quad_NUMBER` is refused, for what SB3 itself schedules: it has a linear decay,
-            which any SB3 can read from a model's file.
+        value: a number, or one of `lin_NUMBER`, `sqrt_NUMBER` and `quad_NUMBER`.
+        linear_only: whether the last two are refused.
 
     Raises:
         InputError: `value` is none of these.
     """
-    powers = {LINEAR: 1} if linear_only else _POWERS
+    powers = {LINEAR: 1.0} if linear_only else _POWERS
     text = value if isinstance(value, str) else None
     form = next((form for form in powers if text is not None and text.startswith(form)), "")
     try:
@@ -114,11 +113,11 @@ def parse_schedule(key: str, value: Schedule, linear_only: bool = False) -> Deca
         number = math.nan
     is_written_so = text is None or (form and "_" not in text.removeprefix(form))  # Python reads 0_3 as 3
     if not (0 <= number < math.inf and is_written_so):
-        quadratic = "" if linear_only else ", or quad_NUMBER for a quadratic one"
+        others = "" if linear_only else " (sqrt_, quad_: for one by a root or a square)"
         raise InputError(
-            f"{key}={value}: must be a number of at least 0, or {LINEAR}NUMBER for a linear decay{quadratic}"
+            f"{key}={value}: must be a number of at least 0, or {LINEAR}NUMBER for a linear decay{others}"
         )
-    return Decay(number, powers.get(form, 0))
+    return Decay(number, powers.get(form, 0.0))
 
 
 class EpsilonSchedule(Protocol):

@@ -62,7 +62,7 @@ TRAIN = [
     ("agent.learning_rate=inf", "agent.learning_rate=inf: must be"),
     ("agent.learning_rate=fast", "agent.learning_rate=fast: must be a number of at least 0, or lin_NUMBER"),
     ("agent.learning_rate=true", "agent.learning_rate=true"),
-    ("agent.learning_rate=quad_1", "=quad_1: must be a number of at least 0, or lin_NUMBER for a linear"),
+    ("agent=ppo agent.clip_range=quad_1", "clip_range=quad_1: must be a number of at least 0, or lin_NUMBER"),
     ("agent.gamma=1.1", "agent.gamma=1.1: must be from 0 to 1"),
     ("evaluation.gamma=-0.1", "evaluation.gamma=-0.1: must be from 0 to 1"),
     ("evaluation.gamma=1 env.step_reward=1", "return may grow without end"),
@@ -81,7 +81,7 @@ TRAIN = [
     ("agent=ppo agent.clip_range=-0.1", "agent.clip_range=-0.1: must be"),
     ("agent=ppo agent.ent_coef=nan", "agent.ent_coef=nan: must be a number of at least 0, or lin_NUMBER"),
     ("agent=ppo agent.ent_coef=lin_0_3", "agent.ent_coef=lin_0_3: must be a number of at least 0, or lin_"),
-    ("agent=ppo agent.ent_coef=cub_1", "lin_NUMBER for a linear decay, or quad_NUMBER for a quadratic one"),
+    ("agent=ppo agent.ent_coef=cub_1", "linear decay (sqrt_, quad_: for one by a root or a square)"),
     ("agent=ppo agent.gae_lambda=lin_1.5", "agent.gae_lambda=lin_1.5: must be from 0 to 1"),
     (
         "agent=a2c +agent.arguments.gae_lambda=quad_2",

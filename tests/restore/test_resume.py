@@ -23,6 +23,7 @@ CASES = {
         *SHORT["ppo"],
         "agent.ent_coef=quad_0.5",
         "agent.gae_lambda=lin_0.5",
+        "agent.learning_rate=sqrt_0.01",
         "stratified_draws=true",
         "env.slip=0.1",
     ],

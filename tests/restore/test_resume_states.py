@@ -126,7 +126,10 @@ DERIVED = {
     "agent.model.values._last_episode_starts": "one row of the buffer, which the advantages do not need",
     "agent.model.values.start_time": "the clock's",
     "agent.seconds": "the clock's",
-    "agent.model.values.ent_coef": "of a bonus that falls: set anew before each update",
+    "agent.model.values.ent_coef": "falls here: set anew before each update",
+    "agent.model.values.lr_schedule.value_schedule.val": "falls here: set anew before each update",
+    "agent.model.values.gae_lambda": "falls here: set anew before each rollout",
+    "agent.model.values.rollout_buffer.gae_lambda": "falls here: set anew before each rollout",
     "agent.model.values._logger.name_to_value": "told to TensorBoard only, which is off here",
     "agent.model.values._logger.name_to_excluded": "told to TensorBoard only, which is off here",
 }

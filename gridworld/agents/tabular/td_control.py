@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 class TabularControlConfig(TabularConfig):
     """Temporal-difference control. Where Stable-Baselines3 has the same setting, it has the same name."""
 
-    learning_rate: Schedule = 0.1  # step size; a number, or lin_NUMBER or quad_NUMBER to fall to 0
+    learning_rate: Schedule = 0.1  # step size; a number; lin_NUMBER, sqrt_NUMBER and quad_NUMBER fall to 0
     learning_rate_power: float = 0.0  # times (visits of the state and action) ** -power
     initial_value: float = 0.0  # of every action in every state that is no end
     exploration_fraction: float = 1.0  # of training, in which epsilon falls linearly

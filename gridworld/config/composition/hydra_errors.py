@@ -127,6 +127,8 @@ def _suggestion(facts: str) -> str:
             "; a new entry of a dictionary needs a plus: "
             "+agent.policy_kwargs.optimizer_kwargs.eps=1e-5, +agent.arguments.gamma=0.9"
         )
+    if "Could not append to config" in facts:
+        return "; leave out the plus"
     unknown = re.search(r"Key '([^']*)' not in '([^']*)'", facts)
     schema = _schemas().get(unknown.group(2)) if unknown else None
     if unknown is None or not isinstance(schema, type) or not dataclasses.is_dataclass(schema):

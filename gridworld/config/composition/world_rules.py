@@ -1,5 +1,6 @@
 """Values of settings that follow the world: the functions that the agents' yaml files call.
 
+    ${adam_eps:${agent.policy_kwargs.optimizer_class},1e-6}  that number, or none for another optimiser
     ${clearest_gamma:${env},${evaluation.gamma},[0.9,0.95]}  see `world.recommendation`
     ${quadratic_scale:${env},${agent.gamma}}                 see there
     ${for_size:${env},30000}                        30000 up to 30 states, in larger worlds in proportion
@@ -46,6 +47,7 @@ _MOST_CELLS = 512  # the rules solve the world a few times, which takes 0.3 s th
 def register_world_rules() -> None:
     """Register these functions with OmegaConf."""
     for rule in (
+        adam_eps,
         clearest_gamma,
         divided,
         features_class,
@@ -60,6 +62,11 @@ def register_world_rules() -> None:
         times,
     ):
         OmegaConf.register_new_resolver(rule.__name__, rule, replace=True)
+
+
+def adam_eps(optimizer_class: str | None, eps: float) -> float | None:
+    """`eps` for SB3's own optimiser, Adam; None, its default, where another one was chosen."""
+    return eps if optimizer_class in (None, "torch.optim.Adam") else None
 
 
 def clearest_gamma(env: DictConfig, evaluation_gamma: float, candidates: Sequence[float]) -> float:

@@ -56,6 +56,7 @@ def test_lambda_falls_to_nothing_in_plain_sb3(algorithm: Any) -> None:
         ("ent_coef", "quad_0.5", [0.32, 0.18, 0.08, 0.02, 0]),
         ("gae_lambda", "lin_0.5", [0.5, 0.4, 0.3, 0.2, 0.1]),
         ("gae_lambda", "quad_0.5", [0.5, 0.32, 0.18, 0.08, 0.02]),
+        ("learning_rate", "sqrt_0.5", [0.5 * left**0.5 for left in (0.8, 0.6, 0.4, 0.2, 0)]),
     ],
 )
 def test_a_run_has_it_by_its_setting(
@@ -67,7 +68,7 @@ def test_a_run_has_it_by_its_setting(
     def noting(callback: FallingSetting) -> None:
         own(callback)
         model: Any = callback.model
-        found.append(getattr(model, name))
+        found.append(model.lr_schedule(0) if name == "learning_rate" else getattr(model, name))
 
     monkeypatch.setattr(FallingSetting, "_set", noting)
     words = ("agent=ppo", f"agent.engine={engine}", *SHORT)

@@ -163,7 +163,7 @@ DIFFERENT: dict[str, list[list[str]]] = {  # of each argument; the empty one is 
         ["clip_range_vf=0.01", "clip_range_vf=lin_1", ""],
         ["max_grad_norm=0.01", "max_grad_norm=1000", ""],
         OPTIMIZERS,
-        ["ent_coef=quad_0.3", "gae_lambda=lin_0.9", ""],
+        ["ent_coef=quad_0.3", "gae_lambda=lin_0.9", "learning_rate=sqrt_0.01", ""],
     ],
     "a2c": [
         ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],

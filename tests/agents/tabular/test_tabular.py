@@ -78,7 +78,7 @@ class Textbook:
         rate = self.config.learning_rate
         if isinstance(rate, str):
             form, number = rate.split("_")
-            rate = float(number) * (1 - done / self.steps) ** {"lin": 1, "quad": 2}[form]
+            rate = float(number) * (1 - done / self.steps) ** {"lin": 1, "sqrt": 0.5, "quad": 2}[form]
         self.visits[pair] += 1
         visits = np.array([self.visits[pair]], dtype=np.float64)  # numbers alone have another power function
         return rate * float((visits**-self.config.learning_rate_power)[0])
@@ -123,10 +123,10 @@ class Textbook:
     [
         {"learning_rate": 0.5, "exploration_initial_eps": 0.1, "exploration_final_eps": 0.1},
         {"learning_rate": "lin_0.8", "initial_value": 1.0, "exploration_fraction": 0.5},
-        {"learning_rate": "quad_0.8", "exploration_fraction": 0.5},
+        {"learning_rate": "sqrt_0.8", "exploration_fraction": 0.5},
         {"learning_rate": 1.0, "learning_rate_power": 0.6, "gamma": 0.9},
     ],
-    ids=["constant", "linear", "quadratic", "power"],
+    ids=["constant", "linear", "root", "power"],
 )
 def test_one_environment_is_the_textbook_bit_for_bit(
     schema: type[TabularControlConfig], settings: dict[str, Any]

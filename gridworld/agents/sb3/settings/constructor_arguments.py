@@ -132,10 +132,10 @@ def _convert(given: Arguments, where: str) -> Arguments:
     """Yaml's plain values as what SB3 takes; `where` names them in messages."""
     converted = {}
     for name, value in given.items():
-        if name in SCHEDULES and isinstance(value, str):
-            value = LinearSchedule(parse_schedule(where + name, value, linear_only=True).initial, 0.0, 1.0)
-        elif name in FALLING and falls(value):
-            value = parse_schedule(where + name, value).initial
+        if (name in SCHEDULES and isinstance(value, str)) or (name in FALLING and falls(value)):
+            decay = parse_schedule(where + name, value, linear_only=name not in FALLING)
+            linear = name in SCHEDULES and decay.power == 1
+            value = LinearSchedule(decay.initial, 0.0, 1.0) if linear else decay.initial
         elif name == "train_freq" and isinstance(value, list):
             value = tuple(value)
         elif name.endswith(("_class", "_fn")) and value is not None:

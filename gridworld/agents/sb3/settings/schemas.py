@@ -56,6 +56,11 @@ class PolicyKwargs:
     optimizer_class: Optional[str] = None  # noqa: UP045
     optimizer_kwargs: dict[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self.optimizer_kwargs = {
+            name: value for name, value in self.optimizer_kwargs.items() if value is not None
+        }
+
 
 @dataclass
 class ActorCriticPolicyKwargs(PolicyKwargs):
@@ -139,7 +144,7 @@ class SB3ClassConfig(SB3Config):
 class SB3CheckedConfig(SB3Config):
     """A class of Stable-Baselines3 whose arguments are fields here, with their types."""
 
-    learning_rate: Schedule = 1e-3  # a number, or lin_NUMBER to fall linearly to 0 at the end of training
+    learning_rate: Schedule = 1e-3  # a number; lin_NUMBER, sqrt_NUMBER and quad_NUMBER fall to 0
     batch_size: int = 64
     gamma: float = 0.99
     stats_window_size: int = field(default=100, metadata=affects(Effect.LABELS))

@@ -27,8 +27,8 @@ _COUNTS = (
     *("n_steps", "batch_size", "sub_sampling_factor", "n_epochs", "n_critic_updates", "cg_max_steps"),
     *("buffer_size", "target_update_interval", "stats_window_size", "n_quantiles"),
 )
-SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")
-FALLING = ("ent_coef", "gae_lambda")  # numbers in SB3; as schedules, see `agents.sb3.falling_setting`
+SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")  # what SB3 has a linear schedule for
+FALLING = ("ent_coef", "gae_lambda", "learning_rate")  # see `agents.sb3.falling_setting` for all other ones
 _ORDINARY = 1e3  # a rate or a coefficient; beyond, numbers of 32 bits may come to their end
 _LEAST_REWARD, _MOST_RETURN = 1e-30, 1e15
 # Those that are a share or a probability.
@@ -158,7 +158,7 @@ def _check_class(agent: SB3ClassConfig, n_envs: int) -> None:
 
 
 def _check_fields(agent: SB3CheckedConfig, config: TrainConfig) -> None:
-    parse_schedule("agent.learning_rate", agent.learning_rate, linear_only=True)
+    parse_schedule("agent.learning_rate", agent.learning_rate)
     if isinstance(agent, PPOConfig):
         at_least("agent.n_steps", agent.n_steps, 1)  # the minibatch may follow from it
     at_least("agent.batch_size", agent.batch_size, 1)
