@@ -1,16 +1,20 @@
-"""What a sweep's finished jobs came to: a row for each agent, task and settings, over the seeds."""
+"""What a sweep's finished jobs came to: a row for each agent, task and settings, over the seeds.
+
+Settings are told by the words that asked for them, since many others may follow from these.
+"""
 
 from __future__ import annotations
 
 import math
 import statistics
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from gridworld.config.effects import Effect
 from gridworld.config.flatten import flat
-from gridworld.config.settings_by_effect import ON_RESULT, is_of_network, with_effects
+from gridworld.config.settings_by_effect import ON_RESULT, effect_of, with_effects
 from gridworld.envs.intervals import wilson_interval
 from gridworld.errors import InputError
 from gridworld.process.console.columns import aligned
@@ -32,17 +36,17 @@ def results_lines(folder: Path, rows: Sequence[JobRow]) -> list[str]:
         folder: the sweep's.
         rows: of its jobs; those that are not done are left out.
     """
-    groups: dict[tuple[str, str], dict[Settings, list[Summary]]] = defaultdict(lambda: defaultdict(list))
+    groups: dict[tuple[str, str], dict[Settings, list[_Result]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
         found = _result(folder / row.job) if row.status == DONE else None
         if found is not None:
-            summary, settings = found
-            groups[summary["agent"], summary["env"]][settings].append(summary)
-    cells = [
-        [agent, task, _difference(settings, alike), _certified(found), _steps(found)]
-        for (agent, task), alike in groups.items()
-        for settings, found in alike.items()
-    ]
+            groups[found.summary["agent"], found.summary["env"]][found.settings].append(found)
+    cells = []
+    for (agent, task), alike in groups.items():
+        told = _differences([results[0] for results in alike.values()])
+        for results, difference in zip(alike.values(), told, strict=True):
+            summaries = [result.summary for result in results]
+            cells.append([agent, task, difference, _certified(summaries), _steps(summaries)])
     if not cells:
         return []
     keep = [0, 1, *([2] if any(row[2] for row in cells) else []), 3, 4]
@@ -51,21 +55,45 @@ def results_lines(folder: Path, rows: Sequence[JobRow]) -> list[str]:
     return aligned([[f"{cell} " for cell in row] for row in table], forms)  # two blanks between columns
 
 
-def _result(folder: Path) -> tuple[Summary, Settings] | None:
+@dataclass(frozen=True)
+class _Result:
+    """What a job came to, and by which settings and words."""
+
+    summary: Summary
+    settings: Settings
+    words: tuple[str, ...]  # that chose settings
+
+
+def _result(folder: Path) -> _Result | None:
     try:
         run = read_run(folder)
         chosen = with_effects(_OF_SETTINGS, run.manifest["config"])
-        return run.read_summary(), tuple((name, str(value)) for name, value in flat(chosen))
+        settings = tuple((name, str(value)) for name, value in flat(chosen))
+        words = tuple(word for word in run.manifest["overrides"] if effect_of(_key(word)) in _OF_SETTINGS)
+        return _Result(run.read_summary(), settings, words)
     except InputError:  # it was changed since; the report says so
         return None
 
 
-def _difference(settings: Settings, alike: Iterable[Settings]) -> str:
-    """In what the settings differ from the others of this agent on this task; a network's come last."""
-    shared = set(settings).intersection(*alike)
-    own = sorted((each for each in settings if each not in shared), key=lambda each: is_of_network(each[0]))
-    told = " ".join(f"{name.removeprefix('agent.')}={value}" for name, value in own)
-    return told if len(told) <= _LONGEST else f"{told[: _LONGEST - 1]}…"
+def _key(word: str) -> str:
+    return word.partition("=")[0].lstrip("+~").partition("@")[0]
+
+
+def _differences(results: Sequence[_Result]) -> list[str]:
+    """The words of each that not all have; where one names no such setting, its value."""
+    shared = set(results[0].words).intersection(*(result.words for result in results))
+    keys = dict.fromkeys(_key(word) for result in results for word in result.words if word not in shared)
+    told = []
+    for result in results:
+        given = {_key(word): word for word in result.words}
+        values = {key: f"{key}={value}" for key, value in result.settings}
+        words = [given.get(key) or values.get(key, "") for key in keys]
+        told.append(_shortened(" ".join(word.removeprefix("agent.") for word in words if word)))
+    return told
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 
 def _certified(found: Sequence[Summary]) -> str:

@@ -31,6 +31,7 @@ from gridworld.storage.file_lock import is_locked, locked
 from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.job_table import JobRow, JobTable
 from gridworld.sweep.progress import sweep_line
+from gridworld.sweep.results import results_lines
 
 QUICK = ("agent=q_learning", "total_timesteps=500", *NO_PICTURES)
 FOLDER = "hydra.sweep.dir=sweep"
@@ -115,10 +116,21 @@ def test_a_sweep_is_come_back_to(tmp_path: Path) -> None:
     assert sweep("seed=0", "agent.gamma=0.5", "hydra.sweeper.extend=true", cwd=tmp_path).returncode == 0
     (added,) = statuses(folder).keys() - {"seed=0", "seed=1", "seed=2"}
     assert "agent.gamma=0.5" in added
+    rows = list(JobTable(folder).read().values())
+    assert [line.split()[2] for line in results_lines(folder, rows)[1:]] == ["gamma=0.9", "gamma=0.5"]
 
     subprocess.run(["rm", "-r", str(folder / "seed=1")], check=True)  # to have it again
     assert "1 to run" in sweep("seed=0,1", cwd=tmp_path).stderr
     assert statuses(folder)["seed=1"] == "done"
+
+
+def test_settings_are_told_by_the_words_that_asked_for_them(tmp_path: Path) -> None:
+    """Many others follow from the slip, and would hide it."""
+    words = ("agent=ppo", "env.slip=0,0.1", "observation=one_hot,image", "total_timesteps=300", "seed=0")
+    done = sweep(*words, cwd=tmp_path)
+    assert [row[2] for row in results(done.stdout)] == [
+        f"env.slip={slip} observation={kind}" for slip in ("0", "0.1") for kind in ("one_hot", "image")
+    ]
 
 
 @pytest.mark.parametrize("launcher", ["basic", "forks", "joblib"])
