@@ -9,6 +9,9 @@ Hydra, which tests/sweep/test_config_loader.py checks one by one.
 from __future__ import annotations
 
 import pickle
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any, cast
 
 from hydra._internal.config_loader_impl import get_overrides_dirname
@@ -18,11 +21,14 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
+from gridworld.config.composition.compose import to_config
 from gridworld.config.composition.loader import Loader
 from gridworld.config.composition.words import with_whole_numbers
+from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 
 _MOST_BASES = 64
+_SEED = re.compile(r"seed=(0|[1-9][0-9]*)")
 _NUMBERED = "${hydra.job.num}"  # hydra.sweep.subdir unless it is set; the sweeper has its own names
 
 
@@ -102,6 +108,47 @@ class SweepLoader(Loader):
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_bases": {}, "_settings": {}}
+
+
+class Configurations:
+    """Composes a sweep's jobs; of those that differ only in the seed, the first, for all of them.
+
+    Args:
+        loader: composes settings.
+        master: the configuration of the sweep itself.
+    """
+
+    def __init__(self, loader: SweepLoader, master: DictConfig) -> None:
+        self._loader = loader
+        self._master = master
+        self._of_any_seed: dict[tuple[str, ...], TrainConfig] = {}  # by the other overrides
+
+    def __call__(self, overrides: Sequence[str]) -> TrainConfig:
+        """Compose a job's overrides.
+
+        Raises:
+            InputError, HydraException: as `SweepLoader.load_settings` and `to_config`.
+        """
+        seeds = [found for word in overrides if (found := _SEED.fullmatch(word)) is not None]
+        others = tuple(word for word in overrides if _SEED.fullmatch(word) is None)
+        if len(seeds) == 1 and others in self._of_any_seed:
+            return replace(self._of_any_seed[others], seed=int(seeds[0][1]))
+        settings = self._loader.load_settings(self._master, list(overrides))
+        config = to_config(settings)
+        if len(self._of_any_seed) >= _MOST_BASES:
+            self._of_any_seed.clear()
+        # where an interpolation names the seed, other settings may follow from it
+        if not any("seed" in text for text in _interpolations(OmegaConf.to_container(settings))):
+            self._of_any_seed[others] = config
+        return config
+
+
+def _interpolations(node: object) -> Iterator[str]:
+    if isinstance(node, dict | list):
+        for each in node.values() if isinstance(node, dict) else node:
+            yield from _interpolations(each)
+    elif isinstance(node, str) and "${" in node:
+        yield node
 
 
 def _refuse_own_lists(settings: DictConfig, master: DictConfig) -> None:

@@ -15,15 +15,13 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig
 
-from gridworld.config.composition.compose import to_config
 from gridworld.config.composition.words import with_whole_numbers
 from gridworld.config.sweep import SweepConfig
-from gridworld.config.train import TrainConfig
 from gridworld.errors import EXIT_CODE, FolderLostError, InputError, reason
 from gridworld.process.console.terminal import tell, tell_error
 from gridworld.process.signals import exiting, signal_name
 from gridworld.sweep import console
-from gridworld.sweep.config_loader import SweepLoader
+from gridworld.sweep.config_loader import Configurations, SweepLoader
 from gridworld.sweep.folder import JobEntry, SweepFolder
 from gridworld.sweep.job import StopSweep, mark_failed
 from gridworld.sweep.job_table import (
@@ -73,11 +71,8 @@ def run_sweep(
     def divided(by_name: dict[str, Job], to_do: list[JobEntry]) -> list[list[JobEntry]]:
         return populations([(entry, by_name[entry.job]) for entry in to_do], settings, master.hydra)
 
-    def configure(overrides: Sequence[str]) -> TrainConfig:
-        return to_config(loader.load_settings(master, list(overrides)))
-
     words = [*_of_yaml(settings), *words]  # a word of the command line comes later, and counts
-    jobs = plan(expand(words, loader, settings.max_jobs, settings.paired), configure)
+    jobs = plan(expand(words, loader, settings.max_jobs, settings.paired), Configurations(loader, master))
     _refuse_mistakes(jobs, settings)
     folder.check(jobs, settings.extend)
     populations([], settings, master.hydra)  # finds a mistake

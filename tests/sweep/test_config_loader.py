@@ -15,8 +15,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from gridworld.config.composition import loader as composition_loader
-from gridworld.config.composition.compose import register_schemas
+from gridworld.config.composition.compose import register_schemas, to_config
 from gridworld.errors import InputError
+from gridworld.sweep.config_loader import Configurations, SweepLoader
+from gridworld.sweep.plan import expand
 
 WHAT_TO_DO = (
     f"Hydra {hydra_version} changed an internal that gridworld/sweep/config_loader.py, or "
@@ -134,8 +136,6 @@ def test_hydra_is_asked_for_the_mode_where_something_may_set_it(
     ],
 )
 def test_jobs_are_composed_as_hydra_does_it(loader: ConfigLoader, overrides: list[str]) -> None:
-    from gridworld.sweep.config_loader import SweepLoader
-
     known_in_a_job = "hydra.job.id=${hydra.job.num}"
     words = ["n_envs=2", "hydra.sweep.dir=x", known_in_a_job]
     master = loader.load_configuration("train", words, RunMode.MULTIRUN)
@@ -169,8 +169,6 @@ def test_jobs_are_composed_as_hydra_does_it(loader: ConfigLoader, overrides: lis
 def test_folders_that_the_sweep_would_not_use_are_refused(
     loader: ConfigLoader, word: str, job: str, sentence: str, tmp_path: Path
 ) -> None:
-    from gridworld.sweep.config_loader import SweepLoader
-
     (tmp_path / "experiment").mkdir()
     for key in ("dir", "subdir"):
         text = f"# @package _global_\nhydra: {{sweep: {{{key}: mine}}}}\n"
@@ -182,3 +180,33 @@ def test_folders_that_the_sweep_would_not_use_are_refused(
     for allowed in ("hydra.sweep.dir=mine", "hydra.sweep.subdir=${hydra.job.num}"):
         master = loader.load_configuration("train", [words[0], allowed], RunMode.MULTIRUN)
         assert SweepLoader(loader).load_settings(master, ["seed=3"]).seed == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "compositions"),
+    [
+        (["agent=ppo,q_learning", "env.slip=0,0.1", "seed=range(3)"], 4),
+        (["seed=range(3)", "agent=ppo,q_learning"], 2),
+        (["agent.learning_rate=0.1,0.2", "agent=q_learning"], 2),
+        (["n_envs=${seed}", "seed=1,2,3"], 3),  # it follows from the seed
+        (["seed=${n_envs}", "n_envs=1,2"], 2),
+        (["seed=3", "agent=ppo,q_learning"], 2),
+    ],
+)
+def test_jobs_that_differ_in_the_seed_only_are_composed_once(
+    loader: ConfigLoader, words: list[str], compositions: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    master = loader.load_configuration("train", [], RunMode.MULTIRUN)
+    composed: list[list[str]] = []
+
+    class Counted(SweepLoader):
+        def load_settings(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
+            composed.append(sweep_overrides)
+            return super().load_settings(master_config, sweep_overrides)
+
+    configure = Configurations(Counted(loader), master)
+    jobs = [overrides for overrides, _ in expand(words, loader, 100)]
+    configs = [configure(job) for job in jobs]
+    assert len(composed) == compositions
+    for job, config in zip(jobs, configs, strict=True):
+        assert config == to_config(SweepLoader(loader).load_settings(master, job))
