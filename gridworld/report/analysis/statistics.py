@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridworld.envs.intervals import wilson_interval
-from gridworld.world.mdp import FloatArray
+from gridworld.world.mdp import FloatArray, IntArray
 
 LEVEL = 0.95
 RESAMPLES = 2000
@@ -125,8 +125,13 @@ def bands(
 def _bootstrapped(
     statistic: Statistic, samples: Sequence[FloatArray], chance: np.random.Generator, resamples: int
 ) -> FloatArray:
-    """The statistic of samples (..., n) that are drawn anew, (..., resamples) in order of size."""
+    """The statistic of samples (..., n) that are drawn anew, (..., resamples) in order of size.
+
+    Points with the same values, such as those of a curve that has arrived, have the same draws, and so the
+    same statistics, which are taken once.
+    """
     batch = max(1, _LARGEST_BATCH // sum(sample.size for sample in samples))
+    samples, place = _distinct(samples)
     parts = []
     for begun in range(0, resamples, batch):
         rows = min(batch, resamples - begun)
@@ -136,7 +141,17 @@ def _bootstrapped(
             for sample, count in zip(samples, counts, strict=True)
         ]
         parts.append(statistic(*drawn, axis=-1))
-    return np.sort(np.concatenate(parts, axis=-1), axis=-1)
+    ordered = np.sort(np.concatenate(parts, axis=-1), axis=-1)
+    return np.asarray(ordered[place])
+
+
+def _distinct(samples: Sequence[FloatArray]) -> tuple[list[FloatArray], IntArray]:
+    """The points of samples (..., n) without repetition, (points, n) each, and where each point is there."""
+    joined = np.concatenate(samples, axis=-1)
+    rows = joined.reshape(-1, joined.shape[-1])
+    _, first, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    kept = [sample.reshape(-1, sample.shape[-1])[first] for sample in samples]
+    return kept, place.reshape(joined.shape[:-1])
 
 
 def _quantile(ordered: FloatArray, share: float) -> FloatArray:
