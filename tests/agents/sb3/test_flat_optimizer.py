@@ -1,6 +1,7 @@
 """Stepping on all parameters as one vector is stepping on each of them."""
 
 import copy
+import math
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from gridworld.agents.sb3.tabulated.flat_optimizer import ELEMENTWISE, FlatOptimizer
+from gridworld.agents.sb3.tabulated.flat_optimizer import ELEMENTWISE, FlatOptimizer, joint_step
 
 OPTIONS: dict[str, dict[str, Any]] = {
     "Adam": {"amsgrad": True, "weight_decay": 0.01},
@@ -80,3 +81,39 @@ def test_gradients_that_somebody_removed_come_back() -> None:
         descent.step([net(inputs)], [slopes], 1.0)
         for parameter, old in zip(net.parameters(), before, strict=True):
             assert torch.allclose(parameter, old - 0.1 * parameter.grad, atol=1e-7)
+
+
+@pytest.mark.parametrize("by_somebody_else", [False, True])
+@pytest.mark.parametrize("jointly", [False, True])
+@pytest.mark.parametrize("kind", [torch.optim.Adam, torch.optim.RMSprop], ids=["Adam", "RMSprop"])
+def test_moments_that_shrink_become_zero_and_weights_are_the_same(
+    kind: type[torch.optim.Optimizer], jointly: bool, by_somebody_else: bool
+) -> None:
+    if not torch.set_flush_denormal(False):
+        pytest.skip("this processor has no such mode")
+    arguments: dict[str, Any] = {"lr": 0.01} if kind is torch.optim.Adam else {"lr": 0.01, "momentum": 0.9}
+    moment = "exp_avg" if kind is torch.optim.Adam else "momentum_buffer"
+    nets = [network() for _ in range(2)]
+    make: Any = kind
+    ours, theirs = (make(net.parameters(), **arguments) for net in nets)
+    descent = FlatOptimizer(ours)
+    inputs, slopes = draw(0)
+    descent.step([nets[0](inputs)], [slopes], math.inf)
+    stepped(theirs, nets[1], 0, math.inf)
+    step = joint_step([descent]) if jointly else descent.advance
+    descent.gradient.zero_()
+    theirs.zero_grad(set_to_none=False)
+    torch.set_flush_denormal(by_somebody_else)
+    try:
+        for _ in range(1000):
+            step()
+        is_still_on = math.ulp(0.0) * 1.0 == 0
+    finally:
+        torch.set_flush_denormal(False)
+    assert is_still_on == by_somebody_else
+    for _ in range(1000):
+        theirs.step()
+    for mine, peer in zip(nets[0].parameters(), nets[1].parameters(), strict=True):
+        assert torch.equal(mine, peer)
+        assert (ours.state[mine][moment] == 0).all()
+        assert (theirs.state[peer][moment] != 0).any()  # this is what costs

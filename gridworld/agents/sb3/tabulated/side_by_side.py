@@ -194,6 +194,5 @@ class SideBySide:
             for each in (self._optimizers[row] for row in rows):
                 kinds.setdefault(each.kind, []).append(each)
             self._steps = {rows: [joint_step(same) for same in kinds.values()]}
-        with torch.no_grad():
-            for step in self._steps[rows]:
-                step()
+        for step in self._steps[rows]:
+            step()
