@@ -61,6 +61,16 @@ A2C = "stable_baselines3.A2C"
         (A2C, ["+agent.arguments.ent_coef=true"], "agent.arguments.ent_coef=True: must be float"),
         (A2C, ["agent.arguments.gamma=2"], "agent.arguments.gamma=2: must be from 0 to 1"),
         (A2C, ["+agent.arguments.n_steps=0"], "agent.arguments.n_steps=0: must be at least 1"),
+        (
+            A2C,
+            ["+agent.arguments.ent_coef=abc"],
+            "agent.arguments.ent_coef=abc: must be a number of at least 0, or lin_",
+        ),
+        (
+            A2C,
+            ["+agent.arguments.ent_coef=-1"],
+            "agent.arguments.ent_coef=-1: must be a number of at least 0, or lin_",
+        ),
         (A2C, ["+agent.arguments.ent_coef=nan"], "agent.arguments.ent_coef=nan: must be a finite number"),
         (
             "sb3_contrib.TRPO",

@@ -106,9 +106,9 @@ def _check_arguments(config: SB3ClassConfig, algorithm: type[BaseAlgorithm]) -> 
                 f"agent.arguments.{name}: {config.algorithm} has no such argument; it has {known}"
             )
         wanted = parameters[name].annotation if name in parameters else None
-        if name in FALLING and falls(value):
-            continue
-        if wanted in _PLAIN_TYPES and not _is_a(value, wanted):
+        if name in FALLING and wanted is float and type(value) in (int, float, str):
+            parse_schedule(f"agent.arguments.{name}", value)
+        elif wanted in _PLAIN_TYPES and not _is_a(value, wanted):
             raise InputError(f"agent.arguments.{name}={value}: must be {wanted.__name__}")
 
 
