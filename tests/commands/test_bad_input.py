@@ -112,8 +112,9 @@ TRAIN = [
     ("agent.policy_kwargs.net_arch={{pi:[8],vf:[8]}}", "DQN has one network"),
     (
         "agent.policy_kwargs.optimizer_kwargs={{eps:1e-5}}",
-        "a new entry of a dictionary needs a plus: +agent",
+        "a new entry of a dictionary needs a plus: +agent.policy_kwargs.optimizer_kwargs.eps=...",
     ),
+    ("agent=trpo agent.arguments.use_sde=true", "a plus: +agent.arguments.use_sde=..."),
     ("agent.family=tf", "agent.family=tf: there is no such family"),
     ("agent.family=tabular", "agent.family=tabular: these are the settings of sb3; choose agent=..."),
     ("agent=sarsa agent.family=sb3", "agent.family=sb3: these are the settings of tabular"),

@@ -122,11 +122,10 @@ def _unknown_choice(message: str) -> str:
 def _suggestion(facts: str) -> str:
     if "Ambiguous value" in facts:
         return "; to run one job for each of the values, add -m"
-    if "is not in struct" in facts:
-        return (
-            "; a new entry of a dictionary needs a plus: "
-            "+agent.policy_kwargs.optimizer_kwargs.eps=1e-5, +agent.arguments.gamma=0.9"
-        )
+    if added := re.search(r"Could not override '([^']*)'.*Key '([^']*)' is not in struct", facts, re.DOTALL):
+        place, name = added.groups()
+        entry = place if place.endswith(f".{name}") else f"{place}.{name}"
+        return f"; a new entry of a dictionary needs a plus: +{entry}=..."
     if "Could not append to config" in facts:
         return "; leave out the plus"
     unknown = re.search(r"Key '([^']*)' not in '([^']*)'", facts)
