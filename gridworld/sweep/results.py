@@ -69,10 +69,17 @@ def _result(folder: Path) -> _Result | None:
         run = read_run(folder)
         chosen = with_effects(_OF_SETTINGS, run.manifest["config"])
         settings = tuple((name, str(value)) for name, value in flat(chosen))
-        words = tuple(word for word in run.manifest["overrides"] if effect_of(_key(word)) in _OF_SETTINGS)
+        asked = [word for word in run.manifest["overrides"] if effect_of(_key(word)) in _OF_SETTINGS]
+        words = tuple(_resolved(word, dict(settings)) for word in asked)
         return _Result(run.read_summary(), settings, words)
     except InputError:  # it was changed since; the report says so
         return None
+
+
+def _resolved(word: str, settings: dict[str, str]) -> str:
+    """The word with its value where it names other settings, as `n_envs=${seed}` does."""
+    value = settings.get(_key(word))
+    return f"{_key(word)}={value}" if "${" in word and value is not None else word
 
 
 def _key(word: str) -> str:

@@ -133,6 +133,11 @@ def test_settings_are_told_by_the_words_that_asked_for_them(tmp_path: Path) -> N
     ]
 
 
+def test_a_setting_that_follows_from_the_seed_is_told_by_its_value(tmp_path: Path) -> None:
+    done = sweep("agent=q_learning", "n_envs=${seed}", "seed=3,4", "total_timesteps=300", cwd=tmp_path)
+    assert [row[2] for row in results(done.stdout)] == ["n_envs=3", "n_envs=4"]
+
+
 @pytest.mark.parametrize("launcher", ["basic", "forks", "joblib"])
 def test_a_failure_stops_no_other_job(launcher: str, tmp_path: Path) -> None:
     words = ("agent.learning_rate=0.1,2,0.2", "seed=0,1", f"hydra/launcher={launcher}", "agent=q_learning")
