@@ -12,6 +12,7 @@ from gridworld.world.exact.bellman import pick
 from gridworld.world.exact.solver import solved
 from gridworld.world.mdp import BoolArray, FloatArray
 
+_NOTHING = 1e-9  # of the scale of the values
 _CLEARER = 5  # times the gap
 _FAINT = 1e-3  # of the largest reward: less than a network's values resolve
 _SPREAD = 0.5  # of the entropy of a uniform policy
@@ -21,7 +22,7 @@ _POOR = 0.5  # of a uniform policy's regret
 def other_optimum(run: Evidence) -> Finding | None:
     """What it does is optimal under its own discount, exactly."""
     best = run.evaluator.solution
-    states = run.split.wrong & (run.gap <= 1e-9 * run.own.scale)
+    states = run.split.wrong & (run.gap <= _NOTHING * run.own.scale)
     if run.gamma == best.gamma or not states.any():
         return None
     why = (
@@ -49,9 +50,12 @@ def _faint(run: Evidence, limit: FloatArray) -> Finding | None:
     if better == run.gamma or not states.any():
         return None
     worst = costliest(run, states)
+    worth = f"worth only {run.gap[worst]:.2g} more, less than its values err"
+    if run.gap[worst] <= _NOTHING * run.own.scale[worst]:
+        worth = "not worth more than what it does"
     why = (
-        f"with its gamma of {run.gamma:g} the right action is worth only {run.gap[worst]:.2g} more, less "
-        f"than its values err; with {better:g} it is {clear[worst]:.2g}"
+        f"with its gamma of {run.gamma:g} the right action is {worth}; with {better:g} it is worth "
+        f"{clear[worst]:.2g} more"
     )
     return Finding("objective", states, why, (run.change("gamma", better),))
 
