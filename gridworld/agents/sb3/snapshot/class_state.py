@@ -38,9 +38,12 @@ class ClassState:
     def __init__(self) -> None:
         self._before: dict[type, dict[str, Any]] = {}
 
-    def parts(self, kind: type) -> Iterator[tuple[type, list[Part]]]:
-        """Every class in the order of inheritance, and what it holds that counts."""
+    def parts(self, kind: type, looked_at: set[int]) -> Iterator[tuple[type, list[Part]]]:
+        """Every class in the order of inheritance, and what it holds that counts, but for those looked at."""
         for base in kind.__mro__:
+            if id(base) in looked_at:
+                continue
+            looked_at.add(id(base))
             if not is_known(base.__module__):
                 yield base, list(_held(base))
             elif base.__module__ != "builtins":

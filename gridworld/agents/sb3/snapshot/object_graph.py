@@ -176,10 +176,7 @@ class ObjectGraph:
 
     def _parts_of_class(self, kind: type, path: str) -> Iterator[tuple[str, Any, Put]]:
         """What a class keeps for all its objects, each class once."""
-        for base, parts in self._classes.parts(kind):
-            if id(base) in self._looked_at:
-                continue
-            self._looked_at.add(id(base))
+        for base, parts in self._classes.parts(kind, self._looked_at):
             holder = f"<{base.__qualname__}>"
             self._holders[f"{path}.{holder}" if path else holder] = base
             for name, value, put in parts:
