@@ -22,8 +22,9 @@ from omegaconf.errors import OmegaConfBaseException
 from gridworld.commands import run
 from gridworld.commands.shell.help import manual
 from gridworld.commands.shell.output_folder import check_settings_of, check_sweep_folder, run_folder
-from gridworld.config.composition.compose import register_schemas, to_config
+from gridworld.config.composition.compose import register_schemas
 from gridworld.config.composition.conf_folder import conf_folder, own_conf_folders
+from gridworld.config.composition.for_all_seeds import converted
 from gridworld.config.composition.hydra_errors import sentence, unreadable_file
 from gridworld.config.composition.loader import run_hydra
 from gridworld.config.composition.words import refuse_dashes
@@ -156,7 +157,7 @@ def _run_job(settings: DictConfig) -> float:
     overrides = cast("list[str]", OmegaConf.to_container(context.overrides.task))
     is_one_of_many = context.mode is RunMode.MULTIRUN
     try:
-        config = to_config(settings)
+        config = converted(settings)
         if is_one_of_many and (folder.parent / SWEEP_JSON).exists():
             from gridworld.sweep.job import run_in_sweep
 

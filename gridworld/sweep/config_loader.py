@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import pickle
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from functools import partial
 from typing import Any, cast
 
 from hydra._internal.config_loader_impl import get_overrides_dirname
@@ -22,6 +22,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from gridworld.config.composition.compose import to_config
+from gridworld.config.composition.for_all_seeds import ForAllSeeds
 from gridworld.config.composition.loader import Loader
 from gridworld.config.composition.words import with_whole_numbers
 from gridworld.config.train import TrainConfig
@@ -121,7 +122,7 @@ class Configurations:
     def __init__(self, loader: SweepLoader, master: DictConfig) -> None:
         self._loader = loader
         self._master = master
-        self._of_any_seed: dict[tuple[str, ...], TrainConfig] = {}  # by the other overrides
+        self._known = ForAllSeeds()
 
     def __call__(self, overrides: Sequence[str]) -> TrainConfig:
         """Compose a job's overrides.
@@ -129,26 +130,14 @@ class Configurations:
         Raises:
             InputError, HydraException: as `SweepLoader.load_settings` and `to_config`.
         """
-        seeds = [found for word in overrides if (found := _SEED.fullmatch(word)) is not None]
+        seeds = [int(found[1]) for word in overrides if (found := _SEED.fullmatch(word)) is not None]
+        if len(seeds) != 1:
+            return to_config(self._load(overrides))
         others = tuple(word for word in overrides if _SEED.fullmatch(word) is None)
-        if len(seeds) == 1 and others in self._of_any_seed:
-            return replace(self._of_any_seed[others], seed=int(seeds[0][1]))
-        settings = self._loader.load_settings(self._master, list(overrides))
-        config = to_config(settings)
-        if len(self._of_any_seed) >= _MOST_BASES:
-            self._of_any_seed.clear()
-        # where an interpolation names the seed, other settings may follow from it
-        if not any("seed" in text for text in _interpolations(OmegaConf.to_container(settings))):
-            self._of_any_seed[others] = config
-        return config
+        return self._known.config(others, seeds[0], partial(self._load, overrides))
 
-
-def _interpolations(node: object) -> Iterator[str]:
-    if isinstance(node, dict | list):
-        for each in node.values() if isinstance(node, dict) else node:
-            yield from _interpolations(each)
-    elif isinstance(node, str) and "${" in node:
-        yield node
+    def _load(self, overrides: Sequence[str]) -> DictConfig:
+        return self._loader.load_settings(self._master, list(overrides))
 
 
 def _refuse_own_lists(settings: DictConfig, master: DictConfig) -> None:

@@ -24,6 +24,7 @@ from omegaconf import DictConfig
 
 from gridworld.agents import family
 from gridworld.config.composition.compose import to_config
+from gridworld.config.composition.for_all_seeds import converting_once
 from gridworld.config.sweep import SweepConfig
 from gridworld.errors import InputError
 from gridworld.process.parallel.forks import can_fork
@@ -70,7 +71,7 @@ class PopulationTask:
         try:
             entries = {entry.job: entry for entry in SweepFolder(folder).entries.values()}
             jobs = [(int(number), entries[name]) for number, name in together]
-            with mixing(self._mixed(settings, [entry for _, entry in jobs])):
+            with mixing(self._mixed(settings, [entry for _, entry in jobs])), converting_once():
                 results = self._run_all(folder, jobs)
         finally:
             shared.cfg = before
