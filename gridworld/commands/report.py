@@ -82,7 +82,7 @@ def _parser() -> argparse.ArgumentParser:
         choices=FORMATS,
         default=FORMATS,
         metavar="FORMAT",
-        help=f"of the figures' files, some of {' '.join(FORMATS)} or none (default: all of them)",
+        help=f"of the figures' files, any of {' '.join(FORMATS)}; with no word, none (default: all of them)",
     )
     parser.add_argument(
         "--log-steps",
