@@ -145,10 +145,7 @@ class Evidence:
 
         Of a schedule it is the first value; the default stands in for what the agent has not.
         """
-        agent = self.config.agent
-        given = getattr(agent, name, None)
-        if given is None:
-            given = getattr(agent, "arguments", {}).get(name)
+        given = self._given(name)
         if given is None and not self.is_tabular:
             given = getattr(self.agent.model, name, None)
         if isinstance(given, str):
@@ -160,14 +157,25 @@ class Evidence:
 
     def last_setting(self, name: str) -> float:
         """The same, but of a schedule its last value."""
-        agent = self.config.agent
-        given = vars(agent).get(name, vars(agent).get("arguments", {}).get(name))
-        return 0.0 if falls(given) else self.setting(name)
+        return 0.0 if self.falls(name) else self.setting(name)
+
+    def falls(self, name: str) -> bool:
+        """Whether one of the agent's settings is a schedule, which ends at 0."""
+        return falls(self._given(name))
+
+    def multiplied(self, name: str, by: float, most: float = math.inf) -> str:
+        """The word that multiplies one of the agent's settings, of which a schedule stays one."""
+        given, value = self._given(name), min(by * self.setting(name), most)
+        return self.change(name, f"{given.partition('_')[0]}_{value:.3g}" if falls(given) else value)
 
     def change(self, name: str, value: float | str) -> str:
         """The word that sets one of the agent's settings on a command line."""
         text = value if isinstance(value, str) else f"{value:.3g}" if value % 1 else f"{value:.0f}"
         return f"{self.config.agent.key(name)}={text}"
+
+    def _given(self, name: str) -> Any:
+        given = getattr(self.config.agent, name, None)
+        return getattr(self.config.agent, "arguments", {}).get(name) if given is None else given
 
     def takes(self, name: str) -> bool:
         """Whether the agent has a setting of this name."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gridworld.config.agents import LINEAR
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.world.mdp import BoolArray
 
@@ -38,14 +39,19 @@ def costliest(run: Evidence, states: BoolArray) -> int:
 
 def slower(run: Evidence) -> tuple[str, ...]:
     """Words for smaller learning rates."""
-    rate = run.setting("learning_rate")
-    return tuple(run.change("learning_rate", rate / by) for by in (10, 100))
+    return tuple(run.multiplied("learning_rate", by) for by in (0.1, 0.01))
+
+
+def falling(run: Evidence) -> tuple[str, ...]:
+    """The word for a learning rate that falls to 0; none where it does."""
+    if run.falls("learning_rate"):
+        return ()
+    return (run.change("learning_rate", f"{LINEAR}{run.setting('learning_rate'):g}"),)
 
 
 def faster(run: Evidence) -> tuple[str, ...]:
     """Words for a larger learning rate and for a longer run."""
-    rate = run.change("learning_rate", min(10 * run.setting("learning_rate"), 1.0))
-    return rate, longer(run, 4)
+    return run.multiplied("learning_rate", 10, most=1.0), longer(run, 4)
 
 
 def longer(run: Evidence, times: int) -> str:

@@ -155,6 +155,15 @@ def test_a_certificate_that_was_lost_is_said() -> None:
     assert f"certified at step {step:,}" in found.sentence()
 
 
+def test_a_rate_that_falls_is_not_told_to_fall_and_falls_in_what_is_told() -> None:
+    falls = ["agent=q_learning", "agent.learning_rate=quad_0.001", "evaluation.stop_after=5"]
+    run = gridworld.train(*falls, seed=0, progress=False)
+    run.curve["certified"] = run.curve["certified"].copy()
+    run.curve["certified"][3] = True
+    (told,) = gridworld.diagnose(run).commands
+    assert told.endswith("evaluation.stop_after=5 seed=0 agent.learning_rate=quad_0.0001")
+
+
 def test_a_command_takes_the_place_of_the_setting_that_it_changes() -> None:
     run = gridworld.train("agent=q_learning", "agent.learning_rate=0.001", seed=0, progress=False)
     first = gridworld.diagnose(run).commands[0]

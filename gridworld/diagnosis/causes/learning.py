@@ -6,7 +6,7 @@ import numpy as np
 
 from gridworld.diagnosis.evidence import Evidence, entropy
 from gridworld.diagnosis.experiments import entropy_optimum, sweeps_missing
-from gridworld.diagnosis.finding import Finding, costliest, faster, longer, slower
+from gridworld.diagnosis.finding import Finding, costliest, falling, faster, longer, slower
 from gridworld.world.exact.bellman import backup
 from gridworld.world.mdp import BoolArray
 
@@ -24,8 +24,8 @@ def lost_again(run: Evidence) -> Finding | None:
     steps, last = run.curve["step"], int(certified[-1])
     after = int(steps[min(last + 1, len(steps) - 1)])
     why = f"it was certified at step {int(steps[last]):,} and had lost that again at step {after:,}"
-    linear = run.change("learning_rate", f"lin_{run.setting('learning_rate'):g}")
-    return Finding("lost", run.split.wrong, why, (linear, "evaluation.stop_after=3", slower(run)[0]))
+    sooner = () if run.config.evaluation.stop_after else ("evaluation.stop_after=3",)
+    return Finding("lost", run.split.wrong, why, (*falling(run), *sooner, slower(run)[0]))
 
 
 def diverged(run: Evidence) -> Finding | None:
@@ -140,7 +140,7 @@ def _slow_table(run: Evidence, states: BoolArray) -> Finding | None:
     )
     changes = [run.change("learning_rate_power", 0.0)] if power else []
     if rate < 0.5:
-        changes.append(run.change("learning_rate", min(10 * rate, 0.5)))
+        changes.append(run.multiplied("learning_rate", 10, most=0.5))
     return Finding("slow", states, f"{why}{_behind(run)}", (*changes, longer(run, 4)))
 
 
@@ -154,5 +154,4 @@ def unsettled(run: Evidence) -> Finding:
         f"its values do not settle: in {run.mdp.state_name(worst)} they err by {error:.2g} where the right "
         f"action is worth {run.gap[worst]:.2g} more"
     )
-    linear = run.change("learning_rate", f"lin_{run.setting('learning_rate'):g}")
-    return Finding("rate", run.split.wrong, why, (slower(run)[0], linear, longer(run, 4)))
+    return Finding("rate", run.split.wrong, why, (slower(run)[0], *falling(run), longer(run, 4)))
