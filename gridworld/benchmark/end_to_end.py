@@ -12,6 +12,7 @@ from functools import partial
 
 from gridworld.benchmark import peers
 from gridworld.benchmark.measure import Comparison, Workload
+from gridworld.errors import InputError
 
 _STEPS = 20_000  # of environment, beside RL Zoo
 
@@ -84,7 +85,7 @@ def run(command: list[str], env: Mapping[str, str] | None = None) -> tuple[float
     with tempfile.TemporaryDirectory() as folder:
         done = subprocess.run(measured, cwd=folder, env=env, capture_output=True, text=True)
     if done.returncode:
-        raise RuntimeError(f"{' '.join(command)}: {done.stderr}")
+        raise InputError(f"{' '.join(command)}: {peers.why(done)}")
     seconds, peak = map(float, done.stdout.split())
     return seconds, peak / (1024 if sys.platform.startswith("linux") else 1024**2)
 

@@ -1,15 +1,18 @@
 """Peers in an environment of their own, since their dependencies conflict with ours.
 
 `NAVIX_PYTHON`, `SBX_PYTHON` and `RL_ZOO_PYTHON` name a Python that has NAVIX, SBX (SB3 in JAX) or RL Zoo
-(SB3's training scripts); the README says how to make one. A peer without a Python is in the table as not
-measured.
+(SB3's training scripts); docs/how-to/speed.md says how to make one. A peer without a Python is in the table
+as not measured.
 """
 
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 from pathlib import Path
+
+from gridworld.errors import InputError
 
 # NAVIX's own PPO on Empty-5x5, compiled; the second of two runs is timed, when nothing is left to compile.
 _NAVIX = """
@@ -59,7 +62,8 @@ _RL_ZOO_SETTINGS = Path(__file__).with_name("rl_zoo.yml")
 def why_not(peer: str) -> str:
     """Why a peer (NAVIX, SBX or RL_ZOO) is not measured; "" where it is."""
     variable = _variable(peer)
-    return "" if variable in os.environ else f"not measured, {variable} names no Python that has it"
+    is_there = shutil.which(os.environ.get(variable, "")) is not None
+    return "" if is_there else f"not measured, {variable} names no Python that has it"
 
 
 def navix(seeds: int = 1) -> float:
@@ -89,6 +93,11 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
 
 
+def why(failed: subprocess.CompletedProcess[str]) -> str:
+    """The last line that a process said, which failed."""
+    return (failed.stderr.strip() or f"it ended with {failed.returncode}").splitlines()[-1]
+
+
 def _variable(peer: str) -> str:
     return f"{peer}_PYTHON"
 
@@ -102,5 +111,5 @@ def _run(peer: str, script: str, *arguments: str) -> float:
         timeout=600,
     )
     if done.returncode:
-        raise RuntimeError(f"{peer}: {done.stderr}")
+        raise InputError(f"{_variable(peer)}={os.environ[_variable(peer)]}: {why(done)}")
     return float(done.stdout.split()[-1])

@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 
 import gridworld
 from gridworld.benchmark import end_to_end as whole
-from gridworld.benchmark import population, training, worlds
+from gridworld.benchmark import peers, population, training, worlds
 from gridworld.benchmark.measure import QUICK, Comparison
 from gridworld.commands import benchmark, evaluate, run
 from gridworld.commands import record as record_command
@@ -334,8 +334,17 @@ def test_rl_zoo_is_given_the_same_steps_of_the_same_world(
     python("echo no such algorithm >&2", "exit 1")
     theirs = row("dqn").theirs
     assert theirs is not None
-    with pytest.raises(RuntimeError, match="no such algorithm"):
+    with pytest.raises(InputError, match=r"rl_zoo3\.train.*: no such algorithm$"):
         theirs()
+
+
+def test_a_peers_python_is_tried_by_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NAVIX_PYTHON", str(tmp_path / "none"))
+    assert peers.why_not("NAVIX") == "not measured, NAVIX_PYTHON names no Python that has it"
+    monkeypatch.setenv("NAVIX_PYTHON", sys.executable)
+    assert peers.why_not("NAVIX") == ""
+    with pytest.raises(InputError, match=r"^NAVIX_PYTHON=.*: ModuleNotFoundError: No module"):
+        peers.navix()
 
 
 def test_populations_are_measured() -> None:
