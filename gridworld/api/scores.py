@@ -28,12 +28,14 @@ def evaluate(
 
     Args:
         model_or_table: a model of SB3 or of any library with its interface (DQN, PPO, A2C, QRDQN, TRPO, ...),
-            or its policy; or a table: actions (S,), whole numbers from 0, or their probabilities (S, A).
-        env: an environment or a batch of Gymnasium or SB3, wrapped or not: a GridWorld, or one of Gymnasium's
-            own with a transition table; a compiled world (`compile_mdp`, `compile_env`); or the name of a
-            map. A model sees states as this environment shows them, if it has the model's observation space,
-            and else by the world's own observation with that space. None: the environment that the model was
-            trained on.
+            or its policy, which acts as its `predict` does, with the environment's `action_masks()` if it
+            takes them; or a table: actions (S,), whole numbers from 0, or their probabilities (S, A).
+        env: an environment or a batch of Gymnasium or SB3: a GridWorld, or one with a transition table; a
+            compiled world (`compile_mdp`, `compile_env`); or the name of a map. The task is that of the
+            environment with its wrappers, which must be neutral or functions; see
+            `gridworld.world.sources.wrappers`. A model sees states as this environment shows them; where that
+            is the world's own observation of another kind, by the kind that has the model's observation
+            space. None: the environment that the model was trained on.
         gamma: discount of value and regret.
         q: in place of `model_or_table`: Q values (S, A), of which the first of the best actions is taken.
         deterministic: whether to score a model's best action in every state, or the distribution that it
@@ -45,8 +47,8 @@ def evaluate(
         probabilities of `goal`, `trap` and `timeout`, `expected_return` and `expected_length`.
 
     Raises:
-        InputError: no world that is known exactly; a table that does not fit it; a model that keeps a memory,
-            or sees or does something else.
+        InputError: no world that is known exactly; a wrapper that may change it in an unknown way; a table
+            that does not fit it; a model that keeps a memory, or sees or does something else.
 
     Example:
         >>> evaluate([1] * 30, "classic").regret > 0.9  # always to the right
@@ -62,19 +64,25 @@ def evaluate(
     place = model_or_table.get_env() if env is None and hasattr(model_or_table, "get_env") else env
     if place is None:
         raise InputError("env: is needed; give an environment, a compiled world or the name of a map")
-    mdp, limit = task_of(place, max_episode_steps)
+    task = task_of(place, max_episode_steps)
+    mdp, limit = task.mdp, task.max_episode_steps
     if is_model:
         from gridworld.agents.sb3.interop.foreign_model import tables_of  # here, since it imports torch
 
-        tables = tables_of(model_or_table, mdp, place)
-        policy = tables.greedy if deterministic else tables.sampled
+        tables = tables_of(model_or_table, task)
+        if tables.sampled is None and not deterministic:
+            raise InputError(
+                f"{type(model_or_table).__name__}: has its own predict(), so the distribution that it "
+                "explores with is not known; take deterministic=True"
+            )
+        policy = tables.greedy if deterministic or tables.sampled is None else tables.sampled
     else:
         policy = _greedy(mdp, q) if q is not None else _policy(mdp, model_or_table)
     return Evaluator(mdp, gamma, limit).score(policy)
 
 
 def _policy(mdp: Mdp, table: Any) -> FloatArray:
-    numbers = _array("the table", table)
+    numbers = _by_state(mdp, _array("the table", table))
     if numbers.shape == (mdp.num_states,):
         wrong = ~np.isin(numbers, np.arange(mdp.num_actions))
         if wrong.any():
@@ -92,11 +100,17 @@ def _policy(mdp: Mdp, table: Any) -> FloatArray:
 
 
 def _greedy(mdp: Mdp, q: ArrayLike) -> FloatArray:
-    values = _array("q", q)
+    values = _by_state(mdp, _array("q", q))
     if values.ndim != 2:
         raise InputError(f"q: has shape {values.shape}, must be ({mdp.num_states}, {mdp.num_actions})")
     _check_shape("q", mdp, values)
     return one_hot_policy(values.argmax(axis=1), mdp.num_actions)
+
+
+def _by_state(mdp: Mdp, table: FloatArray) -> FloatArray:
+    """A table by what the environment shows, where two states may look alike, as one by states."""
+    is_by_number = table.ndim > 0 and len(table) == mdp.num_numbers < mdp.num_states
+    return table[mdp.number] if is_by_number else table
 
 
 def _array(name: str, table: Any) -> FloatArray:

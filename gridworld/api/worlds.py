@@ -16,14 +16,15 @@ def compile_env(env: Any) -> Mdp:
 
     Args:
         env: an environment of Gymnasium with a transition table (`P` and `initial_state_distrib`: FrozenLake,
-            CliffWalking, Taxi and their like), a GridWorld, or a batch of them, of Gymnasium or SB3. Of
-            wrappers, only the step limit counts.
+            CliffWalking, Taxi and their like), a GridWorld, or a batch of them, of Gymnasium or SB3. Wrappers
+            that transform rewards or actions by a function are compiled into the tables.
 
     Returns:
         The world, with the environment's step limit as `max_episode_steps`; a GridWorld's own world.
 
     Raises:
-        InputError: no table; or an environment whose steps are not those of its table.
+        InputError: no table; an environment whose steps are not those of its table; or a wrapper that may
+            change the task in an unknown way.
 
     Example:
         >>> import gymnasium

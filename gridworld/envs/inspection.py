@@ -1,19 +1,20 @@
-"""Inspecting a wrapped environment: its world, its step limit, the observation of each state.
+"""The one door to a certificate: which task an environment or a batch is, and what an agent sees in it.
 
-Environments of Gymnasium, its batches, and those of SB3 are recognised by their attributes, so that none of
-the libraries need be imported for it.
+What is scored has to be what was given: wrappers included, in every copy of a batch. What is not known
+exactly is refused. `gridworld.world.sources.wrappers` says what the wrappers of an environment do; here are
+the environments below them and the batches above them. Libraries are recognised by the names of their
+classes, so that none of them need be imported for it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from os import PathLike
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from gridworld.bounds import MOST_STEPS, STEP_LIMIT, at_most
@@ -23,22 +24,65 @@ from gridworld.errors import InputError
 from gridworld.world.grid import GridMdp, compile_mdp
 from gridworld.world.layout import Layout, load, positive_int
 from gridworld.world.mdp import Mdp
-from gridworld.world.sources.gymnasium_table import compile_table
-from gridworld.world.sources.making import wrappers_of
+from gridworld.world.sources.gymnasium_table import compile_table, has_table
+from gridworld.world.sources.wrappers import NEUTRAL, Wrapped, known_class, same, step_limit
 
-_LIMITS = ("_max_episode_steps", "max_episode_steps")  # of TimeLimit, of a native batch
-_STATEFUL = "gymnasium.wrappers.stateful_observation"
+# What a batch is, by the class whose methods it runs.
+_GYMNASIUM, _SB3 = "gymnasium.wrappers.vector", "stable_baselines3.common.vec_env"
+_NATIVE, _COPIES, _PROCESSES, _TABLE = "native", "copies", "other processes", "table"
+_GYMNASIUM_BATCHES = {
+    "gridworld.envs.vector_env:GridWorldVectorEnv": _NATIVE,
+    "gridworld.envs.statistics_env:StatisticsVectorEnv": _NATIVE,
+    "gridworld.envs.observations:VectorTableObservation": _TABLE,
+    "gymnasium.vector.sync_vector_env:SyncVectorEnv": _COPIES,
+    "gymnasium.vector.async_vector_env:AsyncVectorEnv": _PROCESSES,
+    f"{_GYMNASIUM}.common:RecordEpisodeStatistics": NEUTRAL,
+    f"{_GYMNASIUM}.dict_info_to_list:DictInfoToList": NEUTRAL,
+    f"{_GYMNASIUM}.rendering:HumanRendering": NEUTRAL,
+    f"{_GYMNASIUM}.rendering:RecordVideo": NEUTRAL,
+}
+_SB3_BATCHES = {
+    "gridworld.agents.sb3.vec_env:GridWorldVecEnv": _NATIVE,
+    f"{_SB3}.dummy_vec_env:DummyVecEnv": _COPIES,
+    f"{_SB3}.subproc_vec_env:SubprocVecEnv": _PROCESSES,
+    f"{_SB3}.vec_check_nan:VecCheckNan": NEUTRAL,
+    f"{_SB3}.vec_monitor:VecMonitor": NEUTRAL,
+    f"{_SB3}.vec_video_recorder:VecVideoRecorder": NEUTRAL,
+    f"{_SB3}.vec_extract_dict_obs:VecExtractDictObs": "extract",
+    f"{_SB3}.vec_normalize:VecNormalize": "normalize",
+    f"{_SB3}.vec_transpose:VecTransposeImage": "transpose",
+    f"{_SB3}.vec_frame_stack:VecFrameStack": "memory",
+}
+_BY_METHOD: dict[str, Callable[[Any, Any], Any]] = {  # what SB3's wrappers make of observations (S, ...)
+    "extract": lambda wrapper, rows: rows[wrapper.key],
+    "normalize": lambda wrapper, rows: wrapper.normalize_obs(rows),
+    "transpose": lambda wrapper, rows: wrapper.transpose_observations(rows),
+}
+
+Rows = NDArray[Any] | dict[str, NDArray[Any]]  # (S, *shape), or of each entry of a Dict
 
 
-class Task(NamedTuple):
-    """A world and the step limit of its episodes."""
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What somebody trains on, or asks a score for.
+
+    Attributes:
+        mdp: the world, with what wrappers make of rewards and actions.
+        max_episode_steps: the step limit of an episode.
+        own_limit: the same where the environment has one.
+        seen: the observations as they are now, or None where a world alone was given.
+        masks: which actions are allowed in each state, (S, A), or None where nothing is said of it.
+    """
 
     mdp: Mdp
-    max_episode_steps: int
+    own_limit: int | None = None
+    max_episode_steps: int = STEP_LIMIT
+    seen: Callable[[], ObservationTable] | None = None
+    masks: Callable[[], NDArray[np.bool_] | None] = lambda: None
 
 
 def task_of(env: Any, max_episode_steps: int | None = None) -> Task:
-    """Find the world and the step limit of an environment.
+    """Find out which task an environment is.
 
     Args:
         env: an environment or a batch of Gymnasium or SB3, wrapped or not: a GridWorld, or one with a
@@ -47,69 +91,187 @@ def task_of(env: Any, max_episode_steps: int | None = None) -> Task:
         max_episode_steps: the step limit; None: the environment's own, or 100 where it has none.
 
     Raises:
-        InputError: there is no world in it.
+        InputError: there is no world in it, or a wrapper may change the task in an unknown way.
     """
-    limit = max_episode_steps
     if isinstance(env, Mdp):
-        mdp = env
+        task = Task(env, env.max_episode_steps)
     elif isinstance(env, str | PathLike | Layout):
-        mdp = compile_mdp(load(env))
+        task = Task(compile_mdp(load(env)))
     else:
-        mdp = world_of(env)
-        limit = _step_limit(env) if limit is None else limit
-    limit = mdp.max_episode_steps if limit is None else limit
+        task = _task(env)
+    limit = task.own_limit if max_episode_steps is None else max_episode_steps
     limit = STEP_LIMIT if limit is None else positive_int("max_episode_steps", limit)
     at_most("max_episode_steps", limit, MOST_STEPS)
-    return Task(mdp, limit)
+    return replace(task, max_episode_steps=limit)
 
 
 def world_of(env: Any) -> Mdp:
-    """Find the world of an environment, or compile its transition table.
-
-    Args:
-        env: an environment or a batch of Gymnasium or SB3, wrapped or not.
+    """The world of an environment or a batch, with its step limit.
 
     Raises:
-        InputError: it is neither a GridWorld nor an environment with a table that is true.
+        InputError: as `task_of`.
     """
-    mdp = _attribute(env, "mdp")
-    if isinstance(mdp, Mdp):
-        return mdp
-    if _attribute(env, "P") is not None:
-        mdp = compile_table(env if isinstance(env, gym.Env) else _of_first(env, "unwrapped"))
-        return replace(mdp, max_episode_steps=_step_limit(env))
-    raise InputError(
+    task = _task(env)
+    has_limit = isinstance(task.mdp, GridMdp) or task.mdp.max_episode_steps == task.own_limit
+    return task.mdp if has_limit else replace(task.mdp, max_episode_steps=task.own_limit)
+
+
+def _task(env: Any) -> Task:
+    if isinstance(env, gym.Env):
+        return _single(env)
+    if isinstance(env, gym.vector.VectorEnv):
+        return _gymnasium_batch(env)
+    if hasattr(env, "step_wait"):
+        return _sb3_batch(env)
+    raise _no_world(env)
+
+
+def _no_world(env: Any) -> InputError:
+    return InputError(
         f"env: {type(env).__name__} has no GridWorld in it and no transition table; must be a GridWorld "
         "environment, one of Gymnasium with a table P, a compiled world, or the name of a map"
     )
 
 
-def _step_limit(env: Any) -> int | None:
-    found = (_attribute(env, name) for name in _LIMITS)
-    return next((each for each in found if each is not None), None)
+def _single(env: gym.Env[Any, Any], like: Task | None = None) -> Task:
+    """The task of a single environment; `like`: of another copy in the same batch, to be compared with."""
+    real, limit = env.unwrapped, step_limit(env)
+    mdp = getattr(real, "mdp", None)
+    if isinstance(mdp, GridMdp):
+        if known_class(real, {"gridworld.envs.env:GridWorldEnv": _NATIVE}, ("step", "reset")) is None:
+            raise InputError(
+                f"env: {type(real).__name__} has its own step() or reset(), so it may be another task than "
+                "its map says; leave them as they are in GridWorldEnv, or wrap it"
+            )
+    elif has_table(real):
+        is_gymnasiums = type(real).__module__.startswith("gymnasium.envs.")
+        mdp = compile_table(real, limit, walked=like is None or not is_gymnasiums)
+    else:
+        raise _no_world(real)
+    wrapped = Wrapped("env", env, mdp)
 
+    def masks() -> NDArray[np.bool_] | None:
+        found = wrapped.action_masks()
+        return None if found is None else np.stack(found)
 
-def _attribute(env: Any, name: str) -> Any:
-    """An attribute of an environment under its wrappers; of a batch, of its first environment; else None."""
-    ways: tuple[Callable[[], Any], ...] = (
-        lambda: env.get_wrapper_attr(name),
-        lambda: getattr(env.unwrapped, name),
-        lambda: _of_first(env, name),
+    return Task(
+        mdp=wrapped.mdp,
+        own_limit=limit,
+        seen=lambda: _seen(env, wrapped, mdp),
+        masks=masks,
     )
-    for ask in ways:
-        try:
-            return ask()
-        except (AttributeError, TypeError):
-            continue
-    return None
 
 
-def _of_first(batch: Any, name: str) -> Any:
-    """An attribute of a batch's first environment. Other processes would die of one that is not there."""
-    has = batch.has_attr(name) if hasattr(batch, "has_attr") else all(batch.call("has_wrapper_attr", name))
-    if not has:
-        raise AttributeError(name)
-    return batch.get_attr(name)[0]
+def _seen(env: gym.Env[Any, Any], wrapped: Wrapped, mdp: Mdp) -> ObservationTable:
+    if not wrapped.transforms and not wrapped.memory:
+        return make_observation(mdp, "none")
+    only = wrapped.transforms[0] if len(wrapped.transforms) == 1 and not wrapped.memory else None
+    if isinstance(only, TableObservation) and type(only).observation is TableObservation.observation:
+        return only.table
+    return tabulated(env.observation_space, _stacked(wrapped.observations), mdp.num_states)
+
+
+def _stacked(observations: list[Any]) -> Rows:
+    first = observations[0]
+    if isinstance(first, dict):
+        return {key: np.stack([np.asarray(each[key]) for each in observations]) for key in first}
+    if not isinstance(first, np.ndarray | int | np.integer | float | np.floating):
+        raise InputError(
+            f"env: its observations are of type {type(first).__name__}; must be arrays or numbers"
+        )
+    return np.asarray(observations)
+
+
+def _copies(batch: Any) -> Task:
+    """The task of a batch's environments, which must be the same in all of them."""
+    first, *others = batch.envs
+    task = _single(first)
+    tasks = [_single(each, task) for each in others]
+    for index, other in enumerate(tasks, start=1):
+        if other.mdp.text() != task.mdp.text() or other.own_limit != task.own_limit:
+            raise InputError(
+                f"env: environment {index} of the {type(batch).__name__} is another task than environment 0; "
+                "give one of them, or a batch of one task"
+            )
+
+    def seen() -> ObservationTable:
+        assert task.seen is not None
+        table = task.seen()
+        for index, other in enumerate(tasks, start=1):
+            if other.seen is None or not _same_table(table, other.seen()):
+                raise InputError(
+                    f"env: environment {index} of the {type(batch).__name__} shows states otherwise than "
+                    "environment 0; give one of them, or a batch that shows all alike"
+                )
+        return table
+
+    return replace(task, seen=seen)
+
+
+def _same_table(one: ObservationTable, other: ObservationTable) -> bool:
+    return one is other or (one.space == other.space and same(_rows(one), _rows(other)))
+
+
+def _rows(table: ObservationTable) -> Any:
+    return table.stored if isinstance(table.stored, dict) else table.table()
+
+
+def _batch_kind(env: Any, table: dict[str, str], *methods: str) -> str:
+    """What is known of a batch or of a wrapper around one, by the methods that decide what it does."""
+    kind, name = known_class(env, table, methods), type(env).__name__
+    also = {_NATIVE: "advance", _TABLE: "observations"}.get(kind or "")
+    if kind is None or (also is not None and known_class(env, table, [also]) is None):
+        raise InputError(
+            f"env: {name} is no batch, and no wrapper of one, whose effect on the task is known, so nothing "
+            "exact is known of what is in it; leave it out, or give one environment as env=..."
+        )
+    if kind == _PROCESSES:
+        raise InputError(
+            f"env: {name} has its environments in other processes, where their wrappers cannot be looked at; "
+            "give one environment, made as they are, as env=..."
+        )
+    return kind
+
+
+def _gymnasium_batch(env: Any) -> Task:
+    kind = _batch_kind(env, _GYMNASIUM_BATCHES, "step", "reset")
+    if kind == _COPIES:
+        return _copies(env)
+    if kind == _NATIVE:
+        observation = make_observation(env.mdp, "none")
+        return Task(env.mdp, env.max_episode_steps, seen=lambda: observation)
+    below = _gymnasium_batch(env.env)
+    return replace(below, seen=lambda: env.table) if kind == _TABLE else below
+
+
+def _sb3_batch(env: Any) -> Task:
+    kind = _batch_kind(env, _SB3_BATCHES, "step", "step_async", "step_wait", "reset")
+    if kind == _COPIES:
+        return _copies(env)
+    if kind == _NATIVE:
+        below = _gymnasium_batch(env.envs)
+        return replace(below, seen=lambda: env.observation)
+    below = _sb3_batch(env.venv)
+    if kind == NEUTRAL:
+        return below
+
+    def seen() -> ObservationTable:
+        if kind not in _BY_METHOD:
+            raise InputError(
+                f"env: {type(env).__name__} makes observations of more than the state, so no table "
+                "of the policy can be evaluated exactly; leave it out"
+            )
+        assert below.seen is not None
+        return tabulated(
+            env.observation_space, _BY_METHOD[kind](env, _rows(below.seen())), below.mdp.num_states
+        )
+
+    return replace(below, seen=seen)
+
+
+def tabulated(space: gym.Space[Any], rows: Any, num_states: int) -> ObservationTable:
+    """The table of observations `rows`, (S, *shape) or such arrays by the keys of a Dict."""
+    return ObservationTable("of its own", space, num_states, rows)
 
 
 def observation_like(mdp: Mdp, space: gym.Space[Any]) -> ObservationTable:
@@ -142,58 +304,3 @@ def _cell_size(mdp: Mdp, space: gym.Space[Any]) -> int:
     width = (space.shape or (1,))[-1]
     per_cell, border = frame_size(mdp, 2)[0] - frame_size(mdp, 1)[0], frame_size(mdp, 1)[0]
     return max(1, (width - border) // per_cell + 1)
-
-
-def observation_of(env: gym.Env[Any, Any], mdp: Mdp) -> ObservationTable:
-    """What an agent in a scalar environment sees of each state, through all of its wrappers.
-
-    Args:
-        env: the environment.
-        mdp: its world.
-
-    Raises:
-        InputError: what it sees or does is not a function of the state alone.
-    """
-    wrappers: list[Any] = list(wrappers_of(env))[::-1]  # from the inside
-    seeing = [each for each in wrappers if _sees(each)]
-    first = seeing[0] if seeing else None
-    if first is None:
-        return make_observation(mdp, "none")
-    if len(seeing) == 1 and isinstance(first, TableObservation):
-        return first.table
-    rows: list[Any] = mdp.number.tolist()
-    for wrapper in seeing:
-        rows = [wrapper.observation(row) for row in rows]
-    if not all(isinstance(row, np.ndarray | int | np.integer) for row in rows):
-        raise InputError(f"env: its observations are {seeing[-1].observation_space}, which is no plain array")
-    return tabulated(env.observation_space, np.asarray(rows))
-
-
-def tabulated(space: gym.Space[Any], rows: NDArray[Any]) -> ObservationTable:
-    """The table of observations `rows` (S, *shape)."""
-    return ObservationTable("of its own", space, len(rows), rows)
-
-
-def _sees(wrapper: Any) -> bool:
-    """Whether a wrapper changes observations, by a function of them."""
-    name = type(wrapper).__name__
-    if type(wrapper).__module__ == _STATEFUL:
-        raise InputError(
-            f"env: {name} makes observations of more than the state, so no table of the policy can be "
-            "evaluated exactly; leave it out"
-        )
-    if isinstance(wrapper, gym.ActionWrapper):
-        raise InputError(f"env: {name} changes actions; an exact score is of the world's own")
-    if isinstance(wrapper, gym.ObservationWrapper):
-        return True
-    if wrapper.observation_space != wrapper.env.observation_space:
-        raise InputError(
-            f"env: {name} changes observations and is no gymnasium.ObservationWrapper, so that what the "
-            "agent sees of a state cannot be asked for"
-        )
-    return False
-
-
-def is_discrete(space: gym.Space[Any], number: int) -> bool:
-    """Whether a space is that of so many actions."""
-    return isinstance(space, spaces.Discrete) and space.n == number and space.start == 0

@@ -174,8 +174,6 @@ def test_refused_models() -> None:
         gym.wrappers.FrameStackObservation(one_hot, 2),
         gym.wrappers.NormalizeObservation(one_hot),
     ):
-        assert "makes observations of more than the state" in refused(model, stateful)
-    turned = gym.wrappers.TransformAction(one_hot, lambda action: 3 - action, gym.spaces.Discrete(4))
-    assert "TransformAction changes actions" in refused(model, turned)
+        assert "makes observations of more than the state's number" in refused(model, stateful)
     stacked = VecFrameStack(DummyVecEnv([lambda: gridworld.CoordinateObservation(gym.make(RAW))]), 3)
     assert "VecFrameStack makes observations of more" in refused(PPO("MlpPolicy", stacked, n_steps=64))

@@ -71,12 +71,13 @@ def why_no_table(policy: BasePolicy, observation: ObservationTable) -> str | Non
     return None
 
 
-def read(policy: BasePolicy, observations: Any) -> Reading:
-    """Ask a policy about a batch of n observations, tensors of its own making."""
+def read(policy: BasePolicy, observations: Any, masks: Any = None) -> Reading:
+    """Ask a policy about a batch of n observations, tensors of its own making; `masks`: allowed actions."""
     policy.set_training_mode(False)
     if _is_actor_critic(policy):
         asked: Any = policy
-        distribution = asked.get_distribution(observations).distribution
+        allowed = {} if masks is None else {"action_masks": masks}
+        distribution = asked.get_distribution(observations, **allowed).distribution
         return Reading(asked.predict_values(observations)[:, 0], distribution.probs, None)
     if hasattr(policy, "quantile_net"):
         return of_q(cast(nn.Module, policy.quantile_net)(observations).mean(dim=1))

@@ -36,7 +36,8 @@ from gridworld.world.sources.enumeration.elapsed_time import (
 )
 from gridworld.world.sources.enumeration.exploring import Clocks, Graph, Subject, TimeMattersError, explore
 from gridworld.world.sources.enumeration.replays import Replays
-from gridworld.world.sources.making import make_env, refuse_changed
+from gridworld.world.sources.making import make_env
+from gridworld.world.sources.wrappers import refuse_transformed
 
 _BEYOND = 5_000  # states more than a step limit away; `env.max_episode_steps` may be larger than the id's
 
@@ -65,7 +66,7 @@ def enumerate_env(
             table = _tabulate(subject, _limit_of_id(env), most_states)
             mdp = _compile(env_id, table, subject)
             Replays(subject, mdp, table.graph, table.clocks, table.state).check(make_env(env_id, kwargs))
-            refuse_changed(f"env.id={env_id}", env)
+            refuse_transformed(f"env.id={env_id}", env)
         finally:
             env.close()
     return mdp

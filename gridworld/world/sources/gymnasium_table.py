@@ -12,7 +12,6 @@ a good policy, and each step must be an outcome of its row.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from typing import Any
 
@@ -24,23 +23,9 @@ from gridworld.errors import InputError
 from gridworld.world.mdp import IntArray, Mdp
 from gridworld.world.outcomes import Outcomes, check_size, mdp_from_outcomes
 from gridworld.world.sources.known_envs import known_env
-from gridworld.world.sources.making import make_env, refuse_changed, told, wrappers_of
-from gridworld.world.sources.table_walk import SEED, walk
-
-_LIBRARIES = ("gymnasium.wrappers.", "stable_baselines3.common.monitor")
-_WATCHING = {  # wrappers of these libraries that leave steps as they are, but for the step limit
-    "TimeLimit",
-    "OrderEnforcing",
-    "PassiveEnvChecker",
-    "RecordEpisodeStatistics",
-    "RecordVideo",
-    "RenderCollection",
-    "HumanRendering",
-    "AddWhiteNoise",
-    "ObstructView",
-    "Autoreset",
-    "Monitor",
-}
+from gridworld.world.sources.making import make_env, told
+from gridworld.world.sources.table_walk import walk
+from gridworld.world.sources.wrappers import copied, refuse_transformed, step_limit
 
 
 def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> Mdp:
@@ -59,7 +44,8 @@ def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> M
     """
     arguments = dict(kwargs or {})
     env = make_env(env_id, arguments)
-    mdp, table = _compiled(env, env_id)
+    refuse_transformed(env_id, env)
+    mdp, table = _compiled(env.unwrapped, env_id, step_limit(env))
     # Only now: a large environment takes long, and may be refused. Its own step limit may be set otherwise.
     again = make_env(env_id, {**arguments, "max_episode_steps": -1})
     if _differ(table, _table(mdp.name, again.unwrapped)):
@@ -67,31 +53,31 @@ def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> M
             f"env.id={env_id}: has another table each time that it is made, so no exact truth is known; "
             "give what it draws as env.kwargs, e.g. desc of a FrozenLake"
         )
-    refuse_changed(env_id, env)
     _check_steps(mdp, table, again)
     env.close()
     again.close()
     return mdp
 
 
-def compile_table(env: gym.Env[Any, Any]) -> Mdp:
-    """Compile the transition table of an environment, which is left as it is.
+def compile_table(real: gym.Env[Any, Any], limit: int | None = None, walked: bool = True) -> Mdp:
+    """Compile the transition table of an environment without wrappers, which is left as it is.
 
     Args:
-        env: an environment with `unwrapped.P` and `unwrapped.initial_state_distrib`. Of its wrappers, those
-            that only watch, or only change what is seen, count for the step limit only; the others must
-            leave the steps what they are.
+        real: an environment with `P` and `initial_state_distrib`.
+        limit: the step limit of its wrappers.
+        walked: whether to step a copy beside the table.
 
     Returns:
         The world, with the environment's id as its name, or its class where it has none.
 
     Raises:
-        InputError: no table, or an environment or wrapper that does not do what the table says.
+        InputError: no table, or an environment that does not do what the table says.
     """
-    spec = env.unwrapped.spec
-    mdp, table = _compiled(env, spec.id if spec is not None else type(env.unwrapped).__name__)
-    refuse_changed(mdp.name, env)
-    _check_steps(mdp, table, _wrapped_alike(mdp.name, env, _copied(env.unwrapped)))
+    mdp, table = _compiled(real, real.spec.id if real.spec is not None else type(real).__name__, limit)
+    if own := {"step", "reset"} & vars(real).keys():
+        raise InputError(f"{mdp.name}: its {own.pop()}() was replaced, so nothing exact is known of it")
+    if walked:
+        _check_steps(mdp, table, copied(real))
     return mdp
 
 
@@ -100,8 +86,7 @@ def has_table(env: Any) -> bool:
     return getattr(env, "P", None) is not None
 
 
-def _compiled(env: gym.Env[Any, Any], name: str) -> tuple[Mdp, Outcomes]:
-    real = env.unwrapped
+def _compiled(real: gym.Env[Any, Any], name: str, limit: int | None) -> tuple[Mdp, Outcomes]:
     table = _table(name, real)
     known = known_env(real)
     num_states, num_actions = table.next_state.shape[:2]
@@ -113,19 +98,11 @@ def _compiled(env: gym.Env[Any, Any], name: str) -> tuple[Mdp, Outcomes]:
         action_names=names,
         places=places if places is not None and len(places) == num_states else None,
         panel_names=known.panel_names if known is not None else (),
-        max_episode_steps=_step_limit(env),
+        max_episode_steps=limit,
     )
     if known is not None and (reason := known.refused(real)):
         raise InputError(f"{name}: {reason}")
     return mdp, table
-
-
-def _step_limit(env: gym.Env[Any, Any]) -> int | None:
-    try:
-        limit = env.get_wrapper_attr("_max_episode_steps")  # of the wrapper TimeLimit
-    except AttributeError:
-        return None
-    return None if limit is None else int(limit)
 
 
 def _table(name: str, real: Any) -> Outcomes:
@@ -236,43 +213,6 @@ def _is_row(row: Any, states: int) -> bool:
 def _differ(table: Outcomes, other: Outcomes) -> bool:
     names = ("next_state", "probability", "reward", "terminated", "start")
     return not all(np.array_equal(getattr(table, name), getattr(other, name)) for name in names)
-
-
-def _copied(real: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
-    """An environment to walk in, with a generator of its own, which opens no window."""
-    from gymnasium.utils import seeding
-
-    try:
-        other = copy.deepcopy(real)
-    except Exception:  # a window, say; what a step sets anew is the copy's own all the same
-        other = copy.copy(real)
-    other.render_mode = None
-    other.np_random = seeding.np_random(SEED)[0]
-    return other
-
-
-def _wrapped_alike(name: str, env: gym.Env[Any, Any], real: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
-    """An environment to walk in, with copies of the wrappers that may change what a step does."""
-    for wrapper in list(wrappers_of(env))[::-1]:  # from the inside
-        kind = type(wrapper)
-        inherits = all(getattr(kind, each) is getattr(gym.Wrapper, each) for each in ("step", "reset"))
-        if inherits or isinstance(wrapper, gym.ObservationWrapper) or _watches(kind):
-            continue
-        try:
-            real = copy.deepcopy(wrapper, {id(wrapper.env): real})
-        except Exception as error:
-            raise InputError(
-                f"{name}: its wrapper {kind.__name__} cannot be copied ({told(error)}), so that what it "
-                "changes cannot be found out; leave it out"
-            ) from None
-    return real
-
-
-def _watches(kind: type) -> bool:
-    """Whether wrappers of a class leave what steps do as it is."""
-    if kind.__module__ == "gymnasium.wrappers.stateful_observation":
-        return kind.__name__ != "MaxAndSkipObservation"  # which repeats actions
-    return kind.__module__.startswith(_LIBRARIES) and kind.__name__ in _WATCHING
 
 
 def _check_steps(mdp: Mdp, table: Outcomes, env: gym.Env[Any, Any]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -13,7 +13,6 @@ import numpy as np
 from gridworld.errors import InputError, in_short, install_command
 
 _PACKAGES = {"MiniGrid-": "minigrid", "BabyAI-": "minigrid"}  # which register ids that begin so
-_CHANGING: dict[type, str] = {gym.RewardWrapper: "rewards", gym.ActionWrapper: "actions"}
 
 
 def make_env(
@@ -54,32 +53,6 @@ def make_env(
         given = f"env.kwargs={_shown(arguments)}: {env_id}" if arguments else f"env.id={env_id}:"
         takes = _arguments(spec) if arguments else ""
         raise InputError(f"{given} cannot be made ({told(error)}){takes}") from None
-
-
-def refuse_changed(name: str, env: gym.Env[Any, Any]) -> None:
-    """Refuse an environment with a wrapper that is there to change rewards or actions.
-
-    Args:
-        name: what the message calls the environment.
-        env: the environment with its wrappers.
-
-    Raises:
-        InputError: it has such a wrapper.
-    """
-    for wrapper in wrappers_of(env):
-        for kind, changed in _CHANGING.items():
-            if isinstance(wrapper, kind):
-                raise InputError(
-                    f"{name}: its wrapper {type(wrapper).__name__} changes {changed}, so the environment "
-                    "below it, of which the truth is known, is not what an agent is in; leave it out"
-                )
-
-
-def wrappers_of(env: Any) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
-    """The wrappers of an environment, from the outside."""
-    while isinstance(env, gym.Wrapper):
-        yield env
-        env = env.env
 
 
 def told(error: BaseException) -> str:

@@ -10,15 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 
-from gridworld.agents.sb3.interop.foreign_model import Tables, read_tables, seen_by, tables_of
+from gridworld.agents.sb3.interop.foreign_model import ForeignPolicy
 from gridworld.bounds import at_least, discount
-from gridworld.envs.inspection import task_of
-from gridworld.envs.observations import KINDS, ObservationTable
+from gridworld.envs.inspection import Task, task_of
 from gridworld.run.evaluations_file import write_evaluations
 from gridworld.run.folder import BEST_MODEL, EVALUATIONS
 from gridworld.storage.atomic_write import replacing
 from gridworld.world.exact.evaluation import Evaluator, Score
-from gridworld.world.mdp import Mdp
 from gridworld.world.metrics import numbers
 
 _KINDS: dict[str, type] = {"step": np.int64, "certified": np.bool_}
@@ -82,7 +80,7 @@ class ExactEvalCallback(BaseCallback):
         self.evaluator: Evaluator | None = None
         self.best_regret = np.inf
         self.stopped_at: int | None = None
-        self._env, self._every, self._gamma, self._limit = env, every, gamma, max_episode_steps
+        self._every, self._gamma, self._limit = every, gamma, max_episode_steps
         self._best_path = None if best_model_save_path is None else Path(best_model_save_path)
         self._log_path = None if log_path is None else Path(log_path)
         self._stop_after = stop_after
@@ -90,8 +88,7 @@ class ExactEvalCallback(BaseCallback):
         self._streak = 0  # certificates in a row
         self._newest: NDArray[Any] | None = None  # the outputs that were evaluated last
         self._next = 0
-        if env is not None:
-            self._evaluate_on(env)
+        self._task = None if env is None else self._evaluate_on(env)
 
     @property
     def evaluations(self) -> dict[str, NDArray[Any]]:
@@ -100,16 +97,15 @@ class ExactEvalCallback(BaseCallback):
         table = {name: np.array([row[name] for row in self._rows]) for name in names}
         return table | {name: table[name].astype(kind) for name, kind in _KINDS.items() if name in table}
 
-    def _evaluate_on(self, env: Any) -> None:
-        mdp, limit = task_of(env, self._limit)
-        self.evaluator = Evaluator(mdp, self._gamma, limit)
+    def _evaluate_on(self, env: Any) -> Task:
+        task = task_of(env, self._limit)
+        self.evaluator = Evaluator(task.mdp, self._gamma, task.max_episode_steps)
+        return task
 
     def _on_training_start(self) -> None:
-        if self.evaluator is None:
-            self._evaluate_on(self._seen_through)
-        assert self.evaluator is not None
-        tables_of(self.model, self.evaluator.mdp, self._seen_through)  # refuses what has no table
-        self._observation: ObservationTable | None = None
+        if self._task is None:
+            self._task = self._evaluate_on(self.training_env)
+        self._policy = ForeignPolicy(self.model, self._task)  # refuses what has no table
         self._evaluate()
 
     def _on_step(self) -> bool:
@@ -124,16 +120,12 @@ class ExactEvalCallback(BaseCallback):
     def _on_training_end(self) -> None:
         self._evaluate()
 
-    @property
-    def _seen_through(self) -> Any:
-        return self.training_env if self._env is None else self._env
-
     def _evaluate(self) -> None:
         """Score the policy as it is now, and write what comes of it; once a step and policy."""
         assert self.evaluator is not None
         step = self.num_timesteps
         self._next = (step // self._every + 1) * self._every
-        tables = self._tables(self.evaluator.mdp)
+        tables = self._policy.tables()
         is_new = self._newest is None or not np.array_equal(self._newest, tables.outputs)
         if not is_new and self._rows[-1]["step"] == step:
             return
@@ -146,11 +138,6 @@ class ExactEvalCallback(BaseCallback):
             self._keep_best(score.shortfall)
         if self._log_path is not None:
             self._write(self._log_path)
-
-    def _tables(self, mdp: Mdp) -> Tables:
-        if self._observation is None or self._observation.kind not in KINDS:  # a wrapper may have changed it
-            self._observation = seen_by(self.model.policy, mdp, self._seen_through)
-        return read_tables(self.model.policy, self._observation)
 
     def _log(self, score: Score) -> None:
         outcome = score.outcome

@@ -1,105 +1,165 @@
 """Reading any model of SB3 as a policy over the states of a world, whoever trained it.
 
-The model may have seen states through wrappers of Gymnasium and of SB3. What it saw of each state is made
-again through the same wrappers, once a state, and its policy is asked about all of them in batches.
+The greedy policy is what `predict` does on what the environment shows of each state, with the action masks of
+that environment. What it explores with is read from its network.
 """
 
 from __future__ import annotations
 
+import inspect
 from typing import Any, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.vec_env import (
-    DummyVecEnv,
-    VecCheckNan,
-    VecEnv,
-    VecEnvWrapper,
-    VecMonitor,
-    VecNormalize,
-    VecTransposeImage,
-)
 
+from gridworld.agents.sb3.memory_size import CHUNK
 from gridworld.agents.sb3.policy_outputs import (
-    epsilon_greedy,
+    Reading,
     read,
     read_states,
     why_no_table,
     why_unreadable,
 )
-from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.envs.inspection import is_discrete, observation_like, observation_of, tabulated
-from gridworld.envs.observations import ObservationTable
-from gridworld.errors import InputError
+from gridworld.envs.inspection import Task, observation_like
+from gridworld.envs.observations import KINDS, ObservationTable
+from gridworld.errors import InputError, in_short
 from gridworld.world.exact.markov_chain import one_hot_policy
-from gridworld.world.mdp import FloatArray, Mdp
+from gridworld.world.mdp import FloatArray, IntArray
+from gridworld.world.sources.wrappers import is_discrete
+
+_LIBRARIES = ("stable_baselines3.", "sb3_contrib.", "gridworld.")
+_ONE_BY_ONE = 512  # states in which `predict` is asked alone, too
+_PREDICTS = ("predict", "_predict")  # what decides an action, of a model or a policy
 
 
 class Tables(NamedTuple):
     """A model's policies, and what they are of; (S, A), float64, each."""
 
     greedy: FloatArray  # action probabilities
-    sampled: FloatArray  # the same
+    sampled: FloatArray | None  # the same; None: its own `predict` decides, which shows no probabilities
     outputs: FloatArray  # action probabilities of an actor-critic, Q values of others
 
 
-def tables_of(model: Any, mdp: Mdp, env: Any = None) -> Tables:
-    """Read a model's policies.
+class ForeignPolicy:
+    """A model's policy in a task.
 
     Args:
         model: an SB3 model, or its policy.
-        mdp: the world.
-        env: the environment that it was trained on, in which it sees states; None, or one that it does not
-            fit: the world's own observation with the model's space.
+        task: the task, whose observations are asked for anew at every reading, since statistics may change.
 
     Raises:
         InputError: it has no table: it keeps a memory, sees or does something else, or is no SB3 model.
     """
-    policy = _policy_of(model)
-    observation = seen_by(policy, mdp, env)
-    _check_is_a_table(policy, observation)
-    return read_tables(policy, observation, _epsilon(model))
 
+    def __init__(self, model: Any, task: Task) -> None:
+        self._model, self._task, self._policy = model, task, _policy_of(model)
+        if not is_discrete(self._policy.action_space, task.mdp.num_actions):
+            raise InputError(
+                f"the model acts in {self._policy.action_space}; {task.mdp.name} has "
+                f"Discrete({task.mdp.num_actions})"
+            )
+        reason = why_unreadable(self._policy)
+        if reason is not None:
+            raise InputError(f"the model {reason}")
+        takes_masks = "action_masks" in inspect.signature(model.predict).parameters
+        self._masks = task.masks() if takes_masks else None
+        self._check_is_a_table(self._observation())
 
-def seen_by(policy: BasePolicy, mdp: Mdp, env: Any = None) -> ObservationTable:
-    """What a policy sees of each state; the arguments are those of `tables_of`.
+    def tables(self) -> Tables:
+        """Ask it about every state. It is left as it was.
 
-    Raises:
-        InputError: it sees or does something else.
-    """
-    if not is_discrete(policy.action_space, mdp.num_actions):
-        raise InputError(
-            f"the model acts in {policy.action_space}; {mdp.name} has Discrete({mdp.num_actions})"
+        Raises:
+            InputError: its outputs are no finite numbers.
+        """
+        observation = self._observation()
+        was_training = self._policy.training
+        _, probabilities, q = read_states(
+            observation.num_states, lambda states: self._read(observation, states)
         )
-    observation = _observation(env, mdp)
-    if observation is not None and observation.space == policy.observation_space:
-        return observation
-    return observation_like(mdp, policy.observation_space)
+        outputs = q if probabilities is None else probabilities
+        assert outputs is not None
+        if not np.isfinite(outputs).all():
+            raise InputError("the model's outputs are no finite numbers; its training has diverged")
+        greedy = one_hot_policy(self._predicted(observation), outputs.shape[1])
+        self._policy.set_training_mode(was_training)
+        epsilon = float(getattr(self._model, "exploration_rate", 0.0))
+        sampled = outputs if q is None else (1 - epsilon) * greedy + epsilon / outputs.shape[1]
+        return Tables(greedy, sampled if self._is_of_a_library() else None, outputs)
+
+    def _observation(self) -> ObservationTable:
+        """What it sees of each state: what the task shows, or the world's own observation with its space."""
+        seen, wanted = None if self._task.seen is None else self._task.seen(), self._policy.observation_space
+        if seen is not None and seen.space == wanted:
+            if isinstance(seen.stored, dict):
+                raise InputError(
+                    "env: its observations are a Dict; take one entry, as VecExtractDictObs does"
+                )
+            return seen
+        if seen is not None and seen.kind not in KINDS:
+            raise InputError(
+                f"the model sees {wanted}, and the environment shows {seen.space}; give the environment that "
+                "the model was trained on, as model.get_env() has it"
+            )
+        return observation_like(self._task.mdp, wanted)
+
+    def _read(self, observation: ObservationTable, states: IntArray) -> Reading:
+        rows = self._policy.obs_to_tensor(observation.rows(states))[0]
+        return read(self._policy, rows, None if self._masks is None else self._masks[states])
+
+    def _predicted(self, observation: ObservationTable) -> IntArray:
+        """(S,), the actions that `predict` takes, asked in batches."""
+        parts = [
+            self._predict(observation, np.arange(start, min(start + CHUNK, observation.num_states)))
+            for start in range(0, observation.num_states, CHUNK)
+        ]
+        return np.concatenate(parts)
+
+    def _predict(self, observation: ObservationTable, states: IntArray) -> IntArray:
+        """(n,), the actions of some states; `states` is one number to ask as for a single environment."""
+        masks = {} if self._masks is None else {"action_masks": self._masks[states]}
+        try:
+            found = self._model.predict(observation.rows(states), deterministic=True, **masks)
+            actions = np.asarray(found[0])
+        except Exception as error:  # it may be anybody's own
+            raise InputError(f"the model: its predict() raised {in_short(error)}") from error
+        fits = actions.shape == np.shape(states) and actions.dtype.kind in "iu"
+        if not fits or not np.isin(actions, np.arange(self._task.mdp.num_actions)).all():
+            raise InputError(
+                f"the model: its predict() gave {str(actions)[:60]} for {np.size(states)} states; must be an "
+                f"action of each, {self._task.mdp.action_choices()}"
+            )
+        return actions
+
+    def _check_is_a_table(self, observation: ObservationTable) -> None:
+        was_training = self._policy.training
+        reason = why_no_table(self._policy, observation)
+        together = self._predicted(observation)
+        reached = np.flatnonzero(self._task.mdp.acting)[:_ONE_BY_ONE]
+        rounds = [self._predicted(observation)[reached]]
+        rounds += [np.array([self._predict(observation, state) for state in reached])]
+        self._policy.set_training_mode(was_training)
+        if any((each != together[reached]).any() for each in rounds) and reason is None:
+            reason = (
+                "does not always take the same action in the same state, asked alone and with others, so no "
+                "table of it can be evaluated exactly"
+            )
+        if reason is not None:
+            raise InputError(f"the model {reason}")
+
+    def _is_of_a_library(self) -> bool:
+        """Whether it acts by SB3's own `predict`, so that its network says what it explores with."""
+        for thing in (self._model, self._policy):
+            for name in _PREDICTS:
+                method = getattr(type(thing), name, None)
+                is_own = method is not None and not method.__module__.startswith(_LIBRARIES)
+                if is_own or name in vars(thing):
+                    return False
+        return True
 
 
-def read_tables(policy: BasePolicy, observation: ObservationTable, epsilon: float = 0.0) -> Tables:
-    """Ask a policy about every state; it is left as it was.
-
-    Args:
-        policy: of SB3.
-        observation: what it sees of each.
-        epsilon: the exploration rate, of a policy with Q values.
-
-    Raises:
-        InputError: its outputs are no finite numbers.
-    """
-    was_training = policy.training
-    _, probabilities, q = read_states(
-        observation.num_states,
-        lambda states: read(policy, policy.obs_to_tensor(observation.rows(states))[0]),
-    )
-    policy.set_training_mode(was_training)
-    table = q if probabilities is None else probabilities
-    assert table is not None
-    if not np.isfinite(table).all():
-        raise InputError("the model's outputs are no finite numbers; its training has diverged")
-    sampled = table if q is None else epsilon_greedy(q, epsilon)
-    return Tables(one_hot_policy(table.argmax(axis=1), table.shape[1]), sampled, table)
+def tables_of(model: Any, task: Task) -> Tables:
+    """Read a model's policies once; see `ForeignPolicy`."""
+    return ForeignPolicy(model, task).tables()
 
 
 def _policy_of(model: Any) -> BasePolicy:
@@ -107,52 +167,3 @@ def _policy_of(model: Any) -> BasePolicy:
     if not isinstance(policy, BasePolicy):
         raise InputError(f"{type(model).__name__}: is neither a model of Stable-Baselines3 nor a table")
     return policy
-
-
-def _epsilon(model: Any) -> float:
-    return float(getattr(model, "exploration_rate", 0.0))
-
-
-def _check_is_a_table(policy: BasePolicy, observation: ObservationTable) -> None:
-    reason = why_unreadable(policy)
-    if reason is None:
-        was_training = policy.training
-        reason = why_no_table(policy, observation)
-        policy.set_training_mode(was_training)
-    if reason is not None:
-        raise InputError(f"the model {reason}")
-
-
-def _observation(env: Any, mdp: Mdp) -> ObservationTable | None:
-    """What an environment shows of each state; None where that cannot be seen from here."""
-    if isinstance(env, VecEnvWrapper):
-        return _through(env, _observation(env.venv, mdp))
-    if isinstance(env, GridWorldVecEnv):
-        return env.observation
-    if isinstance(env, DummyVecEnv):
-        return observation_of(env.envs[0], mdp)
-    if isinstance(env, VecEnv) or env is None:
-        return None  # in other processes, say
-    table = getattr(env, "table", None)  # of a batch's wrapper
-    if isinstance(table, ObservationTable):
-        return table
-    is_single = hasattr(env, "get_wrapper_attr") and not hasattr(env, "num_envs")
-    return observation_of(env, mdp) if is_single else None
-
-
-def _through(wrapper: VecEnvWrapper, observation: ObservationTable | None) -> ObservationTable | None:
-    """The observations as a wrapper of SB3 hands them on."""
-    if isinstance(wrapper, VecMonitor | VecCheckNan) or observation is None:
-        return observation
-    if isinstance(wrapper, VecTransposeImage):
-        rows = np.stack([wrapper.transpose_image(row) for row in observation.table()])
-        return tabulated(wrapper.observation_space, rows)
-    if isinstance(wrapper, VecNormalize):
-        rows = np.asarray(wrapper.normalize_obs(observation.table()))
-        return tabulated(wrapper.observation_space, rows)
-    if wrapper.observation_space == wrapper.venv.observation_space:
-        return observation
-    raise InputError(
-        f"env: {type(wrapper).__name__} makes observations of more than the state, so no table of the policy "
-        "can be evaluated exactly; leave it out"
-    )

@@ -1,0 +1,468 @@
+"""What the wrappers of an environment make of its world.
+
+A certificate is about the environment that a user holds, wrappers included. So every wrapper is looked at,
+and recognised by whose `step` and `reset` it runs:
+
+    neutral      leaves the task as it is: it records, checks or renders
+    time limit   its limit is the world's
+    observation  `observation(o)`, asked for what the agent sees of each state
+    reward       `reward(r)`, compiled into the rewards
+    action       `action(a)`, compiled into the transitions
+    memory       shows more than the state's number; the task is the same, but a policy behind it has no table
+
+Anything else is refused. The three methods must be functions of their argument and of nothing else. They
+are asked again and again on a copy, which must not change by it, and the copy is stepped beside the tables.
+"""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import pickle
+import random
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields, replace
+from functools import cached_property
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+
+from gridworld.errors import InputError, in_short
+from gridworld.world.mdp import Mdp, checked_reward, frozen
+from gridworld.world.outcomes import thresholds_of
+
+NEUTRAL, LIMIT, MEMORY = "neutral", "time limit", "memory"
+_CALLS = 1000  # at least so many of a method, before it counts as a function
+_STEPS = 2000  # of the copy beside the tables, in episodes
+_ROWS = 20_000  # pairs of state and action that are tried one by one, if states can be set
+_SEED = 20_261_123
+
+_SO_UNKNOWN = (
+    ", so what it makes of the task is not exactly known; "
+    "leave it out, or make it a function of its argument alone"
+)
+
+_WRAPPERS = "gymnasium.wrappers"
+_ROLES = {
+    "gymnasium.core:Wrapper": NEUTRAL,  # of a wrapper that changes neither steps nor resets
+    f"{_WRAPPERS}.common:Autoreset": NEUTRAL,
+    f"{_WRAPPERS}.common:OrderEnforcing": NEUTRAL,
+    f"{_WRAPPERS}.common:PassiveEnvChecker": NEUTRAL,
+    f"{_WRAPPERS}.common:RecordEpisodeStatistics": NEUTRAL,
+    f"{_WRAPPERS}.rendering:AddWhiteNoise": NEUTRAL,
+    f"{_WRAPPERS}.rendering:HumanRendering": NEUTRAL,
+    f"{_WRAPPERS}.rendering:ObstructView": NEUTRAL,
+    f"{_WRAPPERS}.rendering:RecordVideo": NEUTRAL,
+    f"{_WRAPPERS}.rendering:RenderCollection": NEUTRAL,
+    "stable_baselines3.common.monitor:Monitor": NEUTRAL,
+    f"{_WRAPPERS}.common:TimeLimit": LIMIT,
+    "gymnasium.core:ObservationWrapper": "observation",
+    "gymnasium.core:RewardWrapper": "reward",
+    "gymnasium.core:ActionWrapper": "action",
+    f"{_WRAPPERS}.transform_observation:AddRenderObservation": MEMORY,
+    f"{_WRAPPERS}.stateful_observation:DelayObservation": MEMORY,
+    f"{_WRAPPERS}.stateful_observation:FrameStackObservation": MEMORY,
+    f"{_WRAPPERS}.stateful_observation:NormalizeObservation": MEMORY,
+    f"{_WRAPPERS}.stateful_observation:TimeAwareObservation": MEMORY,
+}
+# Environments whose state can be set, by the class whose steps they run.
+_STATE_ATTRIBUTES = {
+    "gridworld.envs.env:GridWorldEnv": "state",
+    "gymnasium.envs.toy_text.frozen_lake:FrozenLakeEnv": "s",
+    "gymnasium.envs.toy_text.cliffwalking:CliffWalkingEnv": "s",
+    "gymnasium.envs.toy_text.taxi:TaxiEnv": "s",
+}
+
+
+def wrappers_of(env: Any) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
+    """The wrappers of an environment, from the outside."""
+    while isinstance(env, gym.Wrapper):
+        yield env
+        env = env.env
+
+
+def known_class(thing: Any, table: dict[str, str], methods: Sequence[str]) -> str | None:
+    """What a table says of the class whose methods an object runs.
+
+    Args:
+        thing: a wrapper, an environment or a batch.
+        table: by "module:class".
+        methods: those that decide what it does.
+
+    Returns:
+        The entry of its first known ancestor; None: there is none, or a method is its own.
+    """
+    kind = type(thing)
+    for base in kind.__mro__:
+        entry = table.get(f"{base.__module__}:{base.__qualname__}")
+        if entry is not None:
+            inherits = (getattr(kind, name, None) is getattr(base, name, None) for name in methods)
+            own = any(name in getattr(thing, "__dict__", ()) for name in methods)
+            return entry if all(inherits) and not own else None
+    return None
+
+
+def role_of(where: str, wrapper: gym.Wrapper[Any, Any, Any, Any]) -> str:
+    """What a wrapper does: an entry of the table at the top of this module.
+
+    Args:
+        where: what messages call the environment.
+        wrapper: the wrapper.
+
+    Raises:
+        InputError: it may do anything.
+    """
+    name, role = type(wrapper).__name__, known_class(wrapper, _ROLES, ("step", "reset"))
+    if role is None:
+        raise InputError(
+            f"{where}: its wrapper {name} has its own step() or reset(), which may change the task, so "
+            "nothing exact is known of it; leave it out, or make it a gymnasium ObservationWrapper, "
+            "RewardWrapper or ActionWrapper that defines only observation(), reward() or action()"
+        )
+    seen_alike = wrapper.observation_space == wrapper.env.observation_space
+    if not seen_alike and role not in ("observation", MEMORY):
+        raise InputError(
+            f"{where}: its wrapper {name} changes the observation space and is no "
+            "gymnasium.ObservationWrapper, so what the agent sees of a state is not known; make it one"
+        )
+    if wrapper.action_space != wrapper.env.action_space and role != "action":
+        raise InputError(
+            f"{where}: its wrapper {name} changes the action space and is no gymnasium.ActionWrapper, so "
+            "what its actions do is not known; make it one"
+        )
+    return role
+
+
+def refuse_transformed(where: str, env: gym.Env[Any, Any]) -> None:
+    """Refuse an environment whose wrappers change its task or what is seen of it.
+
+    Raises:
+        InputError: one of them does.
+    """
+    for wrapper in wrappers_of(env):
+        if (role := role_of(where, wrapper)) not in (NEUTRAL, LIMIT):
+            changed = "observation" if role == MEMORY else role
+            raise InputError(
+                f"{where}: its wrapper {type(wrapper).__name__} changes {changed}s, so the environment "
+                "below it, of which the truth is known, is not what an agent is in; leave it out"
+            )
+
+
+def step_limit(env: gym.Env[Any, Any]) -> int | None:
+    """The least step limit of an environment's wrappers; None: there is none."""
+    found = [
+        int(getattr(wrapper, "_max_episode_steps"))  # noqa: B009
+        for wrapper in wrappers_of(env)
+        if isinstance(wrapper, gym.wrappers.TimeLimit)
+    ]
+    return min(found, default=None)
+
+
+class Wrapped:
+    """An environment's world, as it is through its wrappers.
+
+    Args:
+        where: what messages call the environment.
+        env: the environment, which is left as it is.
+        mdp: the world of the environment below all wrappers, which shows its state's number.
+
+    Raises:
+        InputError: a wrapper that changes the task otherwise than by a function.
+    """
+
+    def __init__(self, where: str, env: gym.Env[Any, Any], mdp: Mdp) -> None:
+        self._where, self._env, self._bare = where, env, mdp
+        roles = [(wrapper, role_of(where, wrapper)) for wrapper in list(wrappers_of(env))[::-1]]
+        self.memory = [type(wrapper).__name__ for wrapper, role in roles if role == MEMORY]
+        self.transforms = [wrapper for wrapper, role in roles if role in ("observation", "reward", "action")]
+        changing = [wrapper for wrapper, role in roles if role in ("reward", "action")]
+        self.changes_task = bool(changing)
+        self.mdp = mdp
+        if changing:
+            self._copied  # noqa: B018 - refused if it cannot be copied
+            for wrapper in self._copied_transforms:
+                if isinstance(wrapper, gym.RewardWrapper):
+                    self.mdp = self._paid(self.mdp, wrapper)
+                elif isinstance(wrapper, gym.ActionWrapper):
+                    self.mdp = self._acted(self.mdp, wrapper)
+            names = ", ".join(type(wrapper).__name__ for wrapper in changing)
+            self.mdp = replace(self.mdp, name=f"{mdp.name} in {names}")
+            self._check_steps(None)
+
+    @cached_property
+    def observations(self) -> list[Any]:
+        """What an agent sees of each state: S of them, arrays or of any other kind.
+
+        Raises:
+            InputError: it sees more than the state, or something that is no function of it.
+        """
+        if self.memory:
+            raise InputError(
+                f"{self._where}: {self.memory[0]} makes observations of more than the state's number, so no "
+                "table of the policy can be evaluated exactly; leave it out"
+            )
+        rows: list[Any] = self._bare.number.tolist()
+        if not self.transforms:
+            return rows
+        for wrapper in self._copied_transforms:
+            if isinstance(wrapper, gym.ObservationWrapper):
+                rows = self._asked(wrapper, "observation", rows)
+        self._check_steps(rows)
+        return rows
+
+    def action_masks(self) -> list[Any] | None:
+        """What `action_masks()` of the environment allows in each state, (A,) each; None: there is none.
+
+        Raises:
+            InputError: it is no function of the state, or states cannot be set.
+        """
+        if not self._env.has_wrapper_attr("action_masks"):
+            return None
+        env = self._copied
+        masks = env.get_wrapper_attr("action_masks")
+        for each in (env.unwrapped, *wrappers_of(env)):
+            if hasattr(type(each), "action_masks"):
+                self._remembered(each, "action_masks")  # refuses what looks into another environment
+        attribute = known_class(env.unwrapped, _STATE_ATTRIBUTES, ("step", "reset"))
+        if attribute is None:
+            raise InputError(
+                f"{self._where}: action_masks() cannot be asked for each state, since the state of "
+                f"{type(env.unwrapped).__name__} cannot be set; use a model without masks"
+            )
+        env.reset(seed=_SEED)
+        states = np.flatnonzero(self._bare.acting)
+        found: list[Any] = [None] * self._bare.num_states
+        for again in (False, True):
+            for state in states.tolist():
+                setattr(env.unwrapped, attribute, int(self._bare.number[state]))
+                allowed = np.array(masks(), dtype=np.bool_)
+                if again and not np.array_equal(found[state], allowed):
+                    raise self._no_function("action_masks()", f"state {state}")
+                found[state] = allowed
+        everything = np.ones(self.mdp.num_actions, dtype=np.bool_)
+        return [everything if each is None else each for each in found]
+
+    @cached_property
+    def _copied(self) -> gym.Env[Any, Any]:
+        """A copy of the environment to ask and to step: with its transforms, without what records."""
+        real = copied(self._env.unwrapped)
+        seen: dict[int, Any] = {id(self._env.unwrapped): real}
+        for wrapper in list(wrappers_of(self._env))[::-1]:
+            if wrapper in self.transforms or type(wrapper).step is gym.Wrapper.step:
+                try:
+                    real = copy.deepcopy(wrapper, seen)
+                except Exception as error:
+                    raise InputError(
+                        f"{self._where}: its wrapper {type(wrapper).__name__} cannot be copied "
+                        f"({in_short(error)}), so what it changes cannot be found out; leave it out"
+                    ) from None
+            seen[id(wrapper)] = real
+        return real
+
+    @property
+    def _copied_transforms(self) -> list[Any]:
+        """The copies of the transforms, from the inside."""
+        kinds = gym.ObservationWrapper | gym.RewardWrapper | gym.ActionWrapper
+        return [wrapper for wrapper in wrappers_of(self._copied) if isinstance(wrapper, kinds)][::-1]
+
+    def _paid(self, mdp: Mdp, wrapper: Any) -> Mdp:
+        """The world with a wrapper's rewards; an end pays nothing, nor does a state without a way to it."""
+        counts = (mdp.probability > 0) & (~mdp.absorbing | mdp.reachable & ~mdp.terminal)[:, None, None]
+        given = np.unique(mdp.reward[counts])
+        made = np.array(
+            [
+                checked_reward(f"{self._where}: a reward of {type(wrapper).__name__}", _plain(reward))
+                for reward in self._asked(wrapper, "reward", given.tolist())
+            ]
+        )
+        reward = np.zeros(mdp.reward.shape)
+        reward[counts] = made[np.searchsorted(given, mdp.reward[counts])]
+        return _changed(mdp, reward=reward)
+
+    def _acted(self, mdp: Mdp, wrapper: Any) -> Mdp:
+        """The world with a wrapper's actions."""
+        space, name = wrapper.action_space, type(wrapper).__name__
+        if not is_discrete(space, getattr(space, "n", -1)):
+            raise InputError(f"{self._where}: the actions of {name} are {space}; must be Discrete(n) from 0")
+        chosen = [_plain(each) for each in self._asked(wrapper, "action", list(range(int(space.n))))]
+        for action, inner in enumerate(chosen):
+            if inner not in range(mdp.num_actions):
+                raise InputError(
+                    f"{self._where}: {name} makes {str(inner)[:50]} of action {action}; must be "
+                    f"{mdp.action_choices()}"
+                )
+        return _changed(
+            mdp,
+            action_names=tuple(mdp.action_names[inner] for inner in chosen),
+            **{key: getattr(mdp, key)[:, chosen] for key in ("next_state", "probability", "reward")},
+        )
+
+    def _asked(self, wrapper: Any, method: str, arguments: list[Any]) -> list[Any]:
+        """What a wrapper's method makes of each argument, if it is a function of it alone."""
+        name = f"{method}() of {type(wrapper).__name__}"
+        ask: Callable[[Any], Any] = getattr(wrapper, method)
+        before = self._remembered(wrapper, method)
+        try:
+            found = [copy.deepcopy(ask(copy.deepcopy(each))) for each in arguments]
+            for _ in range(1 + _CALLS // max(1, len(arguments))):
+                for argument, first in zip(arguments[::-1], found[::-1], strict=True):
+                    if not same(ask(copy.deepcopy(argument)), first):
+                        raise self._no_function(name, str(argument)[:50])
+        except InputError:
+            raise
+        except Exception as error:
+            raise InputError(f"{self._where}: {name} raised {in_short(error)}") from error
+        if self._remembered(wrapper, method) != before:
+            raise InputError(f"{self._where}: {name} keeps a memory or draws random numbers{_SO_UNKNOWN}")
+        return found
+
+    def _no_function(self, what: str, argument: str) -> InputError:
+        return InputError(f"{self._where}: {what} does not always give the same for {argument}{_SO_UNKNOWN}")
+
+    def _remembered(self, wrapper: Any, method: str) -> list[Any]:
+        """Whatever a wrapper's method could change or draw from: attributes, closures, generators."""
+        held = {key: value for key, value in vars(wrapper).items() if key != "env"}
+        for function in (getattr(type(wrapper), method), *held.values()):
+            if inspect.isfunction(function) and not function.__module__.startswith("gymnasium."):
+                around = inspect.getclosurevars(function)
+                held = {**around.nonlocals, **around.globals, **held}
+        if any(isinstance(value, gym.Env) for value in held.values()):
+            raise InputError(
+                f"{self._where}: {method}() of {type(wrapper).__name__} looks into an environment"
+                f"{_SO_UNKNOWN}"
+            )
+        generator = wrapper.unwrapped.np_random.bit_generator.state
+        numpy_state = np.random.get_state(legacy=True)
+        return [_as_bytes(each) for each in (*held.values(), generator, numpy_state, random.getstate())]
+
+    def _check_steps(self, rows: list[Any] | None) -> None:
+        """Step the copy beside the tables: from every state that can be set, then in whole episodes.
+
+        Args:
+            rows: what is seen of each state; None: it does not count.
+
+        Raises:
+            InputError: a step is not what the tables say.
+        """
+        env, probe = self._copied, _Probe.below(self._copied)
+        rng = np.random.default_rng(_SEED)
+        observation, _ = env.reset(seed=_SEED)
+        self._check_seen(rows, probe.number, observation)
+        attribute = known_class(env.unwrapped, _STATE_ATTRIBUTES, ("step", "reset"))
+        if attribute is not None:
+            pairs = np.flatnonzero(np.repeat(self._bare.acting, self.mdp.num_actions))
+            if len(pairs) > _ROWS:
+                pairs = rng.choice(pairs, _ROWS, replace=False)
+            for state, action in zip(*np.divmod(pairs, self.mdp.num_actions), strict=True):
+                setattr(env.unwrapped, attribute, int(self._bare.number[state]))
+                self._check_step(rows, probe, int(state), int(action), env.step(int(action)))
+        env.reset()
+        for _ in range(_STEPS):
+            state, action = probe.number, int(rng.integers(self.mdp.num_actions))
+            step = env.step(action)
+            self._check_step(rows, probe, state, action, step)
+            if step[2] or step[3]:
+                observation, _ = env.reset()
+                self._check_seen(rows, probe.number, observation)
+
+    def _check_step(self, rows: Any, probe: _Probe, state: int, action: int, step: Any) -> None:
+        observation, reward, terminated, _, _ = step
+        mdp, pair = self.mdp, (state, action)
+        following = mdp.next_state[pair]
+        same_end = (mdp.number[following] == probe.number) & (mdp.terminal[following] == bool(terminated))
+        possible = same_end & (mdp.reward[pair] == float(reward)) & (mdp.probability[pair] > 0)
+        if not possible.any():
+            raise InputError(
+                f"{self._where}: through its wrappers, action {action} in state {state} led to state "
+                f"{probe.number} with reward {float(reward):g}{' and ended' if terminated else ''}, which is "
+                "not what reward() and action() gave when they were asked; make them functions of their "
+                "argument alone"
+            )
+        self._check_seen(rows, probe.number, observation)
+
+    def _check_seen(self, rows: list[Any] | None, number: int, observation: Any) -> None:
+        if rows is not None and not same(rows[number], observation):
+            raise InputError(
+                f"{self._where}: what is seen of state {number} through its wrappers is not always the same"
+                f"{_SO_UNKNOWN}"
+            )
+
+
+class _Probe(gym.Wrapper[Any, Any, Any, Any]):
+    """Remembers the number that the environment below all wrappers showed last."""
+
+    number = -1
+
+    @classmethod
+    def below(cls, env: gym.Env[Any, Any]) -> _Probe:
+        """Put a probe under the innermost wrapper of an environment, unless there is one."""
+        wrappers = list(wrappers_of(env))
+        if isinstance(wrappers[-1], cls):
+            return wrappers[-1]
+        probe = cls(env.unwrapped)
+        wrappers[-1].env = probe
+        return probe
+
+    def reset(self, **arguments: Any) -> Any:
+        found = self.env.reset(**arguments)
+        self.number = int(found[0])
+        return found
+
+    def step(self, action: Any) -> Any:
+        found = self.env.step(action)
+        self.number = int(found[0])
+        return found
+
+
+def copied(real: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+    """A copy of an environment without wrappers, with a generator of its own, which opens no window."""
+    try:
+        other = copy.deepcopy(real)
+    except Exception:  # a window, say; what a step sets anew is the copy's own all the same
+        other = copy.copy(real)
+    other.render_mode = None
+    other.np_random = seeding.np_random(_SEED)[0]
+    return other
+
+
+def is_discrete(space: gym.Space[Any], number: int) -> bool:
+    """Whether a space is that of so many actions."""
+    return isinstance(space, spaces.Discrete) and space.n == number and space.start == 0
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two observations, actions or rewards are equal, dictionaries of arrays included."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    return np.array_equal(np.asarray(one), np.asarray(other))
+
+
+def _plain(value: Any) -> Any:
+    """A number of numpy's as one of Python's."""
+    return value.item() if isinstance(value, np.generic | np.ndarray) and value.size == 1 else value
+
+
+def _as_bytes(value: Any) -> bytes:
+    try:
+        return pickle.dumps(value)
+    except Exception:  # what cannot be written is compared by what it gives
+        return b""
+
+
+def _changed(mdp: Mdp, **tables: Any) -> Mdp:
+    """A world with other tables, which is not that of a map any more."""
+    kept = {field.name: getattr(mdp, field.name) for field in fields(Mdp)}
+    made = Mdp(**{**kept, **tables})
+    stays = (made.next_state == np.arange(mdp.num_states)[:, None, None]) & (made.reward == 0)
+    absorbing = made.terminal | (stays | (made.probability == 0)).all(axis=(1, 2))
+    return replace(
+        made,
+        next_state=frozen(made.next_state),
+        probability=frozen(made.probability),
+        reward=frozen(made.reward),
+        thresholds=frozen(thresholds_of(made.probability)),
+        absorbing=frozen(absorbing),
+    )

@@ -1,0 +1,606 @@
+"""A score is of what was given: wrappers, every copy of a batch, what `predict` does. Truth is by playing."""
+
+import functools
+import random
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces, wrappers
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from sb3_contrib import MaskablePPO
+from sb3_contrib.common.wrappers import ActionMasker
+from stable_baselines3 import DQN, PPO
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecCheckNan,
+    VecEnvWrapper,
+    VecExtractDictObs,
+    VecMonitor,
+    VecNormalize,
+    VecTransposeImage,
+)
+
+import gridworld
+from gridworld import InputError
+
+DRAWS = np.random.default_rng(0)  # a generator that wrappers reach as a global
+
+
+def lake(**given: Any) -> Any:
+    return gym.make("FrozenLake-v1", **{"is_slippery": False, **given})
+
+
+def grid(**given: Any) -> Any:
+    return gym.make("GridWorld-v0", **{"layout": "frozen_lake_4x4", **given})
+
+
+def slippery_grid() -> Any:
+    return grid(slip=0.3, step_reward=-0.01, max_episode_steps=40)
+
+
+def cliff() -> Any:
+    return gym.make("CliffWalking-v1", max_episode_steps=30)
+
+
+def taxi() -> Any:
+    return gym.make("Taxi-v4", max_episode_steps=25)
+
+
+class Turned(gym.ActionWrapper):
+    def action(self, action: Any) -> Any:
+        return (action + 1) % self.env.action_space.n
+
+
+class Fewer(gym.ActionWrapper):
+    """Two actions, of which the first is the inner one's last."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.action_space = spaces.Discrete(2)
+
+    def action(self, action: Any) -> Any:
+        return 2 - int(action)
+
+
+class Paid(gym.RewardWrapper):
+    def reward(self, reward: Any) -> float:
+        return 2 * float(reward) - 0.125
+
+
+class Shown(gym.ObservationWrapper):
+    """The states in the opposite order."""
+
+    def observation(self, observation: Any) -> Any:
+        return self.observation_space.n - 1 - observation
+
+
+class Labelled(gym.Wrapper):
+    """Changes nothing that a step does."""
+
+    label = "mine"
+
+    def render(self) -> Any:
+        return self.label
+
+
+class Quiet(Monitor):
+    def close(self) -> None:
+        pass
+
+
+def pixels(env: Any) -> Any:
+    size = env.observation_space.n
+    space = spaces.Box(0, 255, (8, 8, 3), np.uint8)
+
+    def drawn(state: Any) -> Any:
+        image = np.zeros((8, 8, 3), np.uint8)
+        image.ravel()[state :: size + 1] = 255
+        return image
+
+    return wrappers.TransformObservation(env, drawn, space)
+
+
+NEUTRAL: dict[str, Callable[[Any], Any]] = {
+    "Monitor": Monitor,
+    "a Monitor of one's own that steps as it does": Quiet,
+    "RecordEpisodeStatistics": wrappers.RecordEpisodeStatistics,
+    "TimeLimit, the shorter of two": lambda env: wrappers.TimeLimit(env, 7),
+    "TimeLimit, the longer of two": lambda env: wrappers.TimeLimit(wrappers.TimeLimit(env, 9), 800),
+    "OrderEnforcing": wrappers.OrderEnforcing,
+    "PassiveEnvChecker": wrappers.PassiveEnvChecker,
+    "a wrapper of one's own that steps as gymnasium.Wrapper": Labelled,
+    "masks that nobody asks for": lambda env: ActionMasker(env, lambda _: np.ones(4, dtype=bool)),
+}
+COMPILED: dict[str, Callable[[Any], Any]] = {
+    "turned actions": Turned,
+    "actions turned twice": lambda env: Turned(Monitor(Turned(env))),
+    "fewer actions": Fewer,
+    "TransformAction": lambda env: wrappers.TransformAction(
+        env, lambda a: 0 if a == 2 else a, env.action_space
+    ),
+    "costs": Paid,
+    "TransformReward": lambda env: wrappers.TransformReward(env, lambda r: -r),
+    "ClipReward": lambda env: wrappers.ClipReward(env, -0.5, 0.25),
+    "costs around turned actions": lambda env: Paid(Turned(env)),
+    "turned actions around costs": lambda env: Turned(wrappers.TimeLimit(Paid(env), 6)),
+    "a reversed observation, and costs": lambda env: Shown(Paid(Shown(env))),
+}
+
+
+class Careless(gym.ActionWrapper):
+    def action(self, action: Any) -> Any:
+        return self.action_space.sample() if self.np_random.random() < 0.3 else action
+
+
+class RarelyCareless(gym.ActionWrapper):
+    def action(self, action: Any) -> Any:
+        return 0 if DRAWS.random() < 1e-4 else action
+
+
+class Restless(gym.Wrapper):
+    def step(self, action: Any) -> Any:
+        return self.env.step(self.action_space.sample() if self.np_random.random() < 0.3 else action)
+
+
+class Alternating(gym.ActionWrapper):
+    turn = 0
+
+    def action(self, action: Any) -> Any:
+        self.turn += 1
+        return (action + self.turn // 5000) % 4
+
+
+class Homesick(gym.ActionWrapper):
+    """Looks at the state."""
+
+    def action(self, action: Any) -> Any:
+        base = self.unwrapped
+        return 0 if getattr(base, "s", getattr(base, "state", 0)) == 1 else action
+
+
+class Tired(gym.RewardWrapper):
+    steps = 0
+
+    def reward(self, reward: Any) -> float:
+        self.steps += 1
+        return float(reward) - 0.001 * (self.steps // 3000)
+
+
+class Shaped(gym.RewardWrapper):
+    def reward(self, reward: Any) -> float:
+        base = self.unwrapped
+        return float(reward) + (getattr(base, "s", getattr(base, "state", 0)) in (4, 8))
+
+
+class Costly(gym.ObservationWrapper):
+    """An observation wrapper by name, and more by its step."""
+
+    def observation(self, observation: Any) -> Any:
+        return observation
+
+    def step(self, action: Any) -> Any:
+        observation, reward, *others = self.env.step(action)
+        return observation, float(reward) - 0.3, *others
+
+
+class Elsewhere(gym.Wrapper):
+    def reset(self, **given: Any) -> Any:
+        super().reset(**given)
+        self.unwrapped.s = self.unwrapped.state = 2
+        return 2, {}
+
+
+class Hasty(Monitor):
+    def step(self, action: Any) -> Any:
+        observation, reward, _, truncated, info = super().step(action)
+        return observation, reward, True, truncated, info
+
+
+def replaced(env: Any) -> Any:
+    held = Labelled(env)
+    held.step = lambda action: env.step(0)  # type: ignore[method-assign]
+    return held
+
+
+def by_closure(env: Any) -> Any:
+    return wrappers.TransformReward(env, lambda r: float(r) - 0.1 * (getattr(env.unwrapped, "s", 0) == 1))
+
+
+UNKNOWN: dict[str, Callable[[Any], Any]] = {
+    "random actions": Careless,
+    "random actions, one in ten thousand": RarelyCareless,
+    "random actions in a step of its own": Restless,
+    "StickyAction": lambda env: wrappers.StickyAction(env, 0.2),
+    "RepeatAction": lambda env: wrappers.RepeatAction(env, 2),
+    "MaxAndSkipObservation": lambda env: wrappers.MaxAndSkipObservation(env, 2),
+    "an action that depends on time": Alternating,
+    "an action that depends on the state": Homesick,
+    "a reward that depends on time": Tired,
+    "a reward that depends on the state": Shaped,
+    "a reward that sees through a closure": by_closure,
+    "a random reward": lambda env: wrappers.TransformReward(
+        env, lambda r: float(r) - (random.random() < 1e-4)
+    ),
+    "NormalizeReward": wrappers.NormalizeReward,
+    "an observation wrapper with a step": Costly,
+    "a reset of its own": Elsewhere,
+    "a Monitor that ends episodes": Hasty,
+    "a step that was replaced": replaced,
+    "a neutral one around an unknown one": lambda env: Monitor(Restless(env)),
+    "an unknown one around a neutral one": lambda env: Restless(Monitor(env)),
+}
+WORLDS = {"lake": lake, "grid": grid, "slippery grid": slippery_grid, "cliff": cliff, "taxi": taxi}
+
+
+def state_of(env: Any) -> int:
+    base = env.unwrapped
+    return int(base.state if isinstance(base, gridworld.GridWorldEnv) else base.s)
+
+
+def played(env: Any, act: Callable[[Any], int], episodes: int) -> tuple[float, float]:
+    """The mean return of episodes and its standard error; `act` gets the observation."""
+    returns = []
+    for episode in range(episodes):
+        observation, _ = env.reset(seed=1000 + episode)
+        total, over = 0.0, False
+        while not over:
+            observation, reward, terminated, truncated, _ = env.step(act(observation))
+            total, over = total + float(reward), terminated or truncated
+        returns.append(total)
+    return float(np.mean(returns)), float(np.std(returns) / np.sqrt(episodes))
+
+
+def agrees(score: gridworld.Score, mean: float, error: float) -> bool:
+    """Rare ends may be missing from a sample, which the error does not say: 0.03 for these."""
+    return abs(score.outcome.expected_return - mean) <= 5 * error + (0.03 if error else 1e-9)
+
+
+@pytest.mark.parametrize("kind", [*NEUTRAL, *COMPILED])
+@pytest.mark.parametrize("world", WORLDS)
+def test_the_score_of_a_table_is_what_it_earns_through_wrappers(world: str, kind: str) -> None:
+    env = {**NEUTRAL, **COMPILED}[kind](WORLDS[world]())
+    states, actions = env.unwrapped.observation_space.n, env.action_space.n
+    rng = np.random.default_rng(3)
+    for _ in range(1 + (world != "taxi")):
+        table = rng.integers(actions, size=states)
+        score = gridworld.evaluate(table, env)
+        mean, error = played(
+            env,
+            lambda _, table=table: int(table[state_of(env)]),
+            {"slippery grid": 400, "taxi": 60}.get(world, 1),
+        )
+        assert agrees(score, mean, error), (score, mean, error)
+        vectors = [DummyVecEnv([lambda: env]), SyncVectorEnv([lambda: env])]
+        assert all(gridworld.evaluate(table, batch) == score for batch in vectors)
+    best = gridworld.Evaluator(gridworld.compile_env(env), 0.99, 100).optimal_policy()
+    assert gridworld.evaluate(best, env).certified
+
+
+@pytest.mark.parametrize("kind", UNKNOWN)
+@pytest.mark.parametrize("world", ["lake", "grid", "cliff"])
+def test_an_unknown_wrapper_is_refused_alone_and_in_every_batch(world: str, kind: str) -> None:
+    make = WORLDS[world]
+    table = np.ones(make().unwrapped.observation_space.n, dtype=int)
+
+    def changed() -> Any:
+        return UNKNOWN[kind](make())
+
+    given = [
+        *(
+            changed(),
+            DummyVecEnv([changed]),
+            DummyVecEnv([make, changed]),
+            VecCheckNan(DummyVecEnv([changed])),
+        ),
+        *(SyncVectorEnv([changed]), wrappers.vector.RecordEpisodeStatistics(SyncVectorEnv([make, changed]))),
+    ]
+    if world != "grid":  # whose native batch takes no wrappers
+        name = make().spec.id
+        given.append(gym.make_vec(name, 2, vectorization_mode="sync", wrappers=[UNKNOWN[kind]]))
+    for env in given:
+        with pytest.raises(InputError, match=r"^env: ") as refused:
+            gridworld.evaluate(table, env)
+        assert "\n" not in str(refused.value)
+        with pytest.raises(InputError):
+            gridworld.compile_env(env)
+
+
+def test_copies_of_a_batch_must_be_one_task() -> None:
+    table = np.ones(16, dtype=int)
+    for other in (Turned, Paid, lambda env: wrappers.TimeLimit(env, 5), lambda env: lake(desc=["SF", "FG"])):
+        for batch in (DummyVecEnv, SyncVectorEnv) if other is not lake else (DummyVecEnv,):
+            try:
+                mixed = batch([lake, lambda other=other: other(lake())])
+            except (AssertionError, RuntimeError):
+                continue  # refused by the batch itself
+            with pytest.raises(InputError, match=r"environment 1 of the .* is another task"):
+                gridworld.evaluate(table, mixed)
+
+
+class LyingGrid(gridworld.GridWorldEnv):
+    def step(self, action: int) -> Any:
+        return super().step((action + 1) % 4)
+
+
+class DrawnGrid(gridworld.GridWorldEnv):
+    """Draws itself otherwise, and steps as its class."""
+
+    def render(self) -> Any:
+        return "otherwise"
+
+
+def test_a_class_of_its_own() -> None:
+    table = np.ones(30, dtype=int)
+    assert gridworld.evaluate(table, DrawnGrid()) == gridworld.evaluate(table, "classic")
+    for env in (LyingGrid(), DummyVecEnv([lambda: LyingGrid()])):
+        with pytest.raises(InputError, match=r"LyingGrid has its own step"):
+            gridworld.evaluate(table, env)
+    env = gridworld.GridWorldEnv()
+    env.step = lambda action: (0, 1.0, False, False, {})  # type: ignore[method-assign]
+    with pytest.raises(InputError, match="has its own step"):
+        gridworld.evaluate(table, env)
+
+
+class Mixing(VecEnvWrapper):
+    """Turns the actions of a whole batch."""
+
+    def step_async(self, actions: Any) -> None:
+        self.venv.step_async((np.asarray(actions) + 1) % 4)
+
+    def step_wait(self) -> Any:
+        return self.venv.step_wait()
+
+    def reset(self) -> Any:
+        return self.venv.reset()
+
+
+def test_what_a_batch_does_must_be_known() -> None:
+    table = np.ones(16, dtype=int)
+    native = gym.make_vec("GridWorld-v0", 2, layout="frozen_lake_4x4")
+    unknown = [
+        *(
+            Mixing(DummyVecEnv([lake])),
+            VecCheckNan(Mixing(gridworld.make_vec_env("frozen_lake_4x4", n_envs=2))),
+        ),
+        wrappers.vector.TransformReward(native, lambda r: -r),
+        wrappers.vector.NormalizeReward(SyncVectorEnv([lake])),
+    ]
+    for env in unknown:
+        with pytest.raises(InputError, match="whose effect on the task is known"):
+            gridworld.evaluate(table, env)
+    known = [
+        native,
+        wrappers.vector.RecordEpisodeStatistics(native),
+        VecCheckNan(VecMonitor(DummyVecEnv([grid]))),
+    ]
+    assert all(gridworld.evaluate(table, env) == gridworld.evaluate(table, grid()) for env in known)
+
+
+def turned_lake() -> Any:
+    return Turned(lake())
+
+
+@pytest.mark.slow
+def test_environments_in_other_processes_are_refused() -> None:
+    for batch in (SubprocVecEnv([turned_lake]), AsyncVectorEnv([turned_lake])):
+        with pytest.raises(InputError, match="in other processes, where their wrappers cannot be looked at"):
+            gridworld.evaluate(np.ones(16, dtype=int), batch)
+        batch.close()
+
+
+def lake_model(env: Any, algorithm: Any = DQN, **settings: Any) -> Any:
+    if algorithm is DQN:
+        settings = {"learning_starts": 100, "exploration_fraction": 0.5, "buffer_size": 3000} | settings
+    return algorithm("MlpPolicy", env, seed=1, device="cpu", **settings)
+
+
+def noisy(env: Any) -> Any:
+    return wrappers.TransformObservation(
+        env, lambda s: (s + (DRAWS.random() < 0.01)) % 16, env.observation_space
+    )
+
+
+def with_last_action(env: Any) -> Any:
+    class Seen(gym.ObservationWrapper):
+        def observation(self, observation: Any) -> Any:
+            return (observation + int(self.unwrapped.lastaction or 0)) % 16
+
+    return Seen(env)
+
+
+@pytest.mark.parametrize("wrapper", [noisy, with_last_action, wrappers.TimeAwareObservation])
+def test_an_observation_that_is_no_function_of_the_state_is_refused(wrapper: Any) -> None:
+    model = lake_model(wrapper(lake()))
+    for env in (None, wrapper(lake())):
+        with pytest.raises(InputError):
+            gridworld.evaluate(model, env)
+    assert gridworld.evaluate(np.ones(16, dtype=int), wrapper(lake())).regret > 0  # a table asks for none
+
+
+SEEN: dict[str, Callable[[], Any]] = {
+    "reversed": lambda: Shown(lake()),
+    "one-hot": lambda: wrappers.FlattenObservation(lake()),
+    "reversed behind turned actions": lambda: Turned(Shown(lake())),
+    "a row of numbers": lambda: wrappers.TransformObservation(
+        lake(), lambda s: np.array([s // 4, s % 4], np.float32) / 3, spaces.Box(0, 1, (2,), np.float32)
+    ),
+    "an entry of a Dict": lambda: VecExtractDictObs(DummyVecEnv([as_dict]), "place"),
+    "normalised": lambda: VecNormalize(DummyVecEnv([lambda: wrappers.FlattenObservation(lake())])),
+    "pixels": lambda: VecTransposeImage(DummyVecEnv([lambda: pixels(lake())])),
+    "a mixture of batches": lambda: VecMonitor(
+        VecNormalize(VecExtractDictObs(DummyVecEnv([as_dict] * 2), "place"))
+    ),
+    "grid coordinates behind costs": lambda: gridworld.CoordinateObservation(grid()),
+    "our batch": lambda: VecCheckNan(gridworld.make_vec_env("frozen_lake_4x4", n_envs=3)),
+}
+
+
+def as_dict() -> Any:
+    space = spaces.Dict({"place": spaces.Box(0, 1, (2,), np.float32), "rest": spaces.Discrete(3)})
+    return wrappers.TransformObservation(
+        lake(), lambda s: {"place": np.array([s // 4, s % 4], np.float32) / 3, "rest": 1}, space
+    )
+
+
+def played_by(model: Any, env: Any) -> float:
+    """The undiscounted return of an episode of the first environment of what it was trained on."""
+    batch = env if hasattr(env, "step_wait") else DummyVecEnv([lambda: env])
+    batch.training = False
+    observation, total, done = batch.reset(), 0.0, [False]
+    while not done[0]:
+        action, _ = model.predict(observation, deterministic=True)
+        observation, reward, done, _ = batch.step(action)
+        total += float(batch.get_original_reward()[0] if hasattr(batch, "get_original_reward") else reward[0])
+    return total
+
+
+@pytest.mark.parametrize("kind", SEEN)
+def test_a_model_is_scored_by_what_it_is_shown(kind: str) -> None:
+    env = SEEN[kind]()
+    for seed in range(6):
+        model = PPO(
+            "CnnPolicy" if False else "MlpPolicy", env, n_steps=8, batch_size=8, seed=seed, device="cpu"
+        )
+        score = gridworld.evaluate(model, env)
+        assert score == gridworld.evaluate(model, model.get_env()) == gridworld.evaluate(model)
+        assert score.outcome.expected_return == pytest.approx(played_by(model, env), abs=1e-6)
+
+
+def test_a_model_behind_turned_actions_is_certified_for_what_it_earns() -> None:
+    env = Turned(lake(desc=["SF", "HG"]))
+    callback = gridworld.ExactEvalCallback(every=200, stop_after=1)
+    model = lake_model(env, gamma=0.9, learning_rate=0.01, learning_starts=200)
+    model.learn(4000, callback=callback)
+    score = gridworld.evaluate(model)
+    assert score.certified
+    assert callback.evaluations["certified"][-1]
+    assert score.outcome.expected_return == played_by(model, env) == 1
+    assert not gridworld.evaluate(model, lake(desc=["SF", "HG"])).certified
+
+
+class Rotating(DQN):
+    def predict(self, observation: Any, *args: Any, **named: Any) -> Any:
+        actions, state = super().predict(observation, *args, **named)
+        return (actions + 1) % 4, state
+
+
+class Whimsical(DQN):
+    def predict(self, observation: Any, *args: Any, **named: Any) -> Any:
+        actions, state = super().predict(observation, *args, **named)
+        return (actions + np.random.randint(0, 4, np.shape(actions))) % 4, state
+
+
+class FirstOnly(DQN):
+    """Answers all of a batch as its first."""
+
+    def predict(self, observation: Any, *args: Any, **named: Any) -> Any:
+        actions, state = super().predict(observation, *args, **named)
+        return np.full_like(actions, actions if np.ndim(actions) == 0 else actions[0]), state
+
+
+class Failing(DQN):
+    def predict(self, observation: Any, *args: Any, **named: Any) -> Any:
+        raise ValueError("no actions today")
+
+
+def test_a_predict_of_its_own_is_what_is_scored() -> None:
+    env, differ = grid(step_reward=-0.1), False
+    for seed in range(3):
+        plain, rotating = (kind("MlpPolicy", env, buffer_size=10, seed=seed) for kind in (DQN, Rotating))
+        for model in (plain, rotating):
+            assert gridworld.evaluate(model).outcome.expected_return == pytest.approx(played_by(model, env))
+        differ |= gridworld.evaluate(plain) != gridworld.evaluate(rotating)
+        plain.predict = rotating.predict  # type: ignore[method-assign]
+        assert gridworld.evaluate(plain) == gridworld.evaluate(rotating)
+    assert differ
+    with pytest.raises(InputError, match=r"has its own predict\(\), so the distribution"):
+        gridworld.evaluate(rotating, deterministic=False)
+    for kind, told in (
+        (Whimsical, "same action in the same state"),
+        (FirstOnly, "same action"),
+        (Failing, "raised"),
+    ):
+        with pytest.raises(InputError, match=told):
+            gridworld.evaluate(kind("MlpPolicy", env, buffer_size=10, seed=0))
+
+
+def only_left(env: Any) -> Any:
+    return ActionMasker(env, lambda _: np.array([True, False, False, False]))
+
+
+def never_back(env: Any) -> Any:
+    """Forbids up in the first row and left in the first column."""
+
+    def allowed(inner: Any) -> Any:
+        row, column = divmod(inner.unwrapped.s, 4)
+        return np.array([column > 0, True, True, row > 0])
+
+    return ActionMasker(env, allowed)
+
+
+@pytest.mark.parametrize("masking", [only_left, never_back])
+def test_a_model_with_masks_is_scored_with_them(masking: Any) -> None:
+    for seed in range(6):
+        env = masking(lake())
+        model = MaskablePPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=seed, device="cpu")
+        observation, _ = env.reset()
+        total, over = 0.0, False
+        while not over:
+            action, _ = model.predict(observation, deterministic=True, action_masks=env.action_masks())
+            observation, reward, terminated, truncated, _ = env.step(int(action))
+            total, over = total + float(reward), terminated or truncated
+        score = gridworld.evaluate(model)
+        assert score.outcome.expected_return == total
+        sampled = gridworld.evaluate(model, env, deterministic=False)
+        if masking is only_left:
+            assert (score.value, sampled.value, sampled.outcome.timeout) == (0, 0, 1)
+    random_masks = ActionMasker(lake(), lambda _: DRAWS.random(4) < 0.9)
+    outside = lake()
+    elsewhere = ActionMasker(lake(), lambda _: np.arange(4) != outside.unwrapped.s)
+    for env in (random_masks, elsewhere):
+        with pytest.raises(InputError):
+            gridworld.evaluate(model, env)
+
+
+def test_a_table_may_be_by_what_the_environment_shows() -> None:
+    """In a lake whose hole pays on some ways in, states outnumber what is shown."""
+
+    class Six(gym.Env):
+        observation_space, action_space = spaces.Discrete(6), spaces.Discrete(2)
+        P = {  # noqa: RUF012
+            s: {
+                0: [(1.0, max(s - 1, 0), 0.0, False)],
+                1: [(0.5, min(s + 1, 5), float(s == 4), s == 4), (0.5, max(s - 1, 0), 0.0, s == 3)],
+            }
+            for s in range(6)
+        }
+        initial_state_distrib = np.eye(6)[0]
+
+        def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+            super().reset(seed=seed)
+            self.s = 0
+            return 0, {}
+
+        def step(self, action: Any) -> Any:
+            row = self.P[self.s][int(action)]
+            _, self.s, reward, over = (
+                row[int(self.np_random.random() > row[0][0])] if len(row) > 1 else row[0]
+            )
+            return self.s, reward, over, False, {}
+
+    env = wrappers.TimeLimit(Six(), 30)
+    world = gridworld.compile_env(env)
+    assert world.num_states > 6
+    for table in ([1] * 6, [1, 1, 0, 1, 1, 1]):
+        score = gridworld.evaluate(table, env)
+        assert agrees(score, *played(env, functools.partial(lambda table, s: table[s], table), 400))
+        assert (
+            gridworld.evaluate(np.eye(2)[table], env)
+            == score
+            == gridworld.evaluate(q=np.eye(2)[table], env=env)
+        )
