@@ -1,8 +1,8 @@
 """Put many runs side by side: statistics over seeds with intervals, curves and tables, as one page.
 
-RUNS are folders of runs, of sweeps, or any above them. The exit code is 0 if every run found is counted, 1 if
-the report was written but names something to look into (a run that is unfinished, damaged or contradicts
-another), 2 if there was nothing to report.
+RUNS are folders of runs, of sweeps, or any above them. The exit code is 0 if every run found is counted and
+whole, 1 if the report was written but names something to look into (a run that is unfinished or contradicts
+another, a damaged file), 2 if there was nothing to report.
 """
 
 from __future__ import annotations
@@ -20,14 +20,13 @@ from gridworld.process.console.command_line import program
 from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
-from gridworld.report.build import Report, gather
+from gridworld.report.build import MOST_TOLD, Report, gather
 from gridworld.report.evidence.reasons import Reason, reasons
 from gridworld.report.writer import FORMATS, MARKERS, check_markers, check_out, write_readme, write_report
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.claim import check_inside
 
 _MOST_DIAGNOSED = 10
-_MOST_TOLD = 20  # sentences on standard error; the page has them all
 
 
 @limited()
@@ -50,7 +49,8 @@ def main(arguments: Sequence[str]) -> None:
     with telling_if_slow("reading the runs"):
         report = gather(options.runs, options.seed, options.log_steps)
     with telling_if_slow("diagnosing runs that are not certified"):
-        report = replace(report, reasons=reasons(report.study.groups, _reason, options.diagnose))
+        found, untold = reasons(report.study.groups, _reason, options.diagnose)
+        report = replace(report, reasons=found, notes=(*report.notes, *untold))
     with telling_if_slow("writing the report"):
         page = write_report(report, out, options.formats)
     if options.readme is not None:
@@ -106,10 +106,7 @@ def _reason(folder: Path) -> Reason | None:
     from gridworld.diagnosis.evidence import Evidence
     from gridworld.diagnosis.verdict import diagnose
 
-    try:
-        found = diagnose(Evidence.of(SavedRun(folder)))
-    except Exception:  # a run may be another version's, or anybody's; its numbers stand without a reason
-        return None
+    found = diagnose(Evidence.of(SavedRun(folder)))
     return None if found.phrase is None else Reason(found.phrase, found.first_change)
 
 
@@ -119,9 +116,9 @@ def _usual_out(runs: Sequence[Path]) -> Path:
 
 def _tell(report: Report) -> None:
     sentences = report.sentences()
-    for sentence in sentences[:_MOST_TOLD]:
+    for sentence in sentences[:MOST_TOLD]:
         print(f"warning: {printable(sentence)}", file=sys.stderr)
-    if len(sentences) > _MOST_TOLD:
-        print(f"warning: and {len(sentences) - _MOST_TOLD} more, all in the report", file=sys.stderr)
+    if len(sentences) > MOST_TOLD:
+        print(f"warning: and {len(sentences) - MOST_TOLD} more, all in the report", file=sys.stderr)
     for note in (*report.study.notes, *report.notes):
         print(f"note: {printable(note)}", file=sys.stderr)

@@ -72,9 +72,8 @@ def _sum_up(sweep: Path, kind: object, error: BaseException | None, trace: objec
         return
     from gridworld.report.writer import write_over_seeds
 
-    with contextlib.suppress(InputError, OSError, FolderLostError):  # the report says what cannot be used
-        if (folder := write_over_seeds(sweep, sweep)) is not None:
-            print(f"  over seeds: {printable(shown(folder))}, beside the jobs in TensorBoard")
+    if (folder := write_over_seeds(sweep, sweep)) is not None:
+        print(f"  over seeds: {printable(shown(folder))}, beside the jobs in TensorBoard")
 
 
 def _exit_on_error(check: Callable[[], None]) -> None:

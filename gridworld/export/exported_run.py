@@ -84,7 +84,7 @@ def read(folder: Path, copies: Path) -> ExportedRun:
     """
     evidence = read_evidence(folder)
     if isinstance(evidence, Unusable):
-        raise InputError(evidence.reason)
+        raise InputError("; ".join(evidence.reasons))
     run = open_run(folder)
     return ExportedRun(
         identity=sha256(repr(sorted(run.manifest["sha256"].items())).encode())[:16],

@@ -13,12 +13,13 @@ from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import SOURCES
 from gridworld.errors import InputError
 from gridworld.report.analysis.analyse import Overall, TaskAnalysis, analyse
-from gridworld.report.embedded_images import changed_pictures
 from gridworld.report.evidence.discovery import find_runs
 from gridworld.report.evidence.grouping import Study, arrange
 from gridworld.report.evidence.reasons import Reasons
-from gridworld.report.evidence.run_reader import Evidence, Unusable, read
+from gridworld.report.evidence.run_reader import DAMAGED, Evidence, Unusable, read
 from gridworld.report.evidence.tuning_study import TuningStudy, find_tunings
+
+MOST_TOLD = 20  # sentences on standard error; the page has them all
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +39,19 @@ class Report:
     @property
     def complete(self) -> bool:
         """Whether every run is counted and nothing contradicts anything."""
-        return not (self.unusable or self.problems or self.study.warnings)
+        return not self.sentences()
+
+    @property
+    def damage(self) -> list[str]:
+        """A sentence for each damaged file of the runs."""
+        counted = [told for group in self.study.groups for run in group.runs for told in run.damage]
+        others = [told for run in self.unusable if run.state == DAMAGED for told in run.reasons]
+        return [*counted, *others]
 
     def sentences(self) -> list[str]:
         """What somebody should look into."""
-        return [*self.problems, *(run.reason for run in self.unusable), *self.study.warnings]
+        unfinished = [told for run in self.unusable if run.state != DAMAGED for told in run.reasons]
+        return [*self.problems, *self.damage, *unfinished, *self.study.warnings]
 
 
 def gather(paths: Sequence[Path], seed: int = 0, log_steps: bool = False) -> Report:
@@ -62,11 +71,12 @@ def gather(paths: Sequence[Path], seed: int = 0, log_steps: bool = False) -> Rep
     runs = [outcome for outcome in outcomes if isinstance(outcome, Evidence)]
     unusable = tuple(outcome for outcome in outcomes if isinstance(outcome, Unusable))
     if not runs:
-        reasons = [*problems, *(run.reason for run in unusable), *found.notes]
-        raise InputError("nothing to report: " + "; ".join(reasons[:20]))
-    study = arrange(runs)
+        reasons = [*problems, *(reason for run in unusable for reason in run.reasons), *found.notes]
+        more = f"; and {len(reasons) - MOST_TOLD} more" if len(reasons) > MOST_TOLD else ""
+        raise InputError(f"nothing to report: {'; '.join(reasons[:MOST_TOLD])}{more}")
+    study = arrange(runs, unusable)
     tasks, overall = analyse(study, seed, log_steps)
-    problems += [told for task in tasks for result in task.results for told in changed_pictures(result)]
+    problems += [f"{task.task}: {task.world.problem}" for task in tasks if task.world.problem]
     tunings, unread = find_tunings(paths)
     problems += unread
     notes = (*found.notes, *_foreign(runs))

@@ -12,11 +12,10 @@ from pathlib import Path
 from PIL import Image
 
 from gridworld.config.pictures import PICTURES
-from gridworld.errors import InputError
 from gridworld.report.analysis.analyse import Result
 from gridworld.report.evidence.run_reader import Evidence
 from gridworld.report.table import number
-from gridworld.storage.safe_read import file_sha256, read_bytes, sha256
+from gridworld.storage.safe_read import read_bytes, sha256
 
 _LARGEST_PNG = 4 * 2**20  # bytes
 _LARGEST_GIF = 256 * 2**10  # bytes; it stands in the page as it is
@@ -43,18 +42,6 @@ def pictures(result: Result) -> Iterator[Picture]:
         embedded = embed(run.folder / name, run.pictures[name]) if name in run.pictures else None
         if embedded is not None:
             yield Picture(*embedded, f"{result.group.agent}, seed {run.seed}, {verdict}: {drawn.caption}")
-
-
-def changed_pictures(result: Result) -> Iterator[str]:
-    """A sentence for each of these pictures that is not the one that the run drew."""
-    run = _shown(result)
-    for name, digest in run.pictures.items():
-        try:
-            changed = digest is not None and file_sha256(run.folder / name, _most(name)) != digest
-        except InputError:
-            continue  # it was taken away, or is too large to be shown
-        if changed:
-            yield f"{run.folder / name}: is not the picture that the run drew, and is left out"
 
 
 def _shown(result: Result) -> Evidence:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jinja2
@@ -23,7 +23,7 @@ from gridworld.report.charts.style import AGENT_PAINTS, DARK, LIGHT, Styles, sty
 from gridworld.report.charts.task_charts import task_charts
 from gridworld.report.charts.tuning_charts import tuning_charts
 from gridworld.report.embedded_images import pictures
-from gridworld.report.evidence.run_reader import Unusable
+from gridworld.report.evidence.grouping import shortfall
 from gridworld.report.evidence.tuning_study import TuningStudy
 from gridworld.report.table import Cell, interval_text, is_text, main_text, number
 from gridworld.report.tuning_tables import finalists_table, trials_table, winner_table
@@ -36,9 +36,14 @@ _MOST_TOLD = 4  # agents, each by name in the opening
 def charts(report: Report) -> dict[str, list[Chart]]:
     """The figures by task, in the agents' colours, those of tuning studies by title, and over tasks."""
     look = _look(report)
-    drawn = {task.task: list(task_charts(task, look)) for task in report.tasks}
+    drawn = {task.task: _noted(task_charts(task, look), task.shortfall) for task in report.tasks}
     drawn |= {tuning.title: list(tuning_charts(tuning)) for tuning in report.tunings}
-    return drawn | {_ALL_TASKS: list(overall_charts(report.overall, look)) if report.overall else []}
+    overall = overall_charts(report.overall, look) if report.overall else ()
+    return drawn | {_ALL_TASKS: _noted(overall, shortfall(report.study.groups))}
+
+
+def _noted(drawn: Iterable[Chart], shortfall: str) -> list[Chart]:
+    return [replace(chart, description=chart.description + shortfall) for chart in drawn]
 
 
 def _look(report: Report) -> Styles:
@@ -81,19 +86,21 @@ def render(report: Report, drawn: dict[str, list[Chart]]) -> str:
                 tuning.sentence if headline else f"{tuning.title}. {tuning.sentence}"
                 for tuning in report.tunings
             ),
-            *(_answer(task, report.unusable) for task in report.tasks),
+            *map(_answer, report.tasks),
         ],
         answer=tables.answer_table(report.study, report.tasks),
         few=_FEW,
         kinds="agents" if len(_agents(report)) == len(report.study.agents) else "configurations",
-        problems=list(map(plain, report.problems)),
-        warnings=list(map(plain, [*report.study.warnings, *_doubts(report)])),
+        problems=list(map(plain, [*report.problems, *report.damage])),
+        warnings=list(map(plain, report.study.warnings)),
         notes=list(map(plain, [*report.study.notes, *report.notes])),
         tunings=[_tuning(tuning, drawn[tuning.title], headline) for tuning in report.tunings],
         tasks=[_task(task, drawn[task.task], look) for task in report.tasks],
-        overall=tables.overall_table(report.overall) if report.overall else None,
+        overall=tables.overall_table(report.overall, report.study.groups) if report.overall else None,
         overall_figures=_figures(drawn[_ALL_TASKS]),
-        overall_improvements=tables.improvement_tables(report.overall.comparisons, "all tasks")
+        overall_improvements=tables.improvement_tables(
+            report.overall.comparisons, "all tasks", report.study.groups
+        )
         if report.overall
         else [],
         unusable=tables.unusable_table(report.unusable),
@@ -125,7 +132,7 @@ def _task(task: TaskAnalysis, drawn: Sequence[Chart], look: Styles) -> dict[str,
         "facts": _facts(task),
         "figures": _figures(drawn),
         "tables": [tables.task_table(task), tables.scores_table(task)],
-        "improvements": tables.improvement_tables(task.comparisons, task.task),
+        "improvements": tables.improvement_tables(task.comparisons, task.task, task.groups),
         "pictures": [found for result in task.ranked if (found := list(pictures(result)))],
         "layout": run.layout,
     }
@@ -217,16 +224,10 @@ def _days(report: Report) -> str:
     return "" if not days else f", {days[0]}" if len(days) == 1 else f", {days[0]} to {days[-1]}"
 
 
-def _answer(task: TaskAnalysis, unusable: Sequence[Unusable]) -> str:
+def _answer(task: TaskAnalysis) -> str:
     ranked = task.ranked
     told = [_verdict(result) for result in ranked] if len(ranked) <= _MOST_TOLD else _verdicts(ranked)
-    layout = task.results[0].group.runs[0].settings.get("env.layout")
-    missing = Counter(run.agent for run in unusable if run.env == layout and run.agent is not None)
-    told += [
-        f"{count} {'run' if count == 1 else 'runs'} of {agent} not counted"
-        for agent, count in sorted(missing.items())
-    ]
-    return f"On {task.task}, " + "; ".join(told) + "."
+    return f"On {task.task}, {'; '.join(told)}{task.shortfall}."
 
 
 def _verdicts(ranked: Sequence[Result]) -> list[str]:
@@ -259,10 +260,6 @@ def _after(result: Result) -> str:
     if cell is None or math.isinf(cell.interval.point):
         return ""
     return f", by step {main_text(cell)}" + (" in the median" if len(result.group.runs) > 1 else "")
-
-
-def _doubts(report: Report) -> list[str]:
-    return [f"{task.task}: {task.world.problem}." for task in report.tasks if task.world.problem]
 
 
 def _provenance(report: Report) -> str:

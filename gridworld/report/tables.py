@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from gridworld.report.analysis.analyse import Comparison, Overall, Result, TaskAnalysis
 from gridworld.report.analysis.metrics import BY_KEY, METRICS
 from gridworld.report.analysis.statistics import Share
-from gridworld.report.evidence.grouping import Study, differing, learning_key
+from gridworld.report.evidence.grouping import Group, Study, differing, learning_key, shortfall
 from gridworld.report.evidence.reasons import Reasons, most_common
 from gridworld.report.evidence.run_reader import Unusable
 from gridworld.report.table import NOTHING, Cell, Estimate, Table, number, steps_up_to
@@ -33,7 +33,18 @@ def results_table(tasks: Sequence[TaskAnalysis], reasons: Reasons) -> Table:
     ]
     columns = ["task", "agent", "seeds certified", "ever certified", *(_heading(*which) for which in shown)]
     columns += ["why not"] if reasons else []
-    return Table("results", "Certified seeds, exact regret and steps, with 95 % intervals", columns, rows)
+    caption = "Certified seeds, exact regret and steps, with 95 % intervals"
+    return _counting([group for task in tasks for group in task.groups], "results", caption, columns, rows)
+
+
+def _counting(
+    groups: Sequence[Group], name: str, caption: str, columns: list[str], rows: list[list[Cell]]
+) -> Table:
+    """A table with a row for each group, and a column for how many of its runs are counted if not all."""
+    if short := shortfall(groups):
+        columns = [*columns, "counted"]
+        rows = [[*row, group.shortfall or "all"] for row, group in zip(rows, groups, strict=True)]
+    return Table(name, caption + short, columns, rows)
 
 
 def task_table(task: TaskAnalysis) -> Table:
@@ -44,7 +55,7 @@ def task_table(task: TaskAnalysis) -> Table:
         [result.group.agent, result.certified, result.ever, *(estimate(result, *which) for which in shown)]
         for result in task.results
     ]
-    return Table(task.task, f"Results on {task.task}", columns, rows)
+    return _counting(task.groups, task.task, f"Results on {task.task}", columns, rows)
 
 
 def scores_table(task: TaskAnalysis) -> Table:
@@ -53,7 +64,8 @@ def scores_table(task: TaskAnalysis) -> Table:
     rows: list[list[Cell]] = [
         [result.group.agent, *(estimate(result, key, "mean") for key in keys)] for result in task.results
     ]
-    return Table(
+    return _counting(
+        task.groups,
         f"{task.task} scores",
         f"Means over seeds on {task.task}, of the greedy policy where nothing else is said",
         ["agent", *(BY_KEY[key].title for key in keys)],
@@ -77,7 +89,9 @@ def estimate(result: Result, key: str, statistic: str) -> Estimate | None:
     return Estimate(found, steps_up_to(result.shortest_uncertified) if key == "steps" else number)
 
 
-def improvement_table(comparisons: Sequence[Comparison], metric: str, name: str) -> Table | None:
+def improvement_table(
+    comparisons: Sequence[Comparison], metric: str, name: str, groups: Iterable[Group]
+) -> Table | None:
     """Probabilities that the row's agent is better than the column's; None where none are compared."""
     cells = {
         (c.agent, c.other): Estimate(c.probability, _two_digits) for c in comparisons if c.metric == metric
@@ -89,15 +103,15 @@ def improvement_table(comparisons: Sequence[Comparison], metric: str, name: str)
     title = BY_KEY[metric].title
     return Table(
         f"{name} improvement in {title}",
-        f"Probability that a run of the row's agent beats one of the column's in {title}",
+        f"Probability that a run of the row's agent beats one of the column's in {title}{shortfall(groups)}",
         ["agent", *agents],
         rows,
     )
 
 
-def improvement_tables(comparisons: Sequence[Comparison], name: str) -> list[Table]:
+def improvement_tables(comparisons: Sequence[Comparison], name: str, groups: Sequence[Group]) -> list[Table]:
     """The probabilities of improvement on the task `name`, a table for each metric that is compared."""
-    found = (improvement_table(comparisons, metric.key, name) for metric in METRICS)
+    found = (improvement_table(comparisons, metric.key, name, groups) for metric in METRICS)
     return [table for table in found if table is not None]
 
 
@@ -105,13 +119,14 @@ def _two_digits(value: float) -> str:
     return f"{value:.2f}"
 
 
-def overall_table(overall: Overall) -> Table:
+def overall_table(overall: Overall, groups: Iterable[Group]) -> Table:
     """One number an agent, over all its tasks."""
     rows: list[list[Cell]] = [
         [agent, f"{count} of {overall.tasks}", Estimate(interval, number)]
         for agent, (count, interval) in overall.optimality.items()
     ]
-    return Table("all tasks", "Optimality over tasks", ["agent", "tasks", "optimality, IQM"], rows)
+    caption = f"Optimality over tasks{shortfall(groups)}"
+    return Table("all tasks", caption, ["agent", "tasks", "optimality, IQM"], rows)
 
 
 def answer_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
@@ -120,7 +135,8 @@ def answer_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
         (result.group.agent, task.task): result.certified for task in tasks for result in task.results
     }
     rows = [[agent, *(found.get((agent, task)) for task in study.tasks)] for agent in study.agents]
-    return Table("certified", "Seeds certified optimal at the end", ["agent", *study.tasks], rows)
+    caption = f"Seeds certified optimal at the end{shortfall(study.groups)}"
+    return Table("certified", caption, ["agent", *study.tasks], rows)
 
 
 def runs_table(study: Study) -> Table:
@@ -172,7 +188,9 @@ def reasons_table(study: Study, reasons: Reasons) -> Table:
 
 def unusable_table(unusable: Sequence[Unusable]) -> Table:
     """A row for each run that is not."""
-    rows: list[list[Cell]] = [[run.agent or NOTHING, run.env or NOTHING, run.reason] for run in unusable]
+    rows: list[list[Cell]] = [
+        [run.agent or NOTHING, run.env or NOTHING, "; ".join(run.reasons)] for run in unusable
+    ]
     return Table("not counted", "Runs that are not counted", ["agent", "task", "reason"], rows)
 
 

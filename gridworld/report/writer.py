@@ -7,9 +7,10 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from gridworld.errors import InputError
+from gridworld.errors import InputError, reason
+from gridworld.process.console.terminal import tell
 from gridworld.report import tables
-from gridworld.report.build import Report, gather
+from gridworld.report.build import MOST_TOLD, Report, gather
 from gridworld.report.table import Table, to_captioned_markdown, to_csv, to_markdown
 from gridworld.report.tensorboard_export import write_events
 from gridworld.report.tuning_tables import finalists_table, trials_table, winner_table
@@ -85,33 +86,40 @@ def write_report(report: Report, folder: Path, formats: Sequence[str] = FORMATS)
 def write_over_seeds(runs: Path, folder: Path) -> Path | None:
     """Write the curves over seeds of a sweep or a study, for TensorBoard to show beside those of the runs.
 
+    What is damaged, or keeps them from being written, is told on standard error.
+
     Args:
         runs: the folder that has the runs' folders.
         folder: of the sweep or the study. What was written there before is replaced.
 
     Returns:
         What was made; None where no agent has two seeds, there are too many runs to read them all, or
-        none has curves for TensorBoard.
-
-    Raises:
-        InputError: no run can be used.
-        OSError: the folder cannot be written.
+        none has curves for TensorBoard or can be used.
     """
     count = sum(1 for _ in runs.glob(f"*/{MANIFEST}"))
     if count > _MOST_READ_UNASKED or not any(runs.glob(f"*/{EVENT_FILE}")):
         return None
-    report = gather([runs])
-    if all(len(result.group.runs) < 2 for task in report.tasks for result in task.results):
+    try:
+        report = gather([runs])
+        for sentence in report.damage[:MOST_TOLD]:
+            tell(sentence)
+        if len(report.damage) > MOST_TOLD:
+            tell(f"{runs}: {len(report.damage) - MOST_TOLD} more files are damaged; the report has all")
+        if all(len(result.group.runs) < 2 for task in report.tasks for result in task.results):
+            return None
+        with replacing_folder(folder / OVER_SEEDS) as new:
+            _write_events(report, new)
+    except (InputError, OSError) as error:
+        tell(f"{folder / OVER_SEEDS}: is not written, {reason(error)}")
         return None
-    with replacing_folder(folder / OVER_SEEDS) as new:
-        _write_events(report, new)
     return folder / OVER_SEEDS
 
 
 def _write_events(report: Report, folder: Path) -> None:
     results = [(task, result) for task in report.tasks for result in task.results]
     # TensorBoard shows these names, so they keep their blanks.
-    names = _file_names((f"{result.group.agent} on {task.task}" for task, result in results), blank=" ")
+    labels = [(f"{result.group.agent} on {task.task}", result.group.seeds) for task, result in results]
+    names = _file_names((", ".join(filter(None, label)) for label in labels), blank=" ")
     for name, (task, result) in zip(names, results, strict=True):
         write_events(result, task, folder / name)
 
@@ -156,9 +164,9 @@ def _tables(report: Report) -> Iterator[Table]:
     for task in report.tasks:
         yield tables.task_table(task)
         yield tables.scores_table(task)
-        yield from tables.improvement_tables(task.comparisons, task.task)
+        yield from tables.improvement_tables(task.comparisons, task.task, task.groups)
     if report.overall is not None:
-        yield tables.overall_table(report.overall)
+        yield tables.overall_table(report.overall, report.study.groups)
     for tuning in report.tunings:
         yield winner_table(tuning)
         yield finalists_table(tuning)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import itertools
 import math
@@ -151,11 +150,10 @@ def _conclude(spec: StudySpec, study: optuna.Study, ranked: list[Finalist]) -> N
     words = shlex.join(_words_beside(recipe, spec.folders))
     train_it = f"{command('train')} recipe={shell_path(spec.folder)} {words}".rstrip()
     lines = [confirmed["sentence"], f"  recipe: {shell_path(recipe)}", f"  train it: {train_it}"]
-    with contextlib.suppress(InputError, OSError):  # the report says what cannot be used
-        runs = spec.folder / CONFIRM
-        if (over_seeds := write_over_seeds(runs, spec.folder)) is not None:
-            told = f"{shell_path(over_seeds)}  (of each run: {shell_path(runs)})"
-            lines.append(f"  curves over seeds: tensorboard --logdir {told}")
+    runs = spec.folder / CONFIRM
+    if (over_seeds := write_over_seeds(runs, spec.folder)) is not None:
+        told = f"{shell_path(over_seeds)}  (of each run: {shell_path(runs)})"
+        lines.append(f"  curves over seeds: tensorboard --logdir {told}")
     _print_outcome(spec, values, lines)
 
 

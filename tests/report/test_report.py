@@ -118,15 +118,18 @@ def test_reasons_are_asked_of_each_cell_before_the_second_of_any(maker: Maker, t
 
     def ask(folder: Path) -> Reason | None:
         asked.append(folder.name)
+        if folder.name == "a2":
+            raise InputError("a2/visits.npy: is another")
         return None if folder.name == "b0" else Reason(f"cause {folder.name > 'a1'}", "seed=1")
 
-    found = reasons(report.study.groups, ask, 5)
+    found, untold = reasons(report.study.groups, ask, 5)
+    assert untold == [f"{tmp_path / 'a2'}: is not diagnosed; a2/visits.npy: is another"]
     assert sorted(asked[:2]) == ["a1", "b0"]
     assert sorted(asked) == ["a1", "a2", "b0", "b1", "b2"]
     table = tables.results_table(report.tasks, found)
     assert table.columns[-1] == "why not"
-    assert [row[-1] for row in table.rows] == ["cause True (2 of 2)", "cause False (1 of 2)"]
-    assert "; 3 more were not looked into" in tables.reasons_table(report.study, found).caption
+    assert [row[-1] for row in table.rows] == ["cause False (1 of 1)", "cause False (1 of 2)"]
+    assert "; 4 more were not looked into" in tables.reasons_table(report.study, found).caption
     assert "why not" not in tables.results_table(report.tasks, {}).columns
 
 

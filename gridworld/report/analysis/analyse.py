@@ -13,7 +13,7 @@ from gridworld.report.analysis import curves, statistics
 from gridworld.report.analysis.curves import Band
 from gridworld.report.analysis.metrics import METRICS
 from gridworld.report.analysis.statistics import Interval, Share
-from gridworld.report.evidence.grouping import Group, Study
+from gridworld.report.evidence.grouping import Group, Study, shortfall
 from gridworld.report.evidence.reference import Reference, reference
 from gridworld.world.mdp import FloatArray
 
@@ -79,6 +79,16 @@ class TaskAnalysis:
         """The results, best first: by the share certified, then by steps to it, then by regret."""
         return sorted(self.results, key=_rank)
 
+    @property
+    def groups(self) -> list[Group]:
+        """The results' runs."""
+        return [result.group for result in self.results]
+
+    @property
+    def shortfall(self) -> str:
+        """See `grouping.shortfall`."""
+        return shortfall(self.groups)
+
 
 def _rank(result: Result) -> tuple[float, float, float]:
     share = result.certified.count / result.certified.total
@@ -115,9 +125,10 @@ def analyse(
 
 
 def _task(task: str, groups: list[Group], seed: int, log_steps: bool) -> TaskAnalysis:
-    world = reference(groups[0].runs[0])
+    runs = [run for group in groups for run in group.runs]
+    world = reference(next((run for run in runs if not run.damage), runs[0]))
     log_steps = log_steps or _is_one_slow(groups)
-    grid = curves.grid_for([run for group in groups for run in group.runs], log_steps)
+    grid = curves.grid_for(runs, log_steps)
     results = tuple(_result(group, world, grid, seed) for group in groups)
     comparisons = compare([{r.group.agent: r.samples for r in results}], seed)
     return TaskAnalysis(task, world, results, comparisons, log_steps)

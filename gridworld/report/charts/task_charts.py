@@ -25,6 +25,7 @@ from gridworld.report.charts.bands import draw_bands
 from gridworld.report.charts.chart import WIDTH, Bounds, Chart
 from gridworld.report.charts.style import LABEL, SMALL, Styles, house_style, text_width
 from gridworld.report.charts.sweep_charts import sweep_charts
+from gridworld.report.evidence.grouping import Group
 from gridworld.world.mdp import FloatArray
 
 _RIGHT = 18.0  # points, right of curves
@@ -64,7 +65,7 @@ def _curves(analysis: TaskAnalysis, styles: Styles, more: str) -> Iterator[Chart
             f"{task} regret",
             f"Regret on {task}",
             told("regret of the greedy policy, exact", _BOOTSTRAP) + "; 0 is optimal",
-            [(result.group.agent, result.regret) for result in results],
+            [(result.group, result.regret) for result in results],
             _Vertical("regret", _regret_bounds(results)),
             references={"optimum": 0.0, "uniformly random": world.optimal_value - world.random_value},
         )
@@ -76,10 +77,10 @@ def _curves(analysis: TaskAnalysis, styles: Styles, more: str) -> Iterator[Chart
                 "share of seeds whose greedy policy is optimal from the start",
                 "bands are Wilson's 95 % intervals",
             ),
-            [(result.group.agent, _certificates(result)) for result in results],
+            [(result.group, _certificates(result)) for result in results],
             _Vertical("seeds certified", (0.0, 1.0), style.percent),
         )
-    online = [(result.group.agent, result.online) for result in results if result.online is not None]
+    online = [(result.group, result.online) for result in results if result.online is not None]
     if any(band.point.any() for _, band in online):
         yield draw(
             f"{task} on-line return",
@@ -104,6 +105,15 @@ def _told(what: str, statistic: str, results: Sequence[Result], more: str) -> st
     if counts == [1]:
         return f"{what}; one seed, so no interval{more}"
     return f"{what}: {statistic}, {' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} seeds{more}"
+
+
+def _names(groups: Sequence[Group]) -> list[str]:
+    """What a figure calls agents, with the number of their seeds where that is not all of them."""
+    agents = style.without_shared([group.agent for group in groups])
+    return [
+        f"{agent}, {group.seeds}" if group.seeds else agent
+        for agent, group in zip(agents, groups, strict=True)
+    ]
 
 
 def _regret_bounds(results: Sequence[Result]) -> Bounds:
@@ -138,7 +148,7 @@ def _draw_curves(
     name: str,
     title: str,
     description: str,
-    bands: Sequence[tuple[str, Band]],
+    bands: Sequence[tuple[Group, Band]],
     vertical: _Vertical,
     styles: Styles,
     log_steps: bool,
@@ -150,9 +160,9 @@ def _draw_curves(
     left = 28 + max(text_width(form(tick), SMALL) for tick in chart.ticks(low, high))
     seen = {mark: level for mark, level in references.items() if low <= level <= high}
     room = WIDTH - left - _RIGHT
-    agents = style.without_shared([agent for agent, _ in bands])
-    names = [*style.wrapped_apart(agents, room - 24, SMALL), *seen]
-    lines = [styles[agent].line for agent, _ in bands]
+    groups = [group for group, _ in bands]
+    names = [*style.wrapped_apart(_names(groups), room - 24, SMALL), *seen]
+    lines = [styles[group.agent].line for group in groups]
     looks = [*lines, *({"color": style.INK, "linestyle": _REFERENCES[mark]} for mark in seen)]
     rows = chart.legend_rows(names, room)
     top = 42 + chart.legend_height(names, rows)
@@ -190,8 +200,7 @@ def _draw_strip(analysis: TaskAnalysis, key: str, styles: Styles, more: str) -> 
     results = [result for result in analysis.results if len(result.samples[key])]
     samples = np.concatenate([result.samples[key] for result in results])
     never = not np.isfinite(samples).all()
-    agents = style.without_shared([result.group.agent for result in results])
-    names = style.wrapped_apart(agents, _NAME, LABEL)
+    names = style.wrapped_apart(_names([result.group for result in results]), _NAME, LABEL)
     left = 22 + max(text_width(name, LABEL) for name in names)
     each = max(_ROW, 12 + style.LINE * max(map(style.line_count, names)))
     right = 62 if never else 20

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gridworld.run.folder import CURVE, MANIFEST
+from gridworld.run.folder import CURVE, MANIFEST, VISITS
 
 MOST_ENTRIES = 2_000_000  # files and folders below a given one: some seconds
 
@@ -78,7 +78,7 @@ class _Walk:
         while waiting and self._entries <= MOST_ENTRIES:
             folder = waiting.pop()
             names, inner = self._look_into(folder)
-            if not names.isdisjoint((MANIFEST, CURVE)):
+            if not names.isdisjoint((MANIFEST, CURVE, VISITS)):
                 yield folder
             waiting += [folder / name for name in sorted(inner, reverse=True)]
         if self._entries > MOST_ENTRIES:

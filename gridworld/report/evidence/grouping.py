@@ -7,14 +7,14 @@ differ in anything that touches learning are reported apart, under labels that s
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gridworld.config.effects import Effect
 from gridworld.config.settings_by_effect import effect_of, is_of_network
-from gridworld.report.evidence.run_reader import Evidence, Settings
+from gridworld.report.evidence.run_reader import Evidence, Settings, Unusable
 from gridworld.storage.safe_read import sha256
 
 _OF_LEARNING = (Effect.LEARNING, Effect.LENGTH, Effect.EVALUATION)
@@ -24,6 +24,7 @@ _OF_TABLES = ("layout", "max_episode_steps", "evaluation.gamma")
 _NULL = "null"
 _EMPTY = "{}"  # a mapping; in what its entries are, it is told by these
 _UNSET = "(not set)"
+_MOST_NAMED = 3  # folders
 _LONGEST_VALUE = 24  # characters in a label
 
 Key = tuple[tuple[str, str], ...]
@@ -36,6 +37,20 @@ class Group:
     agent: str  # label
     task: str  # label
     runs: tuple[Evidence, ...]
+    lost: tuple[Unusable, ...] = ()  # of other seeds
+    perhaps: tuple[Unusable, ...] = ()  # the same, but they may be of another group
+
+    @property
+    def seeds(self) -> str:
+        """How many of its seeds are counted, "4 of 5 seeds"; "" for all of them."""
+        runs = len(self.runs)
+        least, most = runs + len(self.lost), runs + len(self.lost) + len(self.perhaps)
+        return f"{runs} of {least if most == least else f'{least} to {most}'} seeds" if most > runs else ""
+
+    @property
+    def shortfall(self) -> str:
+        """The same, and which ones are not."""
+        return f"{self.seeds}; {listed([*self.lost, *self.perhaps])}" if self.seeds else ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +68,12 @@ class Study:
         return [group for group in self.groups if group.task == task]
 
 
-def arrange(runs: Iterable[Evidence]) -> Study:
+def arrange(runs: Iterable[Evidence], unusable: Sequence[Unusable] = ()) -> Study:
     """Sort runs into groups, name the groups, and keep one run per seed.
 
     Args:
         runs: all that are usable.
+        unusable: the others. Each is put to the group that it would be in, as far as that can be told.
 
     Returns:
         The groups, by task and agent. Its notes and warnings name runs with the same settings and seed.
@@ -80,12 +96,65 @@ def arrange(runs: Iterable[Evidence]) -> Study:
             groups.append(Group(agent, task, _one_per_seed(group, notes, warnings)))
     groups.sort(key=lambda group: (group.task, group.agent))
     return Study(
-        tuple(groups),
+        tuple(_with_lost(groups, unusable, warnings)),
         tuple(sorted({group.agent for group in groups})),
         tuple(sorted({group.task for group in groups})),
         tuple(notes),
         tuple(warnings),
     )
+
+
+def shortfall(groups: Iterable[Group]) -> str:
+    """What numbers of these groups leave out, to go on a caption with; "" where that is nothing."""
+    short = [group for group in groups if group.seeds]
+    told = [f"{each.agent} on {each.task} has {each.shortfall}" for each in short[:_MOST_NAMED]]
+    told += [f"{len(short) - _MOST_NAMED} more are not complete"] if len(short) > _MOST_NAMED else []
+    return f"; not all runs are counted: {'; '.join(told)}" if told else ""
+
+
+def listed(lost: Sequence[Unusable]) -> str:
+    """How many runs are in which state, and their folders' names."""
+    states: dict[str, list[str]] = defaultdict(list)
+    for run in lost:
+        states[run.state].append(run.folder.name)
+    return "; ".join(f"{len(names)} {state}: {_named(names)}" for state, names in states.items())
+
+
+def _named(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    return ", ".join(names[:_MOST_NAMED]) + more
+
+
+def _with_lost(groups: list[Group], unusable: Sequence[Unusable], warnings: list[str]) -> Iterator[Group]:
+    """The groups with the unusable runs of seeds that they lack; a warning for those that are of none."""
+    like: dict[object, list[Group]] = defaultdict(list)
+    for group in groups if unusable else ():
+        for key in {each for run in group.runs for each in (_but_for_seed(run), (run.agent, run.env))}:
+            like[key].append(group)
+    lost: dict[tuple[Group, bool], dict[object, Unusable]] = defaultdict(dict)  # by seed
+    alone: dict[str, list[Unusable]] = defaultdict(list)
+    for run in unusable:
+        found = like[_but_for_seed(run)]
+        if not found and run.settings is not None:
+            alone[f"{run.agent} on {run.env}"].append(run)
+            continue
+        for group in found or groups:
+            if all(run.seed != other.seed for other in group.runs):
+                lost[group, len(found) == 1][run.folder if run.seed is None else run.seed] = run
+    warnings += [f"no run of {of} with these settings is counted; {listed(alone[of])}" for of in alone]
+    for group in groups:
+        surely, perhaps = (tuple(lost[group, is_sure].values()) for is_sure in (True, False))
+        yield replace(group, lost=surely, perhaps=perhaps)
+
+
+def _but_for_seed(run: Evidence | Unusable) -> object:
+    """What is the same in runs that differ in the seed alone; of one without settings, less."""
+    if run.settings is None:
+        return run.agent, run.env
+    kinds = (*_OF_LEARNING, Effect.TASK)
+    settings = {(name, value) for name, value in run.settings.items() if effect_of(name) in kinds}
+    kept = frozenset((name, value) for name, value in settings if name not in _MAP and value != _EMPTY)
+    return run.agent, run.layout, kept
 
 
 def task_key(run: Evidence) -> Key:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from gridworld.errors import InputError
 from gridworld.report.evidence.grouping import Group
 from gridworld.report.evidence.run_reader import Evidence
 
@@ -28,17 +29,28 @@ class Reason:
 Reasons = Mapping[Path, Reason]  # by the run's folder
 
 
-def reasons(groups: Iterable[Group], ask: Callable[[Path], Reason | None], most: int) -> Reasons:
+def reasons(
+    groups: Iterable[Group], ask: Callable[[Path], Reason | None], most: int
+) -> tuple[Reasons, list[str]]:
     """Ask why runs are not certified.
 
     Args:
         groups: their runs, of which the first seed of each comes before the second of any.
-        ask: tells the reason of the run in a folder; None: it cannot.
+        ask: tells the reason of the run in a folder; None: it cannot. Raises `InputError` where a file of
+            the run keeps it from that.
         most: how many to ask about.
+
+    Returns:
+        The reasons, and a sentence for each run that cannot be asked about.
     """
-    asked = itertools.islice(_in_turn([_uncertified(group) for group in groups]), most)
-    found = {run.folder: ask(run.folder) for run in asked}
-    return {folder: reason for folder, reason in found.items() if reason is not None}
+    found, untold = {}, []
+    for run in itertools.islice(_in_turn([_uncertified(group) for group in groups]), most):
+        try:
+            if (reason := ask(run.folder)) is not None:
+                found[run.folder] = reason
+        except InputError as error:
+            untold.append(f"{run.folder}: is not diagnosed; {error}")
+    return found, untold
 
 
 def _uncertified(group: Group) -> list[Evidence]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Iterator, Mapping
@@ -16,10 +17,13 @@ from gridworld.config.settings_by_effect import is_newer
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import printable
 from gridworld.report.evidence.curve_reader import read_curve
+from gridworld.run.damage import damage
 from gridworld.run.folder import CURVE, SUMMARY
 from gridworld.run.reader import RunReader, read_run
+from gridworld.storage.safe_read import read_object
 from gridworld.world.mdp import FloatArray
 
+DAMAGED = "damaged"
 _LONGEST_NAME = 80  # characters
 _DIGITS = 9  # after the point: two ways to compute one regret differ later than that
 
@@ -46,6 +50,7 @@ class Evidence:
         curve: Columns (evaluations,): those of `curve_reader.REQUIRED`, and optional ones that the file has.
         pictures: As `RunReader.pictures`.
         step_limit: Of an episode, as the summary has it.
+        damage: A sentence for each of its other files that is not the one that it wrote.
     """
 
     folder: Path
@@ -63,6 +68,7 @@ class Evidence:
     curve: Mapping[str, FloatArray]
     pictures: Mapping[str, str | None]
     step_limit: Any = None
+    damage: tuple[str, ...] = ()
 
     @property
     def steps(self) -> int:
@@ -88,28 +94,69 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Unusable:
-    """A run that is in no statistic, and why."""
+    """A run that is in no statistic, and why.
+
+    Attributes:
+        folder: The run's folder.
+        reasons: A sentence each, which begins with the folder.
+        state: `DAMAGED`, or how the run stands that is not finished.
+        agent: As in `Evidence`; these and those below are None where no file says so.
+        env: The map's name.
+        seed: The seed.
+        settings: As in `Evidence`.
+        layout: As in `Evidence`.
+    """
 
     folder: Path
-    reason: str  # begins with the folder
-    agent: str | None = None  # where the manifest says
+    reasons: tuple[str, ...]
+    state: str = DAMAGED
+    agent: str | None = None
     env: str | None = None
+    seed: int | None = None
+    settings: Settings | None = None
+    layout: str | None = None
 
 
 def read(folder: Path) -> Evidence | Unusable:
-    """Read the run in `folder`.
+    """Read the run in `folder`, every file that its manifest vouches for.
 
     Returns:
-        What the statistics need of it, or the reason why it cannot be used; nothing is raised.
+        What the statistics need of it, or the reasons why it cannot be used; nothing is raised.
     """
-    agent = env = None
     try:
         run = read_run(folder)
-        agent, env = _peek(run.manifest, "agent", "name"), _peek(run.manifest, "env", "layout")
-        _check_ended(run)
-        return _evidence(run)
     except InputError as error:
-        return Unusable(folder, str(error), agent, env)
+        return _without_manifest(folder, str(error))
+    config = run.manifest["config"]
+    unusable = Unusable(
+        folder,
+        (),
+        agent=_name_in(config.get("agent"), "name"),
+        env=_name_in(config.get("env"), "layout"),
+        seed=_whole_in(config, "seed"),
+        settings=dict(_settings(config)),
+        layout="\n".join(run.manifest["layout"]),
+    )
+    if not run.is_finished:
+        state = _printable(run.manifest["status"])
+        return dataclasses.replace(unusable, reasons=(_unfinished(run),), state=state)
+    damaged = damage(run)
+    try:
+        if not damaged.keys() & {CURVE, SUMMARY}:
+            return dataclasses.replace(_evidence(run), damage=tuple(damaged.values()))
+    except InputError as error:
+        damaged = {"": str(error)} | damaged
+    return dataclasses.replace(unusable, reasons=tuple(damaged.values()))
+
+
+def _without_manifest(folder: Path, reason: str) -> Unusable:
+    """A run whose manifest cannot be read; what it is of, its summary may still say, though unverified."""
+    try:
+        told = read_object(folder / SUMMARY)
+    except InputError:
+        told = {}
+    agent, env = _name_in(told, "agent"), _name_in(told, "env")
+    return Unusable(folder, (reason,), agent=agent, env=env, seed=_whole_in(told, "seed"))
 
 
 def _evidence(run: RunReader) -> Evidence:
@@ -143,16 +190,12 @@ def _evidence(run: RunReader) -> Evidence:
     return evidence
 
 
-def _check_ended(run: RunReader) -> None:
-    if run.is_finished:
-        return
+def _unfinished(run: RunReader) -> str:
     status, told = run.manifest["status"], run.manifest.get("error")
     why = f": {' '.join(told.split())[:300]}" if told else ""
     if status == "running":
         why = ": it is still going on, or was killed"
-    raise InputError(
-        f"{run.folder}: this run is {status[:_LONGEST_NAME]!r}, not finished{why}{_reached(run)}"
-    )
+    return f"{run.folder}: this run is {status[:_LONGEST_NAME]!r}, not finished{why}{_reached(run)}"
 
 
 def _reached(run: RunReader) -> str:
@@ -210,7 +253,11 @@ def _number(content: Any, key: str, where: str) -> float:
     return float(value)
 
 
-def _peek(manifest: dict[str, Any], section: str, key: str) -> str | None:
-    inner = manifest["config"].get(section)
-    value = inner.get(key) if isinstance(inner, dict) else None
+def _name_in(content: Any, key: str) -> str | None:
+    value = content.get(key) if isinstance(content, dict) else None
     return _printable(value) if isinstance(value, str) else None
+
+
+def _whole_in(content: dict[str, Any], key: str) -> int | None:
+    value = content.get(key)
+    return value if type(value) is int else None
