@@ -24,6 +24,7 @@ from gridworld.sweep.job_table import DONE, JobRow
 
 _HEADINGS = ("agent", "task", "settings", "certified", "steps to certificate, median")
 _OF_SETTINGS = ON_RESULT - {Effect.SEED, Effect.LABELS, Effect.MACHINE}
+_MOST_NAMED = 3  # jobs
 _LONGEST = 60  # characters of settings
 
 Settings = tuple[tuple[str, str], ...]  # dotted names, values as text
@@ -34,12 +35,15 @@ def results_lines(folder: Path, rows: Sequence[JobRow]) -> list[str]:
 
     Args:
         folder: the sweep's.
-        rows: of its jobs; those that are not done are left out.
+        rows: of its jobs; those that are not done or were changed since are left out, which the headings say.
     """
     groups: dict[tuple[str, str], dict[Settings, list[_Result]]] = defaultdict(lambda: defaultdict(list))
+    lost = []
     for row in rows:
         found = _result(folder / row.job) if row.status == DONE else None
-        if found is not None:
+        if found is None:
+            lost.append(row.job)
+        else:
             groups[found.summary["agent"], found.summary["env"]][found.settings].append(found)
     cells = []
     for (agent, task), alike in groups.items():
@@ -52,7 +56,11 @@ def results_lines(folder: Path, rows: Sequence[JobRow]) -> list[str]:
     keep = [0, 1, *([2] if any(row[2] for row in cells) else []), 3, 4]
     table = [[row[column] for column in keep] for row in [list(_HEADINGS), *cells]]
     forms = ["<0" if column < 3 else ">0" for column in keep]
-    return aligned([[f"{cell} " for cell in row] for row in table], forms)  # two blanks between columns
+    lines = aligned([[f"{cell} " for cell in row] for row in table], forms)  # two blanks between columns
+    if lost:
+        named = f"{', '.join(lost[:_MOST_NAMED])}{', ...' if len(lost) > _MOST_NAMED else ''}"
+        lines[0] += f"; {len(lost)} of {len(rows)} jobs are not counted: {named}"
+    return lines
 
 
 @dataclass(frozen=True)
@@ -72,7 +80,7 @@ def _result(folder: Path) -> _Result | None:
         asked = [word for word in run.manifest["overrides"] if effect_of(_key(word)) in _OF_SETTINGS]
         words = tuple(_resolved(word, dict(settings)) for word in asked)
         return _Result(run.read_summary(), settings, words)
-    except InputError:  # it was changed since; the report says so
+    except InputError:  # it was changed since; `report` says in what
         return None
 
 

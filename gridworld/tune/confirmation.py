@@ -20,14 +20,15 @@ import numpy as np
 
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import printable
+from gridworld.process.console.terminal import printable, tell
 from gridworld.process.parallel.together import LARGEST
 from gridworld.report.analysis import statistics
 from gridworld.report.table import number, steps_up_to
+from gridworld.run.damage import damage
 from gridworld.run.recovery import find_run
 from gridworld.storage.symlinks import check_no_links, make_inside, names_inside, remove_inside
 from gridworld.sweep.job import JobError, run_in_sweep
-from gridworld.sweep.job_table import run_status
+from gridworld.sweep.job_table import FAILED, JobTable, run_status
 from gridworld.sweep.plan import plan, shape
 from gridworld.tune.search.worker import become_worker, is_stopped, run_all
 from gridworld.tune.search.worker_pool import share
@@ -75,7 +76,7 @@ def held_out_runs(folder: Path, name: str, config: TrainConfig, seeds: Sequence[
 
 
 def prepare(folder: Path, runs: Sequence[HeldOutRun]) -> None:
-    """Make the runs' folder and remove the runs of an earlier winner, in the study's `folder`.
+    """Make the runs' folder, in the study's `folder`, and remove damaged runs and those of an earlier winner.
 
     Raises:
         InputError: a symbolic link is in the way.
@@ -87,6 +88,19 @@ def prepare(folder: Path, runs: Sequence[HeldOutRun]) -> None:
     for name in names_inside(folder, CONFIRM):
         if fnmatchcase(name, "*,seed=*") and name not in names:
             remove_inside(folder, CONFIRM, name)
+    for run in runs:
+        if damaged := _damage(run.folder):
+            tell(f"{'; '.join(damaged)}; it is run again")
+            remove_inside(folder, CONFIRM, run.folder.name)
+
+
+def _damage(folder: Path) -> list[str]:
+    """A sentence for each file of a run that is not the one that it wrote."""
+    try:
+        run = find_run(folder)
+    except InputError as error:
+        return [str(error)]
+    return [] if run is None or not run.is_finished else list(damage(run).values())
 
 
 def run_held_out(all_runs: HeldOutRuns, worker: int, parent: int) -> None:
@@ -127,6 +141,8 @@ class HeldOutResults:
     certified: statistics.Share
     steps: FloatArray  # (seeds,), environment steps until the certificate that held; infinite without one
     total: int  # environment steps of a run
+    failed: tuple[str, ...] = ()  # runs that ended by an error: they count as not certified
+    left_out: tuple[str, ...] = ()  # runs that have no result; in none of the numbers
 
     def text(self) -> str:
         """The share certified, and the median step, with their intervals, in a few words."""
@@ -135,18 +151,38 @@ class HeldOutResults:
         median = statistics.interval(statistics.median, [self.steps], 0)
         form = steps_up_to(self.total)
         bounds = f"[{form(median.low)}, {form(median.high)}]"
-        return f"{text}, for good by step {form(median.point)} {bounds} in the median"
+        text += f", for good by step {form(median.point)} {bounds} in the median"
+        told = [f"{len(self.failed)} failed and count as not certified: {', '.join(self.failed)}"]
+        left_out = (
+            f"{len(self.left_out)} of {len(self.steps) + len(self.left_out)} left out, without a result"
+        )
+        told.append(f"{left_out}: {', '.join(self.left_out)}")
+        told = [each for each, names in zip(told, (self.failed, self.left_out), strict=True) if names]
+        return f"{text} ({'; '.join(told)})" if told else text
 
 
 def read_results(runs: Sequence[HeldOutRun]) -> HeldOutResults:
     """Read what runs of one configuration came to; one that failed was not certified.
 
     Raises:
-        InputError: a run's files were changed.
+        InputError: none has a result.
     """
-    steps = np.array([_steps(run.folder) for run in runs])
+    steps, failed, left_out = [], [], []
+    for run in runs:
+        try:
+            found = _steps(run.folder)
+        except InputError as error:
+            tell(f"{run.folder}: is left out; {error}")
+            left_out.append(run.folder.name)
+            continue
+        steps.append(math.inf if found is None else found)
+        failed += [run.folder.name] if found is None else []
+    if not steps:
+        raise InputError(f"{runs[0].folder.parent}: no held-out run has a result; try the same line again")
     certified = int(np.isfinite(steps).sum())
-    return HeldOutResults(statistics.share(certified, len(steps)), steps, runs[0].config.total_timesteps)
+    share_of = statistics.share(certified, len(steps))
+    total = runs[0].config.total_timesteps
+    return HeldOutResults(share_of, np.array(steps), total, tuple(failed), tuple(left_out))
 
 
 def verdict_on(winner: HeldOutResults, began_from: HeldOutResults, name: str) -> dict[str, Any]:
@@ -166,8 +202,9 @@ def verdict_on(winner: HeldOutResults, began_from: HeldOutResults, name: str) ->
     more = statistics.difference(winner.certified, began_from.certified)
     sooner = statistics.improvement([(-winner.steps, -began_from.steps)], 0)
     verdict = ("does not beat", "cannot be told apart from", "beats")[1 + _sign(more, sooner)]
+    asked = len(winner.steps) + len(winner.left_out)
     sentence = (
-        f"On {len(winner.steps)} held-out seeds {name} {verdict} the settings that the search began from: "
+        f"On {asked} held-out seeds {name} {verdict} the settings that the search began from: "
         f"{winner.text()}, against {began_from.text()}; a run of it is certified sooner with probability "
         f"{number(sooner.point)} [{number(sooner.low)}, {number(sooner.high)}]."
     )
@@ -202,14 +239,28 @@ def _plain(results: HeldOutResults) -> dict[str, Any]:
     return {
         "certified": dataclasses.asdict(results.certified),
         "steps": [int(step) if math.isfinite(step) else None for step in results.steps],
+        "failed": results.failed,
+        "left_out": results.left_out,
     }
 
 
-def _steps(folder: Path) -> float:
+def _steps(folder: Path) -> float | None:
+    """The steps until the certificate that held, infinite without one; None for a run that failed.
+
+    Raises:
+        InputError: the run has no result: it did not come to its end, or was damaged since.
+    """
+    if told := _damage(folder):
+        raise InputError("; ".join(told))
     run = find_run(folder)
-    if run is None or not run.is_finished:
-        return math.inf
-    since = run.read_summary().get("certified_since_step")
-    if since is not None and (type(since) is not int or since < 0):
-        raise InputError(f"{run.summary_file}: certified_since_step must be a number of steps, or null")
-    return math.inf if since is None else float(since)
+    row = JobTable(folder.parent).row(folder.name)
+    if run is None or run.manifest["status"] == "failed":
+        if run is not None or (row is not None and row.status == FAILED):
+            return None
+    elif run.is_finished:
+        since = run.read_summary().get("certified_since_step")
+        if since is not None and (type(since) is not int or since < 0):
+            raise InputError(f"{run.summary_file}: certified_since_step must be a number of steps, or null")
+        return math.inf if since is None else float(since)
+    why = (row.error if row is not None else "") or (run.manifest.get("error", "") if run is not None else "")
+    raise InputError("it did not come to its end" + (f" ({why})" if why else ""))

@@ -10,11 +10,14 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import sys
+import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from gridworld.errors import InputError, reason
+from gridworld.process.console.terminal import tell
 from gridworld.process.parallel.together import LARGEST
 from gridworld.tune.search.objective import SEEDS, Objective, SeedScore, Stopped, learn, read_score, score
 from gridworld.tune.search.worker import StudyContext, become_worker, is_stopped, run_all, study_of
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
     from optuna import Study
     from optuna.trial import FrozenTrial
 
+_FAILED = sys.float_info.max  # the regret of a run that did
 FINAL = "final "  # what the names of these attributes begin with
 
 
@@ -44,6 +48,7 @@ class Finalist:
     score: float
     certified: int
     seeds: int
+    failed: int  # of these, runs that ended by an error, and count as not certified
 
 
 def choose_finalists(study: Study, count: int, began_from: Mapping[str, Any] | None) -> list[FrozenTrial]:
@@ -92,8 +97,11 @@ def _run_missing(runs: FinalRuns, study: Study, worker: int) -> None:
 def _run(objective: Objective, study: Study, number: int, values: Mapping[str, Any], seed: int) -> None:
     try:
         result = learn(objective.config(values), seed, is_stopped)
-    except Exception:  # the run failed, though its trial did not
-        result = SeedScore(seed, None, sys.float_info.max)
+    except Exception as error:  # the run failed, though its trial did not
+        tell(f"trial {number} on the final seed {seed} failed, and counts as not certified: {reason(error)}")
+        if not isinstance(error, InputError | ArithmeticError):
+            traceback.print_exc()
+        result = SeedScore(seed, None, _FAILED)
     study.set_user_attr(_name(number, seed), dataclasses.asdict(result))
 
 
@@ -116,7 +124,8 @@ def ranking(study: Study, trials: Sequence[FrozenTrial], seeds: Sequence[int], t
         results += [read_score(attributes[_name(trial.number, seed)]) for seed in seeds]
         certified = sum(result.certified_since is not None for result in results)
         value = score(results, total, len(results))
-        found.append(Finalist(trial.number, value, certified, len(results)))
+        failed = sum(result.regret == _FAILED for result in results)
+        found.append(Finalist(trial.number, value, certified, len(results), failed))
     return sorted(found, key=lambda finalist: (finalist.score, finalist.trial))
 
 

@@ -128,7 +128,7 @@ def test_reasons_are_asked_of_each_cell_before_the_second_of_any(maker: Maker, t
     assert sorted(asked) == ["a1", "a2", "b0", "b1", "b2"]
     table = tables.results_table(report.tasks, found)
     assert table.columns[-1] == "why not"
-    assert [row[-1] for row in table.rows] == ["cause False (1 of 1)", "cause False (1 of 2)"]
+    assert [row[-1] for row in table.rows] == ["cause True (2 of 2)", "cause False (1 of 1)"]
     assert "; 4 more were not looked into" in tables.reasons_table(report.study, found).caption
     assert "why not" not in tables.results_table(report.tasks, {}).columns
 

@@ -86,6 +86,22 @@ def test_the_same_line_goes_on_with_the_study(studied: Path) -> None:
     assert rows(studied)[:6] == before
 
 
+def test_damaged_runs_of_the_confirmation_are_run_again(studied: Path, tmp_path: Path) -> None:
+    shutil.copytree(studied / "study", tmp_path / "study")
+    runs = sorted((tmp_path / "study" / "confirm").glob("*,seed=*"))
+    harmed = [runs[0] / "manifest.json", runs[1] / "visits.npy", runs[2] / "summary.json"]
+    for file in harmed:
+        os.truncate(file, 5)
+    again = script("tune.py", *QUICK, "tune.trials=6", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    for file in harmed:
+        (told,) = [line for line in again.stderr.splitlines() if f"{file.parent.name}/{file.name}: " in line]
+        assert told.endswith("; it is run again" if file != harmed[0] else ".state")  # a checkpoint's copy
+    confirmed = json.loads((tmp_path / "study" / "study.json").read_text())["confirmation"]
+    assert "left out" not in confirmed["sentence"]
+    report_command.main([str(tmp_path / "study"), "--formats"])
+
+
 def test_the_report_shows_the_study(studied: Path, tmp_path: Path) -> None:
     report_command.main([str(studied / "study"), "--out", str(tmp_path / "out")])
     page = (tmp_path / "out" / "report.html").read_text()

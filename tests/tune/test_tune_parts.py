@@ -3,24 +3,31 @@
 import contextlib
 import dataclasses
 import itertools
+import json
 import math
 import os
 import shutil
 import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import optuna
 import pytest
+from helpers.hostile import seal
+from helpers.runs_folder import Maker
 from helpers.support import CONF, configure
 from hypothesis import given
 from hypothesis import strategies as st
+from optuna.trial import create_trial
 
 from gridworld.config.tune import DimensionConfig, TuneConfig
 from gridworld.errors import InputError
 from gridworld.report.analysis import statistics
+from gridworld.storage.sealed_json import sealed
 from gridworld.training.setup import check_settings
-from gridworld.tune.confirmation import HeldOutResults, held_out_runs, verdict_on
+from gridworld.tune import finalists
+from gridworld.tune.confirmation import HeldOutResults, held_out_runs, read_results, verdict_on
 from gridworld.tune.existing_study import check_study, legible
 from gridworld.tune.search import storage, worker
 from gridworld.tune.search.objective import Objective, SeedScore, Stopped, score
@@ -377,6 +384,56 @@ def test_the_verdict(winner: Sequence[float], began_from: Sequence[float], verdi
     found = verdict_on(results(*winner), results(*began_from), "the winner")
     assert found["verdict"] == verdict
     assert f"held-out seeds the winner {verdict} the settings" in found["sentence"]
+
+
+def test_the_verdict_says_which_runs_it_is_without(tmp_path: Path) -> None:
+    config = configure("agent=q_learning")
+    before, winner = (held_out_runs(tmp_path, name, config, range(6)) for name in ("default", "trial=3"))
+    maker = Maker("agent=q_learning")
+    for run in [*before, *winner]:
+        maker.write(run.folder, run.config.seed, 3000)
+        content = json.loads((run.folder / "summary.json").read_text()) | {"certified_since_step": 3000}
+        (run.folder / "summary.json").write_text(json.dumps(content))
+        seal(run.folder, "summary.json")
+    whole = read_results(winner)
+    assert (whole.certified.count, whole.certified.total) == (6, 6)
+    assert "left out" not in whole.text()
+    os.truncate(winner[0].folder / "summary.json", 3)
+    os.truncate(winner[1].folder / "manifest.json", 3)
+    (winner[2].folder / "curve.csv").unlink()
+    shutil.rmtree(winner[3].folder)
+    manifest = before[0].folder / "manifest.json"
+    failed = json.loads(manifest.read_text()) | {"status": "failed", "error": "diverged"}
+    manifest.write_text(json.dumps(sealed(failed)))
+    found = verdict_on(read_results(winner), read_results(before), "the winner")
+    names = ", ".join(run.folder.name for run in winner[:4])
+    assert found["sentence"].startswith("On 6 held-out seeds the winner ")
+    assert "certified on 2 of 2 [34 %, 100 %], for good by step 3,000" in found["sentence"]
+    assert f"(4 of 6 left out, without a result: {names})" in found["sentence"]
+    assert f"(1 failed and count as not certified: {before[0].folder.name})" in found["sentence"]
+    assert found["winner"]["left_out"] == tuple(run.folder.name for run in winner[:4])
+    for run in winner:
+        shutil.rmtree(run.folder, ignore_errors=True)
+    with pytest.raises(InputError, match="no held-out run has a result"):
+        read_results(winner)
+
+
+def test_a_final_run_that_fails_is_told_and_counted_as_failed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def diverge(*arguments: object) -> None:
+        raise InputError("training diverged")
+
+    monkeypatch.setattr(finalists, "learn", diverge)
+    study = optuna.create_study()
+    score = dataclasses.asdict(SeedScore(0, 100, 0.0))
+    study.add_trial(create_trial(value=0.1, user_attrs={"seeds": [score]}))
+    objective = SimpleNamespace(config=lambda values: None)
+    finalists._run(objective, study, 0, {}, 7)  # type: ignore[arg-type]
+    told = "trial 0 on the final seed 7 failed, and counts as not certified: training diverged\n"
+    assert capsys.readouterr().err == told
+    (finalist,) = finalists.ranking(study, study.trials, [7], TOTAL)
+    assert (finalist.certified, finalist.seeds, finalist.failed) == (1, 2, 1)
 
 
 SQL = {

@@ -109,7 +109,7 @@ def _read(folder: Path) -> TuningStudy:
             began_from=dict(content["began_from"] or {}),
             space=space,
             finalists=[
-                [str(int(each["trial"])), float(each["score"]), f"{each['certified']} / {each['seeds']}"]
+                [str(int(each["trial"])), float(each["score"]), _certified(each)]
                 for each in content["finalists"]
             ],
             importances={str(key): float(share) for key, share in content["importances"].items()},
@@ -128,6 +128,11 @@ def _trials(file: Path, study: Mapping[str, Any]) -> str:
             "search has gone on and not come to its end"
         )
     return as_table(content, file)
+
+
+def _certified(finalist: Mapping[str, Any]) -> str:
+    failed = int(finalist.get("failed", 0))  # an older study does not say
+    return f"{finalist['certified']} / {finalist['seeds']}" + (f", {failed} failed" if failed else "")
 
 
 def _text(value: Any) -> str:

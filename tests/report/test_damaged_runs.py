@@ -1,0 +1,212 @@
+"""Damaged files of runs: each is named, and what is computed from fewer seeds says so."""
+
+import os
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from helpers.support import SHORT, train_in
+
+from gridworld.commands import report as command
+from gridworld.errors import InputError
+from gridworld.report.build import gather
+from gridworld.report.evidence.run_reader import Evidence, Unusable, read
+from gridworld.report.writer import write_over_seeds
+from gridworld.run.folder import RESULTS, WORLD
+from gridworld.run.reader import read_run
+from gridworld.sweep.job_table import DONE, JobRow
+from gridworld.sweep.results import results_lines
+
+AGENTS = {"sarsa": SHORT["sarsa"], "dqn": SHORT["dqn"]}
+SEEDS = range(3)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two agents on a world of tables, three seeds each, with event files."""
+    folder = tmp_path_factory.mktemp("damaged")
+    for agent, words in AGENTS.items():
+        for seed in SEEDS:
+            own = ("env=river_swim", "logging.tensorboard=true", "recording.gif=false", f"seed={seed}")
+            train_in(folder / f"{agent}{seed}", *words, *own, "total_timesteps=600")
+    return folder
+
+
+@pytest.fixture
+def runs(trained: Path, tmp_path: Path) -> Path:
+    shutil.copytree(trained, tmp_path / "runs")
+    return tmp_path / "runs"
+
+
+def flip(file: Path) -> None:
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+
+
+def replaced(put: Callable[[Path], object]) -> Callable[[Path], None]:
+    def harm(file: Path) -> None:
+        file.unlink()
+        put(file)
+
+    return harm
+
+
+ANOTHER = "is not the file that the run wrote, its checksum is not the one in manifest.json"
+DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "cut off": (lambda file: os.truncate(file, file.stat().st_size // 2), ANOTHER),
+    "a bit": (flip, ANOTHER),
+    "empty": (lambda file: os.truncate(file, 0), ANOTHER),
+    "gone": (lambda file: file.unlink(), "has no "),
+    "a folder": (replaced(lambda file: file.mkdir()), "is no ordinary file"),
+    "a link": (replaced(lambda file: file.symlink_to("/etc/hostname")), "is a symbolic link"),
+    "a pipe": (replaced(os.mkfifo), "is no ordinary file"),
+    "huge": (lambda file: os.truncate(file, 2**40), "is larger than "),
+}
+OF_TABLES = {"cut off": "world", "a bit": "", "empty": "world"}  # world.npz has a checksum of what it holds
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_each_damaged_file_is_named(damage: str, agent: str, runs: Path) -> None:
+    harm, words = DAMAGES[damage]
+    run = runs / f"{agent}1"
+    listed = [name for name in read_run(run).manifest["sha256"] if not name.endswith(".gif")]
+    assert set(RESULTS) <= set(listed)
+    names = [*listed, WORLD]
+    for name in names:
+        shutil.copy2(run / name, runs / "kept")
+        harm(run / name)
+        found = read(run)
+        told = found.damage if isinstance(found, Evidence) else found.reasons
+        assert len(told) == 1, name
+        said = OF_TABLES.get(damage, words) if name == WORLD else words
+        assert said in told[0], name
+        assert str(run) in told[0], name
+        assert name in told[0], name
+        assert isinstance(found, Unusable) == (name in ("curve.csv", "summary.json")), name
+        shutil.rmtree(run / name) if damage == "a folder" else (run / name).unlink(missing_ok=True)
+        (runs / "kept").rename(run / name)
+    for name in names:
+        harm(run / name)
+    found = read(run)
+    assert isinstance(found, Unusable)
+    assert len(found.reasons) == len(names)
+
+
+def report_of(runs: Path, *options: str) -> str:
+    with pytest.raises(SystemExit) as end:
+        command.main([str(runs), "--out", str(runs.parent / "out"), *options])
+    assert end.value.code == 1
+    return (runs.parent / "out" / "report.html").read_text()
+
+
+def test_what_leaves_the_numbers_whole_is_named_and_the_run_counted(
+    runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    damaged = [runs / "sarsa0" / "visits.npy", runs / "dqn0" / "model.zip", runs / "dqn0" / WORLD]
+    for file in damaged:
+        flip(file)
+    page = report_of(runs, "--formats", "--diagnose", "9")
+    told = capsys.readouterr().err
+    for file in damaged:
+        assert f"warning: {file}" in told
+        assert f"<li>{file}" in page
+    assert f"note: {runs / 'sarsa0'}: is not diagnosed; {damaged[0]}: is not the file" in told
+    assert "cannot be built again" not in page  # another run has the same world
+    assert "not all runs are counted" not in page
+    assert {row.split(",")[2] for row in table(runs, "runs")[1:]} == {"0", "1", "2"}
+
+
+def table(runs: Path, name: str) -> list[str]:
+    return (runs.parent / "out" / "tables" / f"{name}.csv").read_text().splitlines()
+
+
+@pytest.mark.parametrize(
+    ("files", "counted"),
+    [
+        (["dqn1/curve.csv"], "2 of 3 seeds; 1 damaged: dqn1"),
+        (["dqn1/summary.json", "dqn2/curve.csv"], "1 of 3 seeds; 2 damaged: dqn1, dqn2"),
+        (["dqn1/manifest.json"], "2 of 3 seeds; 1 damaged: dqn1"),
+        (["dqn1/manifest.json", "dqn1/summary.json"], "3 of 3 to 4 seeds; 1 damaged: dqn1"),
+    ],
+)
+def test_fewer_seeds_are_said_where_the_numbers_are(files: list[str], counted: str, runs: Path) -> None:
+    for file in files:
+        os.truncate(runs / file, 9)
+    page = report_of(runs, "--formats", "svg")
+    results = table(runs, "results")
+    (dqn,) = [row for row in results if ",dqn," in row]
+    (sarsa,) = [row for row in results if ",sarsa," in row]
+    is_known = len({file.split("/")[0] for file in files}) == len(files)
+    assert counted in (dqn if is_known else sarsa)
+    assert sarsa.endswith(",all") == is_known
+    note = f"dqn on RiverSwim 6 has {counted}" if is_known else f"sarsa on RiverSwim 6 has {counted}"
+    assert note in page[: page.index("</ul>")]  # the answer
+    captions = re.findall(r'<figcaption>([^<]*)<|<p class="caption">([^<]*)<', page)
+    of_numbers = [a or b for a, b in captions if "seed 0," not in a and not (a or b).startswith(NO_NUMBERS)]
+    assert of_numbers
+    assert [text for text in of_numbers if note not in text] == []
+    figures = list((runs.parent / "out" / "figures").glob("*.svg"))
+    assert figures
+    assert all(note in file.read_text() for file in figures)
+    over_seeds = [path.name for path in (runs.parent / "out" / "tensorboard").iterdir()]
+    assert f"dqn on RiverSwim 6, {counted.partition(';')[0]}" in over_seeds or not is_known
+
+
+NO_NUMBERS = ("Runs that", "Every run", "Why runs", "Settings in", "Dqn,", "Sarsa,", "dqn,", "sarsa,")
+
+
+def test_an_agent_without_a_whole_run_is_said_to_be_missing(
+    runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seed in SEEDS:
+        (runs / f"dqn{seed}" / "curve.csv").unlink()
+    words = "with these settings is counted; 3 damaged: dqn0, dqn1, dqn2"
+    assert words in report_of(runs, "--formats")
+    assert words in capsys.readouterr().err
+    for seed in SEEDS:
+        (runs / f"sarsa{seed}" / "summary.json").unlink()
+    with pytest.raises(InputError, match=r"nothing to report: .*dqn2: has no curve.csv.*sarsa2: has no summ"):
+        gather([runs])
+
+
+def test_curves_over_seeds_are_not_of_fewer_without_a_word(
+    runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flip(runs / "dqn2" / "curve.csv")
+    flip(runs / "sarsa0" / "best_model.zip")
+    folder = write_over_seeds(runs, runs)
+    assert folder is not None
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == ["dqn on RiverSwim 6, 2 of 3 seeds", "sarsa on RiverSwim 6"]
+    told = capsys.readouterr().err.splitlines()
+    assert [line.partition(": ")[0] for line in told] == [
+        str(runs / "sarsa0" / "best_model.zip"),
+        str(runs / "dqn2" / "curve.csv"),
+    ]
+    shutil.rmtree(folder)
+    for run in runs.iterdir():
+        os.truncate(run / "summary.json", 1)
+    assert write_over_seeds(runs, runs) is None
+    assert "_over_seeds: is not written, nothing to report: " in capsys.readouterr().err
+
+
+def test_a_sweeps_table_names_what_it_leaves_out(runs: Path) -> None:
+    flip(runs / "dqn1" / "summary.json")
+    lines = results_lines(runs, [JobRow(f"dqn{seed}", "", DONE) for seed in SEEDS])
+    assert lines[0].endswith("; 1 of 3 jobs are not counted: dqn1")
+    assert "of 2 [" in lines[1]
+
+
+def test_a_mistake_of_this_program_is_not_taken_for_damage(
+    runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(evidence: object) -> None:
+        raise AttributeError("a bug")
+
+    monkeypatch.setattr("gridworld.diagnosis.verdict.diagnose", broken)
+    with pytest.raises(AttributeError, match="a bug"):
+        command.main([str(runs), "--out", str(runs.parent / "out"), "--formats"])
