@@ -164,7 +164,7 @@ def test_an_agent_without_a_whole_run_is_said_to_be_missing(
 ) -> None:
     for seed in SEEDS:
         (runs / f"dqn{seed}" / "curve.csv").unlink()
-    words = "with these settings is counted; 3 damaged: dqn0, dqn1, dqn2"
+    words = "no run of dqn on river_swim with these settings is counted; 3 damaged: dqn0, dqn1, dqn2"
     assert words in report_of(runs, "--formats")
     assert words in capsys.readouterr().err
     for seed in SEEDS:

@@ -136,7 +136,7 @@ def _with_lost(groups: list[Group], unusable: Sequence[Unusable], warnings: list
     for run in unusable:
         found = like[_but_for_seed(run)]
         if not found and run.settings is not None:
-            alone[f"{run.agent} on {run.env}"].append(run)
+            alone[f"{run.agent or '?'} on {run.env or '?'}"].append(run)
             continue
         for group in found or groups:
             if all(run.seed != other.seed for other in group.runs):

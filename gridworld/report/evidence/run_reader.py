@@ -132,7 +132,9 @@ def read(folder: Path) -> Evidence | Unusable:
         folder,
         (),
         agent=_name_in(config.get("agent"), "name"),
-        env=_name_in(config.get("env"), "layout"),
+        env=next(
+            filter(None, (_name_in(config.get("env"), key) for key in ("layout", "id", "source"))), None
+        ),
         seed=_whole_in(config, "seed"),
         settings=dict(_settings(config)),
         layout="\n".join(run.manifest["layout"]),
