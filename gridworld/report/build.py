@@ -22,6 +22,10 @@ from gridworld.report.evidence.tuning_study import TuningStudy, find_tunings
 MOST_TOLD = 20  # sentences on standard error; the page has them all
 
 
+class NothingFinishedError(InputError):
+    """No run can be used, and none is damaged: they are not finished."""
+
+
 @dataclass(frozen=True, eq=False)
 class Report:
     """Runs, their analysis, and what should be looked into."""
@@ -73,7 +77,9 @@ def gather(paths: Sequence[Path], seed: int = 0, log_steps: bool = False) -> Rep
     if not runs:
         reasons = [*problems, *(reason for run in unusable for reason in run.reasons), *found.notes]
         more = f"; and {len(reasons) - MOST_TOLD} more" if len(reasons) > MOST_TOLD else ""
-        raise InputError(f"nothing to report: {'; '.join(reasons[:MOST_TOLD])}{more}")
+        is_damage = any(run.state == DAMAGED for run in unusable)
+        kind = NothingFinishedError if unusable and not is_damage else InputError
+        raise kind(f"nothing to report: {'; '.join(reasons[:MOST_TOLD])}{more}")
     study = arrange(runs, unusable)
     tasks, overall = analyse(study, seed, log_steps)
     problems += [f"{task.task}: {task.world.problem}" for task in tasks if task.world.problem]

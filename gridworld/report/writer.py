@@ -10,7 +10,7 @@ from pathlib import Path
 from gridworld.errors import InputError, reason
 from gridworld.process.console.terminal import tell
 from gridworld.report import tables
-from gridworld.report.build import MOST_TOLD, Report, gather
+from gridworld.report.build import MOST_TOLD, NothingFinishedError, Report, gather
 from gridworld.report.table import Table, to_captioned_markdown, to_csv, to_markdown
 from gridworld.report.tensorboard_export import write_events
 from gridworld.report.tuning_tables import finalists_table, trials_table, winner_table
@@ -109,6 +109,8 @@ def write_over_seeds(runs: Path, folder: Path) -> Path | None:
             return None
         with replacing_folder(folder / OVER_SEEDS) as new:
             _write_events(report, new)
+    except NothingFinishedError:  # who ran them has said so
+        return None
     except (InputError, OSError) as error:
         tell(f"{folder / OVER_SEEDS}: is not written, {reason(error)}")
         return None
