@@ -28,8 +28,8 @@ class Estimate:
 def wilson_interval(count: int, total: int) -> tuple[float, float]:
     """Wilson's score interval for a share, which is meaningful also where none, or every one, is a hit.
 
-    It is `scipy.stats.binomtest(count, total).proportion_ci(0.95, method="wilson")` to the last bit. By hand,
-    since `scipy.stats` takes a second to import, and `evaluate.py` needs nothing else of it.
+    It is `scipy.stats.binomtest(count, total).proportion_ci(0.95, method="wilson")`. By hand, since
+    `scipy.stats` takes a second to import, and `evaluate.py` needs nothing else of it.
 
     Args:
         count: hits.

@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from gridworld.agents.sb3.tabulated.flat_optimizer import ELEMENTWISE, FlatOptimizer, joint_step
+from gridworld.agents.sb3.tabulated.side_by_side import stacked
 
 OPTIONS: dict[str, dict[str, Any]] = {
     "Adam": {"amsgrad": True, "weight_decay": 0.01},
@@ -71,6 +72,41 @@ def test_every_elementwise_optimiser_steps_as_by_itself(
             optimizers[0].load_state_dict(copy.deepcopy(optimizers[1].state_dict()))
 
 
+@pytest.mark.parametrize("kind", ELEMENTWISE)
+def test_steps_in_a_population_and_after_a_resume_have_the_bits_of_those_alone(
+    kind: type[torch.optim.Optimizer],
+) -> None:
+    """These bits are promised, at every length: a kernel may round a vector's last few numbers otherwise."""
+    make: Any = kind
+    for length in (*range(1, 40), 129, 1000):
+        torch.manual_seed(length)
+        slopes = torch.randn(5, 3, length) * 10 ** torch.randn(5, 1, 1)  # steps, runs, weights
+        first = torch.randn(3, length)
+        alone, members, resumed = (
+            [FlatOptimizer(make([nn.Parameter(run.clone())], lr=0.01)) for run in first] for _ in range(3)
+        )
+        weights, _ = stacked(members)
+        gradients = weights.new_zeros(3, weights.stride(0))[:, :length]
+        for member, *row in zip(members, weights, gradients, strict=True):
+            member.work_on(*row)
+        step = joint_step(members)
+        for number, slope in enumerate(slopes):
+            for run, own in enumerate(alone):
+                own.gradient.copy_(slope[run])
+                own.advance()
+                if number == 2:
+                    resumed[run].weights.copy_(own.weights)
+                    resumed[run]._optimizer.load_state_dict(copy.deepcopy(own._optimizer.state_dict()))
+                elif number > 2:
+                    resumed[run].gradient.copy_(slope[run])
+                    resumed[run].advance()
+            gradients.copy_(slope)
+            step()
+        for run, own in enumerate(alone):
+            assert torch.equal(own.weights, weights[run])
+            assert torch.equal(own.weights, resumed[run].weights)
+
+
 def test_gradients_that_somebody_removed_come_back() -> None:
     net = network()
     descent = FlatOptimizer(torch.optim.SGD(net.parameters(), lr=0.1))
@@ -83,10 +119,14 @@ def test_gradients_that_somebody_removed_come_back() -> None:
             assert torch.allclose(parameter, old - 0.1 * parameter.grad, atol=1e-7)
 
 
+def is_denormal(numbers: torch.Tensor) -> torch.Tensor:
+    return (numbers != 0) & (numbers.abs() < torch.finfo(numbers.dtype).tiny)
+
+
 @pytest.mark.parametrize("by_somebody_else", [False, True])
 @pytest.mark.parametrize("jointly", [False, True])
 @pytest.mark.parametrize("kind", [torch.optim.Adam, torch.optim.RMSprop], ids=["Adam", "RMSprop"])
-def test_moments_that_shrink_become_zero_and_weights_are_the_same(
+def test_moments_that_shrink_never_become_denormal_and_weights_are_the_same(
     kind: type[torch.optim.Optimizer], jointly: bool, by_somebody_else: bool
 ) -> None:
     if not torch.set_flush_denormal(False):
@@ -114,6 +154,6 @@ def test_moments_that_shrink_become_zero_and_weights_are_the_same(
     for _ in range(1000):
         theirs.step()
     for mine, peer in zip(nets[0].parameters(), nets[1].parameters(), strict=True):
-        assert torch.equal(mine, peer)
-        assert (ours.state[mine][moment] == 0).all()
-        assert (theirs.state[peer][moment] != 0).any()  # this is what costs
+        assert torch.allclose(mine, peer, rtol=1e-5, atol=1e-7)
+        assert not is_denormal(ours.state[mine][moment]).any()
+        assert is_denormal(theirs.state[peer][moment]).any()  # this is what costs

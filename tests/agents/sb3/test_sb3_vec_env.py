@@ -66,7 +66,9 @@ def test_spaces_attributes_and_monitoring() -> None:
 @pytest.mark.parametrize("kind", ["one_hot", "coordinates", "none", "image"])
 def test_sb3_learns_on_it_as_it_is(algorithm: type, kind: str) -> None:
     envs = GridWorldVectorEnv(2, autoreset_mode="SameStep")
-    arguments = {"n_steps": 8, "batch_size": 16} if algorithm is PPO else {"learning_starts": 4}
+    arguments = (
+        {"n_steps": 8, "batch_size": 16} if algorithm is PPO else {"learning_starts": 4, "buffer_size": 100}
+    )
     policy = "CnnPolicy" if kind == "image" else "MlpPolicy"
     vec_env = GridWorldVecEnv(envs, make_observation(envs.mdp, kind))
     model = algorithm(policy, vec_env, seed=0, device="cpu", **arguments).learn(32)

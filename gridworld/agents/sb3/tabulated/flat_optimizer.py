@@ -2,9 +2,11 @@
 
 On networks this small the framework's overhead is the cost, and it is paid per tensor. So all parameters are
 made views of one vector, as are their gradients, and a twin of the policy's optimiser steps on that vector.
-For an optimiser that looks at every weight by itself, as Adam does, the numbers are the same to the last bit;
-`ELEMENTWISE` lists those that do. The policy's own optimiser holds views of its twin's state, so that files
-and callbacks see what they would see without it.
+For an optimiser that looks at every weight by itself, as Adam does, the steps are the same up to rounding;
+`ELEMENTWISE` lists them. The last bit may differ: on the CPU Adam's twin takes torch's fused step, which some
+processors round differently, and which may depend on a weight's place in its vector. A run's vector is the
+same alone, in a population and after a resume, and so are its bits. The policy's own optimiser holds views of
+its twin's state, so that files and callbacks see what they would see without it.
 
 A step takes numbers below 1.2e-38 for 0. The moment of a weight whose gradient has become 0 would shrink to
 one of these and stay it for ever; processors are a hundred times slower with them, and no weight is moved.

@@ -26,7 +26,7 @@ class StateRolloutBuffer(RolloutBuffer):
         super().__init__(buffer_size, spaces.Discrete(1), *arguments, **options)
 
     def compute_returns_and_advantage(self, last_values: Tensor, dones: BoolArray) -> None:
-        """SB3's own recursion to the last bit, with everything that does not recur done at once."""
+        """SB3's own recursion, with everything that does not recur done at once."""
         going_on = 1.0 - np.concatenate([self.episode_starts[1:], dones[None].astype(np.float32)])
         following = np.concatenate([self.values[1:], last_values.numpy()[None]])
         self.advantages = advantages = self.rewards + self.gamma * following * going_on - self.values
