@@ -58,8 +58,10 @@ def solve_by_value_and_slope(mdp: Mdp, gamma: float, greedy: IntArray) -> tuple[
         if (is_kept | np.isneginf(found.value)).all():
             greedy, found = improved, then
         else:
-            changed = np.flatnonzero(improved != greedy)
-            worse[changed, improved[changed]] = True
+            changed = improved != greedy
+            fallen = changed & ~is_kept
+            states = np.flatnonzero(fallen if fallen.any() else changed)
+            worse[states, improved[states]] = True
 
 
 def _best_actions(
@@ -74,20 +76,26 @@ def _best_actions(
     assert found.slope_scale is not None
     lost = ~np.isfinite(found.value)
     visible = _VISIBLE if mdp.num_states <= DENSE_STATES else _VISIBLE_IN_LARGE
-    gain, rounding = _advantage(mdp, found.value, found.scale, gamma, mdp.reward, np.abs(mdp.reward))
     next_value, next_scale = (table[mdp.next_state] for table in (found.value, found.scale))
     delay, delay_rounding = _advantage(mdp, found.slope, found.slope_scale, gamma, next_value, next_scale)
-    rounding, delay_rounding = visible * rounding, _SAME_SLOPE * delay_rounding
-    gain[worse] = -np.inf
+    delay_rounding *= _SAME_SLOPE
+    paid = mdp.reward, np.abs(mdp.reward)
+    for negligible in (0.0, visible):  # what rounding may hide is looked for where nothing else is better
+        gain, rounding = _advantage(mdp, found.value, found.scale, gamma, *paid, negligible)
+        rounding *= visible
+        gain[worse] = -np.inf
+        better = gain > rounding
+        if better.any():
+            break
 
     as_good = gain >= -rounding
-    better = gain > rounding
     as_good[np.arange(len(greedy)), greedy] = True
     as_good[lost] = True
     delay = np.where(as_good, delay, np.inf)
     optimal = as_good & ((delay <= delay_rounding) | lost[:, None])
     if better.any():
-        return optimal, np.where(better.any(axis=1), gain.argmax(axis=1), greedy)
+        best = np.where(better, gain, -np.inf).argmax(axis=1)
+        return optimal, np.where(better.any(axis=1), best, greedy)
     soonest = delay.argmin(axis=1)
     is_sooner = ~lost & (pick(delay, soonest) < -pick(delay_rounding, soonest))
     return optimal, np.where(is_sooner, soonest, greedy)
@@ -100,11 +108,14 @@ def _advantage(
     gamma: float,
     reward: FloatArray,
     reward_scale: FloatArray,
+    negligible: float = 0.0,
 ) -> tuple[FloatArray, FloatArray]:
     """Σ_k p_k [ r_k + γ x(next_k) - x(s) ] (S, A) for rewards r (S, A, K) and values x (S,); its size.
 
     Summed up as differences of values, it is exact also where all but a tiny part stays where it is; of an
-    action without a finite value it is -inf. Its size is what its rounding is relative to.
+    action without a finite value it is -inf. Its size is what its rounding is relative to. Outcomes that
+    change less than `negligible`, relative to their own size, change nothing: among them the rounding of a
+    likely one would hide what an unlikely one brings, and who has time waits for that.
     """
     here, there = values[:, None, None], values[mdp.next_state]
     moved = mdp.next_state != np.arange(mdp.num_states)[:, None, None]
@@ -112,6 +123,8 @@ def _advantage(
         change = reward + gamma * (there - here) - (1 - gamma) * here
         size = reward_scale + moved * (scale[mdp.next_state] + scale[:, None, None])
         size += (1 - gamma) * scale[:, None, None]
+        hidden = np.abs(change) < negligible * size
+        change[hidden] = size[hidden] = 0.0
         sums = (np.where(mdp.probability > 0, mdp.probability * part, 0.0) for part in (change, size))
         gained, rounding = (part.sum(axis=2) for part in sums)
     unknown = ~np.isfinite(rounding)
