@@ -15,7 +15,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from gridworld.errors import InputError
 from gridworld.tune.finalists import FINAL
-from gridworld.tune.search.objective import ERROR, SEEDS, WORKER, read_score
+from gridworld.tune.search.objective import DRAW, ERROR, SEEDS, WORKER, read_score
 from gridworld.tune.search.search_space import SearchSpace
 
 _NOT_OURS = (
@@ -71,7 +71,7 @@ def _check_trial(trial: FrozenTrial, space: SearchSpace) -> None:
         _check_complete(trial, space)
     if any(type(value) is not float for value in trial.intermediate_values.values()):
         raise ValueError("a score on its way is no number")
-    _check_attributes(trial.user_attrs, trial.system_attrs)
+    _check_attributes(trial.user_attrs)
 
 
 def _check_complete(trial: FrozenTrial, space: SearchSpace) -> None:
@@ -83,12 +83,11 @@ def _check_complete(trial: FrozenTrial, space: SearchSpace) -> None:
         raise ValueError("it has no seeds")
 
 
-def _check_attributes(own: Mapping[str, Any], optunas: Mapping[str, Any]) -> None:
+def _check_attributes(own: Mapping[str, Any]) -> None:
     for key in (ERROR, WORKER):
         if not isinstance(own.get(key, ""), str):
             raise ValueError(f"{key} must be a text")
     for seed in own.get(SEEDS, []):
         read_score(seed)
-    history = optunas.get("retry_history", [])
-    if not (isinstance(history, list) and all(type(number) is int for number in history)):
-        raise ValueError("retry_history must be a list of trials")
+    if type(own.get(DRAW, 0)) is not int:
+        raise ValueError(f"{DRAW} must be a whole number")

@@ -74,12 +74,12 @@ def _begin(spec: StudySpec) -> StudyContext:
                     "bring its database back, or choose another tune.folder"
                 )
     with legible(storage.shown_url):
-        study = storage.begin(about, spec.space.parameters_of(spec.base))
+        study = storage.begin(about)
         check_study(study, spec.space)
     claim(spec.folder, spec.name, about)
     objective = Objective(spec.measured, spec.space, spec.seeds, settings.reports, settings.stop_after)
     deadline = time.time() + (settings.timeout or math.inf)
-    return StudyContext(spec.folder, storage, objective, deadline)
+    return StudyContext(spec.folder, storage, objective, deadline, spec.space.parameters_of(spec.base))
 
 
 def _about(spec: StudySpec) -> dict[str, Any]:

@@ -42,7 +42,7 @@ from gridworld.tune.confirmation import CONFIRM
 from gridworld.tune.recipe import EXPERIMENT
 from gridworld.tune.search.objective import ERROR, SEEDS, WORKER
 from gridworld.tune.search.search_space import SearchSpace
-from gridworld.tune.search.storage import check_same_search, is_lost
+from gridworld.tune.search.storage import check_same_search, draw_of, is_lost
 from gridworld.tune.study_spec import StudySpec
 
 SEARCH_JSON = "search.json"
@@ -132,9 +132,12 @@ def write_trials(folder: Path, study: optuna.Study, space: SearchSpace, durable:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*_FIELDS, *space.dimensions])
+    lost: dict[int, int] = {}
     for trial in study.get_trials(deepcopy=False):
         values = space.values(trial.params)
-        row = _row(trial)
+        row = _row(trial) | {"repeats": lost.get(draw_of(trial), "")}
+        if is_lost(trial):
+            lost[draw_of(trial)] = trial.number
         writer.writerow(
             [*(row[name] for name in _FIELDS), *(values.get(key, "") for key in space.dimensions)]
         )
@@ -148,7 +151,6 @@ def _row(trial: FrozenTrial) -> dict[str, Any]:
     if trial.state == TrialState.PRUNED and trial.intermediate_values:
         value = trial.intermediate_values[max(trial.intermediate_values)]
     ended = trial.duration.total_seconds() if trial.duration is not None else None
-    history = trial.system_attrs.get("retry_history", [])
     return {
         "trial": trial.number,
         "status": "lost" if is_lost(trial) else _STATUSES[trial.state],
@@ -157,7 +159,6 @@ def _row(trial: FrozenTrial) -> dict[str, Any]:
         "steps": round(fmean(steps)) if steps else "",
         "regret": f"{fmean(seed['regret'] for seed in seeds):.6g}" if seeds else "",
         "seconds": "" if ended is None else f"{ended:.2f}",
-        "repeats": history[-1] if history else "",
         "worker": trial.user_attrs.get(WORKER, ""),
         "error": trial.user_attrs.get(ERROR, ""),
     }

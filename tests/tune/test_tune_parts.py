@@ -183,7 +183,7 @@ def study_of(
     settings = TuneConfig(trials=trials, heartbeat=1, sampler=sampler)
     url = f"sqlite:///{folder / 'study.db'}"
     storage = StudyStorage(url, "one", settings)
-    storage.begin({}, None)
+    storage.begin({})
     return storage.load(), StudyContext(folder, storage, objective, math.inf)  # type: ignore[arg-type]
 
 
@@ -255,7 +255,7 @@ def test_who_runs_a_trial_is_known_after_a_sign_of_life(tmp_path: Path) -> None:
     study, _ = study_of(tmp_path, objective, 1)
     trial = study.ask()  # without the thread that Optuna has for it
     with contextlib.ExitStack() as turn:
-        assert worker._run(trial, objective, turn, [], set()) == 1
+        assert worker._run(trial, objective, 0, turn, [], set()) == 1
     assert study.trials[0].user_attrs.keys() >= {"worker"}
 
 
@@ -465,8 +465,8 @@ SQL = {
     "a direction that there is not": "UPDATE study_directions SET direction = 'x'",
     "a table less": "DROP TABLE trial_values",
     "a database of nothing": "DROP TABLE studies",
-    "what Optuna keeps of repeats": "INSERT INTO trial_system_attributes (trial_id, key, value_json) "
-    "VALUES (1, 'retry_history', '{}')",
+    "a draw that is none": "INSERT INTO trial_user_attributes (trial_id, key, value_json) "
+    "VALUES (1, 'draw', '\"x\"')",
 }
 
 
@@ -474,7 +474,7 @@ SQL = {
 def sqlite_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """With two complete trials."""
     file = tmp_path_factory.mktemp("study") / "study.db"
-    study = StudyStorage(f"sqlite:///{file}", "mine", TuneConfig()).begin(ABOUT, None)
+    study = StudyStorage(f"sqlite:///{file}", "mine", TuneConfig()).begin(ABOUT)
     for number in (0, 1):
         seeds = [dataclasses.asdict(SeedScore(seed, 500, 0.25)) for seed in (0, 1)]
         study.add_trial(
@@ -511,7 +511,7 @@ def test_a_study_whose_database_was_altered_is_refused_in_a_sentence(
         database.execute(SQL[what])
     url = f"sqlite:///{tmp_path / 'study.db'}"
     with pytest.raises(InputError, match=r"^tune\.(storage|study)=.*") as caught, legible(url):
-        check_study(StudyStorage(url, "mine", TuneConfig()).begin(ABOUT, None), TWO)
+        check_study(StudyStorage(url, "mine", TuneConfig()).begin(ABOUT), TWO)
     assert "\n" not in str(caught.value)
 
 

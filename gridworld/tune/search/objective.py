@@ -39,7 +39,8 @@ from gridworld.world.exact.evaluation import Evaluator
 if TYPE_CHECKING:
     from optuna.trial import Trial
 
-SEEDS, ERROR, WORKER = "seeds", "error", "worker"  # a trial's attributes in the storage
+# A trial's attributes in the storage; see `storage.draw_of` for the draw.
+SEEDS, ERROR, WORKER, DRAW, STOPPED = "seeds", "error", "worker", "draw", "stopped"
 _MOST_STEPS = 2**63
 
 

@@ -1,7 +1,7 @@
 """A study in its database, by Optuna's storage, where several processes and machines find it.
 
 A worker that runs a trial leaves a sign of life every few seconds. A trial without one for three times as
-long is failed by the next worker that begins one, and put into the queue again. Optuna has that for its
+long is failed by the next worker that begins one, and its draw is another's. Optuna has that for its
 relational storages, SQLite among them, but not for its journal files and Redis; so those are refused. It
 takes a trial that was begun and never left a sign for alive; so a worker leaves one before its name, and a
 trial without a name is failed when it has been running for as long.
@@ -10,11 +10,13 @@ trial without a name is failed when it has been running for as long.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import math
 import time
 import warnings
 import zlib
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -24,7 +26,7 @@ from typing import Any, cast
 
 import optuna
 from optuna.exceptions import DuplicatedStudyError, ExperimentalWarning, OptunaError, StorageInternalError
-from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback, fail_stale_trials
+from optuna.storages import RDBStorage, fail_stale_trials
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import SQLAlchemyError
@@ -32,11 +34,11 @@ from sqlalchemy.exc import SQLAlchemyError
 from gridworld.config.tune import TuneConfig
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import program
-from gridworld.tune.search.objective import ERROR, WORKER
+from gridworld.tune.search.objective import DRAW, ERROR, STOPPED, WORKER
 from gridworld.tune.search.worker_pool import StorageLostError
 
 _ABOUT = "gridworld"  # the study's attribute that says what is searched
-_MOST_RETRIES = 3  # of a trial whose worker is lost each time
+_MOST_KILLED = 3  # workers, by which a draw is given up: what kills them may be its settings
 _SILENT_BEATS = 3
 _CONNECT_SECONDS = 10
 _EXAMPLES = "sqlite:////shared/study.db or postgresql://user@host/name"
@@ -52,6 +54,7 @@ class TrialCounts:
     pruned: int
     failed: int
     running: int
+    waiting: int
 
     @property
     def ended(self) -> int:
@@ -96,7 +99,6 @@ class StudyStorage:
                     engine_kwargs={"connect_args": connect},
                     heartbeat_interval=heartbeat,
                     grace_period=_SILENT_BEATS * heartbeat,
-                    heartbeat_stale_trial_callback=RetryHeartbeatStaleTrialCallback(max_retry=_MOST_RETRIES),
                 )
         except ImportError as error:
             cause = error.__cause__ or error
@@ -115,12 +117,11 @@ class StudyStorage:
         with _quiet():
             return self.name in optuna.get_all_study_names(self.connect())
 
-    def begin(self, about: Mapping[str, Any], first: dict[str, Any] | None) -> optuna.Study:
+    def begin(self, about: Mapping[str, Any]) -> optuna.Study:
         """Make the study, or see that the one there is the same search.
 
         Args:
             about: what makes its trials comparable, as JSON.
-            first: the parameters of its first trial, if it is to have a given one.
 
         Raises:
             InputError: the database cannot be reached, or its study of that name searches something else.
@@ -136,8 +137,6 @@ class StudyStorage:
                 raise InputError(
                     f"tune.study={name}: is there, but not of {program('tune')}; choose another tune.study"
                 )
-            if first is not None:
-                study.enqueue_trial(first, skip_if_exists=True)
             study.set_user_attr(_ABOUT, about)
         check_same_search(name, study.user_attrs[_ABOUT], about)
         return study
@@ -195,6 +194,7 @@ def count_trials(study: optuna.Study) -> TrialCounts:
         states.count(TrialState.PRUNED),
         states.count(TrialState.FAIL),
         states.count(TrialState.RUNNING),
+        states.count(TrialState.WAITING),
     )
 
 
@@ -203,14 +203,36 @@ def is_lost(trial: FrozenTrial) -> bool:
     return trial.state == TrialState.FAIL and not trial.user_attrs.get(ERROR)
 
 
-def sign_on(trial: optuna.Trial, worker: str) -> None:
-    """Leave a trial's first sign of life, and then the name of the worker that runs it."""
+def draw_of(trial: FrozenTrial) -> int:
+    """Which of the sampler's draws a trial is; it has no other's settings unless that one was lost."""
+    return int(trial.user_attrs.get(DRAW, trial.number))
+
+
+def next_draw(study: optuna.Study) -> int:
+    """The first draw that no trial has, but those that were lost."""
+    trials = [trial for trial in study.get_trials(deepcopy=False) if trial.state != TrialState.WAITING]
+    lost = [trial for trial in trials if is_lost(trial)]
+    killed = Counter(draw_of(trial) for trial in lost if STOPPED not in trial.user_attrs)
+    taken = {draw for draw, count in killed.items() if count > _MOST_KILLED}
+    taken |= {draw_of(trial) for trial in trials if not is_lost(trial)}
+    return next(draw for draw in itertools.count() if draw not in taken)
+
+
+def sign_on(trial: optuna.Trial, draw: int, worker: str) -> None:
+    """Leave a trial's first sign of life, its draw, and then the name of the worker that runs it."""
     cast(Any, trial.storage).record_heartbeat(trial._trial_id)
+    trial.set_user_attr(DRAW, draw)
     trial.set_user_attr(WORKER, worker)
 
 
+def give_up_running(study: optuna.Study) -> None:
+    """Fail all trials that run, for a worker which knows that there is no other."""
+    for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+        study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
+
+
 def give_up_stale(study: optuna.Study, settings: TuneConfig) -> None:
-    """Put the trials of workers that are gone into the queue again."""
+    """Fail the trials of workers that have been silent for long."""
     with _quiet():
         fail_stale_trials(study)
     latest = datetime.now() - timedelta(seconds=_SILENT_BEATS * settings.heartbeat)
@@ -218,26 +240,15 @@ def give_up_stale(study: optuna.Study, settings: TuneConfig) -> None:
         began = trial.datetime_start
         if WORKER not in trial.user_attrs and began is not None and began < latest:
             study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
-            put_back(study, trial.number)
 
 
-def put_back(study: optuna.Study, number: int) -> None:
-    """Put a trial that was interrupted into the queue again."""
-    with _quiet():
-        RetryHeartbeatStaleTrialCallback()(study, study.get_trials(deepcopy=True)[number])
+def seed_sampler(study: optuna.Study, settings: TuneConfig, draw: int, place: str) -> None:
+    """Give a draw a random stream of its own, whichever worker runs it; `place` tells machines apart.
 
-
-def seed_sampler(study: optuna.Study, settings: TuneConfig, place: str) -> None:
-    """Give the next trial a random stream of its own, whichever worker runs it.
-
-    Trials that were lost do not count, nor do their copies that wait to be run again, and neither TPE nor the
-    median pruner counts them. So one worker's study is the same whether it was stopped and gone on with or
-    not. (Hyperband's brackets go by the trial's number, which a copy has of its own.) `place` tells
-    machines apart.
+    Neither TPE nor the median pruner counts trials that were lost. So one worker's study is the same whether
+    it was interrupted or not. (Hyperband's brackets go by the trial's number, which lost ones have too.)
     """
-    trials = study.get_trials(deepcopy=False)
-    begun = sum(trial.state != TrialState.WAITING and not is_lost(trial) for trial in trials)
-    seed = zlib.crc32(repr((settings.sampler_seed, begun, place)).encode())
+    seed = zlib.crc32(repr((settings.sampler_seed, draw, place)).encode())
     with _quiet():
         study.sampler = (
             optuna.samplers.RandomSampler(seed=seed)

@@ -15,7 +15,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from gridworld.errors import reason
 from gridworld.process.parallel.parent_watch import end_with
@@ -23,7 +23,7 @@ from gridworld.process.parallel.together import run_together
 from gridworld.process.signals import set_on
 from gridworld.storage.file_lock import locked
 from gridworld.sweep.job_table import one_line
-from gridworld.tune.search.objective import ERROR, Objective, Stopped
+from gridworld.tune.search.objective import ERROR, STOPPED, Objective, Stopped
 from gridworld.tune.search.worker_pool import UNREACHABLE, StorageLostError
 
 if TYPE_CHECKING:
@@ -35,7 +35,9 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 TURN = ".turn.lock"  # in the study's folder: held while a worker counts the trials and begins one
+WORKERS = ".workers.lock"  # the same: all workers share it
 _POLL_SECONDS = 0.5
+_ORPHAN_SECONDS = 4.0  # that a worker may outlive a command that was killed
 
 _stopped = threading.Event()
 
@@ -48,6 +50,7 @@ class StudyContext:
     storage: StudyStorage
     objective: Objective
     deadline: float  # `time.time()` after which no trial begins
+    first: dict[str, Any] | None = None  # the parameters of the first trial, if it is to have given ones
 
 
 def run_trials(context: StudyContext, worker: int, parent: int) -> None:
@@ -56,8 +59,27 @@ def run_trials(context: StudyContext, worker: int, parent: int) -> None:
     count = context.storage.settings.together or 1
     own: set[int] = set()
     with study_of(context) as storage, contextlib.suppress(Stopped):
-        run_all([partial(_run_trials, study, context, own) for study in storage.load_several(count)])
+        studies = storage.load_several(count)
+        with among_workers(studies[0], context):
+            run_all([partial(_run_trials, study, context, own) for study in studies])
     sys.exit(0)
+
+
+@contextlib.contextmanager
+def among_workers(study: Study, context: StudyContext) -> Iterator[None]:
+    """Share the workers' lock for the block; who finds nobody at it gives up all trials that run.
+
+    Workers of a database that was named may be elsewhere, with a lock of their own.
+    """
+    from gridworld.tune.search.storage import give_up_running
+
+    lock, settings = context.folder / WORKERS, context.storage.settings
+    if settings.storage is None:
+        with locked(lock, wait=_ORPHAN_SECONDS if settings.workers == 1 else 0) as is_alone:
+            if is_alone:
+                give_up_running(study)
+    with locked(lock, shared=True):
+        yield
 
 
 def run_all(tasks: Sequence[Callable[[], T]]) -> list[T]:
@@ -117,7 +139,7 @@ def _run_next(study: Study, context: StudyContext, own: set[int]) -> bool:
         context: what is run.
         own: the numbers of the trials that this process runs, which are not waited for.
     """
-    from gridworld.tune.search.storage import count_trials, give_up_stale, put_back, seed_sampler, show_ended
+    from gridworld.tune.search.storage import count_trials, give_up_stale, next_draw, seed_sampler, show_ended
 
     settings = context.storage.settings
     with ExitStack() as turn:
@@ -128,14 +150,14 @@ def _run_next(study: Study, context: StudyContext, own: set[int]) -> bool:
             return False
         if counts.ended + counts.running < settings.trials:
             begun: list[int] = []
+            draw = next_draw(study)
             place = f"{socket.gethostname()}:{context.folder.absolute()}" if settings.storage else ""
-            seed_sampler(study, settings, place)
-            run = partial(_run, objective=context.objective, turn=turn, begun=begun, own=own)
+            seed_sampler(study, settings, draw, place)
+            if draw == 0 and context.first is not None and counts.waiting == 0:
+                study.enqueue_trial(context.first)
+            run = partial(_run, objective=context.objective, draw=draw, turn=turn, begun=begun, own=own)
             try:
                 study.optimize(run, n_trials=1, catch=(Exception,))
-            except Stopped:
-                put_back(study, begun[0])
-                raise
             finally:
                 own.difference_update(begun)
                 show_ended(study)
@@ -146,7 +168,9 @@ def _run_next(study: Study, context: StudyContext, own: set[int]) -> bool:
     return True
 
 
-def _run(trial: Trial, objective: Objective, turn: ExitStack, begun: list[int], own: set[int]) -> float:
+def _run(
+    trial: Trial, objective: Objective, draw: int, turn: ExitStack, begun: list[int], own: set[int]
+) -> float:
     """Evaluate the objective; note the reason where it fails."""
     import optuna
 
@@ -154,11 +178,14 @@ def _run(trial: Trial, objective: Objective, turn: ExitStack, begun: list[int], 
 
     begun.append(trial.number)
     own.add(trial.number)
-    sign_on(trial, f"{socket.gethostname()}:{os.getpid()}")
+    sign_on(trial, draw, f"{socket.gethostname()}:{os.getpid()}")
     turn.close()
     try:
         value = objective(trial, is_stopped)
     except optuna.TrialPruned:
+        raise
+    except Stopped:
+        trial.set_user_attr(STOPPED, True)
         raise
     except Exception as error:
         trial.set_user_attr(ERROR, one_line(reason(error)))
