@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -11,6 +9,7 @@ from dataclasses import dataclass
 
 from gridworld.process.console.terminal import plain
 from gridworld.report.analysis.statistics import Interval, Share
+from gridworld.storage.csv_text import csv_text
 
 NOTHING = "\N{EN DASH}"
 _MINUS = "\N{MINUS SIGN}"
@@ -125,17 +124,17 @@ def to_markdown(table: Table) -> str:
 
 def to_csv(table: Table) -> str:
     """A CSV of plain numbers; an interval takes three columns, a share four."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
     kinds = [_kind([row[index] for row in table.rows]) for index in range(len(table.columns))]
-    writer.writerow(
+    headings = (
         heading + suffix
         for heading, kind in zip(table.columns, kinds, strict=True)
         for suffix in _SUFFIXES.get(kind, ("",))
     )
-    for row in table.rows:
-        writer.writerow(value for cell, kind in zip(row, kinds, strict=True) for value in _values(cell, kind))
-    return out.getvalue()
+    rows = (
+        (value for cell, kind in zip(row, kinds, strict=True) for value in _values(cell, kind))
+        for row in table.rows
+    )
+    return csv_text([headings, *rows])
 
 
 _SUFFIXES: dict[type | None, tuple[str, ...]] = {

@@ -3,6 +3,9 @@
 After a power cut, a file that was renamed into its place may be empty, or its name may be the old one: the
 disk has a file's content once the file is synced, and its name once the folder is.
 
+What is half written has a name of its own beside the path, and a lock by which others see that somebody is at
+it. Each process removes what killed ones left where it writes first.
+
 Whatever writes raises `FolderLostError` where the folder is no longer this process's (see `file_lock`).
 """
 
@@ -19,15 +22,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gridworld.errors import FolderLostError
-from gridworld.storage.file_lock import check_ours
+from gridworld.storage.file_lock import check_ours, is_at
 from gridworld.storage.symlinks import remove_path
-from gridworld.storage.system_calls import NOT_INHERITED, TO_SYNC, open_carefully
+from gridworld.storage.system_calls import OPENS_FOLDERS, TO_SYNC, open_carefully, take_lock
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _NOT_SYNCED = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)  # where a file system cannot sync a folder
 _PART = re.compile(r"\..+\.\d+\.(old\.)?part", re.DOTALL)
+_tidied: set[str] = set()  # folders, by this process
 
 
 @contextlib.contextmanager
@@ -48,16 +52,16 @@ def replacing(path: Path, durable: bool = False) -> Iterator[Path]:
     check_ours(path)
     part = _beside(path, "part")
     with _named_for(path, part):
-        part.unlink(missing_ok=True)
-        os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | NOT_INHERITED, 0o666))
-        try:
-            yield part
-            if durable:
-                _sync(part)
-            check_ours(path)
-            os.replace(part, path)
-        finally:
-            part.unlink(missing_ok=True)
+        _tidy_once(path.parent)
+        with _at_work_on(part):
+            try:
+                yield part
+                if durable:
+                    _sync(part)
+                check_ours(path)
+                os.replace(part, path)
+            finally:
+                part.unlink(missing_ok=True)
         if durable:
             sync_folder(path.parent)
 
@@ -76,29 +80,58 @@ def replacing_folder(folder: Path) -> Iterator[Path]:
     new, old = _beside(folder, "part"), _beside(folder, "old.part")
     with _named_for(folder, new):
         folder.parent.mkdir(parents=True, exist_ok=True)
-        remove_path(new)
+        _tidy_once(folder.parent)
         remove_path(old)
-        new.mkdir()
-        try:
-            yield new
-            check_ours(folder)
-            if os.path.lexists(folder):
-                folder.rename(old)
+        with _at_work_on(new, is_folder=True):
             try:
-                new.rename(folder)
-            except OSError:
-                if os.path.lexists(old):
-                    old.rename(folder)
-                raise
-        finally:
-            for path in (new, old):
-                with contextlib.suppress(OSError, FolderLostError):
-                    remove_path(path)
+                yield new
+                check_ours(folder)
+                if os.path.lexists(folder):
+                    folder.rename(old)
+                try:
+                    new.rename(folder)
+                except OSError:
+                    if os.path.lexists(old):
+                        old.rename(folder)
+                    raise
+            finally:
+                for path in (new, old):
+                    with contextlib.suppress(OSError, FolderLostError):
+                        remove_path(path)
 
 
 def _beside(path: Path, kind: str) -> Path:
     """A name that no other process uses. `tidy` finds what a killed process leaves."""
     return path.with_name(f".{path.name}.{os.getpid()}.{kind}")
+
+
+@contextlib.contextmanager
+def _at_work_on(part: Path, is_folder: bool = False) -> Iterator[None]:
+    """Make an empty file or folder that `tidy` leaves alone during the block."""
+    with contextlib.ExitStack() as opened:
+        while True:
+            remove_path(part)
+            part.mkdir() if is_folder else part.touch(exist_ok=False)
+            if not OPENS_FOLDERS:
+                break
+            with contextlib.suppress(FileNotFoundError):
+                file = _open(part)
+                opened.callback(os.close, file)
+                with contextlib.suppress(OSError):  # of a file system without locks
+                    take_lock(file, wait=True)
+                if is_at(file, part):  # it was not tidied up before it was locked
+                    break
+        yield
+
+
+def _open(part: Path) -> int:
+    return open_carefully(part, os.O_RDONLY if part.is_dir() else os.O_RDWR)
+
+
+def _tidy_once(folder: Path) -> None:
+    if (where := os.path.abspath(folder)) not in _tidied:
+        _tidied.add(where)
+        tidy(folder)
 
 
 @contextlib.contextmanager
@@ -169,10 +202,14 @@ def make_folder(folder: Path) -> None:
 
 
 def tidy(folder: Path) -> None:
-    """Remove what killed processes had half written. Only for the process that holds the folder."""
+    """Remove what killed processes had half written; what somebody is at work on is locked."""
     for path in folder.glob(".*.part"):
-        if _PART.fullmatch(path.name):
-            remove_path(path)
+        if OPENS_FOLDERS and _PART.fullmatch(path.name):
+            with contextlib.suppress(OSError), contextlib.ExitStack() as opened:
+                file = _open(path)
+                opened.callback(os.close, file)
+                if take_lock(file):
+                    remove_path(path)
 
 
 def write_text(path: Path, text: str, durable: bool = False) -> None:

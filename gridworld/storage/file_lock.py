@@ -65,7 +65,7 @@ def locked(path: Path, wait: float | None = None, shared: bool = False) -> Itera
                     f"{path}: another process has this lock, and the system has none that are shared; wait "
                     "until that has ended"
                 )
-            if is_ours and not _is_at(file, path):
+            if is_ours and not is_at(file, path):
                 continue  # who had it before took the file away; a lock on that keeps nobody out
             with _noted(path, file) if is_ours else contextlib.nullcontext():
                 yield is_ours
@@ -138,7 +138,8 @@ def is_locked(path: Path) -> bool:
         os.close(file)
 
 
-def _is_at(file: int, path: Path) -> bool:
+def is_at(file: int, path: Path) -> bool:
+    """Whether an open file is the one that a path names now."""
     try:
         return os.path.samestat(os.fstat(file), os.lstat(path))
     except FileNotFoundError:

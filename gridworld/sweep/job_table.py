@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import io
 from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
@@ -16,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import plain
 from gridworld.run.folder import LOCK
 from gridworld.run.identity.fingerprint import settings_hash
 from gridworld.run.reader import RunReader
 from gridworld.run.recovery import find_run
 from gridworld.storage.atomic_write import write_text
+from gridworld.storage.csv_text import csv_rows, csv_text
 from gridworld.storage.file_lock import is_locked, locked
 from gridworld.storage.safe_read import read_table
 from gridworld.sweep.folder import JobEntry
@@ -60,7 +59,7 @@ class JobTable:
     def read(self) -> dict[str, JobRow]:
         """The rows of the file; one that cannot be read counts as empty, since it can be made again."""
         try:
-            lines = list(csv.reader(io.StringIO(read_table(self.file))))
+            lines = list(csv_rows(read_table(self.file)))
         except (InputError, csv.Error):
             return {}
         if not lines or lines[0] != _COLUMNS:
@@ -74,12 +73,11 @@ class JobTable:
 
     def set(self, job: str, **changes: str) -> None:
         """Change fields of a job's row. Other rows are copied unread: reading ten thousand takes 0.1 s."""
-        changes = {name: plain(text) for name, text in changes.items()}
         with locked(self.folder / TABLE_LOCK):
             found = self._find(job)
             if found is not None:
                 text, row, place = found
-                line = _line(dataclasses.astuple(dataclasses.replace(row, **changes)))
+                line = csv_text([dataclasses.astuple(dataclasses.replace(row, **changes))])
                 write_text(self.file, text[: place.start] + line + text[place.stop :])
                 return
             rows = self.read()
@@ -90,12 +88,12 @@ class JobTable:
         """(the file's text, the job's row, where in the text its line is); None if it is not that simple."""
         try:
             text = read_table(self.file)
-            start = text.find("\n" + _line([job, ""])[:-1]) + 1
+            start = text.find("\n" + csv_text([[job, ""]])[:-1]) + 1
             stop = text.find("\n", start) + 1
-            fields = next(csv.reader([text[start:stop]]), [])
+            fields = next(csv_rows(text[start:stop]), [])
         except (InputError, csv.Error):
             return None
-        if not start or not stop or not text.startswith(_line(_COLUMNS)) or len(fields) != len(_COLUMNS):
+        if not start or not stop or not text.startswith(csv_text([_COLUMNS])) or len(fields) != len(_COLUMNS):
             return None
         return text, JobRow(*fields), slice(start, stop)
 
@@ -140,17 +138,10 @@ class JobTable:
         return row
 
     def _write(self, rows: Iterable[JobRow], durable: bool = False) -> None:
-        lines = [_line(_COLUMNS), *(_line(dataclasses.astuple(row)) for row in rows)]
-        write_text(self.file, "".join(lines), durable)
+        write_text(self.file, csv_text([_COLUMNS, *map(dataclasses.astuple, rows)]), durable)
 
 
 _COLUMNS = [field.name for field in dataclasses.fields(JobRow)]
-
-
-def _line(fields: Iterable[str]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerow(fields)
-    return text.getvalue()
 
 
 def outcome(run: RunReader) -> dict[str, str]:

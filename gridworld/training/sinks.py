@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from gridworld.process.console.progress import Progress
 from gridworld.storage.append_log import AppendLog
+from gridworld.storage.csv_text import csv_text
 from gridworld.training.learning_curve import Evaluation
 from gridworld.training.tensorboard import EventWriter
 from gridworld.world.exact.evaluation import Evaluator, Score
@@ -64,12 +65,8 @@ class CurveFile:
         row: dict[str, Any] = {"step": evaluation.step, **numbers(evaluation.greedy)}
         row |= {f"sampled_{name}": number for name, number in numbers(evaluation.sampled).items()}
         row |= {metric.name: metric.of(evaluation.returns) for metric in TRAINING_METRICS}
-        text = io.StringIO()
-        rows = csv.DictWriter(text, CURVE_COLUMNS, lineterminator="\n")
-        if self._log.length == 0:
-            rows.writeheader()
-        rows.writerow(row)
-        self._log.append(text.getvalue().encode())
+        head = [] if self._log.length else [CURVE_COLUMNS]
+        self._log.append(csv_text([*head, [row[name] for name in CURVE_COLUMNS]]).encode())
 
 
 def read_curve(log: AppendLog, columns: Sequence[str]) -> dict[str, NDArray[np.float64]]:

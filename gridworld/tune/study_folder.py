@@ -15,8 +15,6 @@ that it needs neither Optuna nor the database.
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import math
 import os
 from collections.abc import Iterator, Mapping
@@ -34,6 +32,7 @@ from gridworld.run.claim import check_writable
 from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON
 from gridworld.run.identity.provenance import versions
 from gridworld.storage.atomic_write import make_folder, tidy, write_json, write_text
+from gridworld.storage.csv_text import csv_text
 from gridworld.storage.file_lock import locked
 from gridworld.storage.safe_read import LARGEST_CSV, file_sha256
 from gridworld.storage.sealed_json import read_sealed, sealed
@@ -83,10 +82,8 @@ def at_work_in(folder: Path) -> Iterator[None]:
     make_folder(folder)
     lock = folder / LOCK
     try:
-        with locked(lock, wait=0) as is_alone:
-            if is_alone:
-                tidy(folder)
         with locked(lock, shared=True):
+            tidy(folder)
             yield
     finally:
         with contextlib.suppress(OSError):
@@ -129,19 +126,15 @@ def claim(folder: Path, name: str, about: Mapping[str, Any]) -> None:
 
 def write_trials(folder: Path, study: optuna.Study, space: SearchSpace, durable: bool = False) -> None:
     """Write a row per trial, with its values as a run would get them; `durable` as for `replacing`."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*_FIELDS, *space.dimensions])
+    rows: list[list[Any]] = [[*_FIELDS, *space.dimensions]]
     lost: dict[int, int] = {}
     for trial in study.get_trials(deepcopy=False):
         values = space.values(trial.params)
         row = _row(trial) | {"repeats": lost.get(draw_of(trial), "")}
         if is_lost(trial):
             lost[draw_of(trial)] = trial.number
-        writer.writerow(
-            [*(row[name] for name in _FIELDS), *(values.get(key, "") for key in space.dimensions)]
-        )
-    write_text(folder / TRIALS_CSV, text.getvalue(), durable)
+        rows.append([*(row[name] for name in _FIELDS), *(values.get(key, "") for key in space.dimensions)])
+    write_text(folder / TRIALS_CSV, csv_text(rows), durable)
 
 
 def _row(trial: FrozenTrial) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -16,6 +15,7 @@ from gridworld.process.console.terminal import plain
 from gridworld.process.memory_budget import check_memory
 from gridworld.report.evidence.discovery import real_folders
 from gridworld.report.table import Cell
+from gridworld.storage.csv_text import csv_rows
 from gridworld.storage.safe_read import LARGEST_CSV, as_table, read_bytes, sha256
 from gridworld.storage.sealed_json import read_sealed
 
@@ -96,6 +96,7 @@ def _read(folder: Path) -> TuningStudy:
     table = _trials(folder / TRIALS_CSV, content)
     check_memory(folder / TRIALS_CSV, _OF_A_TRIAL * table.count("\n"))
     try:
+        head, *rows = csv_rows(table)
         winner = content["winner"]
         space = {str(key): _dimension(dimension) for key, dimension in content["space"].items()}
         return TuningStudy(
@@ -113,7 +114,7 @@ def _read(folder: Path) -> TuningStudy:
                 for each in content["finalists"]
             ],
             importances={str(key): float(share) for key, share in content["importances"].items()},
-            trials=[_trial(row, space) for row in csv.DictReader(io.StringIO(table))],
+            trials=[_trial(dict(zip(head, row, strict=True)), space) for row in rows],
         )
     except (KeyError, TypeError, ValueError, AttributeError, csv.Error) as error:
         raise InputError(f"{file}: has no search that came to an end, or was changed ({error!r})") from None
