@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import types
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gridworld.config.agents import MISSING, AgentConfig, agent_schemas
@@ -25,6 +25,15 @@ _LIBRARIES = (
 
 # A run that was made before there was such a setting is read with the setting's default.
 _WITHOUT_RESULT = (Effect.FILES, Effect.NOTHING)
+
+
+def needs_trust(config: Mapping[str, Any]) -> bool:
+    """Whether a run's settings, as its manifest has them, name what `check_imports` refuses."""
+    try:
+        check_imports([config.get("agent"), config.get("callbacks")], "", "")
+    except InputError:
+        return True
+    return False
 
 
 def check_imports(settings: Any, where: str, allow: str) -> None:

@@ -160,7 +160,7 @@ class Unfinished:
         run, old_total = self.run, self.config.total_timesteps
         if total_timesteps is None and run.is_finished and Checkpoints(run.folder).files():
             raise InputError(
-                f"{run.folder}: is finished; to make it longer, say how long: {run.resume_command()} "
+                f"{run.folder}: is finished; to make it longer, say how long: {_resume_command(run)} "
                 f"total_timesteps={2 * old_total}"
             )
         config = dataclasses.replace(
@@ -234,6 +234,10 @@ class Unfinished:
             tell(_what_changes(config, steps, old_total))
 
 
+def _resume_command(run: RunReader) -> str:
+    return run.resume_command(run.manifest["config"])  # which were read, so the user trusts them
+
+
 def _kind(env: EnvConfig) -> str:
     return "map" if isinstance(env, MapConfig) else "world"
 
@@ -293,7 +297,7 @@ def _differences(then: dict[str, Any], agent: AgentConfig, run: RunReader, anywa
     if differs and not anyway:
         raise InputError(
             f"{run.folder}: was begun in another environment ({'; '.join(differs)}), where numbers may "
-            f"come out otherwise; go on there, or by {run.resume_command()} anyway=true, which notes it in "
+            f"come out otherwise; go on there, or by {_resume_command(run)} anyway=true, which notes it in "
             "the manifest"
         )
     return differs

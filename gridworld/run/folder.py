@@ -26,9 +26,12 @@ reads and verifies them.
 from __future__ import annotations
 
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from gridworld.config import pictures
+from gridworld.config.plain_settings import needs_trust
 from gridworld.process.console.command_line import command, users_folder
 from gridworld.process.console.terminal import printable
 
@@ -90,9 +93,10 @@ class RunFolder:
         """The paths of the files that hold the result."""
         return tuple(self.folder / name for name in RESULTS)
 
-    def resume_command(self) -> str:
-        """The command line that resumes the run."""
-        return f"{command('train')} resume={shlex.quote(shown(self.folder))}"
+    def resume_command(self, trusted: Mapping[str, Any] | None = None) -> str:
+        """The command line that resumes the run; for settings that the user has `trusted`, it says so."""
+        trust = " trust=true" if trusted is not None and needs_trust(trusted) else ""
+        return f"{command('train')} resume={shlex.quote(shown(self.folder))}{trust}"
 
 
 def shown(folder: Path) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +33,7 @@ def train_and_tell(folder: Path, train: Callable[[], Summary]) -> Summary:
         summary = train()
     except Interrupted as interruption:
         run = read_run(folder)
-        told = interruption_text(
-            interruption, run, run.manifest.get("checkpoint"), run.manifest.get("reached")
-        )
-        print(told, file=sys.stderr)
+        print(interruption_text(interruption, run, run.manifest), file=sys.stderr)
         sys.exit(interruption.exit_code)
     try:
         place = shlex.quote(shown(folder))
@@ -48,24 +45,16 @@ def train_and_tell(folder: Path, train: Callable[[], Summary]) -> Summary:
     return summary
 
 
-def interruption_text(
-    interruption: Interrupted, run: RunFolder, saved: int | None, reached: int | None
-) -> str:
-    """How much of an interrupted run is saved, and the command that resumes it.
-
-    Args:
-        interruption: What interrupted it.
-        run: Its folder.
-        saved: Environment steps at the newest checkpoint; None: there is none.
-        reached: Environment steps that were made.
-    """
+def interruption_text(interruption: Interrupted, run: RunFolder, manifest: Mapping[str, Any]) -> str:
+    """How much of an interrupted run is saved, by its manifest, and the command that resumes it."""
+    saved, reached = manifest.get("checkpoint"), manifest.get("reached")
     if not saved:
         what = "nothing is saved, so that it will begin anew"
     elif saved == reached:
         what = f"all {saved:,} steps are saved"
     else:
         what = f"saved are {saved:,} of its {reached:,} steps"
-    return printable(f"{interruption}: {what}; go on with  {run.resume_command()}")
+    return printable(f"{interruption}: {what}; go on with  {run.resume_command(manifest['config'])}")
 
 
 def summary_text(summary: Summary, folder: str) -> str:

@@ -28,7 +28,7 @@ from gridworld.config.composition.for_all_seeds import converting_once
 from gridworld.config.sweep import SweepConfig
 from gridworld.errors import InputError
 from gridworld.process.parallel.forks import can_fork
-from gridworld.process.parallel.machine import free_memory, worker_count
+from gridworld.process.parallel.machine import file_limit, free_memory, worker_count
 from gridworld.process.parallel.together import LARGEST, mixing, run_together
 from gridworld.sweep.folder import JobEntry, SweepFolder
 from gridworld.sweep.plan import Job
@@ -36,6 +36,8 @@ from gridworld.sweep.plan import Job
 AUTO = "auto"
 _SHARE_OF_MEMORY = 4  # a population takes a fourth of what is free, shared by the workers
 _RUNS_BYTES = 16 * 2**20  # of a run beside its agent, with its pictures
+RUNS_FILES = 3  # that a run has open: its lock, its curve, its events
+_OTHER_FILES = 64  # of the process
 _FEWEST = 4  # runs of a population for which another core is taken
 _KEY = "hydra.sweeper.together"
 _IN_FORK = "hydra.sweeper.in_fork=true"
@@ -59,7 +61,8 @@ class PopulationTask:
         """Run the job, or all jobs of the population that it stands for.
 
         Raises:
-            Exception: a job failed; of a population, the first one's. Its row in the table says why.
+            Exception: a job failed; of a population, the first one's, or an `OSError` of any. Its row in the
+                table says why, where it could be written.
             SystemExit: it was interrupted.
         """
         shared = cast("Any", HydraConfig.instance())
@@ -75,10 +78,9 @@ class PopulationTask:
                 results = self._run_all(folder, jobs)
         finally:
             shared.cfg = before
-        for result in results:
-            if isinstance(result, Exception):
-                raise result
-            _ = result.return_value  # raises what the job did
+        failures = [failure for result in results if (failure := _failure(result)) is not None]
+        if failures:  # one of the machine goes first: after that, jobs are tried again that noted none
+            raise min(failures, key=lambda failure: not isinstance(failure, OSError))
         return None
 
     def _mixed(self, settings: DictConfig, entries: Sequence[JobEntry]) -> dict[str, str]:
@@ -101,6 +103,16 @@ class PopulationTask:
                 for number, entry in jobs
             ]
         )
+
+
+def _failure(result: JobReturn | Exception) -> Exception | None:
+    if isinstance(result, Exception):
+        return result
+    try:
+        _ = result.return_value  # raises what the job did
+    except Exception as error:
+        return error
+    return None
 
 
 def line(folder: Path, entry: JobEntry) -> list[str]:
@@ -177,7 +189,8 @@ def populations(
     for members in shapes.values():
         in_this_process = _forks(hydra.launcher) and not any(job.in_fork for _, job in members)
         share = len(members) if most and in_this_process else math.ceil(len(members) / workers)
-        bounds = [most or LARGEST, max(share, _FEWEST) if _forks(hydra.launcher) else share]
+        bounds = [most or LARGEST, (file_limit() - _OTHER_FILES) // RUNS_FILES]
+        bounds.append(max(share, _FEWEST) if _forks(hydra.launcher) else share)
         if most is None:
             bounds.append(int(memory / (_RUNS_BYTES + max(job.memory for _, job in members))))
         if (own := hydra.launcher.get("jobs_per_task")) is not None:  # a task of Slurm's has its own number

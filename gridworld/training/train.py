@@ -117,7 +117,7 @@ def carry_out(
     try:
         run = begin()
     except OSError as error:  # the manifest is the old one, or none: files are replaced whole
-        raise _unwritable(folder, error) from None
+        raise _unwritable(folder, config, error) from None
     log.open(run.log_file)
     if state is None:
         log.add(f"begins: {shlex.join(recorded_command_line())}")
@@ -128,9 +128,8 @@ def carry_out(
             session.checkpoints.held = before.steps
         summary = session.run()
     except Interrupted as interruption:
-        progress = _progress(session)
-        run.end("interrupted", str(interruption), **progress)
-        log.add(interruption_text(interruption, run, progress.get("checkpoint"), progress.get("reached")))
+        run.end("interrupted", str(interruption), **_progress(session))
+        log.add(interruption_text(interruption, run, run.manifest))
         raise
     except BaseException as error:
         with contextlib.suppress(OSError):  # nothing can be written perhaps
@@ -139,7 +138,7 @@ def carry_out(
         if isinstance(error, StateError):
             raise InputError(f"{folder}: its checkpoint does not fit this run: {error}") from None
         if isinstance(error, OSError):
-            raise _unwritable(folder, error) from None
+            raise _unwritable(folder, config, error) from None
         raise
     session.checkpoints.keep(1)
     run.end("finished", None, **_progress(session))
@@ -192,9 +191,10 @@ def _rehearse(config: TrainConfig, mdp: Mdp, observation: ObservationTable) -> N
     family(config.agent).rehearse(config, context)
 
 
-def _unwritable(folder: Path, error: OSError) -> MachineError:
+def _unwritable(folder: Path, config: TrainConfig, error: OSError) -> MachineError:
     run = RunFolder(folder)
-    how = f"go on with {run.resume_command()}" if run.manifest_file.exists() else "give the command again"
+    resume = run.resume_command(dataclasses.asdict(config))
+    how = f"go on with {resume}" if run.manifest_file.exists() else "give the command again"
     return MachineError(f"{shown(folder)}: {reason(error)}; put that right, then {how}")
 
 

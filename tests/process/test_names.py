@@ -125,7 +125,7 @@ def test_what_is_said_of_a_sweeps_jobs(tmp_path: Path, capsys: pytest.CaptureFix
 
 def test_what_is_said_at_the_end(tmp_path: Path) -> None:
     assert shown(tmp_path / EVIL).isprintable()
-    (line,) = interruption_text(Interrupted(2), RunFolder(tmp_path / EVIL), None, None).splitlines()
+    (line,) = interruption_text(Interrupted(2), RunFolder(tmp_path / EVIL), {"config": {}}).splitlines()
     assert line.isprintable()
     assert SHOWN in line
 

@@ -15,7 +15,7 @@ from helpers.support import ROOT, SHORT, configure, script, start
 from gridworld.errors import InputError
 from gridworld.restore.resume import open_unfinished
 from gridworld.run.checkpoints import Checkpoints
-from gridworld.run.folder import LOCK
+from gridworld.run.folder import LOCK, RunFolder
 from gridworld.run.identity import fingerprint as identity
 from gridworld.run.identity import provenance
 from gridworld.run.identity.provenance import Source
@@ -395,3 +395,48 @@ def test_an_interrupted_job_of_a_sweep_goes_on(tmp_path: Path) -> None:
     run_in_sweep(configure(*words), folder, words, stop_at_failure=False)
     assert manifest(folder)["resumed"]
     assert differences(left_behind(folder), left_behind(tmp_path / "calm")) == []
+
+
+def test_the_command_printed_after_ctrl_c_trusts_what_the_run_began_with(tmp_path: Path) -> None:
+    counting = (
+        "{_target_: stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes, max_episodes: 9999999}"
+    )
+    every = (
+        f"{{_target_: stable_baselines3.common.callbacks.EveryNTimesteps, n_steps: 50, callback: {counting}}}"
+    )
+    words = [
+        "agent=a2c",
+        "env=cliff",
+        "total_timesteps=900000000",
+        "checkpoint.every=500",
+        "hydra.run.dir=run",
+    ]
+    with start("train.py", *words, f"callbacks=[{every}]", cwd=tmp_path) as process:
+        curve, end = tmp_path / "run" / "curve.csv", time.monotonic() + 60
+        while not (curve.exists() and curve.read_text().count("\n") > 2):
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        told = process.stderr.read()
+    command = told.splitlines()[-1].rpartition("go on with  python scripts/")[2]
+    assert command == "train.py resume=run trust=true"
+    with start(*command.split(), cwd=tmp_path) as process:
+        line = next(line for line in process.stderr if "callback" not in line)
+        process.kill()
+    assert line.startswith("run: goes on after ")
+    assert script("train.py", "resume=run", cwd=tmp_path).returncode == 2  # it may be anybody's
+
+
+@pytest.mark.parametrize(
+    ("agent", "more"),
+    [
+        ({"algorithm": "mine.Sarsa"}, " trust=true"),
+        ({"policy_kwargs": {"features_extractor_class": "a.B"}}, " trust=true"),
+        ({"algorithm": "DQN"}, ""),
+        ({"optimizer_class": "torch.optim.SGD"}, ""),
+    ],
+)
+def test_only_settings_that_name_code_have_to_be_trusted(agent: dict[str, object], more: str) -> None:
+    run = RunFolder(Path("runs/it"))
+    assert run.resume_command({"agent": agent}) == f"python scripts/train.py resume=runs/it{more}"
+    assert run.resume_command() == "python scripts/train.py resume=runs/it"

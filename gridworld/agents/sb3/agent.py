@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ from gridworld.world.mdp import IntArray
 # observations, say.
 _BYTES_A_BYTE = 16
 _SPARE_BYTES = 64 * 2**20
+_FIRST_YEAR = 1980  # of the zip format
 
 
 class SB3Agent:
@@ -42,11 +44,16 @@ class SB3Agent:
         context: what it learns on.
 
     Raises:
-        InputError: settings that only SB3 itself can judge.
+        InputError: settings that only SB3 itself can judge, or a clock with which it writes no models.
     """
 
     def __init__(self, config: AgentConfig, context: TrainingContext) -> None:
         assert isinstance(config, SB3Config)
+        if (today := time.localtime()).tm_year < _FIRST_YEAR:
+            raise InputError(
+                f"the clock says {time.strftime('%Y-%m-%d', today)}, and SB3's model.zip can have no date "
+                f"before {_FIRST_YEAR}; set the clock"
+            )
         torch.set_num_threads(context.threads)
         self.config = config
         self.observation = context.observation

@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import sys
 from pathlib import Path
 
+_USUAL_FILES = 512  # of Windows
 _USUAL_MEMORY = 4 * 2**30  # bytes, where the system does not tell
 
 
@@ -18,6 +20,16 @@ def core_count() -> int:
 def worker_count(asked: int) -> int:
     """How many workers `n_jobs` asks for: so many, or below 0 one for each core but `-1 - n_jobs`."""
     return asked if asked > 0 else max(1, core_count() + 1 + asked)
+
+
+def file_limit() -> int:
+    """How many files this process may have open at once."""
+    try:
+        import resource
+    except ImportError:
+        return _USUAL_FILES
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    return sys.maxsize if limit == resource.RLIM_INFINITY else limit
 
 
 def free_memory() -> int:
