@@ -167,6 +167,8 @@ def _run_job(settings: DictConfig) -> float:
         if is_one_of_many:
             _stop_if_lost(folder)
             print(printable(f"job {context.job.num} failed: {sentence(error)}"), file=sys.stderr)
+            if isinstance(error, OSError):
+                raise  # it did not even fail: the sweep tries it again
             raise JobError(sentence(error)) from None
         sys.exit(_tell(error))
 

@@ -26,7 +26,7 @@ from gridworld.run.identity.fingerprint import environment, identity
 from gridworld.run.summary import Summary
 from gridworld.run.writer import RunWriter
 from gridworld.storage.append_log import AppendLog
-from gridworld.storage.atomic_write import in_background, write_array, write_bytes, write_json
+from gridworld.storage.atomic_write import in_background, sync, write_array, write_bytes, write_json
 from gridworld.storage.serialization import State, fitting
 from gridworld.training.learning_curve import LearningCurve, Sink
 from gridworld.training.pictures import Pictures
@@ -210,7 +210,7 @@ class Session:
         self._stop.obey()
 
     def _save(self, steps: int, is_last: bool) -> None:
-        # A short run is over before a disk has anything; only who would lose more waits for that.
+        # A short run is over before a disk has anything, and waits for it at its end only (see `_settle`).
         durable = not is_last or self.checkpoints.newest is not None
         logs = {"curve": self._curve_log, "events": None if self._events is None else self._events.log}
         if durable:
@@ -243,9 +243,15 @@ class Session:
         if self._events is not None:
             timeless = {key: value for key, value in summary.items() if key not in CLOCK}
             self._events.text("run/summary", as_markdown(timeless), last.step)
-        with in_background(lambda: self._run.settle(*self._run.results())):
+        with in_background(self._settle):
             parts.pictures.finish(last)
         return summary
+
+    def _settle(self) -> None:
+        """Make the results, and the checkpoint that makes the run longer, survive a power cut."""
+        if newest := self.checkpoints.files()[:1]:
+            sync(newest, self.checkpoints.folder)
+        self._run.settle(*self._run.results())
 
     def _write_evaluations(self) -> None:
         if self._parts.curve.newest is not None:

@@ -16,14 +16,21 @@ from typing import Any
 
 import pytest
 from helpers.resuming import begin, differences, go_on, left_behind
-from helpers.support import script, start
+from helpers.support import ROOT, script, start
 from helpers.sweeps import differing, logged, rows
+from omegaconf import OmegaConf
 
+from gridworld.config.sweep import SweepConfig
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import TOLD
 from gridworld.process.parallel.together import run_together
 from gridworld.run.checkpoints import Checkpoints
+from gridworld.run.claim import claimed
 from gridworld.storage.append_log import AppendLog
+from gridworld.sweep import population
+from gridworld.sweep.folder import JobEntry
+from gridworld.sweep.plan import Job
+from gridworld.training.learning_curve import LearningCurve
 
 SMALL = (
     *("n_envs=16", "total_timesteps=1536", "evaluation.every=512", "agent.batch_size=64"),
@@ -246,3 +253,60 @@ def test_a_signal_interrupts_all_and_nothing_is_lost(
     assert done.returncode == 0, done.stderr
     for run in map(folder.joinpath, rows(folder)):
         assert differences(left_behind(run), left_behind(long_alone / run.name)) == []
+
+
+def test_a_run_has_as_many_files_open_as_a_population_reckons_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    most, evaluate = [], LearningCurve.evaluate
+
+    def counted(*arguments: Any) -> Any:
+        paths = [os.path.realpath(f"/proc/self/fd/{file}") for file in os.listdir("/proc/self/fd")]
+        most.append(sum(path.startswith(f"{tmp_path}/") for path in paths))
+        return evaluate(*arguments)
+
+    monkeypatch.setattr(LearningCurve, "evaluate", counted)
+    with claimed(tmp_path / "run"):
+        begin(tmp_path / "run", "agent=dqn", *SMALL)
+    assert max(most) == population.RUNS_FILES
+
+
+@pytest.mark.parametrize(("files", "largest"), [(10, 1), (79, 5), (94, 10), (sys.maxsize, 10)])
+def test_a_population_has_no_more_runs_than_files_can_be_open(
+    files: int, largest: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(population, "file_limit", lambda: files)
+    job = Job((), (), "", None, False, shape="")
+    jobs = [(JobEntry(str(number), "", ()), job) for number in range(10)]
+    hydra = OmegaConf.create(
+        {"launcher": {"_target_": "BasicLauncher"}, "job": {"chdir": None, "env_set": {}}}
+    )
+    groups = population.populations(jobs, SweepConfig(population=10), hydra)
+    assert max(map(len, groups)) == largest
+    assert [entry for group in groups for entry in group] == [entry for entry, _ in jobs]
+
+
+_WITH_FEW_FILES = """
+import os, resource, runpy, sys
+del sys.argv[0]
+from gridworld.sweep import population
+population.file_limit = lambda: sys.maxsize
+resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 18, 10**4))
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+def test_jobs_that_met_the_limit_of_open_files_are_run_by_the_same_command(tmp_path: Path) -> None:
+    words = ["-m", "agent=a2c", "seed=range(8)", "n_envs=4", "total_timesteps=200", *SMALL[4:]]
+    words += ["hydra.sweep.dir=few", "hydra.sweeper.population=8", "hydra/launcher=basic"]
+    train = str(ROOT / "scripts" / "train.py")
+    command = [sys.executable, "-c", _WITH_FEW_FILES, train, *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1
+    assert "Too many open files" in done.stderr
+    left = {row["status"] for row in rows(tmp_path / "few").values()}
+    assert left & {"pending", "interrupted"}
+    assert left <= {"pending", "interrupted", "done"}
+    again = script("train.py", *words, cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert {row["status"] for row in rows(tmp_path / "few").values()} == {"done"}
