@@ -1,21 +1,25 @@
 """Worlds from deterministic Gymnasium environments, enumerated: every action in a copy of every state.
 
-    explore       the states without their time, and what each action does there
-    elapsed_time  what the time changes; where rewards depend on it, it is made part of the state
-    replays       the environment itself beside the table, thousands of steps: any difference is refused
+    explore   the states and what each action does there; everything that changes is state, the time included
+    replays   the environment itself beside the table, thousands of steps: any difference is refused
 
-The world has the environment's own step limit, that of its id or the one at which it truncates by itself.
+A user may name attributes that are no part of a state, such as a step count on which nothing depends. The
+claim then rests on that, and `truth` says so.
+
+The world has the environment's own step limit, that of its id or the one at which it truncates by itself. A
+state at the limit is not terminal, since the environment does not say so, but nothing follows: every action
+stays there and pays nothing.
 
 Its own observation is a table where the observation space is a Box or Discrete, or a Dict with a Box
 `image`, of which this entry is taken, as minigrid's `ImgObsWrapper` does. Elsewhere there is none.
 
-An end is a success as in `outcomes`; where the reward depends on the time, if it pays more than 0.
+An end is a success if it pays more than 0, and if none does, if it pays best.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from enum import EnumType
 from typing import Any
 
@@ -25,35 +29,31 @@ import numpy as np
 from gridworld.errors import InputError
 from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.memory_budget import check_memory
-from gridworld.world.mdp import IntArray, Mdp
+from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import MOST_STATES, Outcomes, mdp_from_outcomes
-from gridworld.world.sources.enumeration.elapsed_time import (
-    Trials,
-    find_clocks,
-    outcomes_of,
-    own_limit,
-    with_time,
-)
-from gridworld.world.sources.enumeration.exploring import Clocks, Graph, Subject, TimeMattersError, explore
+from gridworld.world.sources.enumeration.exploring import Graph, Subject, explore
 from gridworld.world.sources.enumeration.replays import Replays
 from gridworld.world.sources.making import make_env
 from gridworld.world.sources.wrappers import refuse_transformed
 
-_BEYOND = 5_000  # states more than a step limit away; `env.max_episode_steps` may be larger than the id's
-
 
 def enumerate_env(
-    env_id: str, kwargs: Mapping[str, Any] | None = None, *, most_states: int = MOST_STATES
+    env_id: str,
+    kwargs: Mapping[str, Any] | None = None,
+    *,
+    ignore: Sequence[str] = (),
+    most_states: int = MOST_STATES,
 ) -> Mdp:
     """Compile a deterministic environment by trying every action in a copy of every state.
 
     Args:
         env_id: its registered id.
         kwargs: the arguments of `gymnasium.make`.
+        ignore: attributes of the environment that are no part of its state.
         most_states: more are refused as soon as they are found.
 
     Returns:
-        The world; its `truth` is "enumerated, N states".
+        The world; its `truth` is "enumerated, N states", and without which attributes.
 
     Raises:
         InputError: it cannot be made; it has other than discrete actions, layouts that are drawn anew, random
@@ -62,25 +62,16 @@ def enumerate_env(
     with telling_if_slow(f"enumerating {env_id}"):
         env = make_env(env_id, kwargs)
         try:
-            subject = Subject(env_id, env)
-            table = _tabulate(subject, _limit_of_id(env), most_states)
-            mdp = _compile(env_id, table, subject)
-            Replays(subject, mdp, table.graph, table.clocks, table.state).check(make_env(env_id, kwargs))
+            subject = Subject(env_id, env, ignore)
+            limit = _limit_of_id(env)
+            graph = explore(subject, most_states, limit)
+            mdp = _compile(env_id, subject, graph, _least(_own_limit(subject, graph), limit))
+            replays = Replays(subject, mdp, graph)
+            replays.check(make_env(env_id, kwargs))
             refuse_transformed(f"env.id={env_id}", env)
         finally:
             env.close()
-    return mdp
-
-
-@dataclass(frozen=True, eq=False)
-class _Table:
-    """Attributes: the states of the graph that the n states of the world are, (n,), and their outcomes."""
-
-    graph: Graph
-    clocks: Clocks
-    outcomes: Outcomes
-    state: IntArray
-    max_episode_steps: int | None
+    return replace(mdp, max_episode_steps=replays.limit)
 
 
 def _limit_of_id(env: gym.Env[Any, Any]) -> int | None:
@@ -88,74 +79,46 @@ def _limit_of_id(env: gym.Env[Any, Any]) -> int | None:
     return limit if limit is not None and limit > 0 else None  # -1 is "none" to `gymnasium.make`
 
 
-def _tabulate(subject: Subject, limit_of_id: int | None, most_states: int) -> _Table:
-    clocks = find_clocks(subject, limit_of_id)
-    if clocks:
-        try:
-            return _without_time(subject, clocks, limit_of_id, most_states)
-        except TimeMattersError:
-            pass
-    graph = explore(subject, {}, most_states, limit_of_id, 0 if clocks else _BEYOND)
-    limit = _least(_common_limit(subject, graph), limit_of_id)
-    return _Table(graph, {}, _plain(graph), np.arange(len(graph.keys)), limit)
-
-
-def _without_time(subject: Subject, clocks: Clocks, limit_of_id: int | None, most_states: int) -> _Table:
-    graph = explore(subject, clocks, most_states, limit_of_id, _BEYOND)
-    if len(np.unique(graph.truncated[graph.tried])) > 1:
-        raise _no_common_limit(subject)
-    own = own_limit(subject, graph, clocks, limit_of_id)
-    limit = _least(own, limit_of_id)
-    rewards = Trials(subject, graph, clocks, own).rewards_by_time(limit, most_states)
-    if not rewards or limit is None:  # without a limit no reward varies
-        return _Table(graph, clocks, _plain(graph), np.arange(len(graph.keys)), limit)
-    timed = with_time(graph, rewards, limit)
-    return _Table(graph, clocks, timed.outcomes, timed.state, limit)
-
-
-def _plain(graph: Graph) -> Outcomes:
-    return outcomes_of(graph.next_state, graph.reward, graph.terminated, None)
-
-
 def _least(*limits: int | None) -> int | None:
     return min((limit for limit in limits if limit is not None), default=None)
 
 
-def _common_limit(subject: Subject, graph: Graph) -> int | None:
-    """The time at which it truncates where its time is part of its state, or hidden from the attributes."""
-    times = np.unique(np.broadcast_to(graph.depth[:, None] + 1, graph.truncated.shape)[graph.truncated])
-    if not times.size:
+def _own_limit(subject: Subject, graph: Graph) -> int | None:
+    """The time at which it truncates all episodes, if any."""
+    times = np.broadcast_to(graph.depth[:, None] + 1, graph.truncated.shape)
+    truncating = graph.truncated & ~graph.terminated
+    if not truncating.any():
         return None
-    at_the_end = graph.tried & (graph.depth == times[0] - 1)
-    if (
-        times.size > 1
-        or not graph.truncated[at_the_end].all()
-        or (graph.depth[graph.tried] >= times[0]).any()
-    ):
-        raise _no_common_limit(subject)
-    return int(times[0])
+    limit = int(times[truncating].min())
+    if (graph.truncated != (times >= limit))[graph.tried[:, None] & ~graph.terminated].any():
+        raise subject.refusal(
+            "it truncates some episodes earlier than others, which no step limit of the world says"
+        )
+    return limit
 
 
-def _no_common_limit(subject: Subject) -> InputError:
-    return subject.refusal(
-        "it truncates some episodes earlier than others, which no step limit of the world says"
-    )
-
-
-def _compile(name: str, table: _Table, subject: Subject) -> Mdp:
+def _compile(name: str, subject: Subject, graph: Graph, limit: int | None) -> Mdp:
     observations = None
-    if table.graph.observations:
-        rows = table.graph.observations
-        check_memory(f"env.id={name}: its own observations", len(table.state) * rows[0].nbytes)
-        observations = np.stack(rows)[table.state]
+    if graph.observations:
+        check_memory(f"env.id={name}: its own observations", len(graph.keys) * graph.observations[0].nbytes)
+        observations = np.stack(graph.observations)
+    paid = graph.terminated & (graph.reward > 0)
     mdp = mdp_from_outcomes(
         name,
-        table.outcomes,
+        Outcomes(
+            next_state=graph.next_state[:, :, None],
+            probability=np.ones((*graph.next_state.shape, 1)),
+            reward=graph.reward[:, :, None],
+            terminated=graph.terminated[:, :, None],
+            start=np.eye(1, len(graph.next_state))[0],
+            success=paid[:, :, None] if paid.any() else None,
+        ),
         action_names=_action_names(subject),
-        max_episode_steps=table.max_episode_steps,
+        max_episode_steps=limit,
         own_observation=observations,
     )
-    return replace(mdp, truth=f"enumerated, {mdp.num_states:,} states")
+    told = f" without {', '.join(subject.ignore)} as told" if subject.ignore else ""
+    return replace(mdp, truth=f"enumerated, {mdp.num_states:,} states{told}")
 
 
 def _action_names(subject: Subject) -> list[str] | None:

@@ -98,6 +98,8 @@ class Corridor(gym.Env[Any, int]):
         if self.variant == "once" and self.steps == 37:
             reward += 1
         truncated = 0 < self.limit <= self.steps or (self.variant == "cut" and self.cell == 2)
+        if self.variant == "toll":
+            reward += 0.5 * truncated
         return self._observation(), reward, terminated, truncated, {}
 
 
@@ -197,17 +199,34 @@ def test_any_deterministic_environment(variant: str, limit: int) -> None:
     mdp = enumerate_env(env_id, kwargs)
     assert mdp.max_episode_steps == (limit or 12)
     walk_beside(mdp, gym.make(env_id, **kwargs), 500)
-    if variant in ("plain", "pixels"):
-        assert mdp.num_states == CELLS  # the steps are counted, but nothing depends on them
     best = {"plain": 1.0, "pixels": 1.0, "past": 1.0, "gate": 0.9**4, "decay": 0.9**4}[variant]
     assert Evaluator(mdp, 1.0, limit or 12).optimal_value == pytest.approx(best)
 
 
-def test_a_world_without_a_step_limit() -> None:
-    mdp = enumerate_env("Corridor-v0")
-    assert (mdp.num_states, mdp.max_episode_steps, mdp.action_names) == (CELLS, None, ("0", "1"))
+@pytest.mark.parametrize("variant", ["plain", "pixels", "text"])
+@pytest.mark.parametrize("limit", [None, 30])
+def test_a_step_count_that_is_left_out(variant: str, limit: int | None) -> None:
+    mdp = enumerate_env("Corridor-v0", {"variant": variant, "limit": limit or 0}, ignore=["steps"])
+    assert (mdp.num_states, mdp.max_episode_steps, mdp.action_names) == (CELLS, limit, ("0", "1"))
+    assert mdp.truth == "enumerated, 5 states without steps as told"
     assert mdp.goal.tolist() == [False] * 4 + [True]
     assert mdp.next_state[:, :, 0].tolist() == [[0, 1], [0, 2], [1, 3], [2, 4], [4, 4]]
+    assert (mdp.own_observation is None) == (variant == "text")
+
+
+@pytest.mark.parametrize(
+    ("variant", "limit", "what"),
+    [("once", 60, "reward"), ("decay", 20, "reward"), ("gate", 20, "reward"), ("toll", 25, "reward")],
+)
+def test_what_is_left_out_must_not_matter(variant: str, limit: int, what: str) -> None:
+    with pytest.raises(InputError, match=f"its {what} is not .* depends on steps, which env.ignore leaves out"):
+        enumerate_env("Corridor-v0", {"variant": variant, "limit": limit}, ignore=["steps"])
+
+
+def test_a_reward_for_a_truncation_belongs_to_the_last_step() -> None:
+    mdp = enumerate_env("Corridor-v0", {"variant": "toll", "limit": 9})
+    assert Evaluator(mdp, 1.0, 9).optimal_value == 1.5  # it waits, and goes right with the last step
+    walk_beside(mdp, gym.make("Corridor-v0", variant="toll", limit=9), 300)
 
 
 @pytest.mark.parametrize("variant", ["double", "fuel", "endless"])
@@ -220,13 +239,9 @@ def test_states_that_hold_the_time_end_at_the_step_limit(variant: str) -> None:
 
 
 def test_states_beyond_the_step_limit_that_have_an_end_are_found() -> None:
-    mdp = enumerate_env("ShortCorridor-v0", {"max_episode_steps": 2})
+    mdp = enumerate_env("ShortCorridor-v0", {"max_episode_steps": 2}, ignore=["steps"])
     assert (mdp.num_states, mdp.max_episode_steps) == (CELLS, 2)
     assert Evaluator(mdp, 1.0, 2).optimum.expected_return == 0
-
-
-def test_an_observation_that_is_no_array_is_left_out() -> None:
-    assert enumerate_env("Corridor-v0", {"variant": "text"}).own_observation is None
 
 
 @pytest.mark.parametrize(
@@ -235,15 +250,14 @@ def test_an_observation_that_is_no_array_is_left_out() -> None:
         ("Corridor-v0", {"variant": "random"}, "draws a random number"),
         ("Corridor-v0", {"variant": "global"}, "draws a random number"),
         ("Corridor-v0", {"variant": "layout"}, "a reset leads to another state with another seed"),
-        ("Corridor-v0", {"variant": "hidden"}, "is random, has state outside of its attributes"),
-        ("Corridor-v0", {"variant": "once", "limit": 50}, "enumerated as"),
-        ("Corridor-v0", {"variant": "endless"}, "more than 300 states"),
-        ("Corridor-v0", {"variant": "decay"}, "episodes have no step limit"),
-        ("Corridor-v0", {"variant": "decay", "limit": 200}, "with it there are .* states, 5 without it"),
-        ("Corridor-v0", {"variant": "cut"}, "truncates some episodes earlier"),
+        ("ShortCorridor-v0", {"variant": "hidden"}, "is random, has state outside of its attributes"),
+        ("Corridor-v0", {"variant": "endless"}, "more than 300 states .* since its past keeps changing"),
+        ("Corridor-v0", {}, r"since its steps keeps changing; .* e.g. env.ignore=\[steps\]"),
+        ("Corridor-v0", {"variant": "decay", "limit": 200}, "more than 300 states .* its steps keeps changing"),
+        ("ShortCorridor-v0", {"variant": "cut"}, "truncates some episodes earlier"),
         ("Corridor-v0", {"variant": "fails"}, "a step with action 0 fails: no third cell"),
         ("Corridor-v0", {"size": 3}, "unexpected keyword argument 'size'"),
-        ("DoubledCorridor-v0", {}, r"its reward is not the enumerated one \(2.0, enumerated as 1.0\)"),
+        ("DoubledCorridor-v0", {"limit": 20}, r"its reward is not the enumerated one \(2.0, enumerated as 1.0\)"),
         ("MiniGrid-FourRooms-v0", {}, "a reset leads to another state"),
         ("MiniGrid-Empty-Random-6x6-v0", {}, "a reset leads to another state"),
         ("FrozenLake-v1", {}, "take env=gymnasium"),
@@ -267,12 +281,83 @@ def test_an_observation_must_fit_its_space(variant: str) -> None:
     assert "\n" not in str(refused.value)
 
 
+def test_an_attribute_that_is_left_out_must_be_there() -> None:
+    with pytest.raises(InputError, match=r"env.ignore=\['step'\]: Corridor-v0 has no attribute step; it has .*steps"):
+        enumerate_env("Corridor-v0", ignore=["step"])
+
+
+def test_states_too_far_away_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exploring, "_DEEPEST", 100)
+    with pytest.raises(InputError, match="after 100 steps there are still new states, since its steps keeps"):
+        enumerate_env("Corridor-v0")
+
+
+class Counted(Corridor):
+    """It counts its episodes."""
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        self.episodes = getattr(self, "episodes", 0) + 1
+        return super().reset(**kwargs)
+
+
+def test_what_changes_with_every_episode_is_named() -> None:
+    gym.register("Counted-v0", entry_point=Counted)
+    with pytest.raises(InputError, match=r"at another time \(in episodes\).*env.ignore"):
+        enumerate_env("Counted-v0", {"limit": 9})
+    assert enumerate_env("Counted-v0", {"limit": 9}, ignore=["episodes", "steps"]).num_states == CELLS
+    del gym.registry["Counted-v0"]
+
+
+class Ferry(gym.Env[Any, int]):
+    """Left, right, wait or board: the pier at the end pays much from `first` to `last`, the start little."""
+
+    observation_space: gym.Space[Any] = spaces.Discrete(100)
+    action_space = spaces.Discrete(4)
+
+    def __init__(
+        self, render_mode: str | None = None, cells: int = 6, first: int = 7, last: int = 9, limit: int = 20
+    ) -> None:
+        self.cells, self.first, self.last, self.limit = cells, first, last, limit
+        self.clock: dict[str, int] = {}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.cell, self.clock = 0, {"minutes": 0}
+        return self.cell, {}
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        time = self.clock["minutes"]
+        self.clock["minutes"] = time + 1
+        reward, over = 0.0, False
+        if action == 3 and self.cell == self.cells and self.first <= time <= self.last:
+            reward, over = 1.0, True
+        if action == 3 and self.cell == 0:
+            reward, over = 0.2, True
+        move = {0: -1, 1: 1}.get(action, 0)
+        self.cell = min(max(self.cell + move, 0), self.cells)
+        return self.cell, reward, over, self.clock["minutes"] >= self.limit, {}
+
+
+@pytest.mark.parametrize("cells", [4, 11])
+@pytest.mark.parametrize(("first", "last"), [(3, 3), (5, 9), (11, 11), (13, 14), (19, 19), (20, 30)])
+def test_what_is_there_for_a_time_only(cells: int, first: int, last: int) -> None:
+    gym.register("Ferry-v0", entry_point=Ferry)
+    kwargs = {"cells": cells, "first": first, "last": last}
+    mdp = enumerate_env("Ferry-v0", kwargs)
+    boarded = max(cells, first)
+    truth = 0.98**boarded if boarded <= min(last, 19) else 0
+    assert Evaluator(mdp, 0.98, 20).optimal_value == pytest.approx(max(truth, 0.2), abs=1e-12)
+    if truth:
+        with pytest.raises(InputError, match="env.ignore leaves out"):
+            enumerate_env("Ferry-v0", kwargs, ignore=["clock"])
+    del gym.registry["Ferry-v0"]
+
+
 def test_many_states_are_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(exploring, "_MANY_STATES", 100)
     monkeypatch.setattr(exploring, "ProgressLine", partial(ProgressLine, seconds_between_lines=0))
     with pytest.raises(InputError, match="more than 1,200 states"):
         enumerate_env("Corridor-v0", {"variant": "endless"}, most_states=1200)
-    assert "states so far, at most 1,200, no step limit ends them" in capsys.readouterr().err
+    assert "states so far, at most 1,200; Ctrl-C" in capsys.readouterr().err
 
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,15 +1,13 @@
-"""The reachable states of a deterministic environment, found by trying every action in copies of each.
+"""The reachable states of a deterministic environment, found by trying every action in a copy of each.
 
-A step count is left out of the states (`clocks`): a grid of 144 positions with a step limit of 256 has
-36,864 states, and one step in each of 144 tells almost all about them. `elapsed_time` asks what the time
-changes.
+Everything that changes is state, the elapsed time too, but for the attributes that the user names.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -24,27 +22,15 @@ from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 from gridworld.world.outcomes import MOST_ACTIONS
 from gridworld.world.sources.enumeration.snapshots import Snapshots, key_of, random_states
 
-Clocks = Mapping[str, int]  # attributes that count steps, and what they are at a reset
-_Rows = dict[int, list[tuple[int, float, bool, bool]]]  # next state, reward, terminated, truncated, by action
-
+_BEYOND = 1_000  # states further than a step limit that are found too, so that a small world is whole
+_DEEPEST = 10_000  # steps from the start
 _MANY_STATES = 20_000  # from which on their number is told
 _MOST_BYTES = 2**31  # of all copies and observations together
+_SAMPLED = 16  # of so many states the copy of one is kept, to tell what keeps changing
 _SEEDS = 8  # resets that must lead to the same state
-
-
-class TimeMattersError(Exception):
-    """A step does something else at another time."""
-
-
-class Move(NamedTuple):
-    """What a step does."""
-
-    key: bytes  # of the state that follows
-    seen: bytes  # a digest of the observation
-    observation: Any
-    reward: float
-    terminated: bool
-    truncated: bool
+_FIXED = (
+    "; take an environment whose layout and start are fixed, or leave out by env.ignore what nothing depends on"
+)
 
 
 class Subject:
@@ -53,17 +39,19 @@ class Subject:
     Args:
         name: what messages call it.
         env: an environment, wrapped or not.
+        ignore: the names of attributes that are no part of a state.
 
     Attributes:
         num_actions: A.
         snapshots: of it.
 
     Raises:
-        InputError: other actions than numbers from 0 on; or its resets lead to different states.
+        InputError: other actions than numbers from 0 on; no such attributes; or its resets lead to different
+            states.
     """
 
-    def __init__(self, name: str, env: gym.Env[Any, Any]) -> None:
-        self.name = name
+    def __init__(self, name: str, env: gym.Env[Any, Any], ignore: Sequence[str] = ()) -> None:
+        self.name, self.ignore = name, tuple(ignore)
         self.env = env.unwrapped
         self.snapshots = Snapshots(self.env)
         actions = env.action_space
@@ -72,12 +60,27 @@ class Subject:
                 f"its actions are {actions}, must be Discrete(n), from 0 to {MOST_ACTIONS} - 1"
             )
         self.num_actions = int(actions.n)
-        keys = {self.reset(seed)[0] for seed in range(_SEEDS)}
-        if len(keys) > 1:
-            raise self.refusal(
-                "a reset leads to another state with another seed, so that its states cannot be enumerated "
-                f"from one start{self._remedy or '; take an environment whose layout and start are fixed'}"
+        self.env.reset(seed=0)
+        if unknown := [each for each in ignore if each not in vars(self.env)]:
+            raise InputError(
+                f"env.ignore={list(ignore)}: {name} has no attribute {unknown[0]}; it has "
+                f"{', '.join(vars(self.env))}"
             )
+        self._check_resets()
+
+    def _check_resets(self) -> None:
+        key, before = self.key(), self._keys()
+        for seed in range(_SEEDS):
+            self.env.reset(seed=seed)
+            if self.key() != key:
+                changed = _listed(name for name, each in self._keys().items() if each != before.get(name))
+                raise self.refusal(
+                    f"a reset leads to another state with another seed or at another time (in {changed}), so "
+                    f"that its states cannot be enumerated from one start{self._remedy or _FIXED}"
+                )
+
+    def _keys(self) -> dict[str, bytes]:
+        return {name: key for name, key in self.snapshots.keys().items() if name not in self.ignore}
 
     @property
     def _remedy(self) -> str:
@@ -87,37 +90,10 @@ class Subject:
         """An error that says why there is no table of it."""
         return InputError(f"env.id={self.name}: {reason}")
 
-    def reset(self, seed: int) -> tuple[bytes, Any]:
-        """The key of the state after a reset, and the observation."""
-        observation, _ = self.env.reset(seed=seed)
-        return self.key(), observation
-
-    def truncates(self, snapshot: bytes, clocks: Clocks, time: int, action: int) -> bool:
-        """Whether an action truncates, as in `try_action`."""
-        self._set(snapshot, clocks, time)
-        return self.step(action)[3]
-
-    def _set(self, snapshot: bytes, clocks: Clocks, time: int) -> None:
-        self.snapshots.put_back(snapshot)
-        for clock, first in clocks.items():
-            setattr(self.env, clock, first + time)
-
-    def step(self, action: int) -> tuple[Any, float, bool, bool]:
-        """Observation, reward, terminated and truncated of a step.
-
-        Raises:
-            InputError: the step fails.
-        """
+    def key(self) -> bytes:
+        """The key of its state."""
         try:
-            observation, reward, terminated, truncated, _ = self.env.step(action)
-        except Exception as error:  # whatever it raises
-            raise self.refusal(f"a step with action {action} fails: {error}") from error
-        return observation, float(reward), bool(terminated), bool(truncated)
-
-    def key(self, clocks: Clocks | None = None) -> bytes:
-        """The key of its state; the clocks do not count."""
-        try:
-            return self.snapshots.key(clocks or ())
+            return self.snapshots.key(self.ignore)
         except (TypeError, ValueError, RecursionError) as error:
             raise self.refusal(f"its state cannot be compared: {error}") from error
 
@@ -128,27 +104,46 @@ class Subject:
         except Exception as error:  # whatever the classes in it raise
             raise self.refusal(f"its state cannot be copied: {error}") from error
 
-    def try_action(self, snapshot: bytes, clocks: Clocks, time: int, action: int) -> Move:
-        """Take an action in a copy of a state, with its clocks set as they are after `time` steps.
+    def steps(self, snapshot: bytes) -> list[tuple[bytes, Any, float, bool, bool]]:
+        """Take each action in a copy of a state.
+
+        Returns:
+            Of each, a copy of the state that follows, the observation, reward, terminated and truncated.
 
         Raises:
-            InputError: the step fails, or draws a random number.
+            InputError: a step fails, or draws a random number.
         """
-        self._set(snapshot, clocks, time)
+        found = []
         before = random_states(self.env)
-        observation, reward, terminated, truncated = self.step(action)
+        for action in range(self.num_actions):
+            self.snapshots.put_back(snapshot)
+            try:
+                observation, reward, terminated, truncated, _ = self.env.step(action)
+            except Exception as error:  # whatever it raises
+                raise self.refusal(f"a step with action {action} fails: {error}") from error
+            found.append((self.copy(), observation, float(reward), bool(terminated), bool(truncated)))
         if random_states(self.env) != before:
-            raise self.refusal(
-                f"a step with action {action} draws a random number, so it is not deterministic{self._remedy}"
-            )
-        if any(getattr(self.env, clock, None) != first + time + 1 for clock, first in clocks.items()):
-            raise TimeMattersError
-        return Move(self.key(clocks), key_of(observation), observation, reward, terminated, truncated)
+            raise self.refusal(f"a step draws a random number, so it is not deterministic{self._remedy}")
+        return found
+
+    def changing(self, snapshots: Sequence[bytes]) -> str:
+        """The attributes with the most values in copies of states, that of the elapsed time among them."""
+        values: dict[str, set[bytes]] = {}
+        for snapshot in snapshots:
+            self.snapshots.put_back(snapshot)
+            for name, key in self._keys().items():
+                values.setdefault(name, set()).add(key)
+        most = max(map(len, values.values()))
+        return _listed(name for name, found in values.items() if len(found) == most)
+
+
+def _listed(names: Any) -> str:
+    return ", ".join(sorted(names)) or "nothing"
 
 
 @dataclass(eq=False)
 class Graph:
-    """N states without their time, the start first.
+    """N states, the start first.
 
     Attributes:
         next_state: (N, A), integers; of states that are not tried, themselves.
@@ -160,7 +155,6 @@ class Graph:
         keys: N keys.
         seen: N digests of observations.
         observations: N observations, as arrays; empty where they are none.
-        snapshots: N copies.
     """
 
     next_state: IntArray
@@ -172,163 +166,153 @@ class Graph:
     keys: list[bytes]
     seen: list[bytes]
     observations: list[NDArray[Any]]
-    snapshots: list[bytes]
 
 
-@dataclass(eq=False)
-class _Found:
-    """The states found so far; `goes_on`: whether an episode may go on from there."""
-
-    as_array: Callable[[Any], NDArray[Any] | None]
-    number: dict[bytes, int] = field(default_factory=dict)
-    depth: list[int] = field(default_factory=list)
-    goes_on: list[bool] = field(default_factory=list)
-    seen: list[bytes] = field(default_factory=list)
-    observations: list[NDArray[Any]] = field(default_factory=list)
-    snapshots: list[bytes] = field(default_factory=list)
-    num_bytes: int = 0
-
-    def add(self, key: bytes, seen: bytes, observation: Any, snapshot: bytes, depth: int) -> int:
-        self.number[key] = len(self.number)
-        self.depth.append(depth)
-        self.goes_on.append(False)
-        self.seen.append(seen)
-        self.snapshots.append(snapshot)
-        self.num_bytes += len(snapshot)
-        array = self.as_array(observation)
-        if array is not None:
-            self.observations.append(array)
-            self.num_bytes += array.nbytes
-        return len(self.number) - 1
-
-    def forget(self, first: int) -> None:
-        """Leave out the states from this number on."""
-        for each in (self.depth, self.goes_on, self.seen, self.observations, self.snapshots):
-            del each[first:]
-        self.number = {key: state for key, state in self.number.items() if state < first}
-
-
-def explore(
-    subject: Subject, clocks: Clocks, most_states: int, deepest: int | None = None, beyond: int = 0
-) -> Graph:
+def explore(subject: Subject, most_states: int, limit: int | None) -> Graph:
     """Find all states that can be reached, breadth first, and what every action does there.
 
-    At `deepest` steps from the start episodes are over. What lies beyond is found too where there are few
-    such states, and left out otherwise: a state may hold the time in any form, and then they have no end.
+    Episodes are over at the step limit. What lies beyond it is found too where that is little, and left out
+    otherwise: a state may hold the time, and then there is no end of them.
 
     Args:
         subject: the environment.
-        clocks: attributes that are no part of a state; they are as after a reset before each step.
         most_states: more are refused.
-        deepest: the step limit, if one is known.
-        beyond: states beyond it; if there are more, or one cannot be tried, all are left out.
+        limit: the step limit, if one is known.
 
     Raises:
-        TimeMattersError: the clocks do not count every step, or observations show them.
-        InputError: too many states; or what `Subject.try_action` refuses.
+        InputError: too many states; or what `Subject` refuses.
     """
-    _, observation = subject.reset(0)
-    found = _Found(_array_reader(subject))
-    found.add(subject.key(clocks), key_of(observation), observation, subject.copy(), 0)
-    found.goes_on[0] = True
-    search = _Search(subject, clocks, found, [0])
-    search.go_on(most_states, deepest)
-    if search.pending and beyond:
-        size, rows = len(found.number), dict(search.rows)
+    search = _Search(subject, most_states)
+    search.go_on(limit or _DEEPEST)
+    if search.pending and limit is None:
+        raise subject.refusal(
+            f"after {_DEEPEST:,} steps there are still new states, since its {search.changing()}"
+        )
+    if search.pending:
+        inside = len(search.depth)
+        search.most_states = min(most_states, inside + _BEYOND)
         try:
-            search.go_on(min(most_states, size + beyond), None)
+            search.go_on(None)
         except InputError:
-            found.forget(size)
-            search.rows = rows
-    return _as_graph(found, search.rows, subject.num_actions)
+            return search.graph(inside, limit)
+    return search.graph(len(search.depth), None)
 
 
-@dataclass(eq=False)
 class _Search:
     """A search, breadth first, that can stop at a depth: `pending` is what is to be tried."""
 
-    subject: Subject
-    clocks: Clocks
-    found: _Found
-    pending: list[int]
-    rows: _Rows = field(default_factory=dict)
+    def __init__(self, subject: Subject, most_states: int) -> None:
+        self.subject, self.most_states = subject, most_states
+        self.depth: list[int] = []
+        self.pending = [0]
+        self._as_array = _array_reader(subject)
+        self._rows: dict[int, list[tuple[int, float, bool, bool]]] = {}
+        self._goes_on = {0}
+        self._state_of_copy: dict[bytes, int] = {}  # by a digest of a copy, of which a state may have several
+        self._state: dict[bytes, int] = {}  # by its key
+        self._seen: list[bytes] = []
+        self._observations: list[NDArray[Any]] = []
+        self._snapshots: list[bytes] = []
+        self._num_bytes = 0
+        observation, _ = subject.env.reset(seed=0)
+        self._state_after(subject.copy(), observation, 0)
 
-    def go_on(self, most_states: int, deepest: int | None) -> None:
+    def go_on(self, deepest: int | None) -> None:
         """Try what is pending, and what is found by that; states at the depth `deepest` are left pending."""
-        subject, clocks, found, left = self.subject, self.clocks, self.found, []
+        left = []
         line = ProgressLine(True)
         for state in self.pending:  # which grows
-            if found.depth[state] == deepest:
+            if self.depth[state] == deepest:
                 left.append(state)
                 continue
             row = []
-            for action in range(subject.num_actions):
-                move = subject.try_action(found.snapshots[state], clocks, 0, action)
-                following = _state_of(subject, found, move, found.depth[state] + 1, clocks, most_states)
-                row.append((following, move.reward, move.terminated, move.truncated))
-                over = move.terminated or (move.truncated and not clocks)
-                if not (over or found.goes_on[following]):
-                    found.goes_on[following] = True
+            for copy, observation, reward, terminated, truncated in self.subject.steps(self._snapshots[state]):
+                following = self._state_after(copy, observation, self.depth[state] + 1)
+                row.append((following, reward, terminated, truncated))
+                if not (terminated or truncated or following in self._goes_on):
+                    self._goes_on.add(following)
                     self.pending.append(following)
-            self.rows[state] = row
-            if len(found.number) > _MANY_STATES and state % 500 == 0:
-                line.show(lambda: self._how_far(deepest, most_states))
+            self._rows[state] = row
+            if state % _SAMPLED:
+                self._num_bytes -= len(self._snapshots[state])
+                self._snapshots[state] = b""
+            if len(self.depth) > _MANY_STATES and state % 500 == 0:
+                line.show(
+                    lambda: (
+                        f"enumerating {printable(self.subject.name)}: {len(self.depth):,} states so far, at "
+                        f"most {self.most_states:,}; Ctrl-C ends it"
+                    )
+                )
         line.clear()
         self.pending = left
 
-    def _how_far(self, deepest: int | None, most_states: int) -> str:
-        hint = "" if deepest else ", no step limit ends them (env.kwargs.max_episode_steps would)"
+    def _state_after(self, copy: bytes, observation: Any, depth: int) -> int:
+        """The number of a state that the subject may have been in before, given a copy of it."""
+        subject, short, seen = self.subject, key_of(copy), key_of(observation)
+        state = self._state_of_copy.get(short)
+        if state is None:
+            subject.snapshots.put_back(copy)
+            state = self._state_of_copy[short] = self._state.setdefault(subject.key(), len(self._state))
+        if state == len(self.depth):
+            self._add(copy, seen, observation, depth)
+        elif self._seen[state] != seen:
+            raise subject.refusal(
+                "the same state is shown by different observations, so that what an agent sees is no "
+                f"function of the state{_without(subject.ignore)}"
+            )
+        return state
+
+    def _add(self, copy: bytes, seen: bytes, observation: Any, depth: int) -> None:
+        self.depth.append(depth)
+        self._snapshots.append(copy)
+        self._seen.append(seen)
+        self._num_bytes += len(copy)
+        array = self._as_array(observation)
+        if array is not None:
+            self._observations.append(array)
+            self._num_bytes += array.nbytes
+        size = len(self.depth)
+        if size > self.most_states:
+            raise self.subject.refusal(
+                f"more than {self.most_states:,} states can be reached, and more than that cannot be solved "
+                f"for, since its {self.changing()}"
+            )
+        if self._num_bytes > _MOST_BYTES:
+            raise self.subject.refusal(
+                f"copies of the first {size:,} states take more than {_MOST_BYTES / 2**30:.0f} GiB"
+            )
+        check_memory(f"env.id={self.subject.name}", self._num_bytes)
+
+    def changing(self) -> str:
+        """What keeps changing, and what can be done about it, as the rest of a sentence."""
+        found = self.subject.changing([each for each in self._snapshots[:: _SAMPLED] if each][-1000:])
         return (
-            f"enumerating {printable(self.subject.name)}: {len(self.found.number):,} states so far, at most "
-            f"{most_states:,}{hint}; Ctrl-C ends it"
+            f"{found} keeps changing; take a smaller one, set a step limit (env.kwargs.max_episode_steps), or "
+            f"leave out what nothing depends on, e.g. env.ignore=[{found.split(',')[0]}]"
+        )
+
+    def graph(self, size: int, limit: int | None) -> Graph:
+        """The first states of those found; from a limit on they are not tried."""
+        tried = [state for state in self._rows if state < size and self.depth[state] != limit]
+        rows = [[(state, 0.0, False, False)] * self.subject.num_actions for state in range(size)]
+        for state in tried:
+            rows[state] = self._rows[state]
+        columns = np.array(rows, dtype=np.float64).reshape(size, self.subject.num_actions, 4)
+        return Graph(
+            next_state=columns[:, :, 0].astype(np.int64),
+            reward=columns[:, :, 1],
+            terminated=columns[:, :, 2] > 0,
+            truncated=columns[:, :, 3] > 0,
+            tried=np.isin(np.arange(size), tried),
+            depth=np.array(self.depth[:size]),
+            keys=list(self._state)[:size],
+            seen=self._seen[:size],
+            observations=self._observations[:size],
         )
 
 
-def _state_of(
-    subject: Subject, found: _Found, move: Move, depth: int, clocks: Clocks, most_states: int
-) -> int:
-    """The number of the state that a move has led to, where the subject is now."""
-    state = found.number.get(move.key)
-    if state is None:
-        if len(found.number) >= most_states:
-            raise subject.refusal(
-                f"more than {most_states:,} states can be reached, and more than that cannot be solved for; "
-                "take a smaller one"
-            )
-        state = found.add(move.key, move.seen, move.observation, subject.copy(), depth)
-        if found.num_bytes > _MOST_BYTES:
-            raise subject.refusal(
-                f"copies of the first {state + 1:,} states take more than {_MOST_BYTES / 2**30:.0f} GiB"
-            )
-        check_memory(f"env.id={subject.name}", found.num_bytes)
-    elif found.seen[state] != move.seen:
-        if clocks:
-            raise TimeMattersError
-        raise subject.refusal(
-            "the same state is shown by different observations, so that what an agent sees is no function of "
-            "the state"
-        )
-    return state
-
-
-def _as_graph(found: _Found, rows: _Rows, num_actions: int) -> Graph:
-    size = len(found.number)
-    still = [[(state, 0.0, False, False)] * num_actions for state in range(size)]
-    for state, row in rows.items():
-        still[state] = row
-    columns = np.array(still, dtype=np.float64).reshape(size, num_actions, 4)
-    return Graph(
-        next_state=columns[:, :, 0].astype(np.int64),
-        reward=columns[:, :, 1],
-        terminated=columns[:, :, 2] > 0,
-        truncated=columns[:, :, 3] > 0,
-        tried=np.isin(np.arange(size), list(rows)),
-        depth=np.array(found.depth),
-        keys=list(found.number),
-        seen=found.seen,
-        observations=found.observations,
-        snapshots=found.snapshots,
-    )
+def _without(ignore: Sequence[str]) -> str:
+    return f" without {', '.join(ignore)}, which env.ignore leaves out" if ignore else ""
 
 
 def _array_reader(subject: Subject) -> Callable[[Any], NDArray[Any] | None]:

@@ -50,7 +50,7 @@ class Snapshots:
         self._kept: dict[int, Any] = {}  # by id
 
     def take(self) -> bytes:
-        """A copy of the state.
+        """A copy of the state. Equal copies are of equal states; equal states may have several.
 
         Raises:
             TypeError, pickle.PicklingError, AttributeError: something in it cannot be copied.
@@ -75,9 +75,15 @@ class Snapshots:
         Raises:
             TypeError: it holds what cannot be compared, such as an iterator.
         """
-        left_out = {*without, *_OF_ITS_RANDOMNESS}
-        attributes = {name: value for name, value in vars(self._env).items() if name not in left_out}
+        attributes = {name: value for name, value in self._attributes() if name not in without}
         return _digest(_Reader(self._env).read(attributes))
+
+    def keys(self) -> dict[str, bytes]:
+        """A digest of each attribute."""
+        return {name: _digest(_Reader(self._env).read(value)) for name, value in self._attributes()}
+
+    def _attributes(self) -> list[tuple[str, Any]]:
+        return [each for each in vars(self._env).items() if each[0] not in _OF_ITS_RANDOMNESS]
 
 
 def key_of(value: Any) -> bytes:
@@ -110,17 +116,22 @@ def _digest(value: Any) -> bytes:
     return hashlib.blake2b(marshal.dumps(value, 2), digest_size=16).digest()
 
 
+def _kept(number: int) -> Any:
+    """What a copy says in place of an object that is kept as it is; `_Unpickler` reads it."""
+    raise NotImplementedError
+
+
 class _Pickler(pickle.Pickler):
     def __init__(self, file: io.BytesIO, env: Any, kept: dict[int, Any]) -> None:
         super().__init__(file, protocol=5)
         self._env, self._kept_by_id = env, kept
 
-    def persistent_id(self, obj: Any) -> int | None:
+    def reducer_override(self, obj: Any) -> Any:
         local = isinstance(obj, type) and "<locals>" in obj.__qualname__
-        if obj is self._env or local or isinstance(obj, _KEPT):
+        if obj is not _kept and (obj is self._env or local or isinstance(obj, _KEPT)):
             self._kept_by_id[id(obj)] = obj
-            return id(obj)
-        return None
+            return _kept, (id(obj),)
+        return NotImplemented
 
 
 class _Unpickler(pickle.Unpickler):
@@ -128,8 +139,9 @@ class _Unpickler(pickle.Unpickler):
         super().__init__(file)
         self._kept_by_id = kept
 
-    def persistent_load(self, pid: Any) -> Any:
-        return self._kept_by_id[pid]
+    def find_class(self, module: str, name: str) -> Any:
+        ours = (module, name) == (_kept.__module__, _kept.__name__)
+        return self._kept_by_id.__getitem__ if ours else super().find_class(module, name)
 
 
 class _Reader:
