@@ -130,12 +130,13 @@ class EnumeratedConfig(GymnasiumConfig):
     """A deterministic environment of Gymnasium whose states are found by trying all actions."""
 
     source: str = "enumerated"
+    ignore: list[str] = field(default_factory=list)  # attributes that are no part of its state, by your word
 
     def compile(self) -> Mdp:
         """See `EnvConfig.compile`."""
         from gridworld.world.sources.enumerated import enumerate_env
 
-        return enumerate_env(self.id, self.kwargs)
+        return enumerate_env(self.id, self.kwargs, ignore=self.ignore)
 
     def step_limit(self, mdp: Mdp) -> int:
         """See `EnvConfig.step_limit`; the environment itself ends its episodes at its own limit."""

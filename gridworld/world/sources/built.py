@@ -27,14 +27,25 @@ def build(builder: str | Callable[..., Any], kwargs: Mapping[str, Any] | None = 
         other.
 
     Raises:
-        InputError: there is no such function, it raises something, or what it returns is no world.
+        InputError: there is no such function, it raises something, what it returns is no world, or another
+            one each time.
     """
     where = f"env.builder={_name_of(builder) if callable(builder) else str(builder)[:200]}"
     function = imported("env.builder", builder) if isinstance(builder, str) else builder
     if not callable(function):
         raise InputError(f"{where}: must be the import path of a function, e.g. my_package.worlds.make")
+    mdp, again = (_called(where, function, dict(kwargs or {})) for _ in range(2))
+    if mdp.text() != again.text():
+        raise InputError(
+            f"{where}: makes another world each time that it is called, so that no run is about one; what it "
+            "draws must follow from env.kwargs, e.g. a seed"
+        )
+    return mdp
+
+
+def _called(where: str, function: Callable[..., Any], kwargs: dict[str, Any]) -> Mdp:
     try:
-        found = function(**dict(kwargs or {}))
+        found = function(**kwargs)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     except (Exception, SystemExit) as error:  # a function of the user's own may raise anything

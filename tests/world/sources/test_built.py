@@ -35,6 +35,16 @@ def raising(text="no power"):
     raise RuntimeError(text)
 
 
+def drawn(length=4, seed=None):
+    return arrays(reward=[[float(np.random.default_rng(seed).integers(1, 10**9)) / length]])
+
+
+def test_a_function_that_draws_its_world_needs_a_seed():
+    with pytest.raises(InputError, match=r"^env.builder=drawn: makes another world each time .* env.kwargs"):
+        build(drawn)
+    assert build(drawn, {"seed": 3}).text() == build(drawn, {"seed": 3}).text()
+
+
 def test_the_three_things_that_a_function_may_return():
     assert build("gridworld.world.sources.classics.river_swim", {"length": 4}).num_states == 4
     assert (build(arrays).name, build(arrays, {"name": "mine"}).name) == ("arrays", "mine")
