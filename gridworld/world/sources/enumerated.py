@@ -26,7 +26,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from gridworld.errors import InputError
 from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.memory_budget import check_memory
 from gridworld.world.mdp import Mdp

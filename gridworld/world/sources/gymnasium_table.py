@@ -6,13 +6,14 @@ Environments of Gymnasium's `toy_text` family have a table `P` and a start distr
     initial_state_distrib = (N,) probabilities
 
 Ending belongs to the outcome there; `gridworld.world.outcomes` makes it a state. An environment whose steps
-are not those of its table is refused: the real one is walked beside the table, along random actions and along
-a good policy, and each step must be an outcome of its row.
+are not those of its table is refused: the real one is walked beside the table (`table_walk`), each step must
+be an outcome of its row, and as frequent as the row says, as far as that can be told.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -53,10 +54,10 @@ def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> M
             f"env.id={env_id}: has another table each time that it is made, so no exact truth is known; "
             "give what it draws as env.kwargs, e.g. desc of a FrozenLake"
         )
-    _check_steps(mdp, table, again)
+    truth = _check_steps(mdp, table, again)
     env.close()
     again.close()
-    return mdp
+    return replace(mdp, truth=truth)
 
 
 def compile_table(real: gym.Env[Any, Any], limit: int | None = None, walked: bool = True) -> Mdp:
@@ -76,9 +77,7 @@ def compile_table(real: gym.Env[Any, Any], limit: int | None = None, walked: boo
     mdp, table = _compiled(real, real.spec.id if real.spec is not None else type(real).__name__, limit)
     if own := {"step", "reset"} & vars(real).keys():
         raise InputError(f"{mdp.name}: its {own.pop()}() was replaced, so nothing exact is known of it")
-    if walked:
-        _check_steps(mdp, table, copied(real))
-    return mdp
+    return replace(mdp, truth=_check_steps(mdp, table, copied(real))) if walked else mdp
 
 
 def has_table(env: Any) -> bool:
@@ -215,11 +214,11 @@ def _differ(table: Outcomes, other: Outcomes) -> bool:
     return not all(np.array_equal(getattr(table, name), getattr(other, name)) for name in names)
 
 
-def _check_steps(mdp: Mdp, table: Outcomes, env: gym.Env[Any, Any]) -> None:
-    real = env.unwrapped
-    mistake = None
+def _check_steps(mdp: Mdp, table: Outcomes, env: gym.Env[Any, Any]) -> str:
+    """What `walk` says."""
+    real, mistake, found = env.unwrapped, None, ""
     try:
-        walk(mdp, table, env)
+        found = walk(mdp, table, env)
     except InputError as error:
         mistake = error
     except Exception as error:  # an environment of the user's own may raise anything
@@ -231,3 +230,4 @@ def _check_steps(mdp: Mdp, table: Outcomes, env: gym.Env[Any, Any]) -> None:
         )
     if mistake is not None:
         raise mistake
+    return found

@@ -1,76 +1,327 @@
-"""A real environment beside its transition table: along random actions and along a good policy."""
+"""A real environment beside its transition table: which outcomes occur, and how often.
+
+It is walked along several policies; where its state can be set, every row of the table is stepped, and those
+that look wrong again. The counts are judged by Bayes factors against the table: with a true table one that is
+ever above 1/α has at most probability α, whatever is stepped next and whenever one looks.
+
+Reference: J. Ville, Étude critique de la notion de collectif, 1939.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.special import gammaln, logsumexp
 
 from gridworld.errors import InputError
 from gridworld.world.exact.bellman import backup
-from gridworld.world.mdp import IntArray, Mdp
+from gridworld.world.mdp import FloatArray, IntArray, Mdp
 from gridworld.world.outcomes import Outcomes
+from gridworld.world.sources.enumeration.snapshots import Snapshots
+from gridworld.world.sources.known_envs import known_env
 
 if TYPE_CHECKING:
     import gymnasium as gym
 
 SEED = 20_240_501  # of the walk
-_SWEEPS = 100  # of value iteration, for the policy of the walk
+_FALSE_ALARM = 1e-9  # probability that a true table is refused
+_CONCENTRATIONS = np.array([1.0, 10.0, 100.0, 1000.0])  # of the Dirichlet priors around a row
+_VAGUE = 0.5  # what cannot be told nearer than that is not told
 _GAMMA = 0.99
-# The walk: episodes with these shares of random actions in turn. The passenger of a fickle Taxi changes its
-# mind in 3 of 10 episodes, on the way to the destination, where random actions do not come.
-_RANDOM_SHARES = (0.0, 0.1, 1.0)
-_MOST_STEPS = (200, 200, 50)  # of one episode of each
-_WALK = 2000  # steps in all
-_MOST_EPISODES = 150
+_SWEEPS = 100  # at most, of value iteration, for the policies of the walk
+_WORK = 2 * 10**7  # outcomes that it takes in a policy, and in all that lead to what is new
+_WALK = 6_000  # steps along policies where the state can be set besides
+_LONG_WALK = 24_000  # more of them where it cannot
+_ROWS = 24_000  # steps over all rows
+_ROUNDS, _SUSPECTS, _AGAIN = 4, 8, 500  # how often how many rows that look wrong are stepped how many times
+_MOST_STEPS = 200  # of an episode, where there is no limit
+_RESETS = 600  # at least
+_PROBES = 12
+_WATCHED = 5  # episodes after which it is seen which attributes change
 
 
-def walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> None:
-    """Compare steps of the real environment with its table, in episodes of 2,000 steps together.
+def walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> str:
+    """Compare steps of the real environment with its table.
 
     Args:
         mdp: the world that was made of the table.
         table: what the environment says of itself.
-        real: the environment with its wrappers, which is stepped.
+        real: the environment, which is stepped.
+
+    Returns:
+        What was compared, and how exactly, for `Mdp.truth`.
 
     Raises:
-        InputError: a start or a step that the table does not have.
+        InputError: starts or steps that are not those of the table.
     """
-    policy = _good_policy(mdp)
-    rng = np.random.default_rng(SEED)
-    steps = 0
-    for episode in range(_MOST_EPISODES):
-        share, most = _RANDOM_SHARES[episode % 3], _MOST_STEPS[episode % 3]
-        state = _number(mdp, real.reset(seed=SEED if episode == 0 else None)[0])
-        if not table.start[state] > 0:
+    walker = _Walker(mdp, table, real)
+    walker.along_policies(_WALK)
+    while walker.episodes < _RESETS:
+        walker.reset()
+    if walker.is_settable():
+        walker.along_rows()
+    else:
+        walker.along_policies(_LONG_WALK)
+    return walker.told()
+
+
+class _Walker:
+    """Steps an environment, and counts what its R = N * A rows did."""
+
+    def __init__(self, mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> None:
+        self.mdp, self.table, self.real = mdp, table, real
+        self.episodes = 0
+        self._rng = np.random.default_rng(SEED)
+        self._limit = mdp.max_episode_steps or _MOST_STEPS
+        self._column, self._chance = _merged(table)
+        self._counts = np.zeros(self._chance.shape, dtype=np.int64)
+        self._started = np.zeros(len(table.start), dtype=np.int64)
+        self._open = np.flatnonzero(np.repeat(mdp.acting[: len(table.start)], mdp.num_actions))
+        self._met: list[tuple[int, int, float, bool]] = []  # row, next state, reward, terminated
+        self._state = self._elapsed = 0
+        self._shows_state = True  # as the attribute `s`, so far
+        self._is_known = known_env(real.unwrapped) is not None
+        self._changed: set[str] = set()
+
+    def reset(self) -> None:
+        seed = None if self.episodes % 10 else self.episodes or SEED
+        self._state = _number(self.mdp, self.real.reset(seed=seed)[0])
+        self._elapsed = 0
+        self.episodes += 1
+        self._started[self._state] += 1
+        if not self.table.start[self._state] > 0:
             raise InputError(
-                f"{mdp.name}: started in state {state}, which has no probability in initial_state_distrib"
+                f"{self.mdp.name}: started in state {self._state}, which has no probability in "
+                "initial_state_distrib"
             )
-        for step in range(most):
-            action = int(rng.integers(mdp.num_actions) if rng.random() < share else policy[state])
-            observation, reward, terminated, truncated, _ = real.step(action)
-            following = _number(mdp, observation)
-            _check_step(mdp.name, table, (state, action), (following, float(reward), bool(terminated)))
-            if truncated and step + 1 < (mdp.max_episode_steps or np.inf):
-                raise InputError(
-                    f"{mdp.name}: cuts its episodes by itself, which its table P does not have; must leave "
-                    "that to the wrapper TimeLimit"
-                )
-            steps += 1
-            if terminated or truncated:
+
+    def _step(self, action: int) -> bool:
+        """Take an action.
+
+        Returns:
+            Whether the episode is over.
+        """
+        observation, reward, terminated, truncated, _ = self.real.step(action)
+        row = self._state * self.mdp.num_actions + action
+        self._state = _number(self.mdp, observation)
+        self._met.append((row, self._state, float(reward), bool(terminated)))
+        self._elapsed += 1
+        if truncated and self._elapsed < (self.mdp.max_episode_steps or np.inf):
+            self.check()
+            raise InputError(
+                f"{self.mdp.name}: cuts its episodes by itself, which its table P does not have; must leave "
+                "that to the wrapper TimeLimit"
+            )
+        return bool(terminated or truncated) or self._elapsed >= self._limit
+
+    def along_policies(self, most: int) -> None:
+        """Take steps that are good, that live long, that lead to what is new, and random ones."""
+        mdp, inner, steps = self.mdp, self.real.unwrapped, 0
+        reward = backup(mdp, np.zeros(mdp.num_states), 1.0)
+        good, living = self._policy(reward), self._policy(~mdp.absorbing[:, None] * np.ones(mdp.num_actions))
+        new, more = good, _WORK // (_SWEEPS * mdp.probability.size)
+        snapshots = Snapshots(inner)
+        for episode in range(most):
+            if episode % 5 == 3 and more > 0:
+                new, more = self._policy(self._newness()), more - 1
+            policy, share = [(good, 0.0), (good, 0.1), (living, 0.02), (new, 0.05), (good, 1.0)][episode % 5]
+            self.reset()
+            watched = episode < _WATCHED and not self._is_known
+            before = _keys(snapshots) if watched else {}
+            over = False
+            while not over:
+                self._shows_state = self._shows_state and getattr(inner, "s", None) == self._state
+                random = self._rng.random() < share
+                over = self._step(int(self._rng.integers(mdp.num_actions) if random else policy[self._state]))
+                steps += 1
+            if watched:
+                self._changed |= {name for name, key in _keys(snapshots).items() if key != before.get(name)}
+            if steps >= most:
                 break
-            state = following
-        if steps >= _WALK:
-            break
+        self.check()
+
+    def _policy(self, bonus: FloatArray) -> IntArray:
+        """(S,), actions that lead to a bonus (S, A), up to what value iteration leaves open."""
+        v = np.zeros(self.mdp.num_states)
+        reward = backup(self.mdp, v, 1.0)
+        for _ in range(min(_SWEEPS, max(10, _WORK // self.mdp.probability.size))):
+            q = backup(self.mdp, v, _GAMMA) - reward + bonus
+            v = q.max(axis=1)
+        return np.asarray(q.argmax(axis=1))
+
+    def _newness(self) -> FloatArray:
+        """(S, A), 1 for a row that was never stepped, and less with each step."""
+        self.check()
+        found = np.zeros((self.mdp.num_states, self.mdp.num_actions))
+        visits = self._counts.sum(axis=1).reshape(-1, self.mdp.num_actions)
+        found[: len(visits)] = 1 / (1.0 + visits) ** 2
+        return np.where(self.mdp.absorbing[:, None], 0.0, found)
+
+    def is_settable(self) -> bool:
+        """Whether the attribute `s` is its state, so that setting it leads there.
+
+        It must be what is shown; nothing else may change, but in Gymnasium's own classes; and steps that only
+        the state set can make, not the one it is in, must be made.
+        """
+        if not (self._shows_state and len(self._open) and (self._is_known or self._changed <= {"s"})):
+            return False
+        proven = 0
+        for row in self._rng.choice(self._open, size=20 * _PROBES).tolist():
+            self.reset()
+            state, action = divmod(row, self.mdp.num_actions)
+            if self._possible(state, action) & self._possible(self._state, action):
+                continue
+            self._set(state)
+            observation, reward, terminated, *_ = self.real.step(action)
+            found = _number(self.mdp, observation), float(reward), bool(terminated)
+            if found not in self._possible(state, action):
+                return False
+            proven += 1
+            if proven == _PROBES:
+                break
+        return proven > 0
+
+    def _set(self, state: int) -> None:
+        self.real.unwrapped.s = state  # type: ignore[attr-defined]
+        self._state = state
+
+    def _possible(self, state: int, action: int) -> set[tuple[int, float, bool]]:
+        tables = self.table.next_state, self.table.reward, self.table.terminated
+        possible = self.table.probability[state, action] > 0
+        return set(zip(*(each[state, action][possible].tolist() for each in tables), strict=True))
+
+    def along_rows(self) -> None:
+        """Step every row, or as many as there is time for, and those that look most wrong again."""
+        rows = self._rng.permutation(self._open)[:_ROWS]
+        self._step_rows(self._rng.permutation(np.tile(rows, _ROWS // len(rows))))
+        uncertain = rows[self._chance[rows].max(axis=1) < 1]
+        for _ in range(_ROUNDS):
+            wrong = np.argsort(-_evidence(self._counts[uncertain], self._chance[uncertain]), kind="stable")
+            self._step_rows(np.repeat(uncertain[wrong[:_SUSPECTS]], _AGAIN))
+
+    def _step_rows(self, rows: IntArray) -> None:
+        over = True
+        for row in rows.tolist():
+            if over:
+                self.reset()
+            state, action = divmod(row, self.mdp.num_actions)
+            self._set(state)
+            over = self._step(action)
+        self.check()
+
+    def check(self) -> None:
+        """Count what was met since the last time, and judge all counts.
+
+        Raises:
+            InputError: they are not those of the table.
+        """
+        if self._met:
+            self._count()
+        seen = np.flatnonzero(self._counts.any(axis=1))
+        chances, first, kind = np.unique(self._chance[seen], axis=0, return_index=True, return_inverse=True)
+        together = np.zeros(chances.shape, dtype=np.int64)
+        np.add.at(together, kind.ravel(), self._counts[seen])
+        self._judge(self._started[None], self.table.start[None], lambda row: "the start in state")
+        self._judge(self._counts[seen], self._chance[seen], lambda row: f"{self._name(seen[row])}, outcome")
+        self._judge(together, chances, lambda row: f"all rows like {self._name(seen[first[row]])}, outcome")
+
+    def _judge(self, counts: IntArray, chance: FloatArray, name: Callable[[int], str]) -> None:
+        evidence = _evidence(counts, chance)
+        row = int(evidence.argmax()) if len(evidence) else 0
+        if evidence.max(initial=0) > np.log(3 * len(evidence) / _FALSE_ALARM):
+            size = int(counts[row].sum())
+            which = int(np.abs(counts[row] - size * chance[row]).argmax())
+            raise InputError(
+                f"{self.mdp.name}: leaves its own table: {name(row)} {which}, came {counts[row, which]:,} "
+                f"times of {size:,}, its probability there is {chance[row, which]:.3g}, so no exact truth is "
+                "known; must start by initial_state_distrib and step by P alone"
+            )
+
+    def _name(self, row: int) -> str:
+        state, action = divmod(int(row), self.mdp.num_actions)
+        return f"P[{state}][{action}]"
+
+    def _count(self) -> None:
+        met, self._met = self._met, []
+        row, following, reward, terminated = (np.array(each) for each in zip(*met, strict=True))
+        state, action = np.divmod(row, self.mdp.num_actions)
+        table = self.table
+        same = (table.probability[state, action] > 0) & (
+            table.next_state[state, action] == following[:, None]
+        )
+        same &= table.reward[state, action] == reward[:, None]
+        same &= table.terminated[state, action] == terminated[:, None]
+        if not same.any(axis=1).all():
+            wrong = int(np.argmin(same.any(axis=1)))
+            place = f"{state[wrong]}, action {action[wrong]} led to state {following[wrong]}"
+            raise InputError(
+                f"{self.mdp.name}: leaves its own table: in state {place} with reward {reward[wrong]:g}"
+                f"{' and ended' if terminated[wrong] else ''}, which {self._name(row[wrong])} does not have, "
+                "so no exact truth is known; must step by P alone"
+            )
+        np.add.at(self._counts, (row, self._column[row, same.argmax(axis=1)]), 1)
+
+    def told(self) -> str:
+        """What the counts say."""
+        visits = self._counts.sum(axis=1)
+        stepped = self._open[visits[self._open] > 0]
+        off = _resolved(visits[stepped], self._chance[stepped])
+        rows = f"{len(stepped):,} of {len(self._open):,}" if len(stepped) < len(self._open) else "all"
+        starts = _resolved(self._started.sum(keepdims=True), self.table.start[None])
+        told = [
+            f"{what} to {100 * worst:.2g} %"
+            for what, worst in (("probabilities", off.max(initial=0)), ("starts", starts[0]))
+            if worst < _VAGUE
+        ]
+        return (
+            f"table P, checked by {visits.sum():,} steps in {self.episodes:,} episodes: "
+            f"{', '.join([f'support of {rows} rows', *told])}"
+        )
 
 
-def _good_policy(mdp: Mdp) -> IntArray:
-    """(S,), an optimal action of each state, up to what `_SWEEPS` of value iteration leave open."""
-    v = np.zeros(mdp.num_states)
-    for _ in range(_SWEEPS):
-        q = backup(mdp, v, _GAMMA)
-        v = q.max(axis=1)
-    return np.asarray(q.argmax(axis=1))
+def _merged(table: Outcomes) -> tuple[IntArray, FloatArray]:
+    """Of outcomes that cannot be told apart, the column of the first (R, K), and there the chance of all."""
+    count = table.probability.shape[-1]
+    parts = (table.next_state, table.reward, table.terminated, table.probability > 0)
+    flat = [each.reshape(-1, count) for each in parts]
+    rows = np.repeat(np.arange(len(flat[0])), count)
+    column = np.tile(np.arange(count), len(flat[0]))
+    order = np.lexsort((column, *(each.ravel() for each in flat), rows))
+    changes = np.any([np.diff(each.ravel()[order]) != 0 for each in (*flat, rows)], axis=0)
+    first = order[np.concatenate([[0], 1 + np.flatnonzero(changes)])]
+    leader = np.empty(len(order), dtype=np.int64)
+    leader[order] = first[np.concatenate([[0], np.cumsum(changes)])]
+    chance = np.bincount(leader, weights=table.probability.ravel(), minlength=len(order))
+    return column[leader].reshape(-1, count), np.asarray(chance.reshape(-1, count))
+
+
+def _evidence(counts: IntArray, chance: FloatArray) -> FloatArray:
+    """(R,), log Bayes factors of Dirichlet mixtures around the chances (R, K), against the chances."""
+    if not len(counts):
+        return np.zeros(0)
+    met = counts > 0
+    size = counts.sum(axis=1)
+    found = []
+    for each in _CONCENTRATIONS:
+        prior = each * np.where(met, chance, 1.0)
+        ratio = gammaln(prior + counts) - gammaln(prior) - counts * np.log(np.where(met, chance, 1.0))
+        found.append(gammaln(each) - gammaln(each + size) + np.where(met, ratio, 0.0).sum(axis=1))
+    return np.asarray(logsumexp(found, axis=0) - np.log(len(_CONCENTRATIONS)))
+
+
+def _resolved(size: IntArray, chance: FloatArray) -> FloatArray:
+    """(R,), by how much a probability must be off in a row to be found out nearly always."""
+    spread = (chance * (1 - chance)).max(axis=1)
+    return np.asarray(np.minimum(1.0, 6 * np.sqrt(spread / size) + 4 / size))
+
+
+def _keys(snapshots: Snapshots) -> dict[str, bytes]:
+    try:
+        return snapshots.keys()
+    except (TypeError, ValueError, RecursionError) as error:  # what cannot be compared may have changed
+        return {"": repr((error, np.random.default_rng().random())).encode()}
 
 
 def _number(mdp: Mdp, observation: Any) -> int:
@@ -86,15 +337,3 @@ def _number(mdp: Mdp, observation: Any) -> int:
     if not 0 <= number < mdp.num_numbers:
         raise InputError(f"{mdp.name}: shows state {number}, its table has states 0 to {mdp.num_numbers - 1}")
     return number
-
-
-def _check_step(name: str, table: Outcomes, pair: tuple[int, int], found: tuple[int, float, bool]) -> None:
-    following, reward, terminated = found
-    same = (table.next_state[pair] == following) & (table.reward[pair] == reward)
-    if not (same & (table.terminated[pair] == terminated) & (table.probability[pair] > 0)).any():
-        state, action = pair
-        raise InputError(
-            f"{name}: leaves its own table: in state {state}, action {action} led to state {following} with "
-            f"reward {reward:g}{' and ended' if terminated else ''}, which P[{state}][{action}] does not "
-            "have, so no exact truth is known; must step by P alone"
-        )

@@ -219,7 +219,9 @@ def test_a_step_count_that_is_left_out(variant: str, limit: int | None) -> None:
     [("once", 60, "reward"), ("decay", 20, "reward"), ("gate", 20, "reward"), ("toll", 25, "reward")],
 )
 def test_what_is_left_out_must_not_matter(variant: str, limit: int, what: str) -> None:
-    with pytest.raises(InputError, match=f"its {what} is not .* depends on steps, which env.ignore leaves out"):
+    with pytest.raises(
+        InputError, match=f"its {what} is not .* depends on steps, which env.ignore leaves out"
+    ):
         enumerate_env("Corridor-v0", {"variant": variant, "limit": limit}, ignore=["steps"])
 
 
@@ -253,11 +255,19 @@ def test_states_beyond_the_step_limit_that_have_an_end_are_found() -> None:
         ("ShortCorridor-v0", {"variant": "hidden"}, "is random, has state outside of its attributes"),
         ("Corridor-v0", {"variant": "endless"}, "more than 300 states .* since its past keeps changing"),
         ("Corridor-v0", {}, r"since its steps keeps changing; .* e.g. env.ignore=\[steps\]"),
-        ("Corridor-v0", {"variant": "decay", "limit": 200}, "more than 300 states .* its steps keeps changing"),
+        (
+            "Corridor-v0",
+            {"variant": "decay", "limit": 200},
+            "more than 300 states .* its steps keeps changing",
+        ),
         ("ShortCorridor-v0", {"variant": "cut"}, "truncates some episodes earlier"),
         ("Corridor-v0", {"variant": "fails"}, "a step with action 0 fails: no third cell"),
         ("Corridor-v0", {"size": 3}, "unexpected keyword argument 'size'"),
-        ("DoubledCorridor-v0", {"limit": 20}, r"its reward is not the enumerated one \(2.0, enumerated as 1.0\)"),
+        (
+            "DoubledCorridor-v0",
+            {"limit": 20},
+            r"its reward is not the enumerated one \(2.0, enumerated as 1.0\)",
+        ),
         ("MiniGrid-FourRooms-v0", {}, "a reset leads to another state"),
         ("MiniGrid-Empty-Random-6x6-v0", {}, "a reset leads to another state"),
         ("FrozenLake-v1", {}, "take env=gymnasium"),
@@ -282,7 +292,9 @@ def test_an_observation_must_fit_its_space(variant: str) -> None:
 
 
 def test_an_attribute_that_is_left_out_must_be_there() -> None:
-    with pytest.raises(InputError, match=r"env.ignore=\['step'\]: Corridor-v0 has no attribute step; it has .*steps"):
+    with pytest.raises(
+        InputError, match=r"env.ignore=\['step'\]: Corridor-v0 has no attribute step; it has .*steps"
+    ):
         enumerate_env("Corridor-v0", ignore=["step"])
 
 
@@ -347,7 +359,7 @@ def test_what_is_there_for_a_time_only(cells: int, first: int, last: int) -> Non
     truth = 0.98**boarded if boarded <= min(last, 19) else 0
     assert Evaluator(mdp, 0.98, 20).optimal_value == pytest.approx(max(truth, 0.2), abs=1e-12)
     if truth:
-        with pytest.raises(InputError, match="env.ignore leaves out"):
+        with pytest.raises(InputError, match=r"env.ignore leaves out"):
             enumerate_env("Ferry-v0", kwargs, ignore=["clock"])
     del gym.registry["Ferry-v0"]
 

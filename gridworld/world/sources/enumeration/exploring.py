@@ -28,9 +28,7 @@ _MANY_STATES = 20_000  # from which on their number is told
 _MOST_BYTES = 2**31  # of all copies and observations together
 _SAMPLED = 16  # of so many states the copy of one is kept, to tell what keeps changing
 _SEEDS = 8  # resets that must lead to the same state
-_FIXED = (
-    "; take an environment whose layout and start are fixed, or leave out by env.ignore what nothing depends on"
-)
+_FIXED = "; take an environment with a fixed layout and start, or name in env.ignore what nothing depends on"
 
 
 class Subject:
@@ -226,7 +224,8 @@ class _Search:
                 left.append(state)
                 continue
             row = []
-            for copy, observation, reward, terminated, truncated in self.subject.steps(self._snapshots[state]):
+            moves = self.subject.steps(self._snapshots[state])
+            for copy, observation, reward, terminated, truncated in moves:
                 following = self._state_after(copy, observation, self.depth[state] + 1)
                 row.append((following, reward, terminated, truncated))
                 if not (terminated or truncated or following in self._goes_on):
@@ -285,9 +284,9 @@ class _Search:
 
     def changing(self) -> str:
         """What keeps changing, and what can be done about it, as the rest of a sentence."""
-        found = self.subject.changing([each for each in self._snapshots[:: _SAMPLED] if each][-1000:])
+        found = self.subject.changing([each for each in self._snapshots[::_SAMPLED] if each][-1000:])
         return (
-            f"{found} keeps changing; take a smaller one, set a step limit (env.kwargs.max_episode_steps), or "
+            f"{found} keeps changing; take a smaller one, set a limit (env.kwargs.max_episode_steps), or "
             f"leave out what nothing depends on, e.g. env.ignore=[{found.split(',')[0]}]"
         )
 

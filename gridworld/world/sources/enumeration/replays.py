@@ -72,7 +72,9 @@ class Replays:
         actions: list[int] = []
         while steps < most and not mdp.terminal[state]:
             if not actions:
-                actions = self._way_from(state) + self._random.integers(mdp.num_actions, size=at_random).tolist()
+                actions = (
+                    self._way_from(state) + self._random.integers(mdp.num_actions, size=at_random).tolist()
+                )
             action = actions.pop(0)
             observation, reward, terminated, truncated, _ = env.step(action)
             steps += 1
@@ -81,9 +83,7 @@ class Replays:
             if truncated and self.limit is None and self._subject.ignore:
                 self.limit = steps
             expected = [bool(mdp.terminal[state]), steps >= (self.limit or np.inf)]
-            self._compare(
-                "end (terminated, truncated)", steps, [bool(terminated), bool(truncated)], expected
-            )
+            self._compare("end (terminated, truncated)", steps, [bool(terminated), bool(truncated)], expected)
             self._compare("state", steps, self._seen(snapshots, observation), self._expected(state))
             if truncated:
                 break
