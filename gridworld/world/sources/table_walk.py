@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
 from gridworld.errors import InputError
@@ -37,7 +38,10 @@ _LONG_WALK = 24_000  # more of them where it cannot
 _ROWS = 24_000  # steps over all rows
 _ROUNDS, _SUSPECTS, _AGAIN = 4, 8, 500  # how often how many rows that look wrong are stepped how many times
 _MOST_STEPS = 200  # of an episode, where there is no limit
-_RESETS = 600  # at least
+_RESETS = 1_500  # at least
+_BLOCKS = 8  # of starts that follow each other
+_MOST_KINDS = 10_000  # numbers in different rows, up to which what came before an outcome is counted too
+_JUDGED = 5  # sorts of counts
 _PROBES = 12
 _WATCHED = 5  # episodes after which it is seen which attributes change
 
@@ -77,6 +81,11 @@ class _Walker:
         self._limit = mdp.max_episode_steps or _MOST_STEPS
         self._column, self._chance = _merged(table)
         self._counts = np.zeros(self._chance.shape, dtype=np.int64)
+        self._chances, kind = np.unique(self._chance, axis=0, return_inverse=True)  # of the kinds of rows
+        self._kind = kind.ravel()
+        contexts = 1 + self._chance.shape[1] if self._chances.size < _MOST_KINDS else 1
+        self._after = np.zeros((len(self._chances), contexts, self._chance.shape[1]), dtype=np.int64)
+        self._before = 0  # 1 + the column of the last outcome
         self._started = np.zeros(len(table.start), dtype=np.int64)
         self._open = np.flatnonzero(np.repeat(mdp.acting[: len(table.start)], mdp.num_actions))
         self._met: list[tuple[int, int, float, bool]] = []  # row, next state, reward, terminated
@@ -220,17 +229,34 @@ class _Walker:
         if self._met:
             self._count()
         seen = np.flatnonzero(self._counts.any(axis=1))
-        chances, first, kind = np.unique(self._chance[seen], axis=0, return_index=True, return_inverse=True)
-        together = np.zeros(chances.shape, dtype=np.int64)
-        np.add.at(together, kind.ravel(), self._counts[seen])
-        self._judge(self._started[None], self.table.start[None], lambda row: "the start in state")
+        contexts, columns = self._after.shape[1:]
+        start = self.table.start
+        block = (_BLOCKS * (np.cumsum(start) - start / 2)).astype(np.int64).clip(0, _BLOCKS - 1)
+        parts = [np.bincount(block, each, _BLOCKS).astype(np.float64) for each in (self._started, start)]
+        self._judge(self._started[None], start[None], lambda row: "the start in state")
+        self._judge(parts[0][None], parts[1][None], lambda row: f"of {_BLOCKS} parts of the starts, part")
         self._judge(self._counts[seen], self._chance[seen], lambda row: f"{self._name(seen[row])}, outcome")
-        self._judge(together, chances, lambda row: f"all rows like {self._name(seen[first[row]])}, outcome")
+        self._judge(
+            self._after.sum(axis=1),
+            self._chances,
+            lambda row: f"all rows like {self._name(self._like(row))}, outcome",
+        )
+        self._judge(
+            self._after.reshape(-1, columns),
+            np.repeat(self._chances, contexts, axis=0),
+            lambda row: (
+                f"all rows like {self._name(self._like(row // contexts))} after outcome "
+                f"{row % contexts - 1}, outcome"
+            ),
+        )
 
-    def _judge(self, counts: IntArray, chance: FloatArray, name: Callable[[int], str]) -> None:
+    def _like(self, kind: int) -> int:
+        return int(np.flatnonzero(self._kind == kind)[0])
+
+    def _judge(self, counts: NDArray[Any], chance: FloatArray, name: Callable[[int], str]) -> None:
         evidence = _evidence(counts, chance)
         row = int(evidence.argmax()) if len(evidence) else 0
-        if evidence.max(initial=0) > np.log(3 * len(evidence) / _FALSE_ALARM):
+        if evidence.max(initial=0) > np.log(_JUDGED * len(evidence) / _FALSE_ALARM):
             size = int(counts[row].sum())
             which = int(np.abs(counts[row] - size * chance[row]).argmax())
             raise InputError(
@@ -261,7 +287,11 @@ class _Walker:
                 f"{' and ended' if terminated[wrong] else ''}, which {self._name(row[wrong])} does not have, "
                 "so no exact truth is known; must step by P alone"
             )
-        np.add.at(self._counts, (row, self._column[row, same.argmax(axis=1)]), 1)
+        column = self._column[row, same.argmax(axis=1)]
+        np.add.at(self._counts, (row, column), 1)
+        before = np.concatenate([[self._before], 1 + column])
+        self._before = int(before[-1])
+        np.add.at(self._after, (self._kind[row], before[:-1] % self._after.shape[1], column), 1)
 
     def told(self) -> str:
         """What the counts say."""
@@ -297,7 +327,7 @@ def _merged(table: Outcomes) -> tuple[IntArray, FloatArray]:
     return column[leader].reshape(-1, count), np.asarray(chance.reshape(-1, count))
 
 
-def _evidence(counts: IntArray, chance: FloatArray) -> FloatArray:
+def _evidence(counts: NDArray[Any], chance: FloatArray) -> FloatArray:
     """(R,), log Bayes factors of Dirichlet mixtures around the chances (R, K), against the chances."""
     if not len(counts):
         return np.zeros(0)

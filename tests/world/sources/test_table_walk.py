@@ -1,0 +1,267 @@
+"""An environment that is not its table is found out, by outcomes or their frequencies; a true one is not."""
+
+import re
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv, generate_random_map
+from gymnasium.envs.toy_text.taxi import TaxiEnv
+from gymnasium.envs.toy_text.utils import categorical_sample
+
+from gridworld.errors import InputError
+from gridworld.world.sources import table_walk
+from gridworld.world.sources.gymnasium_table import compile_gymnasium, compile_table
+
+
+class Lake(FrozenLakeEnv):
+    """6x6; `chances` of an outcome are what it steps by."""
+
+    def __init__(self) -> None:
+        super().__init__(desc=["SFFFFF", "FFHFFF", "FFFFFH", "FHFFFF", "FFFFHF", "HFFFFG"], is_slippery=True)
+
+    def chances(self, action: int) -> list[float]:
+        return [row[0] for row in self.P[self.s][action]]
+
+    def step(self, action: int) -> tuple[Any, ...]:
+        row = self.P[self.s][action]
+        _, self.s, reward, terminated = row[categorical_sample(self.chances(action), self.np_random)]
+        return int(self.s), reward, terminated, False, {}
+
+
+class AllRows(Lake):
+    def chances(self, action: int) -> list[float]:
+        return [0.25, 0.25, 0.5] if len(self.P[self.s][action]) == 3 else [1.0]
+
+
+class OneRow(Lake):
+    def chances(self, action: int) -> list[float]:
+        return [0.6, 0.2, 0.2] if (self.s, action) == (27, 1) else super().chances(action)
+
+
+class Sticky(Lake):
+    """What the ice did last, it is likely to do again."""
+
+    drift = 0
+
+    def step(self, action: int) -> tuple[Any, ...]:
+        row = self.P[self.s][action]
+        if len(row) == 3 and self.np_random.random() < 0.5:
+            self.drift = int(self.np_random.integers(3))
+        _, self.s, reward, terminated = row[self.drift if len(row) == 3 else 0]
+        return int(self.s), reward, terminated, False, {}
+
+
+class RareSlip(Lake):
+    def step(self, action: int) -> tuple[Any, ...]:
+        return super().step((action + 1) % 4 if self.np_random.random() < 0.01 else action)
+
+
+class FarReward(TaxiEnv):
+    """One of 400 states in which a passenger may get out pays another fare."""
+
+    def step(self, a: Any) -> tuple[Any, ...]:
+        was = self.s
+        state, reward, *others = super().step(a)
+        return state, reward + (was == 479 and a == 5), *others
+
+
+class FarStarts(TaxiEnv):
+    def reset(self, **kwargs: Any) -> tuple[Any, Any]:
+        state, info = super().reset(**kwargs)
+        return (state, info) if state < 400 else super().reset(**kwargs | {"seed": None})
+
+
+class Tired(CliffWalkingEnv):
+    """Each step of a long episode costs more."""
+
+    def reset(self, **kwargs: Any) -> tuple[Any, Any]:
+        self.steps = 0
+        return super().reset(**kwargs)
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        self.steps += 1
+        state, reward, *others = super().step(action)
+        return state, reward - (self.steps > 90), *others
+
+
+class WornOut(CliffWalkingEnv):
+    """After thousands of steps it turns left instead of right."""
+
+    steps = 0
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        self.steps += 1
+        return super().step(3 if action == 1 and self.steps > 8_000 else action)
+
+
+class Learned(TaxiEnv):
+    """After hundreds of episodes it knows a shortcut."""
+
+    episodes = 0
+
+    def reset(self, **kwargs: Any) -> tuple[Any, Any]:
+        self.episodes += 1
+        return super().reset(**kwargs)
+
+    def step(self, a: Any) -> tuple[Any, ...]:
+        return super().step(0 if a == 1 and self.episodes > 450 else a)
+
+
+class Seeded(Lake):
+    seed_given = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
+        self.seed_given = self.seed_given if seed is None else seed
+        return super().reset(seed=seed)
+
+    def step(self, action: int) -> tuple[Any, ...]:
+        return super().step((action + 2) % 4 if self.seed_given % 4 == 2 else action)
+
+
+class Every97th(TaxiEnv):
+    calls = 0
+
+    def step(self, a: Any) -> tuple[Any, ...]:
+        self.calls += 1
+        return super().step(4 if self.calls % 97 == 0 else a)
+
+
+class Chain(gym.Env[int, int]):
+    """Forty rooms; its state has another name, so that it cannot be set."""
+
+    rooms = 40
+
+    def __init__(self) -> None:
+        self.observation_space, self.action_space = spaces.Discrete(self.rooms), spaces.Discrete(2)
+        self.initial_state_distrib = np.eye(self.rooms)[0]
+        last = self.rooms - 1
+        self.P = {
+            room: {
+                0: [(1.0, max(room - 1, 0), 0.0, False)],
+                1: [
+                    (0.8, min(room + 1, last), float(room == last - 1), room == last - 1),
+                    (0.2, room, 0, False),
+                ],
+            }
+            for room in range(self.rooms)
+        }
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[int, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.room = 0
+        return 0, {}
+
+    def step(self, action: int) -> tuple[Any, ...]:
+        row = self.P[self.room][action]
+        _, self.room, reward, terminated = row[categorical_sample([each[0] for each in row], self.np_random)]
+        return self.room, reward, terminated, False, {}
+
+
+class LastRoom(Chain):
+    def step(self, action: int) -> tuple[Any, ...]:
+        room, reward, *others = super().step(action)
+        return room, reward * 2, *others
+
+
+class Heavy(Chain):
+    def step(self, action: int) -> tuple[Any, ...]:
+        stuck = action == 1 and self.np_random.random() < 0.1
+        return (self.room, 0.0, False, False, {}) if stuck else super().step(action)
+
+
+class Shadowed(Lake):
+    """True, but `s` is only what it shows: it steps from elsewhere."""
+
+    def reset(self, **kwargs: Any) -> tuple[Any, Any]:
+        self.place, info = super().reset(**kwargs)
+        return self.place, info
+
+    def step(self, action: int) -> tuple[Any, ...]:
+        self.s = self.place
+        found = super().step(action)
+        self.place = found[0]
+        return found
+
+
+class Remembered(Chain):
+    """True, but it pays by where it was, which is no attribute that could be set alone."""
+
+    def reset(self, **kwargs: Any) -> tuple[int, dict[str, Any]]:
+        self.s = self.was = 0
+        return super().reset(**kwargs)
+
+    def step(self, action: int) -> tuple[Any, ...]:
+        self.was, (self.s, _, terminated, *others) = self.room, super().step(action)
+        return self.s, float(self.was == self.rooms - 2 and terminated), terminated, *others
+
+
+LIES = {
+    AllRows: "all rows like P",
+    OneRow: r"P\[27\]\[1\], outcome 0, came",
+    Sticky: "outcome [0-2], came",
+    RareSlip: "in state .* led to state",
+    FarReward: r"in state 479, action 5 led to state .* with reward 21 and ended",
+    FarStarts: "(the start in state|of 8 parts of the starts, part) [0-9]*, came",
+    Tired: "with reward -2, which P",
+    WornOut: "action 1 led to",
+    Learned: "action 1 led to",
+    Seeded: "led to state",
+    Every97th: "led to state",
+    LastRoom: r"in state 38, action 1 led to state 39 with reward 2 and ended",
+    Heavy: "outcome [01], came",
+}
+
+
+@pytest.mark.parametrize("kind", LIES)
+@pytest.mark.parametrize("seed", range(2))
+def test_what_is_not_the_table_is_found(
+    kind: type[gym.Env[Any, Any]], seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(table_walk, "SEED", seed)
+    with pytest.raises(InputError, match=f"^{kind.__name__}: leaves its own table: .*{LIES[kind]}"):
+        compile_table(gym.wrappers.TimeLimit(kind(), 150))
+
+
+@pytest.mark.parametrize("kind", [Lake, Shadowed, Chain, Remembered])
+def test_a_true_table_is_not_refused_however_it_is_stepped(kind: type[gym.Env[Any, Any]]) -> None:
+    assert compile_table(kind()).num_actions in (2, 4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("env_id", "kwargs"),
+    [
+        ("FrozenLake-v1", {"desc": generate_random_map(7, p=0.85, seed=1), "success_rate": 0.7}),
+        ("FrozenLake-v1", {"desc": generate_random_map(3, seed=2), "reward_schedule": (10, -3, -0.1)}),
+        ("CliffWalkingSlippery-v1", {}),
+        ("Taxi-v4", {"is_rainy": True}),
+    ],
+)
+def test_gymnasium_s_own_are_far_from_being_refused(
+    env_id: str, kwargs: dict[str, Any], seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(table_walk, "SEED", seed)
+    monkeypatch.setattr(table_walk, "_FALSE_ALARM", 0.01)
+    assert compile_gymnasium(env_id, kwargs).truth.startswith("table P, checked by ")
+
+
+class Swamp(Chain):
+    """Hardly anybody comes far."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        for room, rows in self.P.items():
+            rows[1] = [(0.02, *rows[1][0][1:]), (0.98, room, 0.0, False)]
+
+
+def test_what_could_not_be_told_is_said() -> None:
+    told = compile_gymnasium("Taxi-v4").truth
+    assert "support of all rows, probabilities to" in told
+    assert "starts to" in told
+    gym.register("Swamp-v0", lambda **_: Swamp(), max_episode_steps=100)
+    assert re.search(r"support of \d+ of 78 rows, starts to", compile_gymnasium("Swamp-v0").truth)
+    del gym.registry["Swamp-v0"]
