@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gridworld.checking.training import Trained
+from gridworld.checking.worlds import BONUS
 from gridworld.world.exact.bellman import backup
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.exact.markov_chain import Chain
@@ -12,7 +13,8 @@ from gridworld.world.exact.solver import solved
 from gridworld.world.mdp import BoolArray, FloatArray, Mdp
 
 TOLERANCE = 0.1  # of a value, relative to the largest number in the world
-_LEAST_BEST = 0.8  # share of steps with a best action, at the end of training
+LEAST_BEST = 0.99  # share of late steps with a best action
+PROBABILITY = 0.06  # tolerance of an action's
 _VISITED = 0.05  # share of steps; an actor-critic knows the values of the states that it is in
 _LIMIT = 100
 
@@ -29,7 +31,7 @@ def values(trained: Trained) -> str:
         where = np.broadcast_to(_live(mdp)[:, None], exact.shape)
     else:
         found, exact = last.values, Chain(mdp, last.sampled).value(trained.gamma)
-        where = _live(mdp) & (trained.visits.sum(axis=1) >= _VISITED * trained.visits.sum())
+        where = _live(mdp) & (trained.late.sum(axis=1) >= _VISITED * trained.late.sum())
     return _near(mdp, found, exact, where)
 
 
@@ -51,13 +53,25 @@ def optimal_with_values(trained: Trained) -> str:
 def acts_as_learnt(trained: Trained) -> str:
     """At the end of training nearly all its actions are optimal."""
     best = solved(trained.mdp, trained.gamma).optimal
-    steps = int(trained.visits.sum())
+    steps = int(trained.late.sum())
     if steps == 0:
         return "takes no steps"
-    share = float(trained.visits[best].sum()) / steps
-    if share < _LEAST_BEST:
-        raise UnmetError(f"{share:.0%} of its last actions are best ones, must be {_LEAST_BEST:.0%}")
+    share = float(trained.late[best].sum()) / steps
+    if share < LEAST_BEST:
+        raise UnmetError(f"{share:.0%} of its last actions are best ones, must be {LEAST_BEST:.0%}")
     return f"{share:.0%} of its last actions are best ones"
+
+
+def acts_at_random(trained: Trained) -> str:
+    """In training, all actions of a state are as frequent as each other."""
+    shares = trained.visits / np.maximum(trained.visits.sum(axis=1, keepdims=True), 1)
+    return _are_probable(trained.mdp, shares, np.full(shares.shape, 1 / trained.mdp.num_actions))
+
+
+def soft_optimal(trained: Trained) -> str:
+    """Its policy is the best one for the reward of its one step and `worlds.BONUS` times its entropy."""
+    gains = np.exp(solved(trained.mdp, trained.gamma).q / BONUS)
+    return _are_probable(trained.mdp, trained.last.sampled, gains / gains.sum(axis=1, keepdims=True))
 
 
 def all_layers_learn(trained: Trained) -> str:
@@ -81,13 +95,19 @@ def _live(mdp: Mdp) -> BoolArray:
     return np.asarray(mdp.reachable & ~mdp.terminal)
 
 
-def _near(mdp: Mdp, found: FloatArray, exact: FloatArray, where: BoolArray) -> str:
+def _are_probable(mdp: Mdp, found: FloatArray, exact: FloatArray) -> str:
+    return _near(mdp, found, exact, np.broadcast_to(_live(mdp)[:, None], exact.shape), probability=True)
+
+
+def _near(mdp: Mdp, found: FloatArray, exact: FloatArray, where: BoolArray, probability: bool = False) -> str:
     """The number that is farthest from the exact one."""
     tolerance = TOLERANCE * max(np.abs(exact[where]).max(), np.abs(mdp.reward).max())
+    if probability:
+        tolerance = PROBABILITY
     error = np.where(where, np.abs(found - exact), -1.0)
     worst = tuple(int(each) for each in np.unravel_index(np.argmax(error), error.shape))
-    name = f"{'Q' if len(worst) == 2 else 'V'}({', '.join(map(str, worst))})"
-    text = f"{name} {found[worst]:.3f}, exact {exact[worst]:.3f}"
+    name = "P" if probability else "Q" if len(worst) == 2 else "V"
+    text = f"{name}({', '.join(map(str, worst))}) {found[worst]:.3f}, exact {exact[worst]:.3f}"
     if not error[worst] <= tolerance:
         raise UnmetError(f"{text}, tolerance {tolerance:.2g}")
     return text

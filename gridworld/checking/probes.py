@@ -22,8 +22,8 @@ class Probe:
         holds: what must hold after training; raises `expectations.UnmetError`, else says what was found.
         meaning: what a failure means.
         gamma: the discount that it trains with.
-        arguments: arguments of the algorithm that differ from `settings`. An algorithm that takes none of
-            these names is not asked.
+        arguments: arguments of the algorithm that differ from `settings`, where it takes them.
+        needs: an argument; an algorithm that does not take it is not asked.
     """
 
     name: str
@@ -32,12 +32,15 @@ class Probe:
     meaning: str
     gamma: float = 0.9
     arguments: Mapping[str, Any] = field(default_factory=dict)
+    needs: str = ""
 
     @property
     def training(self) -> tuple[str, float, str]:
         """Probes with the same one share a training run."""
         return self.world.__name__, self.gamma, repr(self.arguments)
 
+
+_NO_EXPLORATION_LEFT = {"exploration_final_eps": 0.0}
 
 PROBES = (
     Probe(
@@ -64,19 +67,39 @@ PROBES = (
         worlds.two_contexts,
         expect.optimal,
         "the policy does not depend on the state: observations are lost, mixed up or of another step",
+        arguments=_NO_EXPLORATION_LEFT,
     ),
     Probe(
         "behaviour",
         worlds.two_contexts,
         expect.acts_as_learnt,
-        "it acts otherwise than it has learnt: exploration does not end, or it sees another observation "
-        "when it acts than when it learns",
+        "it acts otherwise than it has learnt: exploration does not end, or ends late, or it sees another "
+        "observation when it acts than when it learns",
+        arguments=_NO_EXPLORATION_LEFT,
     ),
     Probe(
         "layers",
         worlds.two_contexts,
         expect.all_layers_learn,
         "a layer never changes: it is not in the optimiser, cut off from the gradient or never copied",
+        arguments=_NO_EXPLORATION_LEFT,
+    ),
+    Probe(
+        "exploration",
+        worlds.two_contexts,
+        expect.acts_at_random,
+        "it explores less than its epsilon says: that is ignored, scaled or starts elsewhere",
+        arguments={"exploration_initial_eps": 1.0, "exploration_final_eps": 1.0},
+        needs="exploration_final_eps",
+    ),
+    Probe(
+        "entropy",
+        worlds.dear_contexts,
+        expect.soft_optimal,
+        "the entropy bonus is not what its coefficient says: its sign or scale is wrong, it is missing, or "
+        "it is not that of each state's policy",
+        arguments={"ent_coef": worlds.BONUS},
+        needs="ent_coef",
     ),
     Probe(
         "delay",
@@ -129,5 +152,6 @@ PROBES = (
         "targets are not computed with the target network: it never had an update, the values moved on",
         gamma=0.8,
         arguments={"target_update_interval": 10_000_000},
+        needs="target_update_interval",
     ),
 )

@@ -115,8 +115,9 @@ def _chosen(names: Sequence[str]) -> list[Probe]:
 
 def _try_out(config: AgentConfig, given: Mapping[str, Any], probe: Probe, seed: int) -> None:
     """Build it once: what it refuses is the user's mistake, and no finding."""
-    found = settings(config, probe.gamma, {}, given)
-    assert found is not None
+    found = settings(config, probe, given)
+    if found is None:
+        return
     try:
         build(found[0], probe.world(), found[1].num_envs, seed)
     except InputError as error:
@@ -162,9 +163,9 @@ def _finding(probe: Probe, outcomes: Outcomes, seconds: float) -> Finding:
 
 def _once(config: AgentConfig, given: Mapping[str, Any], seed: int, probes: list[Probe]) -> Outcomes:
     first = probes[0]
-    found = settings(config, first.gamma, first.arguments, given)
+    found = settings(config, first, given)
     if found is None:
-        return [(None, f"takes no {', '.join(first.arguments)}")] * len(probes)
+        return [(None, f"takes no {first.needs}")] * len(probes)
     settled, kind = found
     try:
         trained = train(settled, first.world(), first.gamma, kind.num_envs, kind.steps, seed)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from gridworld.agents.sb3.settings.schemas import SB3ClassConfig, SB3Config
+from gridworld.checking.probes import Probe
 from gridworld.config.agents import AgentConfig
 from gridworld.errors import InputError
 
@@ -63,11 +64,11 @@ KINDS = (  # the first that fits
     Kind(  # PPO
         "n_epochs",
         20_480,
-        {"learning_rate": "lin_0.003", "n_steps": 64, "batch_size": 256, "n_epochs": 10, "ent_coef": 0.0},
-        num_envs=16,
+        {"learning_rate": "lin_0.006", "n_steps": 32, "batch_size": 512, "n_epochs": 5, "ent_coef": 0.0},
+        num_envs=32,
     ),
     Kind(  # A2C
-        "n_steps", 51_200, {"learning_rate": "lin_0.003", "n_steps": 8, "ent_coef": 0.0}, num_envs=16
+        "n_steps", 25_600, {"learning_rate": "lin_0.006", "n_steps": 4, "ent_coef": 0.0}, num_envs=32
     ),
     Kind(  # tables
         "learning_rate_power",
@@ -78,19 +79,16 @@ KINDS = (  # the first that fits
 )
 
 
-def settings(
-    config: AgentConfig, gamma: float, arguments: Mapping[str, Any], given: Mapping[str, Any]
-) -> tuple[AgentConfig, Kind] | None:
+def settings(config: AgentConfig, probe: Probe, given: Mapping[str, Any]) -> tuple[AgentConfig, Kind] | None:
     """The settings of an algorithm on a probe.
 
     Args:
         config: what is checked.
-        gamma: the probe's discount.
-        arguments: the probe's own arguments.
-        given: the user's arguments, which win.
+        probe: its own arguments go before the user's.
+        given: the user's arguments.
 
     Returns:
-        The settings and the kind of the algorithm; None where it takes none of the probe's own arguments.
+        The settings and the kind of the algorithm; None where it does not take what the probe needs.
 
     Raises:
         InputError: an argument of the user's that it does not take, or that is not the user's to choose.
@@ -101,10 +99,10 @@ def settings(
             raise InputError(f"--set {name}: {_OURS[name]}; leave it out")
         if name not in known:
             raise InputError(f"--set {name}: {config.name} has no such argument; it has {', '.join(known)}")
-    if arguments and not set(arguments) & set(known):
+    if probe.needs and probe.needs not in known:
         return None
     kind = next(each for each in KINDS if each.sign in known or not each.sign)
-    wanted = {**kind.arguments, **_of_policy(config), "gamma": gamma, **given, **arguments}
+    wanted = {**kind.arguments, **_of_policy(config), "gamma": probe.gamma, **given, **probe.arguments}
     return _with(config, {name: value for name, value in wanted.items() if name in known}), kind
 
 

@@ -15,7 +15,7 @@ from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.world.exact.markov_chain import one_hot_policy
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 
-_LAST = 0.8  # of training; what it does after that is its behaviour
+_LAST = 0.6  # of training; what it does after that is its behaviour
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,8 @@ class Trained:
         first: what it had before training.
         last: what it has learnt.
         greedy: (S, A), its own deterministic policy.
-        visits: (S, A), its actions in the last fifth of training.
+        visits: (S, A), its actions in training.
+        late: (S, A), those in the last two fifths of it.
         frozen: the names of the parameters that training left as they were.
     """
 
@@ -38,6 +39,7 @@ class Trained:
     last: PolicySnapshot
     greedy: FloatArray
     visits: IntArray
+    late: IntArray
     frozen: list[str]
 
 
@@ -80,9 +82,9 @@ def train(config: AgentConfig, mdp: Mdp, gamma: float, num_envs: int, steps: int
     agent.learn(steps, watch)
     after = _parameters(agent)
     frozen = [name for name, table in before.items() if name in after and np.array_equal(table, after[name])]
-    return Trained(
-        mdp, gamma, first, agent.snapshot(), _greedy(agent, context), context.envs.visits - earlier, frozen
-    )
+    visits = context.envs.visits.copy()
+    greedy = _greedy(agent, context)
+    return Trained(mdp, gamma, first, agent.snapshot(), greedy, visits, visits - earlier, frozen)
 
 
 def _greedy(agent: Agent, context: TrainingContext) -> FloatArray:

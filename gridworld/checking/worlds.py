@@ -7,6 +7,7 @@ agent, and is none of its visits.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,6 +18,10 @@ from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 Outcome = tuple[float, int, float, bool]
 GOES_ON, ENDS = False, True
 _LIMIT = 20  # steps of an episode, unless the world says otherwise
+# With this bonus the soft optimum of `dear_contexts` is right with probability 3/4. Its advantages then have
+# standard deviation 1, so that normalising them changes nothing.
+PAY = 4 / math.sqrt(3)
+BONUS = PAY / math.log(3)
 
 
 def constant() -> Mdp:
@@ -34,10 +39,15 @@ def bandit() -> Mdp:
     return _world("bandit", [[_sure(1, pay, ENDS) for pay in (0.0, 1.0, 0.5)]])
 
 
-def two_contexts() -> Mdp:
+def two_contexts(pay: float = 1.0) -> Mdp:
     """One step from either of two states, in each of which the other action pays 1."""
-    rows = [[_sure(2, float(state == action), ENDS) for action in range(2)] for state in range(2)]
+    rows = [[_sure(2, pay * (state == action), ENDS) for action in range(2)] for state in range(2)]
     return _world("two contexts", rows, start=(0.5, 0.5))
+
+
+def dear_contexts() -> Mdp:
+    """As `two_contexts`, but the right action pays 4 / √3."""
+    return two_contexts(PAY)
 
 
 def delay() -> Mdp:

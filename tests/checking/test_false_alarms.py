@@ -64,8 +64,13 @@ def share(probe: Probe, trained: Trained) -> float:
     if probe.holds is expect.all_layers_learn:
         return float(bool(trained.frozen))
     if probe.holds is expect.acts_as_learnt:
-        right = trained.visits[solved(mdp, trained.gamma).optimal].sum() / trained.visits.sum()
-        return float((1 - right) / (1 - expect._LEAST_BEST))
+        right = trained.late[solved(mdp, trained.gamma).optimal].sum() / trained.late.sum()
+        return float((1 - right) / (1 - expect.LEAST_BEST))
+    if probe.holds is expect.acts_at_random:
+        shares = trained.visits[live] / trained.visits[live].sum(axis=1, keepdims=True)
+        return float(np.abs(shares - 1 / mdp.num_actions).max() / expect.PROBABILITY)
+    if probe.holds is expect.soft_optimal:
+        return float(np.abs(last.sampled[live] - [[0.75, 0.25], [0.25, 0.75]]).max() / expect.PROBABILITY)
     if probe.holds is expect.first_backup:
         assert trained.first.q is not None
         exact = backup(mdp, np.where(mdp.terminal, 0.0, trained.first.q.max(axis=1)), trained.gamma)
@@ -75,7 +80,7 @@ def share(probe: Probe, trained: Trained) -> float:
         return choice
     if last.q is not None:
         return max(choice, of_values(trained, solved(mdp, trained.gamma).q, live, last.q))
-    often = live & (trained.visits.sum(axis=1) >= expect._VISITED * trained.visits.sum())
+    often = live & (trained.late.sum(axis=1) >= expect._VISITED * trained.late.sum())
     exact = Chain(mdp, last.sampled).value(trained.gamma)
     return max(choice, of_values(trained, exact, often, last.values))
 
@@ -85,7 +90,7 @@ def shares(name: str, seeds: range) -> dict[str, np.ndarray]:
     found: dict[str, list[float]] = {}
     for _, group in itertools.groupby(PROBES, lambda probe: probe.training):
         probes = list(group)
-        chosen = settings(subject(name), probes[0].gamma, probes[0].arguments, {})
+        chosen = settings(subject(name), probes[0], {})
         if chosen is None:
             continue
         config = dataclasses.replace(chosen[0], engine="tabulated")

@@ -1,10 +1,11 @@
-"""SB3's PPO and DQN with one bug each, of the kind that implementations have; `CAUGHT` has the probes."""
+"""PPO, A2C, DQN and QR-DQN with one bug each, as implementations have them; `CAUGHT` has the probes."""
 
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from stable_baselines3 import DQN, PPO
+from sb3_contrib import QRDQN
+from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.dqn.policies import DQNPolicy
@@ -158,6 +159,62 @@ class PPOBlind(PPO):
     policy_aliases: ClassVar = {"MlpPolicy": Blind}
 
 
+class _OtherBonus:
+    """The entropy bonus is multiplied."""
+
+    ent_coef: float
+    factor: float
+
+    def train(self) -> None:
+        asked = self.ent_coef
+        self.ent_coef = self.factor * asked
+        super().train()  # type: ignore[misc]
+        self.ent_coef = asked
+
+
+class PPOEntropySign(_OtherBonus, PPO):
+    """Entropy is a cost."""
+
+    factor = -1.0
+
+
+class A2CEntropySign(_OtherBonus, A2C):
+    """Entropy is a cost."""
+
+    factor = -1.0
+
+
+class A2CNoEntropy(_OtherBonus, A2C):
+    """The entropy bonus is forgotten."""
+
+    factor = 0.0
+
+
+class PPOEntropySummed(_OtherBonus, PPO):
+    """Entropy is summed over the samples, not averaged."""
+
+    factor = 256.0
+
+
+class PPOEntropyInBits(_OtherBonus, PPO):
+    """Entropy is measured in bits."""
+
+    factor = 1 / np.log(2)
+
+
+class _EntropyOfMean(ActorCriticPolicy):
+    def evaluate_actions(self, obs: Any, actions: torch.Tensor) -> Any:
+        values, log_prob, entropy = super().evaluate_actions(obs, actions)
+        mean = self.get_distribution(obs).distribution.probs.mean(dim=0)
+        return values, log_prob, (-(mean * mean.log()).sum()).expand_as(entropy)
+
+
+class PPOEntropyOfMean(PPO):
+    """The bonus is for the entropy of the policy's mean over states."""
+
+    policy_aliases: ClassVar = {"MlpPolicy": _EntropyOfMean}
+
+
 class PPOCrashes(PPO):
     """It raises an exception when it learns."""
 
@@ -256,6 +313,72 @@ class EpsilonNeverFalls(DQN):
         self.exploration_rate = 1.0
 
 
+class EpsilonStaysAtThird(DQN):
+    """Epsilon never falls below 0.3."""
+
+    def _on_step(self) -> None:
+        super()._on_step()
+        self.exploration_rate = max(self.exploration_rate, 0.3)
+
+
+class EpsilonStaysAtTenth(DQN):
+    """Epsilon never falls below 0.1."""
+
+    def _on_step(self) -> None:
+        super()._on_step()
+        self.exploration_rate = max(self.exploration_rate, 0.1)
+
+
+class EpsilonRises(DQN):
+    """It explores more and more."""
+
+    def _on_step(self) -> None:
+        super()._on_step()
+        self.exploration_rate = self.exploration_initial_eps - self.exploration_rate
+
+
+class EpsilonFallsLate(DQN):
+    """Epsilon falls to its end over all of training, whatever the fraction."""
+
+    def _setup_model(self) -> None:
+        self.exploration_fraction = 1.0
+        super()._setup_model()
+
+
+class EpsilonCountsCalls(DQN):
+    """Epsilon falls with the calls of `step`, not with the steps of all environments."""
+
+    def _on_step(self) -> None:
+        left = self._current_progress_remaining
+        self._current_progress_remaining = 1 - (1 - left) / self.n_envs
+        super()._on_step()
+        self._current_progress_remaining = left
+
+
+class EpsilonIgnored(DQN):
+    """It acts greedily from the first update on."""
+
+    def _on_step(self) -> None:
+        super()._on_step()
+        self.exploration_rate = 0.0
+
+
+class EpsilonHalved(DQN):
+    """It explores half as often as it should."""
+
+    def _on_step(self) -> None:
+        super()._on_step()
+        self.exploration_rate /= 2
+
+
+class QRDQNEpsilonNeverFalls(QRDQN):
+    """It explores as much at the end as at the beginning."""
+
+    def _on_step(self) -> None:
+        super()._on_step()
+        self.exploration_rate = self.exploration_initial_eps
+
+
 class DQNFrozenLayer(DQN):
     """The last layer has no gradient."""
 
@@ -327,6 +450,12 @@ CAUGHT: dict[type, tuple[str, ...]] = {
     PPONoValueLoss: ("constant",),
     PPOBlind: ("context",),
     PPOCrashes: ("constant",),
+    PPOEntropySign: ("entropy",),
+    A2CEntropySign: ("entropy",),
+    A2CNoEntropy: ("entropy",),
+    PPOEntropySummed: ("entropy",),
+    PPOEntropyInBits: ("entropy",),
+    PPOEntropyOfMean: ("entropy",),
     NoTargetNetwork: ("target",),
     TargetNeverUpdated: ("truncation",),
     DQNBootstrapsTerminal: ("termination",),
@@ -336,6 +465,14 @@ CAUGHT: dict[type, tuple[str, ...]] = {
     CostsLost: ("trap",),
     DQNGammaForgotten: ("discount",),
     EpsilonNeverFalls: ("behaviour",),
+    EpsilonStaysAtThird: ("behaviour",),
+    EpsilonStaysAtTenth: ("behaviour",),
+    EpsilonRises: ("behaviour", "exploration"),
+    EpsilonFallsLate: ("behaviour",),
+    EpsilonCountsCalls: ("behaviour",),
+    EpsilonIgnored: ("exploration",),
+    EpsilonHalved: ("exploration",),
+    QRDQNEpsilonNeverFalls: ("behaviour",),
     DQNFrozenLayer: ("layers",),
     DQNDeadUnits: ("context",),
     DQNColumnsSwapped: ("behaviour",),
