@@ -2,27 +2,37 @@
 
 from __future__ import annotations
 
+import dataclasses
+import tempfile
 from os import PathLike
 from pathlib import Path
 
 from gridworld.api.runs import RunResult, torch_threads_kept
 from gridworld.diagnosis.evidence import Evidence
+from gridworld.diagnosis.trials import beside, check_trusted
+from gridworld.diagnosis.trials import try_offers as _try_offers
 from gridworld.diagnosis.verdict import Diagnosis
 from gridworld.diagnosis.verdict import diagnose as _diagnose
 from gridworld.restore.saved_run import SavedRun
 
 
-def diagnose(run: RunResult | str | PathLike[str]) -> Diagnosis:
+def diagnose(
+    run: RunResult | str | PathLike[str], try_offers: bool = False, trust: bool = False
+) -> Diagnosis:
     """Say why a run is not optimal: its regret by state, the causes, and what to try.
 
     Args:
         run: what `train` or `open_run` returned, or the folder of a finished run.
+        try_offers: train what there is to try, until one is certified: `tried` has the results. The new runs
+            are in the folder `RUN-tried`; of a run without a folder they do not stay.
+        trust: import the classes that the run's settings name, wherever they are from.
 
     Returns:
         The diagnosis; without causes for a run that is certified optimal.
 
     Raises:
-        InputError: the folder holds no finished run, or one of its files was changed.
+        InputError: the folder holds no finished run, or one of its files was changed; or its settings name
+            classes from elsewhere, and are not trusted.
 
     Example:
         >>> import gridworld
@@ -32,8 +42,19 @@ def diagnose(run: RunResult | str | PathLike[str]) -> Diagnosis:
         ('slow', True)
     """
     with torch_threads_kept():
-        if not isinstance(run, RunResult):
-            return _diagnose(Evidence.of(SavedRun(Path(run).expanduser())))
-        return _diagnose(
-            Evidence(run.config, run.overrides, run.curve, run.visits, run.evaluator, run.agent, run.policy)
-        )
+        if isinstance(run, RunResult):
+            folder, saved = run.folder, run.saved
+            evidence = Evidence(
+                run.config, run.overrides, run.curve, run.visits, run.evaluator, run.agent, run.policy
+            )
+        else:
+            folder = Path(run).expanduser()
+            saved = SavedRun(folder, trust)
+            evidence = Evidence.of(saved)
+        found = _diagnose(evidence)
+        if not try_offers:
+            return found
+        check_trusted(saved, found, trust)
+        with tempfile.TemporaryDirectory(prefix="gridworld-") as elsewhere:
+            place = Path(elsewhere) if folder is None else beside(folder)
+            return dataclasses.replace(found, tried=tuple(_try_offers(saved, found, place, trust)))

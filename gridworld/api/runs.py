@@ -68,13 +68,13 @@ class RunResult:
         }
         self.visits = read_visits(saved.run, saved.mdp.next_state.shape[:2])
         self.folder = folder
-        self._saved = saved
+        self.saved = saved
         self._make_agent = agent
 
     @cached_property
     def evaluator(self) -> Evaluator:
         """Scores any policy of the run's world."""
-        return self._saved.evaluator()
+        return self.saved.evaluator()
 
     @cached_property
     def policy(self) -> PolicySnapshot:
@@ -92,7 +92,7 @@ class RunResult:
     @property
     def overrides(self) -> list[str]:
         """The settings that its command line or call changed, as words."""
-        return list(self._saved.run.manifest.get("overrides") or [])
+        return list(self.saved.run.manifest.get("overrides") or [])
 
     @cached_property
     def agent(self) -> Agent:

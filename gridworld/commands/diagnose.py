@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.picture import draw_diagnosis
+from gridworld.diagnosis.trials import beside, check_trusted, try_offers
 from gridworld.diagnosis.verdict import Diagnosis, diagnose
 from gridworld.errors import InputError
 from gridworld.process.console.columns import aligned
@@ -15,6 +17,7 @@ from gridworld.process.console.command_line import program
 from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.console.terminal import printable, tell
 from gridworld.process.memory_budget import limited
+from gridworld.process.signals import Interrupted
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.folder import shown
 from gridworld.storage.safe_read import check_no_link
@@ -22,6 +25,7 @@ from gridworld.visualization.video import save_png
 
 PICTURE = "diagnosis.png"
 _MOST_ROWS = 8
+_NONE = 1  # the exit code
 
 
 @limited()
@@ -30,6 +34,7 @@ def main(arguments: Sequence[str]) -> None:
 
     Raises:
         InputError: The run cannot be read.
+        SystemExit: With code 1 where nothing that was tried is certified.
     """
     options = _parser().parse_args(arguments)
     with telling_if_slow(f"diagnosing {options.run}"):
@@ -44,11 +49,40 @@ def main(arguments: Sequence[str]) -> None:
         for line in found.commands:
             print(printable(f"  {line}"))
         _draw(found, options.run)
+    if options.try_offers and found.findings:
+        check_trusted(saved, found, options.trust)
+        try:
+            certified = _is_any_certified(saved, found, options)
+        except Interrupted as interruption:
+            print(str(interruption), file=sys.stderr)
+            sys.exit(interruption.exit_code)
+        if not certified:
+            sys.exit(_NONE)
+
+
+def _is_any_certified(saved: SavedRun, found: Diagnosis, options: argparse.Namespace) -> bool:
+    """Train what there is to try, and say what became of it."""
+    print("Trying:")
+    certified = False
+    for trial in try_offers(saved, found, beside(options.run), options.trust):
+        certified = trial.certified
+        end = trial.why or ("certified optimal" if certified else f"regret {trial.regret:.3g}, not certified")
+        print(printable(f"  {trial.command}"))
+        print(printable(f"    {end}: {shown(trial.folder)}"), flush=True)
+    if not certified:
+        print("None of them is certified.")
+    return certified
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=program("diagnose"), description=__doc__)
     parser.add_argument("run", type=Path, help="the run's folder, e.g. runs/2026-...")
+    parser.add_argument(
+        "--try",
+        dest="try_offers",
+        action="store_true",
+        help="train what there is to try, in RUN-tried, until one is certified; exit code 1 if none is",
+    )
     parser.add_argument(
         "--trust", action="store_true", help="import the classes that the run names, wherever they are from"
     )

@@ -140,6 +140,17 @@ class Evidence:
         walk = Chain(self.mdp, uniform).outcome(self.evaluator.max_episode_steps)
         return walk.expected_length / walk.goal if walk.goal > 0 else np.inf
 
+    @property
+    def usual_rate(self) -> float:
+        """A learning rate at which small networks learn with Adam; or a table, where nothing is chance."""
+        return 0.5 if self.is_tabular else 0.005 if self.is_actor_critic else 0.001
+
+    @property
+    def has_plain_steps(self) -> bool:
+        """Whether a network's optimiser takes gradients as they are."""
+        optimizer = getattr(getattr(self.agent.model, "policy", None), "optimizer", None)
+        return "SGD" in type(optimizer).__name__
+
     def setting(self, name: str, default: float = 0.0) -> float:
         """A number among the agent's settings: as configured, or as its model has it by default.
 

@@ -10,6 +10,7 @@ from gridworld.diagnosis.evidence import Evidence
 from gridworld.world.exact.bellman import backup
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.exact.markov_chain import Chain
+from gridworld.world.exact.occupancy import discounted_visits, stopping_states
 from gridworld.world.mdp import BoolArray, FloatArray, Mdp
 
 _SWEEPS = 1000
@@ -69,6 +70,28 @@ def optimum_of_epsilon(mdp: Mdp, gamma: float, epsilon: float) -> FloatArray:
         if change <= 1e-12:
             break
     return backup(mdp, v, gamma)
+
+
+def visits_needed(run: Evidence) -> float:
+    """How often an action must be tried to tell the closest actions apart; 0: nothing is left to chance.
+
+    A rate that falls linearly to 0 over n tries averages about the last √n targets. Three standard deviations
+    of that mean are to be below the smallest gap on the optimal policy's way.
+    """
+    mdp, own = run.mdp, run.own
+    targets = mdp.reward + own.gamma * np.where(mdp.terminal, 0.0, own.v)[mdp.next_state]
+    mean = (mdp.probability * targets).sum(axis=2, keepdims=True)
+    variance = (mdp.probability * (targets - mean) ** 2).sum(axis=2)
+    gap = own.v - np.where(own.optimal, -np.inf, own.q).max(axis=1)
+    way = on_the_way(run)
+    return float(9 * variance[way].max() / max(gap[way].min(), 1e-6) ** 2) ** 2
+
+
+def on_the_way(run: Evidence) -> BoolArray:
+    """(S,), where the optimal policy acts."""
+    chain = Chain(run.mdp, run.evaluator.optimal_policy())
+    gamma = run.evaluator.solution.gamma
+    return (discounted_visits(chain, gamma, stopping_states(chain, gamma)) > 0) & run.mdp.acting
 
 
 def sweeps_missing(run: Evidence) -> int:

@@ -6,18 +6,40 @@ import re
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from gridworld.diagnosis.causes import CAUSES, PHRASES
+from gridworld.diagnosis.causes.objective import clearest_gamma
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.finding import Finding
 from gridworld.diagnosis.split import RegretSplit
 from gridworld.process.console.command_line import command
+from gridworld.world.discounts import score_of_optimum
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 
 _MOST_CHANGES = 3
 _NAMELESS = 1e-12  # of the regret: a share that is rounding
+
+
+@dataclass(frozen=True)
+class Trial:
+    """An offer that was trained, see `trials`.
+
+    Attributes:
+        command: the offered command line.
+        folder: of its run.
+        regret: of the greedy policy at its end; infinite where it did not come to its end.
+        certified: whether that policy is certified optimal.
+        why: why it did not come to its end, else "".
+    """
+
+    command: str
+    folder: Path
+    regret: float
+    certified: bool
+    why: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +53,8 @@ class Diagnosis:
         findings: the causes that explain some of it, the largest share first; none for a certified run.
         shares: the share of the regret that each of them explains; they sum to 1.
         cause_of: (S,), the number in `findings` of each state's cause, -1 where there is none.
-        commands: at most three command lines to try.
+        offers: the words of at most three command lines to try.
+        tried: those that were tried, up to the first that is certified.
     """
 
     mdp: Mdp
@@ -40,7 +63,13 @@ class Diagnosis:
     findings: tuple[Finding, ...]
     shares: tuple[float, ...]
     cause_of: IntArray
-    commands: tuple[str, ...]
+    offers: tuple[tuple[str, ...], ...]
+    tried: tuple[Trial, ...] = ()
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """The command lines to try."""
+        return tuple(f"{command('train')} {shlex.join(words)}" for words in self.offers)
 
     @property
     def cause(self) -> str | None:
@@ -87,7 +116,7 @@ def diagnose(run: Evidence) -> Diagnosis:
         findings,
         tuple(shares[index] for index in order),
         place[cause_of],
-        _commands(run, findings),
+        _offers(run, findings),
     )
 
 
@@ -113,16 +142,25 @@ def _assigned(run: Evidence, cost: FloatArray) -> tuple[list[Finding], list[floa
     return found, shares, cause_of
 
 
-def _commands(run: Evidence, findings: tuple[Finding, ...]) -> tuple[str, ...]:
-    """The run's own command line with a change each: those of the first cause, then one of each other."""
+def _offers(run: Evidence, findings: tuple[Finding, ...]) -> tuple[tuple[str, ...], ...]:
+    """The run's own words with a change each: those of the first cause, then one of each other.
+
+    No change helps as long as even the optimum under the agent's own discount is not certified, so each has
+    another discount with it then.
+    """
     first, others = findings[0].changes, [word for each in findings[1:] for word in each.changes[:1]]
     changes = list(dict.fromkeys((*first, *others)))[:_MOST_CHANGES]
-    return tuple(f"{command('train')} {shlex.join(_with(run.overrides, each))}" for each in changes)
+    key, fits = run.config.agent.key("gamma"), score_of_optimum(run.evaluator, run.own.gamma).certified
+    gamma = "" if fits else run.change("gamma", clearest_gamma(run, run.split.wrong))
+    return tuple(
+        _with(run.overrides, (each if fits or key in each else f"{each} {gamma}").split(" "))
+        for each in changes
+    )
 
 
-def _with(overrides: Sequence[str], change: str) -> list[str]:
-    key = _key(change)
-    return [*(word for word in overrides if _key(word) != key), change]
+def _with(overrides: Sequence[str], changes: Sequence[str]) -> tuple[str, ...]:
+    keys = set(map(_key, changes))
+    return (*(word for word in overrides if _key(word) not in keys), *changes)
 
 
 def _key(word: str) -> str:

@@ -2,15 +2,18 @@
 
 import re
 import shlex
+import shutil
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import hostile
 from PIL import Image
 
 import gridworld
 from gridworld.commands import diagnose
+from gridworld.diagnosis.causes import learning
 from gridworld.diagnosis.picture import draw_diagnosis
 
 _SPOILT = ["agent=q_learning", "agent.learning_rate=0.001", "total_timesteps=2000", "seed=0"]
@@ -61,9 +64,55 @@ def test_a_world_without_places_is_diagnosed_and_drawn_too() -> None:
     assert draw_diagnosis(found).ndim == 3
 
 
+def test_offers_are_tried_until_one_is_certified(tmp_path: Path, capsys) -> None:
+    slow = ["agent=q_learning", "agent.learning_rate=0.001", "env.layout=four_rooms", "total_timesteps=20000"]
+    gridworld.train(*slow, folder=tmp_path / "slow", seed=3, progress=False)
+    diagnose.main([str(tmp_path / "slow"), "--try"])
+    told = capsys.readouterr().out
+    tried = sorted((tmp_path / "slow-tried").iterdir())
+    assert f"certified optimal: {tried[-1]}" in told
+    last = gridworld.open_run(tried[-1])
+    assert last.summary["certified"]
+    typed = told[: told.index(f"    certified optimal: {tried[-1]}")].splitlines()[-1]
+    again = gridworld.train(*shlex.split(typed)[2:], progress=False)
+    assert again.summary["regret"] == last.summary["regret"]
+    assert again.curve["regret"].tolist() == last.curve["regret"].tolist()
+
+
+def test_where_no_offer_is_certified_the_exit_code_is_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    monkeypatch.setattr(learning, "_settling", lambda run: ("agent.learning_rate=0.9", "agent.gamma=7"))
+    wild = ["agent=q_learning", "agent.learning_rate=1", "env.slip=0.3", "total_timesteps=600"]
+    run = gridworld.train(*wild, "env.layout=aima_4x3", folder=tmp_path / "a run", seed=1, progress=False)
+    found = gridworld.diagnose(run, try_offers=True)
+    assert not found.tried[-1].certified
+    assert [each.folder.name for each in found.tried] == [str(n + 1) for n in range(len(found.tried))]
+    with pytest.raises(SystemExit) as ended:
+        diagnose.main([str(tmp_path / "a run"), "--try"])
+    assert ended.value.code == 1
+    assert "None of them is certified." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        *("+evil=${oc.env:HOME}", "hydra.searchpath=[pkg://os]", "--config-dir=/tmp", "env/schema@env=built"),
+        *("agent.algorithm=os.system", "callbacks=[{_target_: os.system, command: ls}]"),
+    ],
+)
+def test_nothing_of_strangers_runs_in_a_trial(spoilt: Path, tmp_path: Path, word: str) -> None:
+    folder = tmp_path / "strangers"
+    shutil.copytree(spoilt, folder)
+    hostile.manifest(folder, lambda content: content["overrides"].append(word))
+    with pytest.raises(gridworld.InputError, match="trust"):
+        diagnose.main([str(folder), "--try"])
+    assert not (tmp_path / "strangers-tried").exists()
+
+
 def test_of_a_certified_run_nothing_is_named_or_drawn(tmp_path: Path, capsys) -> None:
     gridworld.train("agent=value_iteration", folder=tmp_path / "best", progress=False)
-    diagnose.main([str(tmp_path / "best")])
+    diagnose.main([str(tmp_path / "best"), "--try"])
     told = capsys.readouterr().out.splitlines()
     assert told[1:] == ["Certified optimal: there is no regret to explain."]
     assert not (tmp_path / "best" / "diagnosis.png").exists()

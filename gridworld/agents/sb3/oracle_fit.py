@@ -98,6 +98,18 @@ def one_state_fit(agent: Agent, best: Solution, states: IntArray, state: int) ->
     return OneState(told_apart, states[was_right & ~right[rows, last]])
 
 
+def narrowest_layer(agent: Agent) -> int:
+    """The units of the narrowest layer between a network's features and its actions; 0: there is none."""
+    assert isinstance(agent, SB3Agent)
+    policy = agent.model.policy
+    extractor = getattr(policy, "mlp_extractor", None)
+    network = getattr(policy, "q_net", None) or getattr(policy, "quantile_net", None)
+    whole = network if extractor is None else extractor.policy_net
+    layers = [each for each in whole.modules() if isinstance(each, torch.nn.Linear)] if whole else []
+    hidden = layers if extractor is not None else layers[:-1]
+    return min((each.out_features for each in hidden), default=0)
+
+
 @dataclass(frozen=True, eq=False)
 class _Fit:
     """Supervised fits of one network to the exact answer of n states.

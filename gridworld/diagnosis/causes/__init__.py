@@ -14,6 +14,7 @@ from gridworld.diagnosis.causes.learning import (
     lost_again,
     not_there_yet,
     overshot,
+    scaled,
     unsettled,
 )
 from gridworld.diagnosis.causes.network import cannot_represent, forgets, spoilt, spoilt_policy
@@ -28,7 +29,7 @@ from gridworld.diagnosis.finding import Cause
 
 CAUSES: tuple[Cause, ...] = (
     *(faulty_class, hopeless_gamma, other_optimum, too_much_epsilon, too_much_entropy),
-    *(forgets, lost_again, diverged, cannot_represent, hardly_moved, overshot),
+    *(scaled, forgets, lost_again, diverged, cannot_represent, hardly_moved, overshot),
     *(spoilt_policy, not_tried, collapsed, faint_gamma, spoilt, not_there_yet, ended_early, unsettled),
 )
 
@@ -39,6 +40,7 @@ PHRASES = {  # by name
     "diverged": "values diverged",
     "epsilon": "plays safe for epsilon",
     "network": "network cannot hold it",
+    "scale": "rewards scaled badly",
     "forgetting": "forgets what it learnt",
     "entropy": "entropy bonus too large",
     "rate": "updates too large",

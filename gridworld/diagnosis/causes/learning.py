@@ -4,15 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 
+from gridworld.config.agents import LINEAR
 from gridworld.diagnosis.evidence import Evidence, entropy
-from gridworld.diagnosis.experiments import entropy_optimum, sweeps_missing
+from gridworld.diagnosis.experiments import (
+    entropy_optimum,
+    on_the_way,
+    sweeps_missing,
+    visits_needed,
+)
 from gridworld.diagnosis.finding import Finding, costliest, falling, faster, longer, slower
 from gridworld.world.exact.bellman import backup
 from gridworld.world.mdp import BoolArray
 
 _SPREAD = 0.5  # of the entropy of a uniform policy: above, it has hardly made up its mind
 _FORGOTTEN = 0.05  # of a first value
+_SMALL, _LARGE = 0.02, 50  # values that networks hardly learn
 _MOVES = 0.1  # Adam moves a weight by about the learning rate an update: less than this in all is nothing
+_MOST_TIMES = 50  # as long
+_EVENLY = "n_envs=256 exploring_starts=1 stratified_draws=true"  # what leaves least to chance
 _REFRESHES = 2  # of the target network, for each step of the way to the goal
 
 
@@ -25,7 +34,8 @@ def lost_again(run: Evidence) -> Finding | None:
     after = int(steps[min(last + 1, len(steps) - 1)])
     why = f"it was certified at step {int(steps[last]):,} and had lost that again at step {after:,}"
     sooner = () if run.config.evaluation.stop_after else ("evaluation.stop_after=3",)
-    return Finding("lost", run.split.wrong, why, (*falling(run), *sooner, slower(run)[0]))
+    calmer = _settling(run) if run.is_tabular and visits_needed(run) else slower(run)
+    return Finding("lost", run.split.wrong, why, (*falling(run), *sooner, calmer[0]))
 
 
 def diverged(run: Evidence) -> Finding | None:
@@ -40,6 +50,20 @@ def diverged(run: Evidence) -> Finding | None:
     interval = run.setting("target_update_interval")
     seldom = (run.change("target_update_interval", 4 * interval),) if interval else ()
     return Finding("diverged", run.split.wrong, why, (slower(run)[0], *seldom))
+
+
+def scaled(run: Evidence) -> Finding | None:
+    """Its `reward_scale` makes the values to be learnt far from those of an untrained network."""
+    if run.is_tabular or not run.takes("reward_scale"):
+        return None
+    scale, largest = run.setting("reward_scale", 1.0), float(np.abs(run.own.v[run.mdp.acting]).max())
+    if scale == 1 or _SMALL <= scale * largest <= _LARGE:
+        return None
+    why = (
+        f"with its reward_scale of {scale:g} the values that it learns reach {scale * largest:.2g}, where "
+        "those of an untrained network are about 0.1"
+    )
+    return Finding("scale", run.split.wrong, why, (run.change("reward_scale", 1 / run.largest_reward),))
 
 
 def hardly_moved(run: Evidence) -> Finding | None:
@@ -100,7 +124,7 @@ def not_there_yet(run: Evidence) -> Finding | None:
         often = max(1.0, round(run.config.total_timesteps / (8 * path)))
         return Finding("target", states, why, (run.change("target_update_interval", often), longer(run, 4)))
     why = f"it was still learning: {run.updates:,.0f} updates were too few{_behind(run)}"
-    return Finding("slow", states, why, faster(run)[::-1])
+    return Finding("slow", states, why, faster(run))
 
 
 def _too_short(run: Evidence) -> bool:
@@ -139,8 +163,9 @@ def _slow_table(run: Evidence, states: BoolArray) -> Finding | None:
         f"its values have not got there: in {where}, {tried:,} updates left {left:.2g} of what it began with"
     )
     changes = [run.change("learning_rate_power", 0.0)] if power else []
-    if rate < 0.5:
-        changes.append(run.multiplied("learning_rate", 10, most=0.5))
+    if rate < run.usual_rate:  # with as many updates, enough of it
+        enough = (1 - _FORGOTTEN ** (1 / max(tried, 1))) / rate
+        changes.append(run.multiplied("learning_rate", max(10, enough), most=run.usual_rate))
     return Finding("slow", states, f"{why}{_behind(run)}", (*changes, longer(run, 4)))
 
 
@@ -154,4 +179,26 @@ def unsettled(run: Evidence) -> Finding:
         f"its values do not settle: in {run.mdp.state_name(worst)} they err by {error:.2g} where the right "
         f"action is worth {run.gap[worst]:.2g} more"
     )
-    return Finding("rate", run.split.wrong, why, (slower(run)[0], *falling(run), longer(run, 4)))
+    return Finding("rate", run.split.wrong, why, _settling(run))
+
+
+def _settling(run: Evidence) -> tuple[str, ...]:
+    """Smaller steps. Of a table, only such as have forgotten the first values by its end; where targets are
+    chance, means of enough of them.
+    """
+    if not run.is_tabular:
+        return slower(run)[0], *falling(run), longer(run, 4)
+    way = on_the_way(run)
+    tried = float(np.where(run.own.optimal, run.visits, 0).max(axis=1)[way].min())
+    if needed := visits_needed(run):
+        times = int(np.clip(needed / max(tried, 1.0), 4, _MOST_TIMES))
+        fades = run.change("learning_rate", f"{LINEAR}{run.usual_rate:g}")
+        if run.config.agent.algorithm == "q_learning":  # whose values do not depend on how it explores
+            fades = " ".join(
+                (fades, *(run.change(f"exploration_{end}_eps", 1.0) for end in ("initial", "final")))
+            )
+        return f"{longer(run, times)} {fades}", f"{longer(run, 16 * times)} {fades} {_EVENLY}"
+    rates = (each for each in (0.5, 0.1) if each < run.setting("learning_rate"))
+    return *(run.change("learning_rate", each) for each in rates if (1 - each) ** tried < _FORGOTTEN), longer(
+        run, 4
+    )

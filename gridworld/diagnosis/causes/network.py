@@ -18,16 +18,20 @@ _OFTEN = 10  # times as many visits
 
 
 def cannot_represent(run: Evidence) -> Finding | None:
-    """The same network with new weights cannot be fitted."""
-    if _fits(run, fresh=True) is not False:
+    """The same network with new weights cannot be fitted, or has a layer too narrow for the exact answer."""
+    if _fits(run, fresh=True) is False:
+        worst = costliest(run, run.split.wrong)
+        told_apart, _ = _alone(run, worst)
+        alone = "its own can learn {} alone" if told_apart else "its own cannot even tell {} from the others"
+        how = (
+            "with new weights and fitted to the exact one, it still errs; "
+            f"{alone.format(run.mdp.state_name(worst))}"
+        )
+    elif units := _bottleneck(run):
+        how = f"it has a layer of {units}, and the best table of rank {units} still errs"
+    else:
         return None
-    worst = costliest(run, run.split.wrong)
-    told_apart, _ = _alone(run, worst)
-    alone = "; its own can learn {} alone" if told_apart else "; its own cannot even tell {} from the others"
-    why = (
-        "its network cannot hold the answer: with new weights and fitted to the exact one, it still errs"
-        f"{alone.format(run.mdp.state_name(worst))}"
-    )
+    why = f"its network cannot hold the answer: {how}"
     wide = f"{run.config.agent.key('policy_kwargs.net_arch')}=[64,64]"
     kinds = () if run.config.observation.kind == "one_hot" else ("observation=one_hot",)
     return Finding("network", run.split.wrong, why, (wide, *kinds))
@@ -66,6 +70,28 @@ def spoilt(run: Evidence) -> Finding | None:
         return None
     why = "its weights are spoilt: fitted to the exact answer from them it still errs, from new ones not"
     return Finding("rate", run.split.wrong, why, slower(run))
+
+
+def _bottleneck(run: Evidence) -> int:
+    """The units of its narrowest layer, if no table of that rank near the exact one is optimal; else 0.
+
+    What an output layer makes of w units is a table of rank w, besides a constant for each action. The one
+    with the least squared error is the sum of the first w singular vectors (Eckart and Young, 1936).
+    """
+    if run.config.agent.family != "sb3":
+        return 0
+    from gridworld.agents.sb3.oracle_fit import narrowest_layer  # imports torch
+
+    units, states = narrowest_layer(run.agent), np.flatnonzero(run.mdp.acting)
+    if not units or units >= run.mdp.num_actions or not np.isfinite(run.own.q[states]).all():
+        return 0
+    advantages = run.own.q[states] - run.own.v[states, None]
+    mean = advantages.mean(axis=0)
+    left, sizes, right = np.linalg.svd(advantages - mean, full_matrices=False)
+    greedy = run.own.q.argmax(axis=1)
+    greedy[states] = ((left[:, :units] * sizes[:units]) @ right[:units] + mean).argmax(axis=1)
+    score = Evaluator(run.mdp, run.own.gamma, 1).score(one_hot_policy(greedy, run.mdp.num_actions))
+    return 0 if score.certified else units
 
 
 def _fits(run: Evidence, fresh: bool) -> bool | None:
