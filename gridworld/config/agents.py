@@ -16,6 +16,7 @@ from typing import Annotated, Any, Protocol, Union
 
 from gridworld.bounds import above_zero, within
 from gridworld.config.effects import Effect, affects
+from gridworld.config.texts import ClassPath, Text, Word
 from gridworld.errors import InputError
 
 MISSING = "???"  # OmegaConf's sign for a value that has to be given
@@ -26,17 +27,17 @@ _POWERS = {LINEAR: 1.0, "sqrt_": 0.5, "quad_": 2.0}  # of what is left of traini
 REPLAY_COUNTS = "gridworld.agents.sb3.replay_counts.ReplayCounts"  # a replay buffer that counts transitions
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
-Schedule = Union[int, float, str]  # noqa: UP007
-WholeNumbers = Annotated[Any, "a whole number, or lists and dicts of them"]  # OmegaConf reads it as Any
+Schedule = Union[int, float, Word]  # noqa: UP007
+WholeNumbers = Annotated[Any, Text.WORD, "a whole number, or lists and dicts of them"]
 
 
 @dataclass
 class AgentConfig:
     """The settings of any agent. `family` is the package in `gridworld.agents` that has the algorithm."""
 
-    name: str = field(default=MISSING, metadata=affects(Effect.LABELS))  # in tables and folders
-    family: str = MISSING  # the package in `gridworld.agents`
-    algorithm: str = MISSING  # the class, by its import path where it is none of ours
+    name: Word = field(default=MISSING, metadata=affects(Effect.LABELS))  # in tables and folders
+    family: Word = MISSING  # the package in `gridworld.agents`
+    algorithm: ClassPath = MISSING  # the class, by its import path where it is none of ours
 
     @property
     def libraries(self) -> tuple[str, ...]:

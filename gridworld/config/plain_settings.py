@@ -6,93 +6,106 @@ Nothing is resolved, instantiated or imported. An interpolation is a text like a
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
+import re
 import types
 from collections.abc import Iterator, Mapping
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gridworld.config.agents import MISSING, AgentConfig, agent_schemas
+from gridworld.config.composition.setting_names import settings_of_a_run
 from gridworld.config.effects import Effect
 from gridworld.config.settings_by_effect import effect_of, is_newer
+from gridworld.config.texts import LIBRARIES, Text
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, schema_of
 from gridworld.errors import InputError
+from gridworld.process.console.terminal import printable
 
-_LIBRARIES = (
-    *("torch.nn.", "torch.optim.", "stable_baselines3.", "sb3_contrib."),
-    "gridworld.agents.sb3.features.",
-    "gridworld.agents.sb3.replay_counts.",
-)
+_LARGEST_KWARG = 1000  # of an environment: sizes, and what it pays
 
 # A run that was made before there was such a setting is read with the setting's default.
 _WITHOUT_RESULT = (Effect.FILES, Effect.NOTHING)
 
 
-def needs_trust(config: Mapping[str, Any]) -> bool:
-    """Whether a run's settings, as its manifest has them, name what `check_imports` refuses."""
-    try:
-        check_imports([config.get("agent"), config.get("callbacks")], "", "")
-    except InputError:
-        return True
-    return False
-
-
-def check_imports(settings: Any, where: str, allow: str) -> None:
-    """Refuse what runs code of a stranger's choice, however deep it stands in the settings.
-
-    That is an import path that leads out of the libraries an agent is made of, and a `_target_` of any: it is
-    called with arguments of the stranger's, and callbacks of SB3 write files where they are told to.
+def check_foreign(settings: Mapping[str, Any], where: str, allow: str) -> None:
+    """Refuse settings by which a stranger would run code, or have a file read, on the reader's machine.
 
     Args:
-        settings: plain values.
+        settings: of a run, or a part of them, as plain values.
         where: they stand, for the message.
         allow: the word that would allow it, for the message.
 
     Raises:
-        InputError: there is such a path.
+        InputError: there is such a setting.
     """
-    for key, path in foreign_imports(settings):
-        raise InputError(
-            f"{where}: {key}={path[:80]} is from none of {', '.join(_LIBRARIES)}; add {allow} to import "
-            "it all the same, if you trust whoever made this"
-        )
-    for path in _targets(settings):
-        raise InputError(
-            f"{where}: _target_={shown(path)} is called with the arguments beside it, and may write files; "
-            f"add {allow} if you trust whoever made this"
-        )
+    for name, value, harm in foreign(settings):
+        told = printable(f"{name[:200]}={str(value)[:80]}")
+        raise InputError(f"{where}: {told} {harm}; add {allow} if you trust whoever made this")
 
 
-def foreign_imports(settings: Any, key: str = "") -> Iterator[tuple[str, str]]:
-    """Find such paths in plain values.
+def foreign(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any, str]]:
+    """Find what does harm if a stranger wrote it, however deep it stands.
 
     Args:
-        settings: the values.
-        key: of `settings`, if they are a value.
+        settings: as for `check_foreign`.
 
     Yields:
-        The key and the path.
+        Its dotted name, the value, and what it does.
     """
-    if isinstance(settings, dict):
-        for name, value in settings.items():
-            yield from foreign_imports(value, str(name))
-    elif isinstance(settings, list):
-        for value in settings:
-            yield from foreign_imports(value, key)
-    elif _is_foreign(key, settings):
-        yield key, settings
+    for name, value in _leaves(settings, ""):
+        for kind in sorted(_kinds(name), key=lambda kind: kind.name):
+            if isinstance(value, str) and not re.fullmatch(kind.pattern, value):
+                yield name, value, kind.harm
+            elif kind is Text.KWARGS and isinstance(value, int | float) and abs(value) > _LARGEST_KWARG:
+                yield name, value, f"is beyond {_LARGEST_KWARG:,}, and may make a world of any size"
 
 
-def _targets(settings: Any) -> Iterator[Any]:
-    if isinstance(settings, dict):
-        yield from [settings["_target_"]] if "_target_" in settings else []
-        settings = list(settings.values())
-    for value in settings if isinstance(settings, list) else []:
-        yield from _targets(value)
+def has_own_code(callbacks: Any) -> bool:
+    """Whether a callback among these, plain values, is of a class that is from none of the libraries."""
+    return any(
+        name.endswith("_target_") and not str(path).startswith(LIBRARIES)
+        for name, path in _leaves(callbacks, "")
+    )
 
 
-def _is_foreign(key: str, value: Any) -> bool:
-    names_a_class = key.endswith(("_class", "_fn")) or key in ("algorithm", "policy", "_target_")
-    return names_a_class and isinstance(value, str) and "." in value and not value.startswith(_LIBRARIES)
+def _leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """All values that are no group, by dotted names; those in a list by the list's."""
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _leaves(inner, f"{name}.{key}" if name else str(key))
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            yield from _leaves(inner, name)
+    else:
+        yield name, value
+
+
+def _kinds(name: str) -> frozenset[Text]:
+    """What the schemas declare a text to be: at the setting of this name, or at the one that it is in.
+
+    What no schema knows may be anything.
+    """
+    while name and name not in declared_texts():
+        name = name.rpartition(".")[0]
+    return declared_texts().get(name, frozenset([Text.CODE]))
+
+
+@functools.cache
+def declared_texts() -> dict[str, frozenset[Text]]:
+    """What a text in each setting of a run is; several where the schemas of agents or worlds differ."""
+    return {
+        name: frozenset(itertools.chain(*map(texts_in, hints))) for name, hints in settings_of_a_run().items()
+    }
+
+
+def texts_in(hint: Any) -> Iterator[Text]:
+    """What a type hint declares of the texts that it allows."""
+    yield from (each for each in getattr(hint, "__metadata__", ()) if isinstance(each, Text))
+    for inner in get_args(hint):
+        if not isinstance(inner, Text | str):
+            yield from texts_in(inner)
 
 
 def read_config(content: Any, where: str) -> TrainConfig:

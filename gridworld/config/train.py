@@ -8,12 +8,13 @@ setting affects (`gridworld.config.effects`). Nothing heavy is imported here.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Optional, Union
+from typing import Optional, Union
 
 from gridworld.bounds import at_least, at_most, discount, within
 from gridworld.config.agents import AgentConfig
 from gridworld.config.effects import Effect, affects
 from gridworld.config.pictures import RecordingConfig
+from gridworld.config.texts import Callback, Word
 from gridworld.config.worlds import EnvConfig, MapConfig
 from gridworld.errors import InputError
 
@@ -29,7 +30,7 @@ AUTO = "auto"  # checkpoints as often as they cost next to nothing
 class ObservationConfig:
     """What the agent sees of a state."""
 
-    kind: str = "one_hot"  # or coordinates, image, own, none (the state's number)
+    kind: Word = "one_hot"  # or coordinates, image, own, none (the state's number)
     cell_size: int = 8  # pixels, for images
 
 
@@ -56,7 +57,7 @@ class LoggingConfig:
 class CheckpointConfig:
     """What it takes to go on after an interruption."""
 
-    every: Optional[Union[int, str]] = "auto"  # noqa: UP007, UP045  # steps; auto: as it costs little; null: none
+    every: Optional[Union[int, Word]] = "auto"  # noqa: UP007, UP045  # steps; auto: as it costs little; null: none
 
 
 @dataclass
@@ -71,10 +72,10 @@ class TrainConfig:
     exploring_starts: float = 0.0  # share of training episodes that begin in a state drawn uniformly
     # whether environments in one state share out an action's outcomes evenly, see `gridworld.envs.stratified`
     stratified_draws: bool = False
-    device: str = field(default="cpu", metadata=affects(Effect.MACHINE))
+    device: Word = field(default="cpu", metadata=affects(Effect.MACHINE))
     threads: int = field(default=1, metadata=affects(Effect.MACHINE))  # of torch
     # of SB3: each a mapping of `_target_`, the import path of a class, and its arguments
-    callbacks: list[Any] = field(default_factory=list)
+    callbacks: list[Callback] = field(default_factory=list)
     agent: AgentConfig = field(default_factory=AgentConfig)  # the chosen agent's own schema in its place
     # of the chosen source (`gridworld.config.worlds`)
     env: EnvConfig = field(default_factory=MapConfig, metadata=affects(Effect.TASK))

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Optional
 
 from gridworld.bounds import MOST_STEPS, STEP_LIMIT, at_least, at_most
 from gridworld.config.agents import MISSING
+from gridworld.config.texts import CodePath, EnvId, FilePath, Kwargs, Word
 from gridworld.errors import InputError
 
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
@@ -76,7 +77,7 @@ class EnvConfig:
 class MapConfig(EnvConfig):
     """A map and its rewards; the arguments of `GridWorldEnv`."""
 
-    layout: str = "classic"  # the name of a shipped map, or a file
+    layout: FilePath = "classic"  # the name of a shipped map, or a file
     num_rows: Optional[int] = None  # noqa: UP045  # of the layout `classic`; null: 5
     num_cols: Optional[int] = None  # noqa: UP045  # the same; null: 6
     slip: float = 0.0  # probability of moving at a right angle instead
@@ -109,9 +110,9 @@ class MapConfig(EnvConfig):
 class GymnasiumConfig(EnvConfig):
     """An environment of Gymnasium that has a transition table; its step limit is that of its id."""
 
-    source: str = "gymnasium"
-    id: str = MISSING  # that it is registered under, e.g. FrozenLake-v1
-    kwargs: dict[str, Any] = field(default_factory=dict)  # of gymnasium.make
+    source: Word = "gymnasium"
+    id: EnvId = MISSING  # that it is registered under, e.g. FrozenLake-v1
+    kwargs: Kwargs = field(default_factory=dict)  # of gymnasium.make
 
     @property
     def name(self) -> str:
@@ -129,8 +130,8 @@ class GymnasiumConfig(EnvConfig):
 class EnumeratedConfig(GymnasiumConfig):
     """A deterministic environment of Gymnasium whose states are found by trying all actions."""
 
-    source: str = "enumerated"
-    ignore: list[str] = field(default_factory=list)  # attributes that are no part of its state, by your word
+    source: Word = "enumerated"
+    ignore: list[Word] = field(default_factory=list)  # attributes that are no part of its state, by your word
 
     def compile(self) -> Mdp:
         """See `EnvConfig.compile`."""
@@ -153,8 +154,8 @@ class EnumeratedConfig(GymnasiumConfig):
 class ArraysConfig(EnvConfig):
     """Tables in a file."""
 
-    source: str = "arrays"
-    path: str = MISSING  # of an .npz
+    source: Word = "arrays"
+    path: FilePath = MISSING  # of an .npz
 
     @property
     def name(self) -> str:
@@ -172,9 +173,9 @@ class ArraysConfig(EnvConfig):
 class BuiltConfig(EnvConfig):
     """What a function returns: an `Mdp`, or the tables of one."""
 
-    source: str = "built"
-    builder: str = MISSING  # the function's import path
-    kwargs: dict[str, Any] = field(default_factory=dict)  # of the function
+    source: Word = "built"
+    builder: CodePath = MISSING  # the function's import path
+    kwargs: Kwargs = field(default_factory=dict)  # of the function
 
     @property
     def name(self) -> str:
@@ -192,7 +193,7 @@ class BuiltConfig(EnvConfig):
 class ClassicConfig(EnvConfig):
     """A world of the literature (`gridworld.world.sources.classics`), whose sizes are the other settings."""
 
-    source: str = MISSING
+    source: Word = MISSING
 
     @property
     def name(self) -> str:
@@ -216,7 +217,7 @@ class ClassicConfig(EnvConfig):
 class RiverSwimConfig(ClassicConfig):
     """Against the current to a large reward, or with it to a small one."""
 
-    source: str = "river_swim"
+    source: Word = "river_swim"
     length: int = 6  # states
 
 
@@ -224,7 +225,7 @@ class RiverSwimConfig(ClassicConfig):
 class DeepSeaConfig(ClassicConfig):
     """One way of 2 ** size leads to the treasure."""
 
-    source: str = "deep_sea"
+    source: Word = "deep_sea"
     size: int = 10  # rows and columns
     seed: Optional[int] = None  # noqa: UP045  # of what the actions mean in each cell; null: left and right
 
@@ -233,7 +234,7 @@ class DeepSeaConfig(ClassicConfig):
 class CombinationLockConfig(ClassicConfig):
     """A wrong action leads back to the start."""
 
-    source: str = "combination_lock"
+    source: Word = "combination_lock"
     length: int = 10  # actions that open it
     num_actions: int = 2  # of each state
     seed: Optional[int] = None  # noqa: UP045  # of the combination; null: the last action everywhere
@@ -243,7 +244,7 @@ class CombinationLockConfig(ClassicConfig):
 class RandomWalkConfig(ClassicConfig):
     """A chain whose right end pays 1."""
 
-    source: str = "random_walk"
+    source: Word = "random_walk"
     length: int = 5  # states without the ends, an odd number
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot, family
-from gridworld.config.plain_settings import check_imports, read_config
+from gridworld.config.plain_settings import check_foreign, read_config
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import MapConfig
 from gridworld.envs.observations import make_observation
@@ -141,8 +141,11 @@ def settings_of(
     try:
         check(config)
         if not trust:
-            named = [dataclasses.asdict(config.agent), config.callbacks if trains else []]
-            check_imports(named, str(run.manifest_file), allow)
+            used = {
+                "agent": dataclasses.asdict(config.agent),
+                "callbacks": config.callbacks if trains else [],
+            }
+            check_foreign(used, str(run.manifest_file), allow)
         family(config.agent).check(config)
     except RecursionError:
         raise InputError(f"{run.manifest_file}: config is nested too deeply") from None

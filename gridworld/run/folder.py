@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.config import pictures
-from gridworld.config.plain_settings import needs_trust
+from gridworld.config.plain_settings import foreign
 from gridworld.process.console.command_line import command, users_folder
 from gridworld.process.console.terminal import printable
 
@@ -95,7 +95,8 @@ class RunFolder:
 
     def resume_command(self, trusted: Mapping[str, Any] | None = None) -> str:
         """The command line that resumes the run; for settings that the user has `trusted`, it says so."""
-        trust = " trust=true" if trusted is not None and needs_trust(trusted) else ""
+        parts = {key: (trusted or {}).get(key) for key in ("agent", "callbacks")}  # that are built again
+        trust = " trust=true" if any(foreign(parts)) else ""
         return f"{command('train')} resume={shlex.quote(shown(self.folder))}{trust}"
 
 

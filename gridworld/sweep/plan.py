@@ -20,7 +20,7 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
-from gridworld.config.plain_settings import foreign_imports
+from gridworld.config.plain_settings import foreign, has_own_code
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig
 from gridworld.errors import InputError
@@ -199,13 +199,14 @@ def plan(
 
 def _in_fork(config: TrainConfig) -> bool:
     """Whether it has only our code and the libraries', and trains on one core."""
-    own_code = any(foreign_imports(dataclasses.asdict(config)))
+    classes = foreign({"agent": dataclasses.asdict(config.agent)})
+    own_code = has_own_code(config.callbacks) or any(classes)
     return config.device == "cpu" and config.threads == 1 and not own_code
 
 
 def shape(config: TrainConfig) -> str | None:
     """What must be equal for runs to train as one population; None: it trains alone."""
-    if config.agent.shape is None or any(foreign_imports(config.callbacks)):
+    if config.agent.shape is None or has_own_code(config.callbacks):
         return None
     return repr(
         (

@@ -88,9 +88,7 @@ def test_a_sweep_of_a_recipe_and_a_search_from_one(tmp_path: Path) -> None:
 def test_a_class_of_others_needs_trust(tmp_path: Path) -> None:
     path = tmp_path / "winner.yaml"
     path.write_text("defaults:\n- override /agent: a2c\nagent: {algorithm: evil.Agent}\n")
-    with pytest.raises(
-        InputError, match=r"algorithm=evil\.Agent is from none of .* add trust=true to import"
-    ):
+    with pytest.raises(InputError, match=r"algorithm=evil\.Agent is from none of .* add trust=true if you"):
         of_words(f"recipe={path}")
     assert of_words(f"recipe={path}", "trust=true").agent.algorithm == "evil.Agent"
 

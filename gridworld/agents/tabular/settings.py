@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 from gridworld.bounds import within
 from gridworld.config.agents import AgentConfig
+from gridworld.config.texts import Word
 
 
 @dataclass
 class TabularConfig(AgentConfig):
     """An agent that keeps a table over the states."""
 
-    family: str = "tabular"
+    family: Word = "tabular"
     gamma: float = 0.99  # the discount it learns with
 
     def check(self) -> None:

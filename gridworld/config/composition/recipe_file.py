@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 from gridworld.config.agents import MISSING
 from gridworld.config.alternatives import alternatives
 from gridworld.config.composition.words import as_whole
-from gridworld.config.plain_settings import check_imports, fits, shown
+from gridworld.config.plain_settings import check_foreign, fits, shown
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.storage.safe_read import as_text, read_bytes
@@ -87,7 +87,7 @@ def overrides(path: Path, trust: bool = False) -> list[str]:
 
     Args:
         path: its file.
-        trust: whether to allow any import path.
+        trust: whether to allow what runs code or reads files.
 
     Returns:
         Overrides: choices first, then values.
@@ -101,7 +101,7 @@ def overrides(path: Path, trust: bool = False) -> list[str]:
     choices = list(_choices(content.pop("defaults", []), path))
     values = list(_values([TrainConfig], content, path, ""))
     if not trust:
-        check_imports(content, str(path), f"{TRUST}=true")
+        check_foreign(content, str(path), f"{TRUST}=true")
     return [*choices, *values]
 
 

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any, cast
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from gridworld.config.agents import REPLAY_COUNTS
-from gridworld.config.plain_settings import foreign_imports
+from gridworld.config.plain_settings import has_own_code
 from gridworld.config.worlds import MapConfig
 from gridworld.errors import InputError
 
@@ -154,7 +154,7 @@ def times(number: int, by: int) -> int:
 
 def _is_own_loop(engine: str, callbacks: ListConfig) -> bool:
     """Whether SB3's own loop trains, which runs the network on every sample."""
-    return engine != "tabulated" or any(foreign_imports(OmegaConf.to_container(callbacks)))
+    return engine != "tabulated" or has_own_code(OmegaConf.to_container(callbacks))
 
 
 def _world(env: DictConfig) -> Mdp | None:

@@ -21,7 +21,7 @@ from gridworld.agents.sb3.settings.validation import FALLING, SCHEDULES
 from gridworld.agents.sb3.tabulated.state_inputs import why_not
 from gridworld.agents.sb3.tabulated.versions import tabulated_version
 from gridworld.config.agents import falls, parse_schedule
-from gridworld.config.plain_settings import foreign_imports
+from gridworld.config.plain_settings import has_own_code
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import tell
 from gridworld.process.import_path import imported
@@ -73,7 +73,7 @@ def algorithm_and_arguments(
         fields = (field.name for field in dataclasses.fields(config) if field.name not in _OWN_FIELDS)
         arguments = _convert({name: getattr(config, name) for name in fields}, "agent.")
     arguments["policy"] = _policy(config, algorithm)
-    return _with_engine(config, algorithm, arguments, any(foreign_imports(list(callbacks)))), arguments
+    return _with_engine(config, algorithm, arguments, has_own_code(list(callbacks))), arguments
 
 
 def _with_engine(

@@ -9,6 +9,7 @@ from typing import Any, Optional
 
 from gridworld.config.agents import REPLAY_COUNTS, AgentConfig, Schedule, WholeNumbers
 from gridworld.config.effects import Effect, affects
+from gridworld.config.texts import Arguments, ClassPath, Word
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
 
@@ -49,12 +50,12 @@ class PolicyKwargs:
     """SB3's `policy_kwargs`; null or {} leaves SB3's own default. Classes are import paths, torch.nn.ReLU."""
 
     net_arch: WholeNumbers = None  # layer widths, [64, 64]
-    activation_fn: Optional[str] = None  # noqa: UP045
-    features_extractor_class: Optional[str] = None  # noqa: UP045
-    features_extractor_kwargs: dict[str, Any] = field(default_factory=dict)
+    activation_fn: Optional[ClassPath] = None  # noqa: UP045
+    features_extractor_class: Optional[ClassPath] = None  # noqa: UP045
+    features_extractor_kwargs: Arguments = field(default_factory=dict)
     normalize_images: Optional[bool] = None  # noqa: UP045
-    optimizer_class: Optional[str] = None  # noqa: UP045
-    optimizer_kwargs: dict[str, Any] = field(default_factory=dict)
+    optimizer_class: Optional[ClassPath] = None  # noqa: UP045
+    optimizer_kwargs: Arguments = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.optimizer_kwargs = {
@@ -89,12 +90,12 @@ def as_dict(group: Any) -> dict[str, Any]:
 class SB3Config(AgentConfig):
     """An algorithm with Stable-Baselines3's interface: `algorithm` is its class."""
 
-    family: str = "sb3"
+    family: Word = "sb3"
     # of SB3's learn(): episodes for DQN, iterations for PPO
     log_interval: int = field(default=1, metadata=affects(Effect.LABELS))
-    policy: str = "MlpPolicy"
+    policy: ClassPath = "MlpPolicy"
     # the network runs once per state, where there is such a version; stock: SB3's own loop, once per sample
-    engine: str = "tabulated"
+    engine: Word = "tabulated"
 
     @property
     def libraries(self) -> tuple[str, ...]:
@@ -126,7 +127,7 @@ class SB3Config(AgentConfig):
 class SB3ClassConfig(SB3Config):
     """Any class of Stable-Baselines3, of sb3-contrib or of one's own, by its import path."""
 
-    arguments: dict[str, Any] = field(  # of the class; it keeps its defaults
+    arguments: Arguments = field(  # of the class; it keeps its defaults
         default_factory=dict, metadata=affects(Effect.LEARNING, stats_window_size=Effect.LABELS)
     )
 
@@ -155,8 +156,8 @@ class SB3CheckedConfig(SB3Config):
 class DQNConfig(SB3CheckedConfig):
     """Arguments of `stable_baselines3.DQN`, with its defaults."""
 
-    name: str = "dqn"
-    algorithm: str = "DQN"
+    name: Word = "dqn"
+    algorithm: Word = "DQN"
     log_interval: int = 4
     learning_rate: Schedule = 1e-4
     batch_size: int = 32
@@ -165,8 +166,8 @@ class DQNConfig(SB3CheckedConfig):
     tau: float = 1.0
     train_freq: WholeNumbers = 4  # steps of the batch, or [n, step] or [n, episode]
     gradient_steps: int = 1
-    replay_buffer_class: Optional[str] = None  # noqa: UP045
-    replay_buffer_kwargs: dict[str, Any] = field(default_factory=dict)
+    replay_buffer_class: Optional[ClassPath] = None  # noqa: UP045
+    replay_buffer_kwargs: Arguments = field(default_factory=dict)
     # rewards are multiplied by it on their way to DQN; null: they are as they are
     reward_scale: Optional[float] = None  # noqa: UP045
     optimize_memory_usage: bool = False
@@ -188,8 +189,8 @@ def reward_scale(config: AgentConfig) -> float:
 class PPOConfig(SB3CheckedConfig):
     """Arguments of `stable_baselines3.PPO`, with its defaults."""
 
-    name: str = "ppo"
-    algorithm: str = "PPO"
+    name: Word = "ppo"
+    algorithm: Word = "PPO"
     policy_kwargs: ActorCriticPolicyKwargs = field(default_factory=ActorCriticPolicyKwargs)
     learning_rate: Schedule = 3e-4
     n_steps: int = 2048
@@ -203,8 +204,8 @@ class PPOConfig(SB3CheckedConfig):
     max_grad_norm: float = 0.5
     use_sde: bool = False
     sde_sample_freq: int = -1
-    rollout_buffer_class: Optional[str] = None  # noqa: UP045
-    rollout_buffer_kwargs: dict[str, Any] = field(default_factory=dict)
+    rollout_buffer_class: Optional[ClassPath] = None  # noqa: UP045
+    rollout_buffer_kwargs: Arguments = field(default_factory=dict)
     target_kl: Optional[float] = None  # noqa: UP045
 
 

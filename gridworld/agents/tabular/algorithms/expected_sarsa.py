@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 from gridworld.agents.tabular.epsilon_greedy import expected_value
 from gridworld.agents.tabular.td_control import TabularControl, TabularControlConfig
+from gridworld.config.texts import Word
 from gridworld.world.mdp import FloatArray
 
 
@@ -20,8 +21,8 @@ from gridworld.world.mdp import FloatArray
 class ExpectedSarsaConfig(TabularControlConfig):
     """Settings of expected SARSA."""
 
-    name: str = "expected_sarsa"
-    algorithm: str = "expected_sarsa"
+    name: Word = "expected_sarsa"
+    algorithm: Word = "expected_sarsa"
 
 
 class ExpectedSarsa(TabularControl):

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gridworld.agents.tabular.td_control import TabularControl, TabularControlConfig
+from gridworld.config.texts import Word
 from gridworld.world.mdp import FloatArray
 
 
@@ -19,8 +20,8 @@ from gridworld.world.mdp import FloatArray
 class QLearningConfig(TabularControlConfig):
     """Settings of Q-learning."""
 
-    name: str = "q_learning"
-    algorithm: str = "q_learning"
+    name: Word = "q_learning"
+    algorithm: Word = "q_learning"
 
 
 class QLearning(TabularControl):

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from gridworld.agents import TrainingContext
 from gridworld.agents.tabular.epsilon_greedy import expected_value
 from gridworld.agents.tabular.td_control import TabularControl, TabularControlConfig
+from gridworld.config.texts import Word
 from gridworld.world.mdp import FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -26,8 +27,8 @@ if TYPE_CHECKING:
 class SarsaConfig(TabularControlConfig):
     """Settings of SARSA."""
 
-    name: str = "sarsa"
-    algorithm: str = "sarsa"
+    name: Word = "sarsa"
+    algorithm: Word = "sarsa"
 
 
 class Sarsa(TabularControl):

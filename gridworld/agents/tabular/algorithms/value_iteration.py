@@ -15,6 +15,7 @@ import numpy as np
 from gridworld.agents import PolicySnapshot, TrainingContext
 from gridworld.agents.tabular.model_file import model_bytes, read_model
 from gridworld.agents.tabular.settings import TabularConfig
+from gridworld.config.texts import Word
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State
 from gridworld.world.exact.solver import value_iteration
@@ -25,8 +26,8 @@ from gridworld.world.mdp import BoolArray, FloatArray
 class ValueIterationConfig(TabularConfig):
     """The exact optimum under `gamma`; nothing is trained."""
 
-    name: str = "value_iteration"
-    algorithm: str = "value_iteration"
+    name: Word = "value_iteration"
+    algorithm: Word = "value_iteration"
 
 
 class ValueIteration:

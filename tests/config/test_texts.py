@@ -1,0 +1,116 @@
+"""What a text in a setting is stands at its field, and decides what is refused of a stranger's settings."""
+
+import types
+from pathlib import Path
+from typing import Any, Union, get_args, get_origin
+
+import pytest
+from helpers.support import configure
+
+from gridworld.config.composition.recipe_file import with_recipe
+from gridworld.config.composition.setting_names import settings_of_a_run
+from gridworld.config.plain_settings import foreign, texts_in
+from gridworld.config.texts import Text
+from gridworld.errors import InputError
+
+
+def holds_text(hint: Any) -> bool:
+    """Whether a value of this type may be a text, or have one in it."""
+    if get_origin(hint) in (Union, types.UnionType, list, dict, tuple):
+        values = get_args(hint)[1:] if get_origin(hint) is dict else get_args(hint)
+        return any(map(holds_text, values))
+    return hint not in (int, float, bool, type(None))
+
+
+def says_what_it_is(hint: Any) -> bool:
+    """Whether every part of a type that may be a text declares what it is."""
+    if any(isinstance(each, Text) for each in getattr(hint, "__metadata__", ())):
+        return True
+    parts = get_args(hint)[1:] if get_origin(hint) is dict else get_args(hint)
+    return all(says_what_it_is(part) for part in parts if holds_text(part)) if parts else not holds_text(hint)
+
+
+@pytest.mark.parametrize("name", settings_of_a_run())
+def test_every_text_says_what_it_is(name: str) -> None:
+    for hint in settings_of_a_run()[name]:
+        assert says_what_it_is(hint), f"{name}: {hint}: annotate it with one of gridworld.config.texts"
+
+
+def test_the_walk_finds_what_says_nothing() -> None:
+    silent = (str, Any, dict[str, Any], list[str], str | None, Union[int, str], bytes)  # noqa: UP007
+    assert not any(map(says_what_it_is, silent))
+    assert all(map(says_what_it_is, (int, float | None, list[int], dict[str, bool])))
+    assert not list(texts_in(dict[str, Any]))
+
+
+def recipe(tmp_path: Path, content: str) -> list[str]:
+    path = tmp_path / "winner.yaml"
+    path.write_text(content)
+    return [f"recipe={path}"]
+
+
+GYM = "defaults: [{override /env: gymnasium}]\nenv: "
+CLASS = "defaults: [{override /agent: qrdqn}]\nagent: "
+HOSTILE = {
+    "defaults: [{override /env: built}]\nenv: {builder: os.system, kwargs: {command: ls}}": "env.builder=",
+    "defaults: [{override /env: built}]\nenv: {builder: print}": "env.builder=print is called",
+    "env: {builder: os.system}": "env.builder=os.system is called",  # whichever env the command line chooses
+    GYM + '{id: "evil:Env-v0"}': "env.id=evil:Env-v0 imports the module",
+    GYM + "{id: FrozenLake-v1, kwargs: {layout: /etc/shadow}}": "env.kwargs.layout=/etc/shadow is for code",
+    GYM + "{id: X-v0, kwargs: {a: [{b: ../x}]}}": "env.kwargs.a.b=../x is for code",
+    GYM + "{id: X-v0, kwargs: {env_id: 'evil:X-v0'}}": "env.kwargs.env_id=evil:X-v0 is for code",
+    GYM + "{id: X-v0, kwargs: {cls: os.system}}": "env.kwargs.cls=os.system is for code",
+    GYM + "{id: X-v0, kwargs: {size: 1000000000}}": "env.kwargs.size=1000000000 is beyond 1,000",
+    GYM + "{id: X-v0, kwargs: {size: -.inf}}": "env.kwargs.size=-inf is beyond 1,000",
+    "callbacks: [{_target_: os.system, command: ls}]": "callbacks._target_=os.system is called",
+    "callbacks: [{_target_: stable_baselines3.common.callbacks.CheckpointCallback, save_path: /x}]": "writ",
+    "callbacks: [os.system]": "callbacks=os.system is called",
+    "defaults: [{override /env: arrays}]\nenv: {path: /etc/shadow}": "env.path=/etc/shadow leads out of",
+    "env: {layout: /etc/shadow}": "env.layout=/etc/shadow leads out of the current folder",
+    "env: {layout: maps/../../x}": "env.layout=maps/../../x leads out",
+    "env: {layout: ..}": "env.layout=.. leads out",
+    "env: {layout: ~/x}": "env.layout=~/x leads out",
+    'env: {layout: "a\\n/x"}': "leads out",
+    CLASS + "{algorithm: evil.Agent}": "agent.algorithm=evil.Agent is from none of",
+    CLASS + "{algorithm: stable_baselines3_evil.A}": "agent.algorithm=stable_baselines3_evil.A is from none",
+    CLASS + "{algorithm: torchXnn.A}": "is from none of",
+    CLASS + "{policy: evil.Policy}": "agent.policy=evil.Policy is from none of",
+    CLASS + "{arguments: {policy_kwargs: {optimizer_class: evil.Adam}}}": "optimizer_class=evil.Adam is no",
+    CLASS + "{arguments: {whatever: [[evil.Adam]]}}": "agent.arguments.whatever=evil.Adam is no plain word",
+    CLASS
+    + "{arguments: {tensorboard_log: /tmp/x}}": "agent.arguments.tensorboard_log=/tmp/x is no plain word",
+    "agent: {policy_kwargs: {activation_fn: os.system}}": "activation_fn=os.system is from none of",
+    "agent: {policy_kwargs: {features_extractor_kwargs: {a: evil.X}}}": "a=evil.X is no plain word",
+    "agent: {policy_kwargs: {optimizer_kwargs: {_target_: os.system}}}": "_target_=os.system is no plain",
+    "agent: {replay_buffer_class: evil.Buffer}": "agent.replay_buffer_class=evil.Buffer is from none of",
+    "agent: {rollout_buffer_kwargs: {path: a/b}}": "agent.rollout_buffer_kwargs.path=a/b is no plain word",
+}
+
+
+@pytest.mark.parametrize("content", HOSTILE, ids=range(len(HOSTILE)))
+def test_a_recipe_that_would_run_code_or_read_files_needs_trust(content: str, tmp_path: Path) -> None:
+    words = recipe(tmp_path, content)
+    with pytest.raises(InputError) as refused:
+        with_recipe(words)
+    told = str(refused.value)
+    assert HOSTILE[content] in told
+    assert told.endswith("; add trust=true if you trust whoever made this")
+    assert "\n" not in told
+    assert with_recipe([*words, "trust=true"])  # words for Hydra, which makes nothing of them yet
+
+
+def test_what_does_no_harm_needs_no_trust(tmp_path: Path) -> None:
+    lake = "{id: FrozenLake-v1, kwargs: {desc: [SFF, FHG], is_slippery: false, success_rate: 0.5}}"
+    assert configure(*with_recipe(recipe(tmp_path, GYM + lake))).env.kwargs["desc"] == ["SFF", "FHG"]
+    harmless = {
+        "env": {"layout": "maps/mine.txt", "path": "tables/..x.npz"},
+        "agent": {
+            "name": "it's mine: a/b.c",
+            "policy": "MlpPolicy",
+            "learning_rate": "lin_3e-4",
+            "replay_buffer_class": "gridworld.agents.sb3.replay_counts.ReplayCounts",
+            "arguments": {"ent_coef": "quad_0.01", "policy_kwargs": {"activation_fn": "torch.nn.ReLU"}},
+        },
+    }
+    assert not list(foreign(harmless))
+    assert [name for name, _, _ in foreign({"new": {"setting": "x"}})] == ["new.setting"]  # till it says
