@@ -13,6 +13,7 @@ from gridworld.diagnosis.trials import beside, check_trusted
 from gridworld.diagnosis.trials import try_offers as _try_offers
 from gridworld.diagnosis.verdict import Diagnosis
 from gridworld.diagnosis.verdict import diagnose as _diagnose
+from gridworld.process.memory_budget import limited
 from gridworld.restore.saved_run import SavedRun
 
 
@@ -31,8 +32,9 @@ def diagnose(
         The diagnosis; without causes for a run that is certified optimal.
 
     Raises:
-        InputError: the folder holds no finished run, or one of its files was changed; or its settings name
-            classes from elsewhere, and are not trusted.
+        InputError: the folder holds no finished run, or one of its files was changed; it would take more
+            memory than the budget, `GRIDWORLD_BUDGET`, usually 1 GB; or its settings name classes from
+            elsewhere, and are not trusted.
 
     Example:
         >>> import gridworld
@@ -41,7 +43,7 @@ def diagnose(
         >>> found.cause, bool(abs(found.split.cost.sum() - found.split.score.regret) < 1e-9)
         ('slow', True)
     """
-    with torch_threads_kept():
+    with torch_threads_kept(), limited():
         if isinstance(run, RunResult):
             folder, saved = run.folder, run.saved
             evidence = Evidence(

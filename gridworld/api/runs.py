@@ -22,6 +22,7 @@ from gridworld.api.settings import Override, compose_words, words
 from gridworld.config.pictures import PICTURES
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError, failure
+from gridworld.process.memory_budget import limited, unlimited
 from gridworld.process.signals import Interrupted
 from gridworld.report.evidence.curve_reader import read_columns
 from gridworld.restore.resume import train_or_resume
@@ -92,7 +93,7 @@ class RunResult:
     @property
     def overrides(self) -> list[str]:
         """The settings that its command line or call changed, as words."""
-        return list(self.saved.run.manifest.get("overrides") or [])
+        return self.saved.overrides
 
     @cached_property
     def agent(self) -> Agent:
@@ -162,15 +163,17 @@ def open_run(folder: str | PathLike[str], trust: bool = False) -> RunResult:
         The run, as `train` returned it.
 
     Raises:
-        InputError: the folder holds no finished run, or one of its files was changed.
+        InputError: the folder holds no finished run, one of its files was changed, or it would take more
+            memory than the budget, `GRIDWORLD_BUDGET`, usually 1 GB.
 
     Example:
         >>> open_run("runs/mine").policy.greedy.shape
         (30,)
     """
     path = Path(folder).expanduser()
-    saved = SavedRun(path, trust)
-    return RunResult(saved, path, saved.agent)
+    with limited():
+        saved = SavedRun(path, trust)
+        return RunResult(saved, path, saved.agent)
 
 
 def _train_in(folder: Path, config: TrainConfig, given: list[str]) -> RunResult:
@@ -199,8 +202,9 @@ def _train_without_files(config: TrainConfig, given: list[str]) -> RunResult:
 def _finished(place: Path, config: TrainConfig, given: list[str], folder: Path | None) -> RunResult:
     agents: list[Agent] = []
     train_or_resume(config, place, given, agents.append)
-    result = RunResult(SavedRun(place, trust=True), folder, agents.pop)
-    _ = result.policy, result.evaluator  # before the model is trained further, or the folder is gone
+    with unlimited():
+        result = RunResult(SavedRun(place, trust=True), folder, agents.pop)
+        _ = result.policy, result.evaluator  # before the model is trained further, or the folder is gone
     return result
 
 

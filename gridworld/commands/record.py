@@ -47,8 +47,8 @@ class _SavedSubject:
 
     history = None
 
-    def __init__(self, saved: SavedRun) -> None:
-        self._saved = saved
+    def __init__(self, saved: SavedRun, is_trusted: bool) -> None:
+        self._saved, self.is_trusted = saved, is_trusted
         self.config = saved.config
         self.snapshot = saved.snapshot()
 
@@ -73,7 +73,7 @@ def _record(options: argparse.Namespace) -> None:
     if options.cell_size is not None:
         frame_size(saved.mdp, options.cell_size)
     formats = list(dict.fromkeys(options.format))
-    subject = _SavedSubject(saved)
+    subject = _SavedSubject(saved, options.trust)
     drawn = {kind: drawer(MAPS[kind]).draw(subject)(options.cell_size) for kind in formats if kind in MAPS}
     episodes = _film(saved.mdp, subject, options)
     video.check_size(episodes, formats)
@@ -130,4 +130,4 @@ def _film(mdp: Mdp, subject: Subject, options: argparse.Namespace) -> Animation:
     policy = choose_policy(subject.snapshot, options.policy)
     limit = subject.evaluator.max_episode_steps
     episodes = [play(mdp, policy, limit, options.seed + index) for index in range(options.episodes)]
-    return film(subject.config.env, mdp, episodes)(options.cell_size)
+    return film(subject.config.env, mdp, episodes, subject.is_trusted)(options.cell_size)

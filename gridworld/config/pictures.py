@@ -22,7 +22,7 @@ class Picture:
 
     file: str  # in the run's folder; its ending says what it is written as
     drawer: str  # the module of `gridworld.visualization` that draws it
-    caption: str | None = None  # in a report's page; None: it has no place there, and no checksum
+    caption: str | None = None  # in a report's page; None: it has no place there
     while_training: bool = False  # TensorBoard has it every `logging.policy_map_every` evaluations
     setting: str = ""  # its name in `recording.*`
 

@@ -58,7 +58,7 @@ class Evidence:
         agent, shape = saved.agent(), saved.mdp.next_state.shape[:2]
         return cls(
             saved.config,
-            saved.run.manifest.get("overrides") or [],
+            saved.overrides,
             read_columns(saved.run),
             read_visits(saved.run, shape),
             saved.evaluator(),

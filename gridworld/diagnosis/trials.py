@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 from gridworld.config.composition.compose import compose
 from gridworld.config.composition.conf_folder import conf_folder
 from gridworld.config.composition.hydra_errors import sentence
-from gridworld.config.plain_settings import check_imports
+from gridworld.config.plain_settings import check_foreign
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import MapConfig
 from gridworld.diagnosis.verdict import Diagnosis, Trial
@@ -81,7 +81,7 @@ def check_trusted(saved: SavedRun, found: Diagnosis, trust: bool) -> None:
                 f"{file}: overrides: {word[:80]} is no plain setting; add --trust to train with it, if you "
                 "trust whoever made this"
             )
-    check_imports([dataclasses.asdict(saved.config.agent), saved.config.callbacks], str(file), "--trust")
+    _check(saved.config, saved)
 
 
 def _settings(saved: SavedRun, words: tuple[str, ...], trust: bool) -> TrainConfig:
@@ -96,7 +96,10 @@ def _settings(saved: SavedRun, words: tuple[str, ...], trust: bool) -> TrainConf
             raise InputError(sentence(error)) from None
         config = dataclasses.replace(composed, env=saved.config.env)
     if not trust:
-        check_imports(
-            [dataclasses.asdict(config.agent), config.callbacks], str(saved.run.manifest_file), "--trust"
-        )
+        _check(config, saved)
     return config
+
+
+def _check(config: TrainConfig, saved: SavedRun) -> None:
+    built = {"agent": dataclasses.asdict(config.agent), "callbacks": config.callbacks}
+    check_foreign(built, str(saved.run.manifest_file), "--trust")

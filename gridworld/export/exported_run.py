@@ -19,14 +19,18 @@ from gridworld.config.flatten import flat
 from gridworld.config.pictures import PICTURES
 from gridworld.config.plain_settings import read_config
 from gridworld.config.train import TrainConfig
+from gridworld.config.worlds import MapConfig
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import plain
+from gridworld.process.console.terminal import plain, printable, tell
 from gridworld.report.evidence.curve_reader import ONLINE, read_columns
 from gridworld.report.evidence.run_reader import Evidence, Unusable
 from gridworld.report.evidence.run_reader import read as read_evidence
+from gridworld.run.folder import WORLD
+from gridworld.run.identity.stored_world import stored_world
 from gridworld.run.reader import LARGEST_RESULT, RunReader, open_run
-from gridworld.storage.safe_read import read_bytes, sha256
+from gridworld.storage.safe_read import sha256
 from gridworld.world.metrics import METRICS
+from gridworld.world.sources.arrays import world_bytes
 
 _LARGEST_PICTURE = 64 * 2**20  # bytes
 _COLUMNS = (*(f"{whose}{metric.name}" for whose in ("", "sampled_") for metric in METRICS), ONLINE)
@@ -45,6 +49,7 @@ class ExportedRun:
     curve: list[Row]  # one for each evaluation
     models: tuple[Path, ...]  # copies: of the last one, and of the best one where it was kept
     pictures: tuple[Path, ...]  # copies of the pictures and films that are there
+    world: Path | None  # a copy of its tables; None: it is a map
 
     @property
     def env(self) -> str:
@@ -86,14 +91,16 @@ def read(folder: Path, copies: Path) -> ExportedRun:
     if isinstance(evidence, Unusable):
         raise InputError("; ".join(evidence.reasons))
     run = open_run(folder)
+    config = read_config(run.manifest["config"], str(run.manifest_file))
     return ExportedRun(
         identity=sha256(repr(sorted(run.manifest["sha256"].items())).encode())[:16],
         evidence=evidence,
-        config=read_config(run.manifest["config"], str(run.manifest_file)),
+        config=config,
         summary=dict(_numbers(run)),
         curve=list(_curve(run)),
         models=tuple(_models(run, copies)),
         pictures=tuple(_pictures(run, copies)),
+        world=_world(run, config, copies),
     )
 
 
@@ -122,15 +129,23 @@ def _models(run: RunReader, copies: Path) -> Iterator[Path]:
             yield copy
 
 
+def _world(run: RunReader, config: TrainConfig, copies: Path) -> Path | None:
+    if isinstance(config.env, MapConfig):
+        return None
+    copy = copies / WORLD
+    copy.write_bytes(world_bytes(stored_world(run, config.env)))
+    return copy
+
+
 def _pictures(run: RunReader, copies: Path) -> Iterator[Path]:
-    """Those that the folder still has; the films of an episode have no checksum."""
+    """Those that the folder still has; earlier versions noted no checksum of an episode's films."""
     for picture in PICTURES:
         path = run.folder / picture.file
         if not path.suffix or not os.path.lexists(path):
             continue
-        content = read_bytes(path, _LARGEST_PICTURE)
-        if run.pictures().get(picture.file) not in (None, sha256(content)):
-            raise InputError(f"{path}: is not the picture that the run drew; put it back, or remove it")
+        if picture.file not in run.manifest["sha256"]:
+            tell(printable(f"{path}: is left out, the run's manifest has no checksum of it"))
+            continue
         copy = copies / path.name
-        copy.write_bytes(content)
+        copy.write_bytes(run.read(path, _LARGEST_PICTURE))
         yield copy

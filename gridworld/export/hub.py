@@ -86,10 +86,10 @@ def to_hub(run: ExportedRun, out: Path, project: str) -> str:
         for path in run.pictures:
             shutil.copyfile(path, new / _shown_as(path))
         write_text(new / "README.md", card)
-        if isinstance(run.config.env, MapConfig):
+        if run.world is None:
             write_text(new / "map.txt", run.evidence.layout + "\n")
         else:
-            shutil.copyfile(run.evidence.folder / WORLD, new / WORLD)
+            shutil.copyfile(run.world, new / WORLD)
         write_json(new / "config.json", dataclasses.asdict(run.config))
         exact = {"is_deterministic": True, "is_exact": True, "run": run.identity}
         write_json(new / _RESULTS, {**run.summary, **_sb3_scores(run), **exact})

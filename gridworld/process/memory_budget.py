@@ -1,17 +1,19 @@
 """One memory budget for whatever reads a folder that somebody else may have written.
 
-A command that reads runs, sweeps or studies is `limited` while it is at work. Whoever then allocates by a
-number that was read calls `check_memory` first. The variable `GRIDWORLD_BUDGET` raises the budget, e.g. to
-8GB. Time has no limit: `progress.telling_if_slow` says what takes long, until it is done or Ctrl-C.
+What opens a run is `limited`, and so is a command that reads sweeps or studies while it is at work. Whoever
+then allocates by a number that was read calls `check_memory` first. The variable `GRIDWORLD_BUDGET` raises
+the budget, e.g. to 8GB. Time has no limit: `progress.telling_if_slow` says what takes long, until it is done
+or Ctrl-C.
 Training of one's own, by train.py or tune.py, has neither budget nor such lines.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 
 from gridworld.errors import InputError
@@ -20,7 +22,7 @@ VARIABLE = "GRIDWORLD_BUDGET"
 _USUAL = "1GB"
 _UNITS = {"MB": 10**6, "GB": 10**9}
 
-_memory: ContextVar[int | None] = ContextVar("memory", default=None)  # bytes; None: no limit
+_memory: ContextVar[float | None] = ContextVar("memory", default=None)  # bytes; None: no limit yet
 
 
 class BudgetError(InputError):
@@ -34,7 +36,19 @@ def limited() -> Iterator[None]:
     Raises:
         InputError: the variable `GRIDWORLD_BUDGET` holds no amount of memory.
     """
-    token = _memory.set(_bytes(os.environ.get(VARIABLE) or _USUAL))
+    own = _memory.get() == math.inf
+    with _budget(math.inf if own else _bytes(os.environ.get(VARIABLE) or _USUAL)):
+        yield
+
+
+def unlimited() -> AbstractContextManager[None]:
+    """Apply no budget to the block, nor to what is `limited` in it: this process wrote what it reads."""
+    return _budget(math.inf)
+
+
+@contextmanager
+def _budget(most: float) -> Iterator[None]:
+    token = _memory.set(most)
     try:
         yield
     finally:
@@ -43,7 +57,7 @@ def limited() -> Iterator[None]:
 
 def is_limited() -> bool:
     """Whether a budget applies here."""
-    return _memory.get() is not None
+    return _memory.get() not in (None, math.inf)
 
 
 def check_memory(what: object, size: float) -> None:

@@ -22,6 +22,8 @@ _DAMAGED = (
     *(RuntimeError, zipfile.BadZipFile, zlib.error),
 )
 
+_COPIES = 3  # the file, its arrays, and what is computed while they are checked
+
 
 def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     """Arrays as the content of a file, uncompressed, in their order."""
@@ -52,8 +54,7 @@ def npz_arrays(where: object, content: bytes, kind: str, most: int | None = None
             raise ValueError("its members are larger than itself")
         if most is not None and size > most:
             raise ValueError(f"its arrays have {size / 2**20:,.0f} MiB, more than {most / 2**20:,.0f}")
-        if most is not None:
-            check_memory(where, 2 * size)
+        check_memory(where, _COPIES * size)
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except InputError:

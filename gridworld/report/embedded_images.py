@@ -39,6 +39,8 @@ def pictures(result: Result) -> Iterator[Picture]:
     verdict = "certified optimal" if run.certified else f"regret {number(run.regret)}"
     for drawn in PICTURES:
         name = drawn.file
+        if drawn.caption is None:
+            continue
         embedded = embed(run.folder / name, run.pictures[name]) if name in run.pictures else None
         if embedded is not None:
             yield Picture(*embedded, f"{result.group.agent}, seed {run.seed}, {verdict}: {drawn.caption}")

@@ -12,11 +12,13 @@ import dataclasses
 import math
 import os
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from gridworld.config.agents import AgentConfig, falls, parse_schedule
 from gridworld.config.flatten import flat
+from gridworld.config.plain_settings import foreign
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import BuiltConfig, EnvConfig, GymnasiumConfig, MapConfig
 from gridworld.errors import InputError
@@ -80,7 +82,7 @@ def open_unfinished(folder: Path, trust: bool = False) -> Unfinished:
     """
     run = run_to_resume(folder)
     config = settings_of(run, trust, allow="trust=true")
-    return Unfinished(run, config, stored_world(run, config.env))
+    return Unfinished(run, config, stored_world(run, config.env), trust)
 
 
 def unfinished_of(folder: Path, config: TrainConfig) -> Unfinished:
@@ -98,11 +100,12 @@ def unfinished_of(folder: Path, config: TrainConfig) -> Unfinished:
 
 @dataclass(frozen=True, eq=False)
 class Unfinished:
-    """A run to resume: its folder, its settings and its world."""
+    """A run to resume: its folder, its settings and its world, and whether what these name may be run."""
 
     run: RunReader
     config: TrainConfig
     mdp: Mdp
+    is_trusted: bool
 
     def check_same(self, config: TrainConfig, world: str) -> None:
         """Check that settings and a world's text are the run's own.
@@ -176,7 +179,8 @@ class Unfinished:
             state = _newest_state(run, identity(config, mdp.text()))
         if state is None:
             self._check_restart(config)
-            return carry_out(config, run.folder, mdp, lambda: self._restart(config), log, on_built=on_built)
+            start = partial(self._restart, config)
+            return carry_out(config, run.folder, mdp, start, log, self.is_trusted, on_built=on_built)
         differs = _differences(state["environment"], config.agent, run, anyway)
         steps = state["steps"]
         self._check_length(config, steps)
@@ -186,18 +190,21 @@ class Unfinished:
         def begin() -> RunWriter:
             return RunWriter.resume(run, steps, config.total_timesteps, differs)
 
-        return carry_out(config, run.folder, mdp, begin, log, (run, state), on_built)
+        return carry_out(config, run.folder, mdp, begin, log, self.is_trusted, (run, state), on_built)
 
     def _tell_if_map_changed(self) -> None:
-        if isinstance(self.config.env, BuiltConfig | GymnasiumConfig):  # which would run their code
+        env = self.config.env
+        if isinstance(env, BuiltConfig | GymnasiumConfig):  # which would run their code
+            return
+        if not self.is_trusted and any(foreign({"env": dataclasses.asdict(env)})):
             return
         try:
-            changed = self.config.env.compile().text() != self.mdp.text()
+            changed = env.compile().text() != self.mdp.text()
         except InputError:
             changed = True
         if changed:
             tell(
-                f"{self.run.folder}: its {_kind(self.config.env)} {self.config.env.name} has changed since; "
+                f"{self.run.folder}: its {_kind(env)} {env.name} has changed since; "
                 "it goes on with the one that it began with"
             )
 

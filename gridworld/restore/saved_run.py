@@ -17,11 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot, family
+from gridworld.config.composition.recipe_file import harmless_words
 from gridworld.config.plain_settings import check_foreign, read_config
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import MapConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
+from gridworld.process.memory_budget import limited
 from gridworld.run.identity.stored_world import stored_world
 from gridworld.run.reader import RunReader, open_run
 from gridworld.training.setup import make_context
@@ -47,6 +49,7 @@ class SavedRun:
         InputError: The folder holds no finished run, or its settings or map are not valid.
     """
 
+    @limited()
     def __init__(self, folder: Path, trust: bool = False, best: bool = False) -> None:
         self.run: RunReader = open_run(folder)
         self._model_file = self.run.best_model_file if best else self.run.model_file
@@ -54,7 +57,18 @@ class SavedRun:
         # The device that it was trained on need not exist here.
         self.config = dataclasses.replace(settings_of(self.run, trust, trains=False), device="cpu")
         self.mdp: Mdp = stored_world(self.run, self.config.env)
+        self._trust = trust
 
+    @property
+    def overrides(self) -> list[str]:
+        """The words of its command line, as they may be given again.
+
+        Of a run that is not trusted they are made of its settings, and what would run code is left out.
+        """
+        words: list[str] = self.run.manifest.get("overrides") or []
+        return list(words) if self._trust else list(harmless_words(words, self.config))
+
+    @limited()
     def evaluator(self, layout: str | None = None) -> Evaluator:
         """An evaluator of the run's world.
 
@@ -81,6 +95,7 @@ class SavedRun:
             mdp = env.compile_on(world)
         return Evaluator(mdp, self.config.evaluation.gamma, self.config.env.step_limit(mdp))
 
+    @limited()
     def snapshot(self) -> PolicySnapshot:
         """The trained agent's values and policy in every state.
 
@@ -89,6 +104,7 @@ class SavedRun:
         """
         return self.agent().snapshot()
 
+    @limited()
     def agent(self) -> Agent:
         """The trained agent, a new object at every call.
 

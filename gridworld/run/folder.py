@@ -19,8 +19,8 @@
 
 The manifest is enough to build the world and the agent again: it holds the resolved settings and the map's
 text, or of another world the digest of the tables beside it. Of a finished run it also has the checksums of
-the files that hold its result and its pictures. It is sealed. `run.writer` writes these files, `run.reader`
-reads and verifies them.
+the files that hold its result, its world and its pictures. It is sealed. `run.writer` writes these files,
+`run.reader` reads and verifies them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ WORLD = "world.npz"
 BEST_MODEL = "best_model.zip"  # these two as SB3's EvalCallback names them
 EVALUATIONS = "evaluations.npz"
 RESULTS = (CURVE, SUMMARY, MODEL, BEST_MODEL, VISITS, EVALUATIONS)
-PICTURES = tuple(each.file for each in pictures.PICTURES if each.caption)  # those with a checksum
+PICTURES = tuple(each.file for each in pictures.PICTURES if Path(each.file).suffix)  # those of one file
+CHECKED = (*RESULTS, WORLD, *PICTURES)  # what has a checksum in the manifest of a finished run
 CHECKPOINTS = "checkpoints"
 EVENTS = "events.out.tfevents.*"
 TRAIN_LOG = "train.log"

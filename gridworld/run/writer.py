@@ -10,7 +10,7 @@ from typing import Any, Self
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import recorded_command_line
 from gridworld.process.parallel.together import mixed
-from gridworld.run.folder import CHECKPOINTS, OUTPUTS, PICTURES, WORLD, RunFolder
+from gridworld.run.folder import CHECKED, CHECKPOINTS, OUTPUTS, WORLD, RunFolder
 from gridworld.run.identity import provenance
 from gridworld.run.identity.provenance import describe, source_differences
 from gridworld.run.manifest import NUMBERS_DEPEND_ON
@@ -151,9 +151,9 @@ class RunWriter(RunFolder):
         if error is not None:
             self._manifest["error"] = error
         if status == "finished":
-            checked = (*self.results(), *(self.folder / name for name in PICTURES))
+            there = [name for name in CHECKED if (self.folder / name).exists()]
             self._manifest["sha256"] = {
-                path.name: file_sha256(path, LARGEST_RESULT) for path in checked if path.exists()
+                name: file_sha256(self.folder / name, LARGEST_RESULT) for name in there
             }
         self._write()
 

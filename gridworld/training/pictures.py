@@ -38,6 +38,7 @@ class _Subject:
     """See `visualization.picture.Subject`."""
 
     config: TrainConfig
+    is_trusted: bool
     evaluator: Evaluator
     snapshot: PolicySnapshot
     steps: int
@@ -55,6 +56,7 @@ class Pictures:
         evaluator: Evaluator,
         visits: NDArray[np.int64],
         events: EventWriter | None,
+        is_trusted: bool,
     ) -> None:
         """Nothing is drawn yet.
 
@@ -64,12 +66,14 @@ class Pictures:
             evaluator: the evaluator of the run's world.
             visits: (S, A), the environments' own counts, which grow.
             events: where TensorBoard's pictures go, if anywhere.
+            is_trusted: see `visualization.picture.Subject`.
         """
         self._config = config
         self._run = run
         self._evaluator = evaluator
         self._visits = visits
         self._events = events
+        self._is_trusted = is_trusted
         self._history = PolicyHistory(evaluator.mdp.num_states) if config.recording.learning else None
         self._evaluations = 0
         self._shown_at: int | None = None  # the step of the newest policy in TensorBoard
@@ -111,7 +115,9 @@ class Pictures:
 
     def _subject(self, evaluation: Evaluation, visits: NDArray[np.int64]) -> _Subject:
         snapshot, step = evaluation.snapshot, evaluation.step
-        return _Subject(self._config, self._evaluator, snapshot, step, visits, self._history)
+        return _Subject(
+            self._config, self._is_trusted, self._evaluator, snapshot, step, visits, self._history
+        )
 
     def _attempt(self, label: str, function: Callable[..., None], *arguments: object) -> None:
         """A picture that cannot be drawn is no reason to fail a run that is trained."""

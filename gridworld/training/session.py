@@ -107,6 +107,7 @@ class Session:
         context: TrainingContext,
         events: EventWriter | None,
         state: State | None,
+        is_trusted: bool,
     ) -> None:
         """Open the run's files; those that grow are cut back to the state.
 
@@ -118,6 +119,7 @@ class Session:
             context: where the agent learns.
             events: the event file, if there is to be one.
             state: the content of a checkpoint to continue from; None: from the start.
+            is_trusted: whether the environment that the settings name may be made.
         """
         self._config, self._run, self._events = config, run, events
         self._visits = context.envs.visits
@@ -135,7 +137,7 @@ class Session:
         self._curve_log = AppendLog(run.curve_file, None if state is None else state["marks"]["curve"])
         label = f"{config.agent.name} on {evaluator.mdp.name}"
         self._progress = Progress(config.total_timesteps, label, config.logging.progress)
-        pictures = Pictures(config, run, evaluator, self._visits, events)
+        pictures = Pictures(config, run, evaluator, self._visits, events, is_trusted)
         scalars = [] if events is None else [CurveScalars(events, evaluator)]
         sinks: list[Sink] = [CurveFile(self._curve_log), *scalars, ProgressLine(self._progress), pictures]
         curve = LearningCurve(evaluator, agent, config, sinks, context.envs)

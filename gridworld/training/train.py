@@ -72,7 +72,7 @@ def train(
         def begin() -> RunWriter:
             return RunWriter.start(folder, dataclasses.asdict(config), mdp, overrides, replace)
 
-        return carry_out(config, folder, mdp, begin, log, on_built=on_built)
+        return carry_out(config, folder, mdp, begin, log, world is compiled, on_built=on_built)
 
 
 def carry_out(
@@ -81,6 +81,7 @@ def carry_out(
     mdp: Mdp,
     begin: Callable[[], RunWriter],
     log: TrainLog,
+    is_trusted: bool,
     earlier: tuple[RunReader, State] | None = None,
     on_built: OnBuilt = ignore,
 ) -> Summary:
@@ -92,6 +93,7 @@ def carry_out(
         mdp: the run's world.
         begin: writes the manifest, once the agent is built.
         log: takes what is warned about; its file is opened here.
+        is_trusted: whether the environment that the settings name may be made.
         earlier: the run as its folder has it and the content of a checkpoint; None: from the start.
         on_built: as for `train`.
 
@@ -123,7 +125,7 @@ def carry_out(
         log.add(f"begins: {shlex.join(recorded_command_line())}")
     session = None
     try:
-        session = Session(config, run, evaluator, agent, context, events, state)
+        session = Session(config, run, evaluator, agent, context, events, state, is_trusted)
         if before is not None and before.has_result():
             session.checkpoints.held = before.steps
         summary = session.run()

@@ -14,6 +14,7 @@ from gridworld.envs.frames.real_env import RealEnvFrames
 from gridworld.envs.frames.rendering import Frame, frame_size
 from gridworld.envs.rollout import Episode, play
 from gridworld.errors import InputError
+from gridworld.process.console.terminal import printable, tell
 from gridworld.visualization.animation import (
     Animation,
     animation_of_cards,
@@ -34,25 +35,29 @@ def draw(subject: Subject) -> Draw:
     """Play one greedy episode on the run's seed; its own cell size is `recording.cell_size`."""
     config, mdp = subject.config, subject.evaluator.mdp
     policy, limit = subject.snapshot.greedy_policy(), subject.evaluator.max_episode_steps
-    drawn = film(config.env, mdp, [play(mdp, policy, limit, config.seed).beginning(_MOST_FRAMES)])
+    episode = play(mdp, policy, limit, config.seed).beginning(_MOST_FRAMES)
+    drawn = film(config.env, mdp, [episode], subject.is_trusted)
     return functools.cache(  # several files show the same
         lambda cell_size: drawn(cell_size or config.recording.cell_size)
     )
 
 
-def film(env: EnvConfig, mdp: Mdp, episodes: Sequence[Episode]) -> Callable[[int | None], Animation]:
+def film(
+    env: EnvConfig, mdp: Mdp, episodes: Sequence[Episode], is_trusted: bool
+) -> Callable[[int | None], Animation]:
     """Prepare an animation of episodes, one after the other.
 
     Args:
         env: the settings of the world, which say whether it has an environment that draws frames.
         mdp: the world.
         episodes: at least one.
+        is_trusted: whether that environment may be made.
 
     Returns:
         A function of a cell size in pixels, None for its own. An environment's own frames are scaled down
         where they are larger than the board would be with cells of that size.
     """
-    frames = _by_the_environment(env, mdp, episodes)
+    frames = _by_the_environment(env, mdp, episodes, is_trusted)
     if frames is not None:
 
         def rendered(cell_size: int | None) -> Animation:
@@ -66,9 +71,16 @@ def film(env: EnvConfig, mdp: Mdp, episodes: Sequence[Episode]) -> Callable[[int
     return lambda cell_size: animation_of_cards(mdp, episodes, cell_size)
 
 
-def _by_the_environment(env: EnvConfig, mdp: Mdp, episodes: Sequence[Episode]) -> list[Frame] | None:
+def _by_the_environment(
+    env: EnvConfig, mdp: Mdp, episodes: Sequence[Episode], is_trusted: bool
+) -> list[Frame] | None:
     """The frames of the world's own environment; None where it has none, or cannot be asked here."""
-    if not isinstance(env, GymnasiumConfig) or ":" in env.id:  # which would import a module of that name
+    if not isinstance(env, GymnasiumConfig):
+        return None
+    if not is_trusted:
+        tell(
+            printable(f"the episode is drawn from the run's tables; {env.id} itself is made with trust only")
+        )
         return None
     try:
         real = RealEnvFrames(env.id, env.kwargs)

@@ -45,6 +45,10 @@ class Subject(Protocol):
         """The run's settings."""
 
     @property
+    def is_trusted(self) -> bool:
+        """Whether the environment that the settings name may be made, which runs its code."""
+
+    @property
     def evaluator(self) -> Evaluator:
         """The evaluator of the run's world."""
 

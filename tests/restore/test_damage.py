@@ -69,7 +69,7 @@ def evaluated(folder: Path) -> str:
 
 def recorded(folder: Path) -> str:
     saved = SavedRun(folder / "run")
-    return f"{record_command._SavedSubject(saved).steps} {read_visits(saved.run, saved.mdp.neighbour.shape)}"
+    return f"{record_command._SavedSubject(saved, False).steps} {read_visits(saved.run, saved.mdp.neighbour.shape)}"
 
 
 def gone_on(folder: Path) -> str:

@@ -138,7 +138,13 @@ def subject(mdp: Mdp, q: NDArray[np.float64], visits: NDArray[np.int64]) -> Subj
     for step in range(3):
         history.add(step, snapshot)
     return SimpleNamespace(
-        config=TrainConfig(), evaluator=evaluator, snapshot=snapshot, steps=3, visits=visits, history=history
+        is_trusted=True,
+        config=TrainConfig(),
+        evaluator=evaluator,
+        snapshot=snapshot,
+        steps=3,
+        visits=visits,
+        history=history,
     )
 
 
@@ -308,7 +314,7 @@ def test_an_episode_in_text_tells_state_action_and_reward() -> None:
     assert episode.actions.tolist() == [1, 1, 1]
     assert episode.rewards.tolist() == [-0.5, -0.5, 1.0]
     assert episode.beginning(2).actions.tolist() == [1]
-    told = film(EnvConfig(), world, [episode, episode])(None)
+    told = film(EnvConfig(), world, [episode, episode], True)(None)
     assert len(told) == 8
     pictures = [np.asarray(told.draw(key).convert("RGB")) for key in told.keys]
     assert np.array_equal(pictures[0], pictures[4])
@@ -328,7 +334,7 @@ def test_an_episode_shows_the_frames_of_the_environment(monkeypatch: pytest.Monk
     monkeypatch.setattr(RealEnvFrames, "episode", _noisy)
     env = GymnasiumConfig(id="FrozenLake-v1")
     walk = Episode(np.array([2, 0, 2, 1]), np.zeros(3, dtype=int), np.zeros(3))
-    prepared = film(env, FROZEN_LAKE, [walk])
+    prepared = film(env, FROZEN_LAKE, [walk], True)
     shown = prepared(None)
     assert shown.size == (80, 40)
     pictures = [np.asarray(shown.draw(key).convert("RGB")).astype(int) for key in shown.keys]

@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 from gridworld.config.agents import MISSING
 from gridworld.config.alternatives import alternatives
 from gridworld.config.composition.words import as_whole
-from gridworld.config.plain_settings import check_foreign, fits, shown
+from gridworld.config.plain_settings import check_foreign, fits, foreign, shown
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.storage.safe_read import as_text, read_bytes
@@ -33,6 +33,10 @@ _LARGEST = 2**16  # bytes
 _DEEPEST = 20  # levels
 _LARGEST_WHOLE = 2**63
 _CHOICE = re.compile(r"\w[\w.-]*(/\w[\w.-]*)*")  # no way out of the folder of choices
+_WORD = re.compile(r"(\+{0,2})(\w+(?:\.\w+)*)=(.*)", re.ASCII | re.DOTALL)  # an override
+_BARE = re.compile(
+    r"(?!(?:true|false|null|nan|inf)$)[a-z_][\w.-]*", re.ASCII | re.IGNORECASE
+)  # text as it is
 _NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 _WITH_VALUE = (  # Hydra's options that the next word belongs to
     *("--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp", "--package", "-p"),
@@ -174,6 +178,32 @@ def _values(schemas: Sequence[type], content: dict[Any, Any], path: Path, sectio
             raise InputError(f"{path}: {name}={shown(value)}: must be {wanted}")
 
 
+def harmless_words(words: Sequence[str], config: TrainConfig) -> Iterator[str]:
+    """What a stranger's command line changed: choices, and settings with the values that `config` has.
+
+    Args:
+        words: the command line, which may be anything.
+        config: the settings that it is said to have led to, checked.
+
+    Yields:
+        Overrides. What is no setting, or would run code or read a file elsewhere, is left out.
+    """
+    settings = dataclasses.asdict(config)
+    for word in words:
+        found = _WORD.fullmatch(word)
+        if found is None:
+            continue
+        sign, key, value = found.groups()
+        place: Any = settings
+        for name in key.split("."):
+            place = place.get(name) if isinstance(place, dict) else None
+        if key in (*CHOSEN, IN_A_STUDY[0]):
+            if _CHOICE.fullmatch(value):
+                yield f"{key}={value}"
+        elif place is not None and not any(foreign({key: place})):
+            yield f"{sign}{key}={literal(place, key)}"
+
+
 def _type_name(hint: Any) -> str:
     return hint.__name__ if isinstance(hint, type) else str(hint).replace("typing.", "")
 
@@ -198,7 +228,8 @@ def literal(value: Any, where: str) -> str:
     if isinstance(value, str):
         if value == MISSING:
             raise InputError(f"{where}: has no value")
-        return str(QuotedString(value, Quote.single).with_quotes())
+        bare = _BARE.fullmatch(value)
+        return value if bare else str(QuotedString(value, Quote.single).with_quotes())
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
     if isinstance(value, int) and abs(value) >= _LARGEST_WHOLE:

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from gridworld.envs.frames.rendering import Frame, import_pygame
-from gridworld.errors import InputError
+from gridworld.errors import InputError, in_short
 from gridworld.world.mdp import Mdp
 from gridworld.world.sources.making import make_env
 
@@ -58,14 +58,15 @@ class RealEnvFrames:
                 env.reset(seed=0)
                 walk = _set_states if hasattr(env.unwrapped, "P") else _replayed
                 return [self._frame(env) for _ in walk(env, mdp, states)]
+            except InputError:
+                raise
+            except Exception as error:  # whatever it raises
+                raise InputError(f"env.id={self._env_id}: cannot be rendered: {in_short(error)}") from error
             finally:
                 env.close()
 
     def _frame(self, env: gym.Env[Any, Any]) -> Frame:
-        try:
-            frame = np.asarray(env.render(), dtype=np.uint8)
-        except Exception as error:  # whatever it raises
-            raise InputError(f"env.id={self._env_id}: cannot be rendered: {error}") from error
+        frame = np.asarray(env.render(), dtype=np.uint8)
         height, width = frame.shape[:2]
         if height * width <= self._max_pixels:
             return frame.copy()

@@ -104,7 +104,9 @@ def test_a_callback_goes_on_to_the_bit(agent: str, tmp_path: Path) -> None:
     begin(tmp_path / "calm", *words, STIRRING)
     begin(tmp_path / "without", *words)
     stopped_after(2, tmp_path / "run", *words, STIRRING, "checkpoint.every=150")
-    with pytest.raises(InputError, match=r"_target_=own_callbacks\.Stirring is from none .* add trust=true"):
+    with pytest.raises(
+        InputError, match=r"_target_=own_callbacks\.Stirring is called with .* add trust=true"
+    ):
         open_unfinished(tmp_path / "run")
     go_on(tmp_path / "run")
     calm, run = left_behind(tmp_path / "calm"), left_behind(tmp_path / "run")
