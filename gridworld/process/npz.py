@@ -22,7 +22,7 @@ _DAMAGED = (
     *(RuntimeError, zipfile.BadZipFile, zlib.error),
 )
 
-_COPIES = 3  # the file, its arrays, and what is computed while they are checked
+COPIES = 3  # the file, its arrays, and what is computed while they are checked
 
 
 def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
@@ -54,7 +54,7 @@ def npz_arrays(where: object, content: bytes, kind: str, most: int | None = None
             raise ValueError("its members are larger than itself")
         if most is not None and size > most:
             raise ValueError(f"its arrays have {size / 2**20:,.0f} MiB, more than {most / 2**20:,.0f}")
-        check_memory(where, _COPIES * size)
+        check_memory(where, COPIES * size)
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except InputError:

@@ -47,7 +47,7 @@ class RunReader(RunFolder):
         attempts = [self.manifest, *self.resumptions]
         return next((attempt["git"] for attempt in reversed(attempts) if "git" in attempt), None)
 
-    def read(self, path: Path, most: int) -> bytes:
+    def read(self, path: Path, most: int, copies: int = 1) -> bytes:
         """Read a file with a part of the result.
 
         Only a finished run has checksums; the files of another are read unverified.
@@ -55,6 +55,7 @@ class RunReader(RunFolder):
         Args:
             path: One of the run's files.
             most: The largest size allowed, in bytes.
+            copies: How often the content will be in memory, for the memory budget.
 
         Returns:
             The whole content.
@@ -62,7 +63,7 @@ class RunReader(RunFolder):
         Raises:
             InputError: The file is missing, too large, or not the one that the run wrote.
         """
-        content = read_bytes(path, most)
+        content = read_bytes(path, most, copies)
         if self.is_finished:
             self._check(path, sha256(content))
         return content

@@ -50,8 +50,12 @@ FIRST = {
     *("ten_million_quantiles", "images_of_cells_of_400_pixels", "sixteen_layers_of_4096"),
     *("checkpoint_of_seven_gigabytes", "checkpoint_of_zeros_that_are_left_out"),
     *("a_replay_of_gigabytes", "event_of_many_empty_values"),
+    *("map_file_elsewhere_that_is_the_secret", "environment_of_a_module", "environment_that_opens_a_file"),
+    *("environment_of_four_million_cells", "environment_that_a_command_builds", "world_that_is_the_secret"),
+    *("world_of_450_megabytes", "world_with_another_digit", "films_that_are_the_secret"),
     *("report_that_leads_outside", "yaml_that_runs_and_grows", "event_of_an_exabyte"),
 }
+RUNS = SHORT | {"lake": [*SHORT["q_learning"], "env=frozen_lake_v1", "n_envs=4"]}  # which has tables
 ALL = os.environ.get("GRIDWORLD_HOSTILE") == "all"
 CASES = [case for case in CATALOGUE if ALL or case.name in FIRST]
 
@@ -61,7 +65,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of every agent that the catalogue spoils."""
     folder = tmp_path_factory.mktemp("good")
     for agent in sorted({case.agent for case in CASES}):
-        train_in(folder / agent, *SHORT[agent], "recording.frames=false", "recording.gif=false")
+        train_in(folder / agent, *RUNS[agent], "recording.frames=false", "recording.gif=false")
     return folder
 
 
@@ -105,8 +109,8 @@ def test_nothing_of_a_hostile_run_gets_out(case: Hostile, good: Path, tmp_path: 
             assert case.words in ended.output, where
             assert ended.code == (0 if FINE in case.words or "policy of" in case.words else 2), where
         if command == "play":
-            # The window is all that is missing where a run can be looked at.
-            assert (NO_DISPLAY in ended.output) == (looked_at == 0), where
+            # The window is all that is missing where a run on a map can be looked at.
+            assert (NO_DISPLAY in ended.output) == (looked_at == 0 and case.agent != "lake"), where
         if command == "evaluate":
             looked_at = ended.code
 

@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import re
+import shutil
 import struct
 import subprocess
 import sys
@@ -18,6 +19,8 @@ from PIL import Image
 
 from gridworld.commands import export
 from gridworld.errors import InputError
+from gridworld.export.exported_run import read
+from gridworld.storage.sealed_json import sealed
 
 NAME = "dqn-classic-seed0"
 
@@ -221,7 +224,66 @@ def test_another_run_of_that_name_gets_a_folder_of_its_own(place: Path) -> None:
     assert not list((place / "other" / NAME).iterdir())
 
 
-@pytest.mark.parametrize("file", ["model.zip", "curve.csv", "policy.png"])
+@pytest.fixture(scope="module")
+def lake(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run on an environment with tables."""
+    folder = tmp_path_factory.mktemp("lake") / "run"
+    words = ("env=frozen_lake_v1_dry", "recording.frames=false", "recording.learning=false")
+    train_in(folder, *SHORT["q_learning"], *words)
+    return folder
+
+
+def as_read(run: Path, copies: Path) -> dict[str, bytes]:
+    """The files that any target would get."""
+    copies.mkdir()
+    found = read(run, copies)
+    assert found.world is not None
+    return {path.name: path.read_bytes() for path in (*found.models, *found.pictures, found.world)}
+
+
+def test_only_what_the_manifest_vouches_for_is_exported(
+    lake: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = as_read(lake, tmp_path / "copies")
+    assert found.keys() >= {"model.zip", "world.npz", "policy.png", "episode.gif"}
+    assert all(content == (lake / name).read_bytes() for name, content in found.items())
+    manifest = json.loads((lake / "manifest.json").read_text())
+    assert found.keys() <= manifest["sha256"].keys()
+    secret = tmp_path / "secret"
+    secret.write_text("secret")
+    for name, content in found.items():
+        run = tmp_path / f"with-{name}" / "run"
+        shutil.copytree(lake, run)
+        digit = next(at for at in range(len(content) // 2, len(content)) if content[at : at + 1].isdigit())
+        other = b"0" if content[digit : digit + 1] != b"0" else b"1"
+        (run / name).write_bytes(content[:digit] + other + content[digit + 1 :])
+        with pytest.raises(InputError, match=re.escape(f"{run / name}: is not the file that the run wrote")):
+            as_read(run, tmp_path / f"changed-{name}")
+        for target in (str(secret), "/dev/zero"):
+            (run / name).unlink()
+            (run / name).symlink_to(target)
+            with pytest.raises(InputError, match=re.escape(f"{run / name}: is a symbolic link")):
+                as_read(run, tmp_path / f"link-{name}-{Path(target).name}")
+    run = tmp_path / "earlier" / "run"  # of a version without these checksums
+    shutil.copytree(lake, run)
+    for name in ("episode.gif", "world.npz"):
+        del manifest["sha256"][name]
+    (run / "manifest.json").write_text(json.dumps(sealed(manifest)))
+    capsys.readouterr()
+    assert found.keys() - as_read(run, tmp_path / "without").keys() == {"episode.gif"}
+    assert "episode.gif: is left out, the run's manifest has no checksum of it" in capsys.readouterr().err
+
+
+def test_the_hub_gets_the_tables_of_the_run(
+    lake: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    export.main([str(lake), "--to", "hub", "--out", "hub"])
+    [world] = (tmp_path / "hub").glob("*/world.npz")
+    assert world.read_bytes() == (lake / "world.npz").read_bytes()
+
+
+@pytest.mark.parametrize("file", ["model.zip", "curve.csv", "policy.png", "episode.gif"])
 def test_what_was_changed_is_not_exported(file: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(place)
     path = place / "runs" / "dqn" / file

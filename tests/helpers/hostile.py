@@ -27,6 +27,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from gridworld.config.plain_settings import read_config
+from gridworld.process.npz import npz_bytes
+from gridworld.run.identity.fingerprint import identity
 from gridworld.storage.event_file import _checksum
 from gridworld.storage.sealed_json import sealed
 from gridworld.storage.serialization import MAGIC, decode, encode
@@ -359,7 +362,7 @@ def target_among_the_settings(run: Path, base: Path) -> None:
     agent_has(run, _target_="os.system", command=f"touch {base}/canary")
 
 
-@hostile("_target_=os.system is from none of torch", "dqn")
+@hostile("optimizer_kwargs.eps._target_=os.system is no plain word", "dqn")
 def target_among_an_optimisers_arguments(run: Path, base: Path) -> None:
     target = {"_target_": "os.system", "command": f"touch {base}/canary", "_recursive_": True}
     manifest(run, lambda c: c["config"]["agent"]["policy_kwargs"].update(optimizer_kwargs={"eps": target}))
@@ -395,7 +398,7 @@ def function_of_a_known_library(run: Path, base: Path) -> None:
     manifest(run, lambda c: c["config"]["agent"]["policy_kwargs"].update(features_extractor_class=path))
 
 
-@hostile("replay_buffer_class=stable_baselines3.common.logger.HumanOutputFormat: must be", "dqn")
+@hostile("agent.replay_buffer_kwargs.filename_or_file=", "dqn")
 def class_that_opens_a_file(run: Path, base: Path) -> None:
     name = {"filename_or_file": str(base / "outside" / "log")}
     path = "stable_baselines3.common.logger.HumanOutputFormat"
@@ -425,7 +428,7 @@ def class_deep_among_the_arguments(run: Path, base: Path) -> None:
     agent_has(run, arguments={"policy_kwargs": [[{"x": [{"optimizer_class": "evil.Agent"}]}]]})
 
 
-@hostile("is not set here but by", "qrdqn")
+@hostile("agent.arguments.tensorboard_log=", "qrdqn")
 def log_folder_among_the_arguments(run: Path, base: Path) -> None:
     agent_has(run, arguments={"tensorboard_log": str(base / "outside")})
 
@@ -433,6 +436,115 @@ def log_folder_among_the_arguments(run: Path, base: Path) -> None:
 @hostile(FINE)
 def map_file_that_is_the_secret(run: Path, base: Path) -> None:
     manifest(run, lambda content: content["config"]["env"].update(layout="secret.txt"))
+
+
+@hostile(FINE)
+def map_file_elsewhere_that_is_the_secret(run: Path, base: Path) -> None:
+    world_is(run, layout=str(base / "secret.txt"))
+
+
+def world_is(run: Path, **values: Any) -> None:
+    """Change the settings of the world, so that resume goes on with them and draws the episode."""
+
+    def edit(content: dict[str, Any]) -> None:
+        content["config"]["env"].update(values)
+        content["config"]["recording"].update(gif=True)
+
+    manifest(run, edit)
+    content = json.loads((run / "manifest.json").read_text())
+    own = identity(read_config(content["config"], ""), "\n".join(content["layout"]))
+    checkpoint(run, lambda state: state.update(identity=own))
+
+
+@hostile(FINE, "lake")
+def environment_of_a_module(run: Path, base: Path) -> None:
+    plant(base)
+    world_is(run, id="evil:FrozenLake-v1")
+
+
+@hostile(FINE, "lake")
+def environment_that_opens_a_file(run: Path, base: Path) -> None:
+    world_is(run, id="gridworld:GridWorld-v0", kwargs={"layout": str(base / "secret.txt")})
+
+
+@hostile(FINE, "lake", megabytes=1000)
+def environment_of_four_million_cells(run: Path, base: Path) -> None:
+    world_is(run, kwargs={"desc": ["S" + "F" * 1998 + "G"] * 2000})
+
+
+@hostile(FINE, "lake")
+def environment_of_another_kind(run: Path, base: Path) -> None:
+    world_is(run, id="Pendulum-v1", kwargs={})
+
+
+@hostile(FINE, "lake")
+def environment_that_a_command_builds(run: Path, base: Path) -> None:
+    built = {"source": "built", "builder": "os.system", "kwargs": {"command": f"touch {base}/canary"}}
+    manifest(run, lambda content: content["config"].update(env=built | {"max_episode_steps": None}))
+
+
+@hostile("world.npz: is a symbolic link", "lake")
+def world_that_is_the_secret(run: Path, base: Path) -> None:
+    link(run / "world.npz", base / "secret.txt")
+
+
+@hostile("world.npz: is a symbolic link", "lake")
+def world_that_never_ends(run: Path, base: Path) -> None:
+    link(run / "world.npz", "/dev/zero")
+
+
+@hostile("world.npz: is no ordinary file", "lake")
+def world_that_waits_for_a_writer(run: Path, base: Path) -> None:
+    (run / "world.npz").unlink()
+    os.mkfifo(run / "world.npz")
+
+
+def in_world(run: Path, **arrays: Any) -> None:
+    """Change arrays of the world's file, whose checksum is right again."""
+    with np.load(run / "world.npz") as there:
+        seal(
+            run, "world.npz", npz_bytes(dict(there) | {key: np.asarray(each) for key, each in arrays.items()})
+        )
+
+
+@hostile("world.npz: would take about 1.35 GB", "lake")
+def world_of_450_megabytes(run: Path, base: Path) -> None:
+    sparse(run / "world.npz", 450_000_000)
+
+
+@hostile("world.npz: not a world that can be read (its members are larger than itself)", "lake")
+def world_that_grows(run: Path, base: Path) -> None:
+    with zipfile.ZipFile(run / "world.npz") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    zeros = header("{'descr': '|u1', 'fortran_order': False, 'shape': (200000000,), }") + bytes(200_000_000)
+    content = zipped(members | {"own_observation.npy": zeros}, zipfile.ZIP_DEFLATED)
+    seal(run, "world.npz", content)
+
+
+@hostile("world.npz: not a world", "lake")
+def world_that_is_pickled(run: Path, base: Path) -> None:
+    with zipfile.ZipFile(run / "world.npz") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    seal(run, "world.npz", zipped(members | {"name.npy": pickled_array(base)}))
+
+
+@hostile("world.npz: is not the world that manifest.json names", "lake")
+def world_with_another_digit(run: Path, base: Path) -> None:
+    with np.load(run / "world.npz") as there:
+        in_world(run, reward=np.where(there["reward"] == 1, 0.5, there["reward"]))
+
+
+@hostile("world.npz: is not the file that the run wrote", "lake")
+def world_that_shows_another_digit(run: Path, base: Path) -> None:
+    sums = json.loads((run / "manifest.json").read_text())["sha256"]["world.npz"]
+    in_world(run, action_names=["a", "b", "c", "e"])
+    manifest(run, lambda told: told["sha256"].update({"world.npz": sums}))
+
+
+@hostile(FINE)
+def films_that_are_the_secret(run: Path, base: Path) -> None:
+    link(run / "episode.gif", base / "secret.png")
+    link(run / "episode.mp4", "/dev/zero")
 
 
 @hostile("at most 262144 cells")

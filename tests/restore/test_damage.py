@@ -25,6 +25,7 @@ from helpers.support import SHORT, train_in
 
 from gridworld.commands import jobs as jobs_command
 from gridworld.commands import record as record_command
+from gridworld.config.pictures import PICTURES
 from gridworld.errors import InputError
 from gridworld.report.build import gather
 from gridworld.report.evidence import tuning_study as tuning
@@ -32,7 +33,6 @@ from gridworld.report.page import charts, render
 from gridworld.restore.comparison import check_whole
 from gridworld.restore.resume import open_unfinished
 from gridworld.restore.saved_run import SavedRun, read_visits
-from gridworld.run.folder import PICTURES
 from gridworld.run.reader import read_run
 from gridworld.storage.safe_read import sha256
 from gridworld.storage.sealed_json import sealed
@@ -69,7 +69,8 @@ def evaluated(folder: Path) -> str:
 
 def recorded(folder: Path) -> str:
     saved = SavedRun(folder / "run")
-    return f"{record_command._SavedSubject(saved, False).steps} {read_visits(saved.run, saved.mdp.neighbour.shape)}"
+    visits = read_visits(saved.run, saved.mdp.neighbour.shape)
+    return f"{record_command._SavedSubject(saved, False).steps} {visits}"
 
 
 def gone_on(folder: Path) -> str:
@@ -113,7 +114,7 @@ CASES: list[tuple[str, int, tuple[Telling, ...]]] = [
     ("run/summary.json", 50, (reported, recorded, reproduced, confirmed)),
     ("run/model.zip", 30, (evaluated, reproduced)),
     ("run/visits.npy", 20, (recorded, reproduced)),
-    *((f"run/{name}", 5, (reported,)) for name in PICTURES),
+    *((f"run/{picture.file}", 5, (reported,)) for picture in PICTURES if picture.caption),
     ("sweep/sweep.json", 20, (listed,)),
     ("sweep/seed=0/manifest.json", 20, (listed,)),
     ("sweep/seed=0/summary.json", 10, (listed,)),

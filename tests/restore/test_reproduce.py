@@ -293,7 +293,7 @@ def test_ones_own_class_needs_trust(
     (tmp_path / "my_own_agents.py").write_text(OWN_CLASS)
     monkeypatch.syspath_prepend(tmp_path)
     train_in(tmp_path / "run", *any_class("my_own_agents.Mine"))
-    with pytest.raises(InputError, match="add --trust to import it"):
+    with pytest.raises(InputError, match="add --trust if you trust"):
         reproduce(tmp_path / "run", capsys)
     assert reproduce(tmp_path / "run", capsys, "--trust").endswith("identical\n")
 

@@ -6,6 +6,7 @@ import dataclasses
 
 from gridworld.config.worlds import EnvConfig, MapConfig
 from gridworld.errors import InputError
+from gridworld.process.npz import COPIES
 from gridworld.run.folder import MANIFEST, WORLD
 from gridworld.run.reader import LARGEST_RESULT, RunReader
 from gridworld.storage.safe_read import read_bytes
@@ -32,7 +33,7 @@ def stored_world(run: RunReader, env: EnvConfig) -> Mdp:
         "sha256", {}
     )  # earlier versions noted the digest of the tables alone
     read = run.read if is_noted else read_bytes
-    mdp = world_from_bytes(read(run.world_file, LARGEST_RESULT), str(run.world_file))
+    mdp = world_from_bytes(read(run.world_file, LARGEST_RESULT, COPIES), str(run.world_file))
     if mdp.text() != text:
         raise InputError(
             f"{run.world_file}: is not the world that {MANIFEST} names; it was damaged or changed"
