@@ -23,7 +23,9 @@ from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import MapConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
+from gridworld.process.console.terminal import tell
 from gridworld.process.memory_budget import limited
+from gridworld.run.folder import shown
 from gridworld.run.identity.stored_world import stored_world
 from gridworld.run.reader import RunReader, open_run
 from gridworld.training.setup import make_context
@@ -66,7 +68,13 @@ class SavedRun:
         Of a run that is not trusted they are made of its settings, and what would run code is left out.
         """
         words: list[str] = self.run.manifest.get("overrides") or []
-        return list(words) if self._trust else list(harmless_words(words, self.config))
+        kept = list(words) if self._trust else list(harmless_words(words, self.config))
+        if left_out := len(words) - len(kept):
+            tell(
+                f"{shown(self.run.folder)}: {left_out} of the {len(words)} words of its command line may run "
+                "code or lead elsewhere, and are not repeated; if you trust the run, say so"
+            )
+        return kept
 
     @limited()
     def evaluator(self, layout: str | None = None) -> Evaluator:

@@ -22,6 +22,12 @@ from gridworld.agents import family
 from gridworld.training.session import Session
 
 TIMES = ("train_seconds", "evaluation_seconds")
+SMALL = (
+    "total_timesteps=300",
+    "agent.learning_starts=100",
+    "n_envs=10",
+    "agent.policy_kwargs.net_arch=[512,512]",
+)
 
 
 def timeless(summary: dict[str, object]) -> dict[str, object]:
@@ -228,3 +234,23 @@ def test_progress_is_shown_or_not(
     assert capsys.readouterr().err == ""
     gridworld.train(*SHORT["q_learning"])
     assert "q_learning on classic: step 2,000 of 2,000" in capsys.readouterr().err
+
+
+def test_a_run_is_opened_within_the_budget_and_ones_own_needs_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GRIDWORLD_BUDGET", "1MB")
+    own = gridworld.train(
+        "agent=dqn", "env=cliff_walking_v1", *SMALL, folder=tmp_path / "run", progress=False
+    )
+    assert own.model is not None  # whatever it takes
+    opened = gridworld.open_run(tmp_path / "run")
+    with pytest.raises(InputError, match=r"its network: would take about .*set GRIDWORLD_BUDGET=1GB"):
+        _ = opened.model
+    with pytest.raises(InputError, match="its network: would take about"):
+        gridworld.diagnose(tmp_path / "run")
+    with (tmp_path / "run" / "world.npz").open("r+b") as file:
+        file.truncate(500_000)
+    for read in (gridworld.open_run, gridworld.diagnose):
+        with pytest.raises(InputError, match=r"world\.npz: would take about 1\.5 MB of memory, the budget"):
+            read(tmp_path / "run")

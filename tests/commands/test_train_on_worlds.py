@@ -1,11 +1,13 @@
 """The commands on worlds that are no maps: train, look, go on, repeat, sweep, report."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.support import script
+from PIL import Image
 
 from gridworld.errors import InputError
 from gridworld.restore.saved_run import SavedRun
@@ -48,6 +50,25 @@ def test_a_run_goes_on_in_the_world_that_it_keeps(folder: Path) -> None:
     curve = (folder / "longer" / "curve.csv").read_text().splitlines()
     assert curve[-1].startswith("4000,")
     assert curve[:3] == (folder / "short" / "curve.csv").read_text().splitlines()[:3]
+
+
+@pytest.mark.parametrize("trust", [True, False])
+def test_the_environment_of_a_run_is_made_with_trust_only(trust: bool, folder: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(folder / "longer", run)
+    sizes = {}
+    for words, film in (
+        (["record.py", "run", "--format", "gif", *["--trust"] * trust], "recording/episode.gif"),
+        (["train.py", "resume=run", "total_timesteps=4500", *["trust=true"] * trust], "episode.gif"),
+    ):
+        done = script(*words, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        told = "the episode is drawn from the run's tables; FrozenLake-v1 itself is made with trust only"
+        assert (told in done.stderr) == (not trust)
+        with Image.open(run / film) as picture:
+            sizes[film] = picture.size
+    assert ((256, 256) in sizes.values()) == trust  # of its own frames
+    assert len(set(sizes.values())) == 1
 
 
 def test_a_run_is_repeated_scored_and_shown_again(folder: Path) -> None:

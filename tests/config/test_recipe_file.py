@@ -14,8 +14,9 @@ from helpers.support import CONF, configure, script
 
 from gridworld.commands import train as train_command
 from gridworld.config.composition.compose import register_schemas, without_hydra
-from gridworld.config.composition.recipe_file import overrides, with_recipe
+from gridworld.config.composition.recipe_file import harmless_words, overrides, with_recipe
 from gridworld.config.train import TrainConfig
+from gridworld.config.worlds import BuiltConfig
 from gridworld.errors import InputError
 from gridworld.storage.safe_read import read_object
 from gridworld.tune.recipe import write_recipe
@@ -211,3 +212,36 @@ def test_nothing_is_written_for_a_recipe_that_is_refused(
     assert told.count("\n") == 1
     assert expected in told
     assert os.listdir(tmp_path) == ["winner.yaml"]
+
+
+@pytest.mark.parametrize("agent", WINNERS)
+def test_a_runs_own_command_line_is_the_same_made_of_its_settings(agent: str) -> None:
+    words = [f"agent={agent}", "env=cliff", "seed=7", "evaluation.stop_after=null", *WINNERS[agent]]
+    config = configure(*words)
+    again = list(harmless_words(words, config))
+    assert len(again) == len(words)
+    assert configure(*again) == config
+
+
+STRANGERS_WORDS = [
+    *("--config-dir=/tmp/evil", "-cd", "--config-name", "hydra.searchpath=[file:///tmp/evil]", "hydra/x=y"),
+    *("callbacks=[{_target_: os.system, command: ls}]", "+callbacks=[os.system]", "env.builder=os.system"),
+    *("+env.x=${oc.env:HOME}", "experiment=../../evil", "env=$(ls)", "recipe=evil.yaml", "trust=true"),
+    *(
+        "agent@evil=dqn",
+        "seed",
+        "env.slip.x=1",
+        "\x1b[2J",
+        "seed=1\nseed=2;ls",
+        "+agent.algorithm=evil.A",
+        "",
+    ),
+]
+
+
+def test_a_strangers_command_line_is_not_repeated() -> None:
+    config = configure("agent=dqn", "seed=3")
+    config.callbacks = [{"_target_": "os.system"}]
+    assert list(harmless_words(STRANGERS_WORDS, config)) == ["seed=3", "+agent.algorithm=DQN"]
+    config.env = BuiltConfig(builder="os.system")
+    assert list(harmless_words(["env.builder=a.b", "env=built"], config)) == ["env=built"]

@@ -75,3 +75,9 @@ def test_large_frames_are_made_smaller():
 def test_what_cannot_be_rendered_is_one_sentence():
     with pytest.raises(InputError, match=r"^env.id=NoSuchWorld-v0: is no environment .*doesn't exist"):
         RealEnvFrames("NoSuchWorld-v0").episode(tables("FrozenLake-v1"), [0])
+
+
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "CartPole-v1", "Blackjack-v1"])
+def test_an_environment_of_another_kind_is_one_sentence(env_id):
+    with pytest.raises(InputError, match=rf"^env.id={env_id}: cannot be rendered: [^\n]*$"):
+        RealEnvFrames(env_id).episode(tables("FrozenLake-v1"), [0, 4, 8])

@@ -33,7 +33,9 @@ _LARGEST = 2**16  # bytes
 _DEEPEST = 20  # levels
 _LARGEST_WHOLE = 2**63
 _CHOICE = re.compile(r"\w[\w.-]*(/\w[\w.-]*)*")  # no way out of the folder of choices
-_WORD = re.compile(r"(\+{0,2})(\w+(?:\.\w+)*)=(.*)", re.ASCII | re.DOTALL)  # an override
+_WORD = re.compile(
+    r"(?:(~)|(\+{0,2}))(\w+(?:\.\w+)*)(?(1)(?:=.*)?|=(.*))", re.ASCII | re.DOTALL
+)  # an override
 _BARE = re.compile(
     r"(?!(?:true|false|null|nan|inf)$)[a-z_][\w.-]*", re.ASCII | re.IGNORECASE
 )  # text as it is
@@ -193,14 +195,16 @@ def harmless_words(words: Sequence[str], config: TrainConfig) -> Iterator[str]:
         found = _WORD.fullmatch(word)
         if found is None:
             continue
-        sign, key, value = found.groups()
+        removed, sign, key, value = found.groups("")
         place: Any = settings
         for name in key.split("."):
-            place = place.get(name) if isinstance(place, dict) else None
-        if key in (*CHOSEN, IN_A_STUDY[0]):
+            place = place.get(name, MISSING) if isinstance(place, dict) else MISSING
+        if removed:
+            yield f"~{key}"
+        elif key in (*CHOSEN, IN_A_STUDY[0]):
             if _CHOICE.fullmatch(value):
                 yield f"{key}={value}"
-        elif place is not None and not any(foreign({key: place})):
+        elif place != MISSING and not any(foreign({key: place})):
             yield f"{sign}{key}={literal(place, key)}"
 
 
