@@ -98,6 +98,8 @@ class Corridor(gym.Env[Any, int]):
         if self.variant == "once" and self.steps == 37:
             reward += 1
         truncated = 0 < self.limit <= self.steps or (self.variant == "cut" and self.cell == 2)
+        if self.variant == "both":
+            truncated = truncated or terminated
         if self.variant == "toll":
             reward += 0.5 * truncated
         return self._observation(), reward, terminated, truncated, {}
@@ -212,6 +214,15 @@ def test_a_step_count_that_is_left_out(variant: str, limit: int | None) -> None:
     assert mdp.goal.tolist() == [False] * 4 + [True]
     assert mdp.next_state[:, :, 0].tolist() == [[0, 1], [0, 2], [1, 3], [2, 4], [4, 4]]
     assert (mdp.own_observation is None) == (variant == "text")
+
+
+def test_an_end_may_be_called_a_truncation_too() -> None:
+    assert enumerate_env("Corridor-v0", {"variant": "both"}, ignore=["steps"]).terminal.sum() == 1
+
+
+def test_what_is_paid_after_the_step_limit_does_not_count() -> None:
+    mdp = enumerate_env("ShortCorridor-v0", {"variant": "decay", "max_episode_steps": 3})
+    assert Evaluator(mdp, 1.0, 3).optimal_value == 0
 
 
 @pytest.mark.parametrize(

@@ -169,8 +169,8 @@ class Graph:
 def explore(subject: Subject, most_states: int, limit: int | None) -> Graph:
     """Find all states that can be reached, breadth first, and what every action does there.
 
-    Episodes are over at the step limit. What lies beyond it is found too where that is little, and left out
-    otherwise: a state may hold the time, and then there is no end of them.
+    Episodes are over at the step limit. What lies beyond it is left out where states hold the time; elsewhere
+    it is found too if it is little.
 
     Args:
         subject: the environment.
@@ -186,8 +186,10 @@ def explore(subject: Subject, most_states: int, limit: int | None) -> Graph:
         raise subject.refusal(
             f"after {_DEEPEST:,} steps there are still new states, since its {search.changing()}"
         )
+    inside = len(search.depth)
+    if search.pending and search.holds_time():
+        return search.graph(inside, limit)
     if search.pending:
-        inside = len(search.depth)
         search.most_states = min(most_states, inside + _BEYOND)
         try:
             search.go_on(None)
@@ -244,6 +246,14 @@ class _Search:
                 )
         line.clear()
         self.pending = left
+
+    def holds_time(self) -> bool:
+        """Whether no state is met at two times."""
+        return all(
+            self.depth[following] == self.depth[state] + 1
+            for state, row in self._rows.items()
+            for following, *_ in row
+        )
 
     def _state_after(self, copy: bytes, observation: Any, depth: int) -> int:
         """The number of a state that the subject may have been in before, given a copy of it."""

@@ -80,12 +80,14 @@ class Replays:
             steps += 1
             self._compare("reward", steps, float(reward), float(mdp.reward[state, action, 0]))
             state = int(mdp.next_state[state, action, 0])
-            if truncated and self.limit is None and self._subject.ignore:
+            cut = bool(truncated and not terminated)
+            if cut and self.limit is None and self._subject.ignore:
                 self.limit = steps
-            expected = [bool(mdp.terminal[state]), steps >= (self.limit or np.inf)]
-            self._compare("end (terminated, truncated)", steps, [bool(terminated), bool(truncated)], expected)
+            over = bool(mdp.terminal[state])
+            expected = [over, steps >= (self.limit or np.inf) and not over]
+            self._compare("end (terminated, truncated)", steps, [bool(terminated), cut], expected)
             self._compare("state", steps, self._seen(snapshots, observation), self._expected(state))
-            if truncated:
+            if cut:
                 break
         return steps
 
