@@ -48,6 +48,7 @@ class RunResult:
         visits: (S, A), int64, how often training took each action in each state.
         evaluator: scores any policy of the run's world, and has its optimum in `solution`.
         folder: the run's folder; None: it was trained without one.
+        saved: the run's files, as far as they were read.
     """
 
     def __init__(self, saved: SavedRun, folder: Path | None, agent: Callable[[], Agent]) -> None:

@@ -210,4 +210,4 @@ class Evidence:
 def entropy(policy: FloatArray) -> FloatArray:
     """(S,), the entropy of a policy (S, A), 1 where it is uniform."""
     logs = np.log(np.maximum(policy, 1e-300))
-    return np.asarray(-(policy * logs).sum(axis=1) / max(np.log(policy.shape[1]), 1e-300))
+    return np.asarray(np.abs((policy * logs).sum(axis=1)) / max(np.log(policy.shape[1]), 1e-300))

@@ -79,6 +79,17 @@ def test_states_that_look_alike_are_alike_in_both_loops(kind: type) -> None:
     assert tabulated.values[0] == tabulated.values[2]
 
 
+def test_of_what_an_algorithm_does_not_take_nothing_is_asked() -> None:
+    for kind, name in (
+        (PPO, "target"),
+        (A2C, "exploration"),
+        (DQN, "entropy"),
+        ("sb3_contrib.TRPO", "entropy"),
+    ):
+        (finding,) = gridworld.check(kind, probes=[name]).findings
+        assert (finding.passed, finding.found[:8]) == (None, "takes no")
+
+
 def test_a_crash_is_a_failure_and_is_told() -> None:
     assert once(bugs.PPOCrashes, "constant") == (False, "training failed: RuntimeError: shapes do not fit")
 

@@ -22,6 +22,7 @@ _SMALL, _LARGE = 0.02, 50  # values that networks hardly learn
 _MOVES = 0.1  # Adam moves a weight by about the learning rate an update: less than this in all is nothing
 _MOST_TIMES = 50  # as long
 _EVENLY = "n_envs=256 exploring_starts=1 stratified_draws=true"  # what leaves least to chance
+_FEW_UPDATES = 500  # of a network: fewer are too few whatever its target
 _REFRESHES = 2  # of the target network, for each step of the way to the goal
 
 
@@ -116,7 +117,7 @@ def not_there_yet(run: Evidence) -> Finding | None:
     interval = run.setting("target_update_interval")
     refreshed = run.config.total_timesteps / max(interval, 1.0) if run.setting("tau", 1.0) == 1 else np.inf
     path = run.evaluator.optimum.expected_length
-    if interval and refreshed < _REFRESHES * path:
+    if interval and run.updates >= _FEW_UPDATES and refreshed < _REFRESHES * path:
         why = (
             f"its target network was refreshed {refreshed:.0f} times, and a value needs {path:.0f} to come "
             f"from the goal to the start{_behind(run)}"
