@@ -1,11 +1,13 @@
 """Tuning as its user meets it: commands, kills, continuations and mistakes, on a real SQLite study."""
 
+import contextlib
 import csv
 import dataclasses
 import json
 import os
 import shutil
 import signal
+import sqlite3
 import sys
 import time
 from pathlib import Path
@@ -351,6 +353,49 @@ def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path
         repeated = next(other for other in found if other["repeats"] == row["trial"])
         chosen = [key for key in keys if row[key]]  # the worker may have been lost before it chose all
         assert [repeated[key] for key in chosen] == [row[key] for key in chosen]
+
+
+def test_a_search_of_one_worker_is_the_same_however_it_is_killed(tmp_path: Path) -> None:
+    words = [*QUICK, "env=river_swim", "total_timesteps=6000", "tune.trials=5", "tune.heartbeat=60"]
+
+    def outcome(folder: Path) -> tuple[list[dict[str, str]], object]:
+        found = [row for row in rows(folder) if row["status"] != "lost"]
+        for row in found:
+            del row["trial"], row["worker"], row["seconds"], row["repeats"]
+        study = json.loads((folder / "study" / "study.json").read_text())
+        return found, (study["winner"]["values"], study["confirmation"])
+
+    for name, kills in (("calm", 0), ("killed", 2)):
+        (tmp_path / name).mkdir()
+        for ended in range(kills):
+            with start("tune.py", *words, cwd=tmp_path / name) as process:
+                database = tmp_path / name / "study" / "study.db"
+                worker = under_way(database, ended)
+                os.kill(worker, signal.SIGKILL)
+                under_way(database, ended, after=worker)
+                process.kill()
+                process.stderr.read()  # until the last worker has let go of it
+        done = script("tune.py", *words, cwd=tmp_path / name)
+        assert done.returncode == 0, done.stderr
+    assert outcome(tmp_path / "killed") == outcome(tmp_path / "calm")
+    assert [row["status"] for row in rows(tmp_path / "killed")].count("lost") >= 1
+
+
+def under_way(database: Path, ended: int, after: int = 0) -> int:
+    """The process that is in a trial, after so many have ended, and is another than `after`."""
+    found = "SELECT value_json FROM trials JOIN trial_user_attributes USING (trial_id) WHERE key = 'worker' "
+    end = time.monotonic() + 60
+    while time.monotonic() < end:
+        if not database.exists():
+            continue
+        with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(database)) as study:
+            states = [state for (state,) in study.execute("SELECT state FROM trials")]
+            workers = study.execute(f"{found} AND state = 'RUNNING' ORDER BY number DESC").fetchall()
+            if sum(state in ("COMPLETE", "PRUNED") for state in states) >= ended and workers:
+                worker = int(json.loads(workers[0][0]).split(":")[1])
+                if worker != after:
+                    return worker
+    raise AssertionError("no such trial began")
 
 
 def test_a_database_that_disappears_is_one_sentence(tmp_path: Path) -> None:

@@ -304,6 +304,89 @@ def test_trials_that_are_cut_short_do_not_change_what_is_chosen(tmp_path: Path, 
     assert chosen("calm", []) == chosen("stopped", [0, 4, 5, 13])
 
 
+MOMENTS = ("before its draw", "half drawn", "drawn", "on its way", "failed")
+
+
+@pytest.mark.filterwarnings("ignore:Heartbeat of storage")  # of `ask`
+@pytest.mark.parametrize("moment", MOMENTS)
+@pytest.mark.parametrize("killed", [(0,), (0, 0, 1), (3, 11)])
+def test_a_killed_search_of_one_worker_goes_on_as_if_it_had_not_been(
+    moment: str, killed: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker._stopped, "wait", lambda seconds: pytest.fail("it waits for a dead worker"))
+    keys = ("x", "y", "z")
+
+    def objective(trial: optuna.Trial, is_stopped: object) -> float:
+        value = sum(trial.suggest_float(key, -1, 1) ** 2 for key in keys)
+        if trial.params["x"] > 0.8:
+            raise ValueError("too far")
+        for step in range(10):
+            trial.report(value + step, step)
+            if trial.should_prune():
+                raise optuna.TrialPruned
+        return value
+
+    def die(study: optuna.Study, context: StudyContext) -> None:
+        """What a worker leaves that is killed in its next trial."""
+        draw = storage.next_draw(study)
+        if draw == 0 and not count_trials(study).waiting:
+            study.enqueue_trial(context.first or {})
+        storage.seed_sampler(study, context.storage.settings, draw, "")
+        trial = study.ask()
+        if moment != "before its draw":
+            storage.sign_on(trial, draw, "here:1")
+            for key in keys[: 2 if moment == "half drawn" else 3]:
+                trial.suggest_float(key, -1, 1)
+        if moment == "on its way":
+            trial.report(0.0, 9)
+        if moment == "failed" and trial.params["x"] > 0.8:
+            trial.set_user_attr("error", "ValueError: too far")
+
+    def search(name: str, killed: Sequence[int]) -> list[tuple[object, ...]]:
+        (tmp_path / name).mkdir()
+        for ended in (*killed, 14):
+            study, context = study_of(tmp_path / name, objective, 14)
+            context = dataclasses.replace(context, first={"x": 0.25, "y": -0.5, "z": 0.75})
+            with worker.among_workers(study, context):
+                while count_trials(study).ended < ended and _run_next(study, context, set()):
+                    pass
+                if ended < 14:
+                    die(study, context)
+        found = [trial for trial in study.trials if not is_lost(trial)]
+        return [(trial.state, trial.params, trial.value, trial.intermediate_values) for trial in found]
+
+    calm = search("calm", ())
+    assert calm[0][1] == {"x": 0.25, "y": -0.5, "z": 0.75}
+    assert search("killed", killed) == calm
+
+
+@pytest.mark.filterwarnings("ignore:Heartbeat of storage")  # of `ask`
+def test_only_who_is_alone_gives_up_what_runs(tmp_path: Path) -> None:
+    study, context = study_of(tmp_path, lambda trial, is_stopped: 0.0, 1)
+    named = dataclasses.replace(context.storage.settings, storage="postgresql://elsewhere/db")
+    elsewhere = dataclasses.replace(context, storage=dataclasses.replace(context.storage, settings=named))
+    study.ask()
+    with worker.among_workers(study, elsewhere), worker.among_workers(study, context):
+        assert count_trials(study).running == 1
+    with worker.among_workers(study, context):
+        assert count_trials(study).running == 0
+
+
+@pytest.mark.filterwarnings("ignore:Heartbeat of storage")  # of `ask`
+def test_settings_that_kill_their_worker_again_and_again_are_left_out(tmp_path: Path) -> None:
+    study, _ = study_of(tmp_path, None, 1)
+    for draw in (0, 0, 0, 0, 1):
+        assert storage.next_draw(study) == draw
+        storage.sign_on(study.ask(), draw, "here:1")
+        storage.give_up_running(study)
+    for _ in range(5):  # being stopped is no reason
+        assert storage.next_draw(study) == 1
+        trial = study.ask()
+        storage.sign_on(trial, 1, "here:1")
+        trial.set_user_attr("stopped", True)
+        storage.give_up_running(study)
+
+
 def test_a_storage_that_goes_away_is_told_in_a_sentence(tmp_path: Path) -> None:
     study, context = study_of(tmp_path, None, 3)
     (tmp_path / "study.db").unlink()
