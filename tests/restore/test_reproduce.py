@@ -154,8 +154,9 @@ def test_another_seed_is_another_run(run: Path, tmp_path: Path, capsys: pytest.C
 
 
 def test_what_differs_in_the_environment_is_told(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.delenv("ATEN_CPU_CAPABILITY", raising=False)
     shutil.copytree(run, tmp_path / "run")
 
     def edit(content: dict[str, dict[str, object]]) -> None:

@@ -124,7 +124,9 @@ CELLS = {"policy_kwargs": {"features_extractor_class": ImageCells, "net_arch": [
 APART = {"policy_kwargs": {**FOURIER["policy_kwargs"], "share_features_extractor": False}}
 LINEAR = {"policy_kwargs": {"net_arch": []}}
 TWO_SIZES = {"policy_kwargs": {"net_arch": {"pi": [8], "vf": [16, 16]}}}
-RELU = {"activation_fn": torch.nn.ReLU, "optimizer_class": torch.optim.RMSprop}
+# RMSprop's first steps are of full size, however small a gradient is: with its own eps rounding would grow.
+RMSPROP = {"optimizer_class": torch.optim.RMSprop, "optimizer_kwargs": {"eps": 1e-3}}
+RELU = {"activation_fn": torch.nn.ReLU, **RMSPROP}
 # Conjugate gradients on a convolutional network's weights would blow rounding up, in SB3's class as here.
 FEW_PRODUCTS = {"cg_max_steps": 2, "cg_damping": 1.0, "n_critic_updates": 1}
 FROM_ROLLOUTS: dict[tuple[type, type], list[tuple[str, dict[str, Any]]]] = {
@@ -152,7 +154,7 @@ FROM_ROLLOUTS: dict[tuple[type, type], list[tuple[str, dict[str, Any]]]] = {
         *[("image", {**FEW_PRODUCTS, "policy_kwargs": {"share_features_extractor": x}}) for x in (0, 1)],
         ("one_hot", {"normalize_advantage": False, "cg_max_steps": 3, "cg_damping": 1.0}),
         ("one_hot", {"sub_sampling_factor": 3, "gae_lambda": 0.9}),
-        ("one_hot", {"target_kl": 0.5, "line_search_shrinking_factor": 0.5}),
+        ("one_hot", {"target_kl": 0.5, "line_search_shrinking_factor": 0.5, "cg_damping": 1.0}),
         ("one_hot", {"line_search_max_iter": 0}),
         ("one_hot", {"policy_kwargs": {"optimizer_class": torch.optim.AdamW}}),
         *[("none", LINEAR), ("coordinates", TWO_SIZES), ("coordinates", FOURIER)],
