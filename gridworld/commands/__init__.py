@@ -37,7 +37,9 @@ def parser_for_a_run(prog: str, about: str | None) -> argparse.ArgumentParser:
     )
     add_best(parser)
     parser.add_argument(
-        "--trust", action="store_true", help="import the classes that the run names, wherever they are from"
+        "--trust",
+        action="store_true",
+        help="import the classes that the run names, wherever they are from, and let its environment draw",
     )
     return parser
 

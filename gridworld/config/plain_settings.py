@@ -85,11 +85,11 @@ def _leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
 def _kinds(name: str) -> frozenset[Text]:
     """What the schemas declare a text to be: at the setting of this name, or at the one that it is in.
 
-    What no schema knows may be anything.
+    What no schema knows, or has no text, may be anything.
     """
     while name and name not in declared_texts():
         name = name.rpartition(".")[0]
-    return declared_texts().get(name, frozenset([Text.CODE]))
+    return declared_texts().get(name) or frozenset([Text.CODE])
 
 
 @functools.cache

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot, family
-from gridworld.config.composition.recipe_file import harmless_words
 from gridworld.config.plain_settings import check_foreign, read_config
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import MapConfig
@@ -67,6 +66,10 @@ class SavedRun:
 
         Of a run that is not trusted they are made of its settings, and what would run code is left out.
         """
+        from gridworld.config.composition.recipe_file import (
+            harmless_words,  # with Hydra, which takes its time
+        )
+
         words: list[str] = self.run.manifest.get("overrides") or []
         kept = list(words) if self._trust else list(harmless_words(words, self.config))
         if left_out := len(words) - len(kept):
