@@ -193,6 +193,13 @@ def test_large_worlds_are_as_exact_as_small_ones_near_one(monkeypatch):
         assert np.array_equal(sparse.optimal, optimum.optimal)
 
 
+def test_a_large_world_that_rounding_makes_singular_has_its_values(monkeypatch):
+    mdp = compile_mdp(parse("S..\n..G", "map"), slip=1e-16)
+    policy = one_hot_policy(np.array([0, 2, 2, 1, 0, 1]), 4)  # comes to the goal by three slips
+    monkeypatch.setattr("gridworld.world.exact.markov_chain.DENSE_STATES", 0)
+    assert Chain(mdp, policy).value(1.0)[mdp.start_states] == pytest.approx([1.0], rel=1e-12)
+
+
 def test_where_nobody_can_go_on_for_ever_a_positive_step_reward_has_an_optimum():
     forced = compile_mdp(parse("SG", "map"), slip=0.0, step_reward=0.5)
     with pytest.raises(InputError, match="may grow without end"):

@@ -120,9 +120,12 @@ def factor(weights: Any, leak: FloatArray) -> Absorption:
         return Elimination(weights, leak, band=len(leak))
     weights.setdiag(0.0)
     weights.eliminate_zeros()
-    sparse = _sparse_factors(weights, leak)
-    leaving = sparse.solve(leak)
-    return sparse if np.abs(leaving - 1).max() <= _ACCURACY else BandedElimination(weights, leak)
+    try:
+        sparse = _sparse_factors(weights, leak)
+        is_accurate = np.abs(sparse.solve(leak) - 1).max() <= _ACCURACY
+    except RuntimeError:  # rounding has made it singular
+        is_accurate = False
+    return sparse if is_accurate else BandedElimination(weights, leak)
 
 
 def _sparse_factors(weights: Any, leak: FloatArray) -> Absorption:
