@@ -204,7 +204,7 @@ def make_folder(folder: Path) -> None:
 def tidy(folder: Path) -> None:
     """Remove what killed processes had half written; what somebody is at work on is locked."""
     for path in folder.glob(".*.part"):
-        if OPENS_FOLDERS and _PART.fullmatch(path.name):
+        if OPENS_FOLDERS and _PART.fullmatch(path.name) and not path.is_symlink():  # those are nobody's
             with contextlib.suppress(OSError), contextlib.ExitStack() as opened:
                 file = _open(path)
                 opened.callback(os.close, file)
