@@ -161,7 +161,7 @@ def test_what_differs_in_the_environment_is_told(
 
     def edit(content: dict[str, dict[str, object]]) -> None:
         content["versions"]["torch"] = "1.0"
-        content["processor"]["torch"] = "AVX2"
+        content["processor"]["torch"] = "MMX"
         content["git"] = {"commit": "abc", "diff": {"sha256": "0" * 64, "file": SOURCE_DIFF}}
         content["environment"] = {"ATEN_CPU_CAPABILITY": "\x1b[2Javx2"}
 
@@ -170,7 +170,7 @@ def test_what_differs_in_the_environment_is_told(
     assert "    commit: abc then, " in shown
     assert f"    uncommitted source: changes 000000000000 ({SOURCE_DIFF} has them) then, " in shown
     assert "    torch: 1.0 then, " in shown
-    assert "    processor torch: AVX2 then, " in shown
+    assert "    processor torch: MMX then, " in shown
     assert "    ATEN_CPU_CAPABILITY: \\x1b[2Javx2 then, none now" in shown
     assert not list(differences(describe(), describe()))
 
