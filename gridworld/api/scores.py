@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Discrete
 from numpy.typing import ArrayLike
 
 from gridworld.bounds import discount
-from gridworld.envs.inspection import task_of
+from gridworld.envs.inspection import Task, task_of
 from gridworld.errors import InputError
 from gridworld.world.exact.evaluation import Evaluator, Score
 from gridworld.world.exact.markov_chain import one_hot_policy
@@ -29,7 +30,8 @@ def evaluate(
     Args:
         model_or_table: a model of SB3 or of any library with its interface (DQN, PPO, A2C, QRDQN, TRPO, ...),
             or its policy, which acts as its `predict` does, with the environment's `action_masks()` if it
-            takes them; or a table: actions (S,), whole numbers from 0, or their probabilities (S, A).
+            takes them; or a table: actions (S,), whole numbers from 0, or their probabilities (S, A);
+            by observations where the environment shows whole numbers.
         env: an environment or a batch of Gymnasium or SB3: a GridWorld, or one with a transition table; a
             compiled world (`compile_mdp`, `compile_env`); or the name of a map. The task is that of the
             environment with its wrappers, which must be neutral or functions; see
@@ -77,12 +79,12 @@ def evaluate(
             )
         policy = tables.greedy if deterministic or tables.sampled is None else tables.sampled
     else:
-        policy = _greedy(mdp, q) if q is not None else _policy(mdp, model_or_table)
+        policy = _greedy(task, q) if q is not None else _policy(task, model_or_table)
     return Evaluator(mdp, gamma, limit).score(policy)
 
 
-def _policy(mdp: Mdp, table: Any) -> FloatArray:
-    numbers = _by_state(mdp, _array("the table", table))
+def _policy(task: Task, table: Any) -> FloatArray:
+    mdp, numbers = task.mdp, _by_state(task, _array("the table", table))
     if numbers.shape == (mdp.num_states,):
         wrong = ~np.isin(numbers, np.arange(mdp.num_actions))
         if wrong.any():
@@ -99,18 +101,24 @@ def _policy(mdp: Mdp, table: Any) -> FloatArray:
     return numbers
 
 
-def _greedy(mdp: Mdp, q: ArrayLike) -> FloatArray:
-    values = _by_state(mdp, _array("q", q))
+def _greedy(task: Task, q: ArrayLike) -> FloatArray:
+    mdp, values = task.mdp, _by_state(task, _array("q", q))
     if values.ndim != 2:
         raise InputError(f"q: has shape {values.shape}, must be ({mdp.num_states}, {mdp.num_actions})")
     _check_shape("q", mdp, values)
     return one_hot_policy(values.argmax(axis=1), mdp.num_actions)
 
 
-def _by_state(mdp: Mdp, table: FloatArray) -> FloatArray:
-    """A table by what the environment shows, where two states may look alike, as one by states."""
-    is_by_number = table.ndim > 0 and len(table) == mdp.num_numbers < mdp.num_states
-    return table[mdp.number] if is_by_number else table
+def _by_state(task: Task, table: FloatArray) -> FloatArray:
+    """A table by what is shown as one by states: two may look alike, and wrappers may renumber them."""
+    mdp = task.mdp
+    if not table.ndim:
+        return table
+    if task.is_transformed and task.seen is not None:
+        seen = task.seen()
+        if isinstance(seen.space, Discrete) and len(table) == seen.space.n:
+            return np.asarray(table[seen.table() - seen.space.start])
+    return np.asarray(table[mdp.number]) if len(table) == mdp.num_numbers < mdp.num_states else table
 
 
 def _array(name: str, table: Any) -> FloatArray:

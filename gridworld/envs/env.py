@@ -88,7 +88,11 @@ class GridWorldEnv(gym.Env[int, int]):
         world = mdp_or_compiled(mdp, layout, num_rows, num_cols, slip, step_reward, goal_reward, trap_reward)
         if not isinstance(world, GridMdp):
             raise InputError(f"mdp={world.name}: has no map; a batch of it is GridWorldVectorEnv(mdp=...)")
-        self.mdp: GridMdp = world
+        if (world.thresholds != world.thresholds[0, 0]).any():
+            raise InputError(
+                f"mdp={world.name}: slips otherwise in some cells; give GridWorldVectorEnv(mdp=...)"
+            )
+        self._mdp: GridMdp = world
         self._thresholds: tuple[float, ...] = tuple(world.thresholds[0, 0].tolist())  # of all cells and moves
         self.render_mode = render_mode
         self.delay: float = delay
@@ -113,6 +117,11 @@ class GridWorldEnv(gym.Env[int, int]):
         self.trap_cells = list(world.traps)
         self.trap_states = [self.grid2state[cell] for cell in world.traps]
         self.terminal_states = [self.grid2state[cell] for cell in world.terminals]
+
+    @property
+    def mdp(self) -> GridMdp:
+        """The world, which stays what it is from when the environment is made."""
+        return self._mdp
 
     @property
     def window(self) -> Any:

@@ -8,6 +8,7 @@ classes, so that none of them need be imported for it.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -25,7 +26,9 @@ from gridworld.world.grid import GridMdp, compile_mdp
 from gridworld.world.layout import Layout, load, positive_int
 from gridworld.world.mdp import Mdp
 from gridworld.world.sources.gymnasium_table import compile_table, has_table
-from gridworld.world.sources.wrappers import NEUTRAL, Wrapped, known_class, same, step_limit
+from gridworld.world.sources.pure_functions import alike, same
+from gridworld.world.sources.verification import verified
+from gridworld.world.sources.wrappers import NEUTRAL, Wrapped, known_class, step_limit, wrappers_of
 
 # What a batch is, by the class whose methods it runs.
 _GYMNASIUM, _SB3 = "gymnasium.wrappers.vector", "stable_baselines3.common.vec_env"
@@ -53,13 +56,35 @@ _SB3_BATCHES = {
     f"{_SB3}.vec_transpose:VecTransposeImage": "transpose",
     f"{_SB3}.vec_frame_stack:VecFrameStack": "memory",
 }
+# Attributes that say where an episode is, not what is done in it.
+_OF_AN_EPISODE = {
+    *(
+        "env",
+        "_np_random",
+        "_np_random_seed",
+        "state",
+        "_state",
+        "s",
+        "lastaction",
+        "_elapsed_steps",
+        "_has_reset",
+    ),
+    *(
+        "needs_reset",
+        "rewards",
+        "t_start",
+        "total_steps",
+        "current_reset_info",
+        "results_writer",
+        "_cached_spec",
+    ),
+    *("episode_returns", "episode_lengths", "episode_times", "episode_start_time", "checked_step"),
+}
 _BY_METHOD: dict[str, Callable[[Any, Any], Any]] = {  # what SB3's wrappers make of observations (S, ...)
     "extract": lambda wrapper, rows: rows[wrapper.key],
     "normalize": lambda wrapper, rows: wrapper.normalize_obs(rows),
     "transpose": lambda wrapper, rows: wrapper.transpose_observations(rows),
 }
-
-Rows = NDArray[Any] | dict[str, NDArray[Any]]  # (S, *shape), or of each entry of a Dict
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +95,7 @@ class Task:
         mdp: the world, with what wrappers make of rewards and actions.
         max_episode_steps: the step limit of an episode.
         own_limit: the same where the environment has one.
+        is_transformed: whether wrappers transform it, so that a Discrete observation may be another number.
         seen: the observations as they are now, or None where a world alone was given.
         masks: which actions are allowed in each state, (S, A), or None where nothing is said of it.
     """
@@ -77,6 +103,7 @@ class Task:
     mdp: Mdp
     own_limit: int | None = None
     max_episode_steps: int = STEP_LIMIT
+    is_transformed: bool = False
     seen: Callable[[], ObservationTable] | None = None
     masks: Callable[[], NDArray[np.bool_] | None] = lambda: None
 
@@ -112,8 +139,10 @@ def world_of(env: Any) -> Mdp:
         InputError: as `task_of`.
     """
     task = _task(env)
-    has_limit = isinstance(task.mdp, GridMdp) or task.mdp.max_episode_steps == task.own_limit
-    return task.mdp if has_limit else replace(task.mdp, max_episode_steps=task.own_limit)
+    usual = STEP_LIMIT if isinstance(task.mdp, GridMdp) else task.mdp.max_episode_steps  # what a map's means
+    return (
+        task.mdp if task.own_limit in (None, usual) else replace(task.mdp, max_episode_steps=task.own_limit)
+    )
 
 
 def _task(env: Any) -> Task:
@@ -133,32 +162,34 @@ def _no_world(env: Any) -> InputError:
     )
 
 
-def _single(env: gym.Env[Any, Any], like: Task | None = None) -> Task:
-    """The task of a single environment; `like`: of another copy in the same batch, to be compared with."""
+def _single(env: gym.Env[Any, Any], walked: bool = True) -> Task:
+    """The task of a single environment; `walked`: whether to step one with a table beside it."""
     real, limit = env.unwrapped, step_limit(env)
+    innermost = [env, *(wrapper.env for wrapper in wrappers_of(env))][-1]
     mdp = getattr(real, "mdp", None)
+    if real is not innermost or not isinstance(real, gym.Env):
+        raise InputError(
+            f"env: {type(innermost).__name__} is in the place of {type(real).__name__} and may do anything "
+            "with its steps, so nothing exact is known of it; make it a gymnasium.Wrapper"
+        )
     if isinstance(mdp, GridMdp):
         if known_class(real, {"gridworld.envs.env:GridWorldEnv": _NATIVE}, ("step", "reset")) is None:
             raise InputError(
                 f"env: {type(real).__name__} has its own step() or reset(), so it may be another task than "
                 "its map says; leave them as they are in GridWorldEnv, or wrap it"
             )
+        verified(mdp, "env")
     elif has_table(real):
-        is_gymnasiums = type(real).__module__.startswith("gymnasium.envs.")
-        mdp = compile_table(real, limit, walked=like is None or not is_gymnasiums)
+        mdp = compile_table(real, limit, walked)
     else:
         raise _no_world(real)
     wrapped = Wrapped("env", env, mdp)
-
-    def masks() -> NDArray[np.bool_] | None:
-        found = wrapped.action_masks()
-        return None if found is None else np.stack(found)
-
     return Task(
         mdp=wrapped.mdp,
         own_limit=limit,
-        seen=lambda: _seen(env, wrapped, mdp),
-        masks=masks,
+        is_transformed=bool(wrapped.transforms),
+        seen=functools.cache(lambda: _seen(env, wrapped, mdp)),
+        masks=lambda: wrapped.action_masks,
     )
 
 
@@ -168,44 +199,78 @@ def _seen(env: gym.Env[Any, Any], wrapped: Wrapped, mdp: Mdp) -> ObservationTabl
     only = wrapped.transforms[0] if len(wrapped.transforms) == 1 and not wrapped.memory else None
     if isinstance(only, TableObservation) and type(only).observation is TableObservation.observation:
         return only.table
-    return tabulated(env.observation_space, _stacked(wrapped.observations), mdp.num_states)
+    return tabulated(
+        env.observation_space, _stacked(wrapped.observations, env.observation_space), mdp.num_states
+    )
 
 
-def _stacked(observations: list[Any]) -> Rows:
-    first = observations[0]
-    if isinstance(first, dict):
-        return {key: np.stack([np.asarray(each[key]) for each in observations]) for key in first}
-    if not isinstance(first, np.ndarray | int | np.integer | float | np.floating):
+def _stacked(observations: list[Any], space: gym.Space[Any]) -> Any:
+    """All observations in one array, of the space's type as batches have them."""
+    if isinstance(space, gym.spaces.Dict):
+        return {key: _stacked([each[key] for each in observations], inner) for key, inner in space.items()}
+    try:
+        given = np.stack([np.asarray(each) for each in observations])
+        rows = given.astype(space.dtype)
+    except (TypeError, ValueError):
+        raise InputError(f"env: its observations are no arrays of {space}, as its space says") from None
+    if not np.allclose(rows.astype(np.float64), given.astype(np.float64), rtol=1e-3, atol=1e-6):
         raise InputError(
-            f"env: its observations are of type {type(first).__name__}; must be arrays or numbers"
+            f"env: its observations are {given.dtype}, and others as {space.dtype}, which its space says and "
+            "a batch makes of them; give the space the right dtype"
         )
-    return np.asarray(observations)
+    return rows
 
 
 def _copies(batch: Any) -> Task:
     """The task of a batch's environments, which must be the same in all of them."""
     first, *others = batch.envs
+    if len({id(each.unwrapped) for each in batch.envs}) < len(batch.envs):
+        raise InputError(
+            f"env: the {type(batch).__name__} has the same environment twice, so that each step of one is a "
+            "step of the other; make one for each"
+        )
     task = _single(first)
-    tasks = [_single(each, task) for each in others]
-    for index, other in enumerate(tasks, start=1):
-        if other.mdp.text() != task.mdp.text() or other.own_limit != task.own_limit:
-            raise InputError(
-                f"env: environment {index} of the {type(batch).__name__} is another task than environment 0; "
-                "give one of them, or a batch of one task"
-            )
+    tasks = {}
+    for index, other in enumerate(others, start=1):
+        if not _is_copy(first, other):
+            tasks[index] = _single(other)
+            if Mdp.text(tasks[index].mdp) != Mdp.text(task.mdp) or tasks[index].own_limit != task.own_limit:
+                raise InputError(
+                    f"env: environment {index} of the {type(batch).__name__} is another task than "
+                    "environment 0; give one of them, or a batch of one task"
+                )
 
     def seen() -> ObservationTable:
         assert task.seen is not None
         table = task.seen()
-        for index, other in enumerate(tasks, start=1):
+        for index, other in tasks.items():
             if other.seen is None or not _same_table(table, other.seen()):
-                raise InputError(
-                    f"env: environment {index} of the {type(batch).__name__} shows states otherwise than "
-                    "environment 0; give one of them, or a batch that shows all alike"
-                )
+                raise _otherwise(batch, index, "shows states")
         return table
 
-    return replace(task, seen=seen)
+    def masks() -> NDArray[np.bool_] | None:
+        for index, other in tasks.items():
+            if not np.array_equal(task.masks(), other.masks()):  # type: ignore[arg-type]
+                raise _otherwise(batch, index, "masks actions")
+        return task.masks()
+
+    return replace(task, seen=functools.cache(seen), masks=masks)
+
+
+def _otherwise(batch: Any, index: int, what: str) -> InputError:
+    return InputError(
+        f"env: environment {index} of the {type(batch).__name__} {what} otherwise than environment 0; give "
+        "one of them, or a batch of one kind"
+    )
+
+
+def _is_copy(one: gym.Env[Any, Any], other: gym.Env[Any, Any]) -> bool:
+    """Whether two environments are made alike, wrapper by wrapper, but for where they are."""
+    chains = [[*wrappers_of(each), each.unwrapped] for each in (one, other)]
+    if [type(each) for each in chains[0]] != [type(each) for each in chains[1]]:
+        return False
+    pairs = list(zip(*chains, strict=True))
+    return all(alike(mine, its, _OF_AN_EPISODE) for mine, its in pairs)
 
 
 def _same_table(one: ObservationTable, other: ObservationTable) -> bool:
@@ -238,14 +303,17 @@ def _gymnasium_batch(env: Any) -> Task:
     if kind == _COPIES:
         return _copies(env)
     if kind == _NATIVE:
-        observation = make_observation(env.mdp, "none")
-        return Task(env.mdp, env.max_episode_steps, seen=lambda: observation)
+        verified(env.mdp, "env")
+        limit = env.step_limit if env.step_limit <= MOST_STEPS else None  # what it plays by
+        return Task(env.mdp, limit, seen=lambda: make_observation(env.mdp, "none"))
     below = _gymnasium_batch(env.env)
     return replace(below, seen=lambda: env.table) if kind == _TABLE else below
 
 
 def _sb3_batch(env: Any) -> Task:
-    kind = _batch_kind(env, _SB3_BATCHES, "step", "step_async", "step_wait", "reset")
+    kind = _batch_kind(
+        env, _SB3_BATCHES, "step", "step_async", "step_wait", "reset", "_save_obs", "_obs_from_buf"
+    )
     if kind == _COPIES:
         return _copies(env)
     if kind == _NATIVE:

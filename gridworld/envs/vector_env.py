@@ -126,7 +126,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
             None if max_episode_steps is None else positive_int("max_episode_steps", max_episode_steps)
         )
         self.step_limit: int = self.max_episode_steps or np.iinfo(np.int64).max
-        self.mdp = mdp_or_compiled(
+        self._mdp = mdp_or_compiled(
             mdp, layout, num_rows, num_cols, slip, step_reward, goal_reward, trap_reward
         )
         self.render_mode = render_mode
@@ -157,6 +157,11 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
     def states(self) -> StateArray:
         """(num_envs,) current states, a copy."""
         return self._state.copy()
+
+    @property
+    def mdp(self) -> Mdp:
+        """The world, which stays what it is from when the batch is made."""
+        return self._mdp
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -28,6 +28,9 @@ from gridworld.world.sources.making import make_env, told
 from gridworld.world.sources.table_walk import walk
 from gridworld.world.sources.wrappers import copied, refuse_transformed, step_limit
 
+# What was found of Gymnasium's own classes by their tables, which are walked once in a process.
+_WALKED: dict[tuple[type, str] | None, str] = {}
+
 
 def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> Mdp:
     """Make an environment of Gymnasium and compile its transition table.
@@ -77,7 +80,13 @@ def compile_table(real: gym.Env[Any, Any], limit: int | None = None, walked: boo
     mdp, table = _compiled(real, real.spec.id if real.spec is not None else type(real).__name__, limit)
     if own := {"step", "reset"} & vars(real).keys():
         raise InputError(f"{mdp.name}: its {own.pop()}() was replaced, so nothing exact is known of it")
-    return replace(mdp, truth=_check_steps(mdp, table, copied(real))) if walked else mdp
+    if not walked:
+        return mdp
+    key = (type(real), mdp.text()) if type(real).__module__.startswith("gymnasium.envs.") else None
+    truth = _WALKED.get(key) or _check_steps(mdp, table, copied(real))
+    if key is not None:
+        _WALKED[key] = truth
+    return replace(mdp, truth=truth)
 
 
 def has_table(env: Any) -> bool:

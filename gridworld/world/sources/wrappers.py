@@ -10,16 +10,13 @@ and recognised by whose `step` and `reset` it runs:
     action       `action(a)`, compiled into the transitions
     memory       shows more than the state's number; the task is the same, but a policy behind it has no table
 
-Anything else is refused. The three methods must be functions of their argument and of nothing else. They
-are asked again and again on a copy, which must not change by it, and the copy is stepped beside the tables.
+Anything else is refused. The three methods must be functions of their argument and of nothing else: they are
+asked on a copy, see `pure_functions`, and the copy is stepped beside the tables.
 """
 
 from __future__ import annotations
 
 import copy
-import inspect
-import pickle
-import random
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
@@ -29,21 +26,20 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import seeding
+from numpy.typing import NDArray
 
 from gridworld.errors import InputError, in_short
+from gridworld.world.exact.bellman import backup
 from gridworld.world.mdp import Mdp, checked_reward, frozen
 from gridworld.world.outcomes import thresholds_of
+from gridworld.world.sources.pure_functions import SO_UNKNOWN, asked, remembered, same
 
 NEUTRAL, LIMIT, MEMORY = "neutral", "time limit", "memory"
-_CALLS = 1000  # at least so many of a method, before it counts as a function
-_STEPS = 2000  # of the copy beside the tables, in episodes
+_STEPS, _MOST_STEPS = 2000, 40_000  # of the copy beside the tables, in episodes
+_SWEEPS = 100  # of value iteration, for episodes that go far
+_GAMMA = 0.99
 _ROWS = 20_000  # pairs of state and action that are tried one by one, if states can be set
 _SEED = 20_261_123
-
-_SO_UNKNOWN = (
-    ", so what it makes of the task is not exactly known; "
-    "leave it out, or make it a function of its argument alone"
-)
 
 _WRAPPERS = "gymnasium.wrappers"
 _ROLES = {
@@ -68,6 +64,12 @@ _ROLES = {
     f"{_WRAPPERS}.stateful_observation:NormalizeObservation": MEMORY,
     f"{_WRAPPERS}.stateful_observation:TimeAwareObservation": MEMORY,
 }
+_COPIED = {
+    "Monitor",
+    "OrderEnforcing",
+    "RecordEpisodeStatistics",
+    "TimeLimit",
+}  # what a transform may look at
 # Environments whose state can be set, by the class whose steps they run.
 _STATE_ATTRIBUTES = {
     "gridworld.envs.env:GridWorldEnv": "state",
@@ -213,45 +215,51 @@ class Wrapped:
         self._check_steps(rows)
         return rows
 
-    def action_masks(self) -> list[Any] | None:
-        """What `action_masks()` of the environment allows in each state, (A,) each; None: there is none.
+    @cached_property
+    def action_masks(self) -> NDArray[np.bool_] | None:
+        """What `action_masks()` of the environment allows, (S, A); None: there is none.
 
         Raises:
             InputError: it is no function of the state, or states cannot be set.
         """
         if not self._env.has_wrapper_attr("action_masks"):
             return None
-        env = self._copied
+        env, chain = self._copied, [self._copied.unwrapped, *wrappers_of(self._copied)]
         masks = env.get_wrapper_attr("action_masks")
-        for each in (env.unwrapped, *wrappers_of(env)):
+        for each in chain:
             if hasattr(type(each), "action_masks"):
-                self._remembered(each, "action_masks")  # refuses what looks into another environment
-        attribute = known_class(env.unwrapped, _STATE_ATTRIBUTES, ("step", "reset"))
-        if attribute is None:
+                remembered(self._where, "action_masks()", each, chain)  # refuses another environment
+        if self._attribute is None:
             raise InputError(
                 f"{self._where}: action_masks() cannot be asked for each state, since the state of "
                 f"{type(env.unwrapped).__name__} cannot be set; use a model without masks"
             )
-        env.reset(seed=_SEED)
-        states = np.flatnonzero(self._bare.acting)
-        found: list[Any] = [None] * self._bare.num_states
-        for again in (False, True):
-            for state in states.tolist():
-                setattr(env.unwrapped, attribute, int(self._bare.number[state]))
-                allowed = np.array(masks(), dtype=np.bool_)
-                if again and not np.array_equal(found[state], allowed):
-                    raise self._no_function("action_masks()", f"state {state}")
-                found[state] = allowed
-        everything = np.ones(self.mdp.num_actions, dtype=np.bool_)
-        return [everything if each is None else each for each in found]
+        found = np.ones((self._bare.num_states, self.mdp.num_actions), dtype=np.bool_)
+        for state in np.flatnonzero(self._bare.acting).tolist():
+            setattr(env.unwrapped, self._attribute, int(self._bare.number[state]))
+            try:
+                found[state] = masks()
+            except Exception as error:
+                raise InputError(f"{self._where}: action_masks() failed ({in_short(error)})") from error
+
+        def check(state: int) -> None:
+            if self._bare.acting[state] and not np.array_equal(found[state], masks()):
+                raise InputError(
+                    f"{self._where}: action_masks() does not always allow the same in state {state}"
+                    f"{SO_UNKNOWN}"
+                )
+
+        self._check_steps(None, check)
+        return found
 
     @cached_property
     def _copied(self) -> gym.Env[Any, Any]:
-        """A copy of the environment to ask and to step: with its transforms, without what records."""
+        """A copy of the environment to ask and to step, without what draws and what only shows more."""
         real = copied(self._env.unwrapped)
         seen: dict[int, Any] = {id(self._env.unwrapped): real}
         for wrapper in list(wrappers_of(self._env))[::-1]:
-            if wrapper in self.transforms or type(wrapper).step is gym.Wrapper.step:
+            if wrapper in self.transforms or type(wrapper).__name__ in _COPIED or _only_adds(wrapper):
+                seen[id(getattr(wrapper, "results_writer", None))] = None  # an open file, of a Monitor
                 try:
                     real = copy.deepcopy(wrapper, seen)
                 except Exception as error:
@@ -260,7 +268,21 @@ class Wrapped:
                         f"({in_short(error)}), so what it changes cannot be found out; leave it out"
                     ) from None
             seen[id(wrapper)] = real
+        self._reset(real)
         return real
+
+    @property
+    def _attribute(self) -> str | None:
+        """By which the state of the environment can be set."""
+        return known_class(self._env.unwrapped, _STATE_ATTRIBUTES, ("step", "reset"))
+
+    def _reset(self, env: gym.Env[Any, Any], **given: Any) -> Any:
+        try:
+            return env.reset(**given)[0]
+        except InputError:
+            raise
+        except Exception as error:
+            raise InputError(f"{self._where}: cannot be reset ({in_short(error)})") from error
 
     @property
     def _copied_transforms(self) -> list[Any]:
@@ -289,7 +311,7 @@ class Wrapped:
             raise InputError(f"{self._where}: the actions of {name} are {space}; must be Discrete(n) from 0")
         chosen = [_plain(each) for each in self._asked(wrapper, "action", list(range(int(space.n))))]
         for action, inner in enumerate(chosen):
-            if inner not in range(mdp.num_actions):
+            if not isinstance(inner, int) or inner not in range(mdp.num_actions):
                 raise InputError(
                     f"{self._where}: {name} makes {str(inner)[:50]} of action {action}; must be "
                     f"{mdp.action_choices()}"
@@ -297,87 +319,92 @@ class Wrapped:
         return _changed(
             mdp,
             action_names=tuple(mdp.action_names[inner] for inner in chosen),
-            **{key: getattr(mdp, key)[:, chosen] for key in ("next_state", "probability", "reward")},
+            **{
+                key: getattr(mdp, key)[:, np.array(chosen, dtype=int)]
+                for key in ("next_state", "probability", "reward")
+            },
         )
 
     def _asked(self, wrapper: Any, method: str, arguments: list[Any]) -> list[Any]:
-        """What a wrapper's method makes of each argument, if it is a function of it alone."""
-        name = f"{method}() of {type(wrapper).__name__}"
-        ask: Callable[[Any], Any] = getattr(wrapper, method)
-        before = self._remembered(wrapper, method)
-        try:
-            found = [copy.deepcopy(ask(copy.deepcopy(each))) for each in arguments]
-            for _ in range(1 + _CALLS // max(1, len(arguments))):
-                for argument, first in zip(arguments[::-1], found[::-1], strict=True):
-                    if not same(ask(copy.deepcopy(argument)), first):
-                        raise self._no_function(name, str(argument)[:50])
-        except InputError:
-            raise
-        except Exception as error:
-            raise InputError(f"{self._where}: {name} raised {in_short(error)}") from error
-        if self._remembered(wrapper, method) != before:
-            raise InputError(f"{self._where}: {name} keeps a memory or draws random numbers{_SO_UNKNOWN}")
-        return found
+        chain = [self._copied.unwrapped, *wrappers_of(self._copied)]
+        return asked(self._where, wrapper, method, arguments, chain)
 
-    def _no_function(self, what: str, argument: str) -> InputError:
-        return InputError(f"{self._where}: {what} does not always give the same for {argument}{_SO_UNKNOWN}")
-
-    def _remembered(self, wrapper: Any, method: str) -> list[Any]:
-        """Whatever a wrapper's method could change or draw from: attributes, closures, generators."""
-        held = {key: value for key, value in vars(wrapper).items() if key != "env"}
-        for function in (getattr(type(wrapper), method), *held.values()):
-            if inspect.isfunction(function) and not function.__module__.startswith("gymnasium."):
-                around = inspect.getclosurevars(function)
-                held = {**around.nonlocals, **around.globals, **held}
-        if any(isinstance(value, gym.Env) for value in held.values()):
-            raise InputError(
-                f"{self._where}: {method}() of {type(wrapper).__name__} looks into an environment"
-                f"{_SO_UNKNOWN}"
-            )
-        generator = wrapper.unwrapped.np_random.bit_generator.state
-        numpy_state = np.random.get_state(legacy=True)
-        return [_as_bytes(each) for each in (*held.values(), generator, numpy_state, random.getstate())]
-
-    def _check_steps(self, rows: list[Any] | None) -> None:
+    def _check_steps(self, rows: list[Any] | None, also: Callable[[int], None] = lambda state: None) -> None:
         """Step the copy beside the tables: from every state that can be set, then in whole episodes.
 
         Args:
             rows: what is seen of each state; None: it does not count.
+            also: what else to compare in a state.
 
         Raises:
             InputError: a step is not what the tables say.
         """
         env, probe = self._copied, _Probe.below(self._copied)
         rng = np.random.default_rng(_SEED)
-        observation, _ = env.reset(seed=_SEED)
-        self._check_seen(rows, probe.number, observation)
-        attribute = known_class(env.unwrapped, _STATE_ATTRIBUTES, ("step", "reset"))
-        if attribute is not None:
-            pairs = np.flatnonzero(np.repeat(self._bare.acting, self.mdp.num_actions))
-            if len(pairs) > _ROWS:
-                pairs = rng.choice(pairs, _ROWS, replace=False)
-            for state, action in zip(*np.divmod(pairs, self.mdp.num_actions), strict=True):
-                setattr(env.unwrapped, attribute, int(self._bare.number[state]))
-                self._check_step(rows, probe, int(state), int(action), env.step(int(action)))
-        env.reset()
-        for _ in range(_STEPS):
-            state, action = probe.number, int(rng.integers(self.mdp.num_actions))
-            step = env.step(action)
-            self._check_step(rows, probe, state, action, step)
-            if step[2] or step[3]:
-                observation, _ = env.reset()
-                self._check_seen(rows, probe.number, observation)
+
+        def reset(**given: Any) -> None:
+            observation = self._reset(env, **given)
+            self._check_seen(rows, probe.number, observation)
+            also(probe.number)
+
+        def step(state: int, action: int) -> None:
+            try:
+                found = env.step(action)
+            except InputError:
+                raise
+            except Exception as error:
+                raise InputError(f"{self._where}: cannot be stepped ({in_short(error)})") from error
+            self._check_step(rows, probe, state, action, found)
+            if found[2] or found[3]:
+                reset()
+            else:
+                also(probe.number)
+
+        reset(seed=_SEED)
+        actions, acting = self.mdp.num_actions, self._bare.acting
+        tried = np.zeros(self.mdp.num_states, dtype=np.int64)
+        if self._attribute is not None:
+            pairs = np.flatnonzero(np.repeat(acting, actions))
+            pairs = pairs if len(pairs) <= _ROWS else rng.choice(pairs, _ROWS, replace=False)
+            for pair in pairs.tolist():
+                setattr(env.unwrapped, self._attribute, int(self._bare.number[pair // actions]))
+                step(*divmod(pair, actions))
+                tried[pair // actions] += 1
+        reset()
+        good = self._good_policy()
+        for number in range(_MOST_STEPS):
+            if number >= _STEPS and tried[self.mdp.acting].all():
+                break
+            state = probe.number
+            is_random = rng.random() < (number // 500) % 3 / 2
+            step(state, int(rng.integers(actions)) if is_random else good[state])
+            tried[state] += 1
+        unmet = np.flatnonzero(self.mdp.acting & (tried == 0))
+        if unmet.size and self._attribute is None:
+            raise InputError(
+                f"{self._where}: state {unmet[0]} was not met in {_MOST_STEPS:,} steps, so what the wrappers "
+                "make of it could not be compared; leave them out"
+            )
+
+    def _good_policy(self) -> list[int]:
+        """An optimal action of each state, up to what so many sweeps leave open."""
+        v = np.zeros(self.mdp.num_states)
+        for _ in range(_SWEEPS):
+            q = backup(self.mdp, v, _GAMMA)
+            v = q.max(axis=1)
+        return [int(action) for action in q.argmax(axis=1)]
 
     def _check_step(self, rows: Any, probe: _Probe, state: int, action: int, step: Any) -> None:
         observation, reward, terminated, _, _ = step
+        reward = float(_plain(reward))
         mdp, pair = self.mdp, (state, action)
         following = mdp.next_state[pair]
         same_end = (mdp.number[following] == probe.number) & (mdp.terminal[following] == bool(terminated))
-        possible = same_end & (mdp.reward[pair] == float(reward)) & (mdp.probability[pair] > 0)
+        possible = same_end & (mdp.reward[pair] == reward) & (mdp.probability[pair] > 0)
         if not possible.any():
             raise InputError(
                 f"{self._where}: through its wrappers, action {action} in state {state} led to state "
-                f"{probe.number} with reward {float(reward):g}{' and ended' if terminated else ''}, which is "
+                f"{probe.number} with reward {reward:g}{' and ended' if terminated else ''}, which is "
                 "not what reward() and action() gave when they were asked; make them functions of their "
                 "argument alone"
             )
@@ -387,8 +414,13 @@ class Wrapped:
         if rows is not None and not same(rows[number], observation):
             raise InputError(
                 f"{self._where}: what is seen of state {number} through its wrappers is not always the same"
-                f"{_SO_UNKNOWN}"
+                f"{SO_UNKNOWN}"
             )
+
+
+def _only_adds(wrapper: gym.Wrapper[Any, Any, Any, Any]) -> bool:
+    """Whether a wrapper adds attributes and methods, and leaves the steps alone."""
+    return type(wrapper).step is gym.Wrapper.step and type(wrapper).reset is gym.Wrapper.reset
 
 
 class _Probe(gym.Wrapper[Any, Any, Any, Any]):
@@ -400,6 +432,8 @@ class _Probe(gym.Wrapper[Any, Any, Any, Any]):
     def below(cls, env: gym.Env[Any, Any]) -> _Probe:
         """Put a probe under the innermost wrapper of an environment, unless there is one."""
         wrappers = list(wrappers_of(env))
+        if not wrappers:
+            return cls(env)
         if isinstance(wrappers[-1], cls):
             return wrappers[-1]
         probe = cls(env.unwrapped)
@@ -433,23 +467,9 @@ def is_discrete(space: gym.Space[Any], number: int) -> bool:
     return isinstance(space, spaces.Discrete) and space.n == number and space.start == 0
 
 
-def same(one: Any, other: Any) -> bool:
-    """Whether two observations, actions or rewards are equal, dictionaries of arrays included."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
-    return np.array_equal(np.asarray(one), np.asarray(other))
-
-
 def _plain(value: Any) -> Any:
     """A number of numpy's as one of Python's."""
     return value.item() if isinstance(value, np.generic | np.ndarray) and value.size == 1 else value
-
-
-def _as_bytes(value: Any) -> bytes:
-    try:
-        return pickle.dumps(value)
-    except Exception:  # what cannot be written is compared by what it gives
-        return b""
 
 
 def _changed(mdp: Mdp, **tables: Any) -> Mdp:

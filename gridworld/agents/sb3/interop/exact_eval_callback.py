@@ -103,9 +103,8 @@ class ExactEvalCallback(BaseCallback):
         return task
 
     def _on_training_start(self) -> None:
-        if self._task is None:
-            self._task = self._evaluate_on(self.training_env)
-        self._policy = ForeignPolicy(self.model, self._task)  # refuses what has no table
+        task = self._task or self._evaluate_on(self.training_env)
+        self._policy = ForeignPolicy(self.model, task)  # refuses what has no table
         self._evaluate()
 
     def _on_step(self) -> bool:

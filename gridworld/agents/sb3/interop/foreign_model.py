@@ -20,15 +20,17 @@ from gridworld.agents.sb3.policy_outputs import (
     why_no_table,
     why_unreadable,
 )
-from gridworld.envs.inspection import Task, observation_like
+from gridworld.envs.inspection import Task, observation_like, tabulated
 from gridworld.envs.observations import KINDS, ObservationTable
 from gridworld.errors import InputError, in_short
 from gridworld.world.exact.markov_chain import one_hot_policy
 from gridworld.world.mdp import FloatArray, IntArray
+from gridworld.world.sources.pure_functions import random_states
 from gridworld.world.sources.wrappers import is_discrete
 
 _LIBRARIES = ("stable_baselines3.", "sb3_contrib.", "gridworld.")
 _ONE_BY_ONE = 512  # states in which `predict` is asked alone, too
+_OFTEN = 100  # times, where `predict` is of its own
 _PREDICTS = ("predict", "_predict")  # what decides an action, of a model or a policy
 
 
@@ -61,7 +63,8 @@ class ForeignPolicy:
         reason = why_unreadable(self._policy)
         if reason is not None:
             raise InputError(f"the model {reason}")
-        takes_masks = "action_masks" in inspect.signature(model.predict).parameters
+        predicts = (model.predict, self._policy.predict)
+        takes_masks = any("action_masks" in inspect.signature(each).parameters for each in predicts)
         self._masks = task.masks() if takes_masks else None
         self._check_is_a_table(self._observation())
 
@@ -89,6 +92,8 @@ class ForeignPolicy:
     def _observation(self) -> ObservationTable:
         """What it sees of each state: what the task shows, or the world's own observation with its space."""
         seen, wanted = None if self._task.seen is None else self._task.seen(), self._policy.observation_space
+        if seen is not None and seen.space != wanted and _is_transposed(seen.space, wanted):
+            return tabulated(wanted, seen.table().transpose(0, 3, 1, 2), seen.num_states)
         if seen is not None and seen.space == wanted:
             if isinstance(seen.stored, dict):
                 raise InputError(
@@ -119,9 +124,14 @@ class ForeignPolicy:
         masks = {} if self._masks is None else {"action_masks": self._masks[states]}
         try:
             found = self._model.predict(observation.rows(states), deterministic=True, **masks)
-            actions = np.asarray(found[0])
+            actions, state = np.asarray(found[0]), found[1]
         except Exception as error:  # it may be anybody's own
             raise InputError(f"the model: its predict() raised {in_short(error)}") from error
+        if state is not None:
+            raise InputError(
+                "the model: its predict() gives a state to give back, so what it does is not a function of "
+                "the observation, and no table of it can be evaluated exactly"
+            )
         fits = actions.shape == np.shape(states) and actions.dtype.kind in "iu"
         if not fits or not np.isin(actions, np.arange(self._task.mdp.num_actions)).all():
             raise InputError(
@@ -131,14 +141,18 @@ class ForeignPolicy:
         return actions
 
     def _check_is_a_table(self, observation: ObservationTable) -> None:
-        was_training = self._policy.training
-        reason = why_no_table(self._policy, observation)
-        together = self._predicted(observation)
+        was_training, before = self._policy.training, random_states()
         reached = np.flatnonzero(self._task.mdp.acting)[:_ONE_BY_ONE]
-        rounds = [self._predicted(observation)[reached]]
-        rounds += [np.array([self._predict(observation, state) for state in reached])]
+        together = self._predicted(observation)[reached]
+        rounds = [np.array([self._predict(observation, state) for state in reached])]
+        rounds += [
+            self._predicted(observation)[reached] for _ in range(1 if self._is_of_a_library() else _OFTEN)
+        ]
+        reason = why_no_table(self._policy, observation)
         self._policy.set_training_mode(was_training)
-        if any((each != together[reached]).any() for each in rounds) and reason is None:
+        if reason is None and random_states() != before:
+            reason = "draws random numbers for its best action, so no table of it can be evaluated exactly"
+        if reason is None and any((each != together).any() for each in rounds):
             reason = (
                 "does not always take the same action in the same state, asked alone and with others, so no "
                 "table of it can be evaluated exactly"
@@ -148,6 +162,9 @@ class ForeignPolicy:
 
     def _is_of_a_library(self) -> bool:
         """Whether it acts by SB3's own `predict`, so that its network says what it explores with."""
+        modules = [type(each).__module__ for each in self._policy.modules()]
+        if not all(module.startswith((*_LIBRARIES, "torch.")) for module in modules):
+            return False
         for thing in (self._model, self._policy):
             for name in _PREDICTS:
                 method = getattr(type(thing), name, None)
@@ -160,6 +177,13 @@ class ForeignPolicy:
 def tables_of(model: Any, task: Task) -> Tables:
     """Read a model's policies once; see `ForeignPolicy`."""
     return ForeignPolicy(model, task).tables()
+
+
+def _is_transposed(shown: Any, wanted: Any) -> bool:
+    """Whether images are shown with their channels last, which `predict` takes too."""
+    shape: tuple[int, ...] = shown.shape or ()
+    is_image = len(shape) == 3 and shown.dtype == wanted.dtype == np.uint8
+    return is_image and (shape[2], *shape[:2]) == wanted.shape
 
 
 def _policy_of(model: Any) -> BasePolicy:
