@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces, wrappers
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from sb3_contrib import MaskablePPO
@@ -609,3 +610,216 @@ def test_a_table_may_be_by_what_the_environment_shows() -> None:
             == score
             == gridworld.evaluate(q=np.eye(2)[table], env=env)
         )
+
+
+def held(table: Any, env: Any = None) -> Any:
+    """A model of the lake, shown one-hot, that acts by a table (16,)."""
+    env = wrappers.FlattenObservation(lake()) if env is None else env
+    model = PPO("MlpPolicy", env, policy_kwargs={"net_arch": []}, device="cpu")
+    with torch.no_grad():
+        model.policy.action_net.weight[:] = 20 * torch.as_tensor(np.eye(4)[table].T)
+        model.policy.action_net.bias[:] = 0
+    return model
+
+
+BEST = np.array([1, 2, 1, 0, 1, 0, 1, 0, 2, 1, 1, 0, 0, 2, 2, 0])  # on the dry lake
+
+
+def test_copies_of_a_map_may_differ_in_slip_or_pay() -> None:
+    for other in ({"slip": 0.5}, {"step_reward": -0.2}, {"goal_reward": 2.0}):
+        for batch in (DummyVecEnv, SyncVectorEnv):
+            with pytest.raises(InputError, match="is another task"):
+                gridworld.evaluate(BEST, batch([grid, lambda other=other: grid(**other)]))
+
+
+def test_one_environment_in_two_places_of_a_batch_is_refused() -> None:
+    env = lake()
+    with pytest.raises(InputError, match="the same environment twice"):
+        gridworld.evaluate(BEST, SyncVectorEnv([lambda: env] * 2))
+
+
+def test_observations_are_what_a_batch_makes_of_them() -> None:
+    def halves(dtype: Any) -> Any:
+        space = spaces.Box(0, 1, (16,), dtype)
+        return wrappers.TransformObservation(lake(), lambda s: np.eye(16)[s] * 0.5, space)
+
+    assert gridworld.evaluate(held(BEST, halves(np.float32))).certified
+    model = PPO("MlpPolicy", halves(np.uint8), device="cpu")
+    with pytest.raises(InputError, match="give the space the right dtype"):
+        gridworld.evaluate(model)
+
+
+def test_a_table_is_by_what_the_environment_shows() -> None:
+    assert gridworld.evaluate(BEST[::-1], Shown(lake())).certified
+    assert not gridworld.evaluate(BEST, Shown(lake())).certified
+    assert gridworld.evaluate(BEST, wrappers.FlattenObservation(lake())).certified
+
+
+class Sampling(PPO):
+    def predict(self, observation: Any, state: Any = None, episode_start: Any = None, **named: Any) -> Any:
+        return super().predict(observation, state, episode_start, deterministic=False)
+
+
+class Clock(PPO):
+    def predict(self, observation: Any, state: Any = None, *args: Any, **named: Any) -> Any:
+        actions, _ = super().predict(observation, None, *args, **named)
+        return actions, 0 if state is None else state + 1
+
+
+def test_a_predict_that_draws_or_keeps_time_is_refused() -> None:
+    for kind, told in ((Sampling, "draws random numbers"), (Clock, "gives a state to give back")):
+        model = held(BEST)
+        model.__class__ = kind
+        with pytest.raises(InputError, match=told):
+            gridworld.evaluate(model, wrappers.FlattenObservation(lake()))
+
+
+class ByLastAction(gym.Wrapper):
+    def action_masks(self) -> Any:
+        return np.arange(4) != {1: 2, 2: 1, 0: 3, 3: 0}.get(self.unwrapped.lastaction)
+
+
+class Forbidding(gym.Wrapper):
+    forbidden = 0
+
+    def action_masks(self) -> Any:
+        return np.arange(4) != self.forbidden
+
+
+class Forwarding(MaskablePPO):
+    def predict(self, *args: Any, **named: Any) -> Any:
+        return super().predict(*args, **named)
+
+
+def test_masks_that_are_no_function_of_the_state_or_differ_are_refused() -> None:
+    def other() -> Any:
+        env = Forbidding(lake())
+        env.forbidden = 1
+        return env
+
+    for make in ([lambda: ByLastAction(lake())], [lambda: Forbidding(lake()), other]):
+        with pytest.raises(InputError, match=r"action_masks\(\) does not always|masks actions otherwise"):
+            gridworld.evaluate(MaskablePPO("MlpPolicy", DummyVecEnv(make), n_steps=8, device="cpu"))
+    one, two = (
+        kind("MlpPolicy", other(), n_steps=8, seed=3, device="cpu") for kind in (MaskablePPO, Forwarding)
+    )
+    assert gridworld.evaluate(one) == gridworld.evaluate(two)
+
+
+def test_a_world_stays_what_it_was_made_as() -> None:
+    env, batch = grid(), gym.make_vec("GridWorld-v0", 2, max_episode_steps=9)
+    for each in (env.unwrapped, batch):
+        with pytest.raises(AttributeError):
+            each.mdp = gridworld.compile_mdp(gridworld.load("classic"), slip=0.4)
+    batch.max_episode_steps = 3  # has no effect on its steps
+    assert gridworld.evaluate(np.zeros(30, dtype=int), batch).outcome.expected_length == 9
+
+
+class Hurried(gym.RewardWrapper):
+    def reward(self, reward: Any) -> float:
+        return float(reward) - 0.1 * (self.get_wrapper_attr("_elapsed_steps") > 3)
+
+
+class Late(gym.ActionWrapper):
+    def action(self, action: Any) -> Any:
+        return action if len(self.env.rewards) < 3 else 0
+
+
+class ByDefault(gym.RewardWrapper):
+    def reward(self, reward: Any, count: Any = [0]) -> float:  # noqa: B006
+        count[0] += 1
+        return float(reward) - (count[0] > 10**6)
+
+
+class ByClass(gym.RewardWrapper):
+    calls = 0
+
+    def reward(self, reward: Any) -> float:
+        type(self).calls += 1
+        return float(reward) - (self.calls > 10**6)
+
+
+def rarely() -> bool:
+    return bool(DRAWS.random() < 1e-5)
+
+
+class ByHelper(gym.ActionWrapper):
+    def action(self, action: Any) -> Any:
+        return 0 if rarely() else action
+
+
+class Delegating(gym.Env):
+    """Not a wrapper, and turns actions."""
+
+    def __init__(self) -> None:
+        self.env = lake()
+        self.observation_space, self.action_space = self.env.observation_space, self.env.action_space
+
+    @property
+    def unwrapped(self) -> Any:
+        return self.env.unwrapped
+
+    def reset(self, **given: Any) -> Any:
+        return self.env.reset(**given)
+
+    def step(self, action: Any) -> Any:
+        return self.env.step(3 - action)
+
+
+class Saving(DummyVecEnv):
+    def _save_obs(self, index: int, observation: Any) -> None:
+        super()._save_obs(index, 15 - observation)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        *(lambda: Hurried(lake()), lambda: Late(Monitor(lake())), lambda: ByDefault(lake()), Delegating),
+        *(lambda: ByClass(lake()), lambda: ByHelper(lake()), lambda: Saving([lake])),
+    ],
+)
+def test_what_looks_at_time_or_remembers_elsewhere_is_refused(make: Any) -> None:
+    with pytest.raises(InputError):
+        gridworld.evaluate(BEST, make())
+
+
+class Buffered(gym.ObservationWrapper):
+    """Writes to one array, as many do."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.observation_space = spaces.Box(0, 1, (16,), np.float32)
+        self.buffer, self.seen = np.zeros(16, np.float32), {}
+
+    def observation(self, observation: Any) -> Any:
+        self.buffer[:] = 0
+        self.buffer[observation] = 1
+        self.seen[observation] = True
+        return self.buffer
+
+
+def test_a_buffer_or_a_cache_is_no_memory() -> None:
+    assert gridworld.evaluate(held(BEST, Buffered(lake()))).certified
+
+
+@pytest.mark.parametrize(
+    "wrapper",
+    [
+        lambda env: wrappers.TransformAction(env, float, env.action_space),
+        lambda env: wrappers.TransformReward(env, lambda r: np.array([r, r])),
+        lambda env: wrappers.TransformReward(env, lambda r: None),
+        lambda env: wrappers.TransformObservation(env, lambda s: "state", env.observation_space),
+    ],
+)
+def test_what_a_function_may_not_give_is_a_sentence(wrapper: Any) -> None:
+    with pytest.raises(InputError, match=r"^env: "):
+        gridworld.evaluate(BEST, wrapper(lake()))
+
+
+def test_a_callback_follows_the_environment_that_a_model_is_given() -> None:
+    callback = gridworld.ExactEvalCallback(every=64)
+    model = PPO("MlpPolicy", gridworld.OneHotObservation(grid()), n_steps=64, device="cpu")
+    model.learn(64, callback=callback)
+    model.set_env(gridworld.OneHotObservation(grid(slip=0.3, step_reward=-0.1)))
+    model.learn(64, callback=callback)
+    assert callback.evaluations["value"][-1] == gridworld.evaluate(model).value
