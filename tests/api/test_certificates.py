@@ -823,3 +823,12 @@ def test_a_callback_follows_the_environment_that_a_model_is_given() -> None:
     model.set_env(gridworld.OneHotObservation(grid(slip=0.3, step_reward=-0.1)))
     model.learn(64, callback=callback)
     assert callback.evaluations["value"][-1] == gridworld.evaluate(model).value
+
+
+def test_a_callback_keeps_the_statistics_of_its_own_environment_like_those_of_training() -> None:
+    def normalised() -> Any:
+        return VecNormalize(DummyVecEnv([lambda: wrappers.FlattenObservation(lake())]))
+
+    callback = gridworld.ExactEvalCallback(normalised(), every=64)
+    model = PPO("MlpPolicy", normalised(), n_steps=64, seed=0, device="cpu").learn(256, callback=callback)
+    assert callback.evaluations["value"][-1] == gridworld.evaluate(model).value

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped, sync_envs_normalization
 
 from gridworld.agents.sb3.interop.foreign_model import ForeignPolicy
 from gridworld.bounds import at_least, discount
@@ -88,7 +89,7 @@ class ExactEvalCallback(BaseCallback):
         self._streak = 0  # certificates in a row
         self._newest: NDArray[Any] | None = None  # the outputs that were evaluated last
         self._next = 0
-        self._task = None if env is None else self._evaluate_on(env)
+        self._env, self._task = env, None if env is None else self._evaluate_on(env)
 
     @property
     def evaluations(self) -> dict[str, NDArray[Any]]:
@@ -122,6 +123,8 @@ class ExactEvalCallback(BaseCallback):
     def _evaluate(self) -> None:
         """Score the policy as it is now, and write what comes of it; once a step and policy."""
         assert self.evaluator is not None
+        if isinstance(self._env, VecEnv) and is_vecenv_wrapped(self._env, VecNormalize):
+            sync_envs_normalization(self.training_env, self._env)  # as SB3's EvalCallback does
         step = self.num_timesteps
         self._next = (step // self._every + 1) * self._every
         tables = self._policy.tables()
