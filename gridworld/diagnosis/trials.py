@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,8 +26,6 @@ from gridworld.errors import InputError
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.claim import claimed
 from gridworld.training.train import train
-
-_PLAIN = re.compile(r"[+~]*(?!hydra\b)\w+(\.\w+)*(=[^$]*)?")  # no interpolation, and nothing of Hydra's
 
 
 def try_offers(saved: SavedRun, found: Diagnosis, folder: Path, trust: bool = False) -> Iterator[Trial]:
@@ -72,16 +69,8 @@ def check_trusted(saved: SavedRun, found: Diagnosis, trust: bool) -> None:
     Raises:
         InputError: it might.
     """
-    file = saved.run.manifest_file
-    if trust or not found.offers:
-        return
-    for word in (each for words in found.offers for each in words):
-        if not _PLAIN.fullmatch(word):
-            raise InputError(
-                f"{file}: overrides: {word[:80]} is no plain setting; add --trust to train with it, if you "
-                "trust whoever made this"
-            )
-    _check(saved.config, saved)
+    if found.offers and not trust:
+        _check(saved.config, saved)
 
 
 def _settings(saved: SavedRun, words: tuple[str, ...], trust: bool) -> TrainConfig:

@@ -15,6 +15,7 @@ import gridworld
 from gridworld.commands import diagnose
 from gridworld.diagnosis.causes import learning
 from gridworld.diagnosis.picture import draw_diagnosis
+from gridworld.restore.saved_run import SavedRun
 
 _SPOILT = ["agent=q_learning", "agent.learning_rate=0.001", "total_timesteps=2000", "seed=0"]
 
@@ -105,9 +106,12 @@ def test_nothing_of_strangers_runs_in_a_trial(spoilt: Path, tmp_path: Path, word
     folder = tmp_path / "strangers"
     shutil.copytree(spoilt, folder)
     hostile.manifest(folder, lambda content: content["overrides"].append(word))
-    with pytest.raises(gridworld.InputError, match="trust"):
-        diagnose.main([str(folder), "--try"])
-    assert not (tmp_path / "strangers-tried").exists()
+    saved = SavedRun(folder)
+    assert word not in saved.overrides
+    offers = gridworld.diagnose(folder).offers
+    assert offers
+    harm = ("evil", "hydra", "config-dir", "schema", "os.system")
+    assert not [each for words in offers for each in words if any(part in each for part in harm)]
 
 
 def test_of_a_certified_run_nothing_is_named_or_drawn(tmp_path: Path, capsys) -> None:

@@ -103,9 +103,8 @@ def test_real_runs_are_reported(tmp_path: Path) -> None:
     assert page.count('src="data:image/png;base64,') == 2 * 3  # a median seed's maps for each agent
     assert [row["why not"] for row in results] == ["too few steps (2 of 2)"] * 2
     why = rows_of(folder / "tables" / "not_certified.csv")
-    assert {(row["agent"], row["seed"], row["to try"]) for row in why} == {
-        (agent, seed, "total_timesteps=20000") for agent, seed in runs
-    }
+    assert {(row["agent"], row["seed"]) for row in why} == set(runs)
+    assert all(int(row["to try"].removeprefix("total_timesteps=")) >= 20000 for row in why)
     assert "Why runs are not certified" in page
 
 

@@ -433,7 +433,7 @@ def test_the_command_printed_after_ctrl_c_trusts_what_the_run_began_with(tmp_pat
         ({"algorithm": "mine.Sarsa"}, " trust=true"),
         ({"policy_kwargs": {"features_extractor_class": "a.B"}}, " trust=true"),
         ({"algorithm": "DQN"}, ""),
-        ({"optimizer_class": "torch.optim.SGD"}, ""),
+        ({"policy_kwargs": {"optimizer_class": "torch.optim.SGD"}}, ""),
     ],
 )
 def test_only_settings_that_name_code_have_to_be_trusted(agent: dict[str, object], more: str) -> None:

@@ -223,7 +223,7 @@ def test_what_is_not_the_table_is_found(
 ) -> None:
     monkeypatch.setattr(table_walk, "SEED", seed)
     with pytest.raises(InputError, match=f"^{kind.__name__}: leaves its own table: .*{LIES[kind]}"):
-        compile_table(gym.wrappers.TimeLimit(kind(), 150))
+        compile_table(kind(), 150)
 
 
 @pytest.mark.parametrize("kind", [Lake, Shadowed, Chain, Remembered])
