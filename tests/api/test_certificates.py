@@ -832,3 +832,16 @@ def test_a_callback_keeps_the_statistics_of_its_own_environment_like_those_of_tr
     callback = gridworld.ExactEvalCallback(normalised(), every=64)
     model = PPO("MlpPolicy", normalised(), n_steps=64, seed=0, device="cpu").learn(256, callback=callback)
     assert callback.evaluations["value"][-1] == gridworld.evaluate(model).value
+
+
+def test_an_encoding_of_ones_own_is_not_taken_for_ours_by_its_space() -> None:
+    def reversed_rows() -> Any:
+        space = spaces.Box(0, 1, (16,), np.float32)
+        return wrappers.TransformObservation(grid(), lambda s: np.eye(16, dtype=np.float32)[15 - s], space)
+
+    model = held(BEST, reversed_rows())
+    for other in (grid(), "frozen_lake_4x4", gridworld.compile_env(reversed_rows())):
+        with pytest.raises(InputError, match="only has the same space"):
+            gridworld.evaluate(model, other)
+    ours = held(BEST, gridworld.OneHotObservation(grid()))
+    assert gridworld.evaluate(ours, "frozen_lake_4x4") == gridworld.evaluate(ours)

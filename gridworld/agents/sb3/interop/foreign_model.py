@@ -20,12 +20,12 @@ from gridworld.agents.sb3.policy_outputs import (
     why_no_table,
     why_unreadable,
 )
-from gridworld.envs.inspection import Task, observation_like, tabulated
+from gridworld.envs.inspection import Task, observation_like, tabulated, task_of
 from gridworld.envs.observations import KINDS, ObservationTable
 from gridworld.errors import InputError, in_short
 from gridworld.world.exact.markov_chain import one_hot_policy
 from gridworld.world.mdp import FloatArray, IntArray
-from gridworld.world.sources.pure_functions import random_states
+from gridworld.world.sources.pure_functions import random_states, same
 from gridworld.world.sources.wrappers import is_discrete
 
 _LIBRARIES = ("stable_baselines3.", "sb3_contrib.", "gridworld.")
@@ -55,6 +55,7 @@ class ForeignPolicy:
 
     def __init__(self, model: Any, task: Task) -> None:
         self._model, self._task, self._policy = model, task, _policy_of(model)
+        self._guess_is_fine = False
         if not is_discrete(self._policy.action_space, task.mdp.num_actions):
             raise InputError(
                 f"the model acts in {self._policy.action_space}; {task.mdp.name} has "
@@ -105,7 +106,31 @@ class ForeignPolicy:
                 f"the model sees {wanted}, and the environment shows {seen.space}; give the environment that "
                 "the model was trained on, as model.get_env() has it"
             )
-        return observation_like(self._task.mdp, wanted)
+        guess = observation_like(self._task.mdp, wanted)
+        self._check_guess(guess)
+        return guess
+
+    def _check_guess(self, guess: ObservationTable) -> None:
+        """Refuse an observation that only has the right space, where the model was shown another one."""
+        env = getattr(self._model, "get_env", lambda: None)()
+        if env is None or self._guess_is_fine:
+            return
+        try:
+            task = task_of(env)
+            shown = None if task.seen is None else task.seen()
+        except InputError as error:
+            raise InputError(
+                "the model: what it was shown in training is not known, so it cannot be scored on an "
+                f"environment that shows something else; give one that shows the same ({error})"
+            ) from None
+        is_ours = shown is not None and shown.kind in KINDS
+        alike = shown is not None and shown.space == guess.space and same(shown.table(), guess.table())
+        if not is_ours and not alike:
+            raise InputError(
+                f"the model was shown observations of its own in training, and {guess.kind} of this world "
+                "only has the same space; give an environment with the wrappers that it was trained on"
+            )
+        self._guess_is_fine = True
 
     def _read(self, observation: ObservationTable, states: IntArray) -> Reading:
         rows = self._policy.obs_to_tensor(observation.rows(states))[0]
