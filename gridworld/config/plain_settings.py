@@ -8,9 +8,11 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+import os
 import re
 import types
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gridworld.config.agents import MISSING, AgentConfig, agent_schemas
@@ -21,6 +23,7 @@ from gridworld.config.texts import LIBRARIES, Text
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, schema_of
 from gridworld.errors import InputError
+from gridworld.process.console.command_line import users_folder
 from gridworld.process.console.terminal import printable
 
 _LARGEST_KWARG = 1000  # of an environment: sizes, and what it pays
@@ -56,10 +59,19 @@ def foreign(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any, str]]:
     """
     for name, value in _leaves(settings, ""):
         for kind in sorted(_kinds(name), key=lambda kind: kind.name):
-            if isinstance(value, str) and not re.fullmatch(kind.pattern, value):
+            if isinstance(value, str) and not _is_harmless(value, kind):
                 yield name, value, kind.harm
             elif kind is Text.KWARGS and isinstance(value, int | float) and abs(value) > _LARGEST_KWARG:
                 yield name, value, f"is beyond {_LARGEST_KWARG:,}, and may make a world of any size"
+
+
+def _is_harmless(text: str, kind: Text) -> bool:
+    if re.fullmatch(kind.pattern, text) is None:
+        return False
+    if kind is not Text.FILE:
+        return True
+    here = os.path.realpath(users_folder())
+    return Path(os.path.realpath(os.path.join(here, text))).is_relative_to(here)
 
 
 def has_own_code(callbacks: Any) -> bool:

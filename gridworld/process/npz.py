@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import io
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -17,9 +18,9 @@ from numpy.typing import NDArray
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import check_memory
 
-_DAMAGED = (
+DAMAGED = (  # what numpy and zipfile raise for a file that is none of theirs
     *(OSError, ValueError, TypeError, KeyError, IndexError, EOFError, SyntaxError, MemoryError),
-    *(RuntimeError, zipfile.BadZipFile, zlib.error),
+    *(RuntimeError, zipfile.BadZipFile, zlib.error, tokenize.TokenError),
 )
 
 COPIES = 3  # the file, its arrays, and what is computed while they are checked
@@ -59,6 +60,6 @@ def npz_arrays(where: object, content: bytes, kind: str, most: int | None = None
             return {name: arrays[name] for name in arrays.files}
     except InputError:
         raise
-    except _DAMAGED as error:
+    except DAMAGED as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{where}: not {kind} that can be read ({reason})") from None

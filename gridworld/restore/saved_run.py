@@ -24,6 +24,7 @@ from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import tell
 from gridworld.process.memory_budget import limited
+from gridworld.process.npz import DAMAGED
 from gridworld.run.folder import shown
 from gridworld.run.identity.stored_world import stored_world
 from gridworld.run.reader import RunReader, open_run
@@ -196,7 +197,7 @@ def read_visits(run: RunReader, shape: tuple[int, ...]) -> NDArray[np.int64]:
     content = run.read(path, _LARGEST_HEADER + 8 * math.prod(shape))
     try:
         visits = np.load(io.BytesIO(content), allow_pickle=False)
-    except (OSError, ValueError, EOFError, MemoryError, SyntaxError):
+    except DAMAGED:
         raise InputError(f"{path}: no counts of visits that can be read") from None
     if not isinstance(visits, np.ndarray) or visits.shape != shape or visits.dtype.kind not in "iu":
         raise InputError(f"{path}: must be counts for every cell and action of this run's world")

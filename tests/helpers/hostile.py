@@ -521,6 +521,18 @@ def world_that_grows(run: Path, base: Path) -> None:
     seal(run, "world.npz", content)
 
 
+@hostile("world.npz: not a world that can be read (('EOF in multi-line", "lake")
+def world_whose_header_is_cut_off(run: Path, base: Path) -> None:
+    with zipfile.ZipFile(run / "world.npz") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    seal(run, "world.npz", zipped(members | {"reward.npy": header("((((")}))
+
+
+@hostile(FINE)
+def visits_whose_header_is_cut_off(run: Path, base: Path) -> None:
+    seal(run, "visits.npy", header("(((("))
+
+
 @hostile("world.npz: not a world", "lake")
 def world_that_is_pickled(run: Path, base: Path) -> None:
     with zipfile.ZipFile(run / "world.npz") as archive:

@@ -98,13 +98,18 @@ def keep_compiler_out() -> None:
             method.__dict__["__dynamo_disable"] = method
 
 
+_DEVICES = ("cpu", "cuda", "mps")  # that tensors can be read from
+
+
 def _device(name: str) -> str:
     """The name, if torch knows it and has it; SB3 would fall back to the processor without a word."""
     try:
-        missing = name != "auto" and torch.device(name).type == "cuda" and not torch.cuda.is_available()
+        kind = "cpu" if name == "auto" else torch.device(name).type
     except RuntimeError:
-        raise InputError(f"device={name}: must be auto, cpu, cuda or cuda:N") from None
-    if missing:
+        kind = ""
+    if kind not in _DEVICES:
+        raise InputError(f"device={name}: must be auto, cpu, cuda or cuda:N")
+    if kind == "cuda" and not torch.cuda.is_available():
         raise InputError(f"device={name}: torch finds no CUDA device here; set device=cpu")
     return name
 
