@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 
 from gridworld.process.console.terminal import plain
 
-_FORMULA = re.compile(r"'*[=+\-@]")
+_FORMULA = re.compile(r"'*[=+\-@\uff1d\uff0b\uff0d\uff20]")  # the last four are as wide as Chinese signs
 
 
 def csv_text(rows: Iterable[Iterable[object]]) -> str:

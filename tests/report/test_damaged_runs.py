@@ -94,6 +94,16 @@ def test_each_damaged_file_is_named(damage: str, agent: str, runs: Path) -> None
     assert len(found.reasons) == len(listed)
 
 
+def test_a_copy_that_is_damaged_is_named_and_the_whole_one_counts(runs: Path) -> None:
+    shutil.copytree(runs / "dqn1", runs / "a copy")
+    flip(runs / "a copy" / "visits.npy")
+    report = gather([runs])
+    assert any("a copy/visits.npy" in told for told in report.sentences())
+    counted = [run.folder.name for group in report.study.groups for run in group.runs]
+    assert "dqn1" in counted
+    assert "a copy" not in counted
+
+
 def report_of(runs: Path, *options: str) -> str:
     with pytest.raises(SystemExit) as end:
         command.main([str(runs), "--out", str(runs.parent / "out"), *options])

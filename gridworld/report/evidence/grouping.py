@@ -254,12 +254,13 @@ def _splits(task: str, configurations: Iterable[tuple[str, Key]]) -> list[str]:
 
 
 def _one_per_seed(runs: list[Evidence], notes: list[str], warnings: list[str]) -> tuple[Evidence, ...]:
-    """Of runs with the same settings and seed the first stays: in a mean it would otherwise count twice."""
+    """Of runs with the same settings and seed the first whole one stays: a mean would count it twice."""
     kept: dict[int, Evidence] = {}
-    for run in sorted(runs, key=lambda run: str(run.folder)):
+    for run in sorted(runs, key=lambda run: (bool(run.damage), str(run.folder))):
         first = kept.setdefault(run.seed, run)
         if first is run:
             continue
+        warnings += run.damage
         told = f"{run.folder} has the settings and the seed of {first.folder}"
         if _same_curve(first, run):
             notes.append(f"{told}, and the same curve; it is counted once.")
