@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
@@ -66,6 +66,7 @@ class TrainingContext:
         threads: of its numerical library.
         write_scalars: takes the agent's own training metrics; None: they are not wanted.
         callbacks: the configured callbacks, as plain values (`config.train.TrainConfig`).
+        features: what the observation adds to the settings of an `MlpPolicy` (`config.train.ObservationConfig`).
         only_asked: it will not learn, and needs no memory for transitions.
     """
 
@@ -76,6 +77,7 @@ class TrainingContext:
     threads: int = 1
     write_scalars: WriteScalars | None = None
     callbacks: Sequence[Any] = ()
+    features: Mapping[str, Any] = field(default_factory=dict)
     only_asked: bool = False
 
 

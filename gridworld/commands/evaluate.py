@@ -16,7 +16,7 @@ from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
 from gridworld.restore.saved_run import SavedRun, choose_policy
-from gridworld.run.summary import circles_text
+from gridworld.run.summary import MOST_NAMED, circles_text
 from gridworld.world.exact.evaluation import Evaluator, Score
 from gridworld.world.mdp import FloatArray
 from gridworld.world.metrics import METRICS, optimal_score
@@ -102,7 +102,9 @@ def _table(evaluator: Evaluator, policy: FloatArray, score: Score, sampled: Samp
 def _verdict(evaluator: Evaluator, policy: FloatArray, score: Score) -> str:
     if score.certified:
         return "  certified optimal"
-    circles = circles_text(evaluator.endless_cells(policy), score.outcome.timeout)
+    states = evaluator.endless_states(policy)
+    names = [evaluator.mdp.state_name(state) for state in states[:MOST_NAMED]]
+    circles = circles_text(len(states), names, score.outcome.timeout)
     return f"  not optimal: regret {score.regret:.3g}{circles}"
 
 

@@ -39,12 +39,13 @@ def main(arguments: Sequence[str]) -> None:
 
     from gridworld.restore.resume import open_unfinished  # here, since it takes a second to import
     from gridworld.run.summary import train_and_tell
+    from gridworld.training.advice import advice
 
     with alone_in(folder):
         unfinished = open_unfinished(folder, words.get("trust", False))
         total_timesteps, anyway = words.get("total_timesteps"), words.get("anyway", False)
         progress = words.get("logging.progress", True)
-        train_and_tell(folder, lambda: unfinished.resume(total_timesteps, anyway, progress))
+        train_and_tell(folder, lambda: unfinished.resume(total_timesteps, anyway, progress), advice)
 
 
 def _parse(arguments: Sequence[str]) -> dict[str, Any]:

@@ -16,7 +16,10 @@ from gridworld.config.train import TrainConfig
 
 # Where one of these is empty, a run is as those that were made before there was such a setting.
 _NEWER = frozenset(
-    {"callbacks", "exploration_bonus", "exploring_starts", "stratified_draws", "agent.reward_scale"}
+    {
+        *("callbacks", "exploration_bonus", "exploring_starts", "stratified_draws"),
+        *("agent.reward_scale", "observation.features"),
+    }
 )
 
 ON_RESULT = frozenset(Effect) - {Effect.FILES, Effect.NOTHING}

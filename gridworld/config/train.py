@@ -8,13 +8,14 @@ setting affects (`gridworld.config.effects`). Nothing heavy is imported here.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Optional, Union
+from typing import Any, Optional, Union
 
 from gridworld.bounds import at_least, at_most, discount, within
 from gridworld.config.agents import AgentConfig
 from gridworld.config.effects import Effect, affects
 from gridworld.config.pictures import RecordingConfig
-from gridworld.config.texts import Callback, Word
+from gridworld.config.privileges import privilege
+from gridworld.config.texts import Callback, ClassPath, Word
 from gridworld.config.worlds import EnvConfig, MapConfig
 from gridworld.errors import InputError
 
@@ -32,6 +33,15 @@ class ObservationConfig:
 
     kind: Word = "one_hot"  # or coordinates, image, own, none (the state's number)
     cell_size: int = 8  # pixels, for images
+    # features extractor of an `MlpPolicy` whose settings name none; null: Stable-Baselines3's own
+    features: Optional[ClassPath] = None  # noqa: UP045
+
+    def policy_kwargs(self) -> dict[str, Any]:
+        """What this adds to an `MlpPolicy`'s settings: the features extractor, for images with their cell size."""
+        if self.features is None:
+            return {}
+        own = {"cell_size": self.cell_size} if self.kind == "image" else {}
+        return {"features_extractor_class": self.features, "features_extractor_kwargs": own}
 
 
 @dataclass
@@ -64,14 +74,21 @@ class CheckpointConfig:
 class TrainConfig:
     """One training run."""
 
+    # the tuned settings of the agent in the world, a file in conf/tuned, that went into this; null: none
+    recipe: Optional[Word] = field(default=None, metadata=affects(Effect.NOTHING))  # noqa: UP045
+    # of conf/preset, whose numbers went into this; auto: none was needed (`config.composition.presets`)
+    preset: Word = field(default="none", metadata=affects(Effect.NOTHING))
+    # what came of these settings when they were tried, where they do not solve the task
+    known_failure: Optional[Word] = field(default=None, metadata=affects(Effect.NOTHING))  # noqa: UP045
     seed: int = field(default=0, metadata=affects(Effect.SEED))  # of all random numbers
     total_timesteps: int = field(default=20_000, metadata=affects(Effect.LENGTH))  # environment steps
     n_envs: int = 64  # environments that step together
     # b of b / sqrt(N), added to a reward of training for an action that was taken there N times; 0 for none
     exploration_bonus: float = 0.0
-    exploring_starts: float = 0.0  # share of training episodes that begin in a state drawn uniformly
+    # share of training episodes that begin in a state drawn uniformly
+    exploring_starts: float = field(default=0.0, metadata=privilege("starts anywhere"))
     # whether environments in one state share out an action's outcomes evenly, see `gridworld.envs.stratified`
-    stratified_draws: bool = False
+    stratified_draws: bool = field(default=False, metadata=privilege("stratified draws"))
     device: Word = field(default="cpu", metadata=affects(Effect.MACHINE))
     threads: int = field(default=1, metadata=affects(Effect.MACHINE))  # of torch
     # of SB3: each a mapping of `_target_`, the import path of a class, and its arguments

@@ -37,6 +37,11 @@ class EnvConfig:
         """What folders and messages call the world."""
         raise NotImplementedError
 
+    @property
+    def compiles_quickly(self) -> bool:
+        """Whether the world may be compiled while settings are composed: soon, and without the user's code."""
+        return True
+
     def compile(self) -> Mdp:
         """Compile the world.
 
@@ -133,6 +138,11 @@ class EnumeratedConfig(GymnasiumConfig):
     source: Word = "enumerated"
     ignore: list[Word] = field(default_factory=list)  # attributes that are no part of its state, by your word
 
+    @property
+    def compiles_quickly(self) -> bool:
+        """See `EnvConfig.compiles_quickly`."""
+        return False
+
     def compile(self) -> Mdp:
         """See `EnvConfig.compile`."""
         from gridworld.world.sources.enumerated import enumerate_env
@@ -181,6 +191,11 @@ class BuiltConfig(EnvConfig):
     def name(self) -> str:
         """See `EnvConfig.name`."""
         return self.builder.rpartition(".")[2]
+
+    @property
+    def compiles_quickly(self) -> bool:
+        """See `EnvConfig.compiles_quickly`."""
+        return False
 
     def compile(self) -> Mdp:
         """See `EnvConfig.compile`."""

@@ -18,13 +18,19 @@ from gridworld.world.metrics import METRICS
 
 Summary = dict[str, Any]
 
+MOST_NAMED = 5  # states of a policy that loops
+_ROUNDING = 1e-9  # of a probability
 
-def train_and_tell(folder: Path, train: Callable[[], Summary]) -> Summary:
+
+def train_and_tell(
+    folder: Path, train: Callable[[], Summary], advise: Callable[[Path], list[str]]
+) -> Summary:
     """Train, and print what comes of it; ends the program if training is interrupted.
 
     Args:
         folder: The run's folder.
         train: Trains in it.
+        advise: Makes lines on what to do next with a run that is not certified.
 
     Returns:
         The run's summary.
@@ -37,7 +43,7 @@ def train_and_tell(folder: Path, train: Callable[[], Summary]) -> Summary:
         sys.exit(interruption.exit_code)
     try:
         place = shlex.quote(shown(folder))
-        print(summary_text(summary, place))
+        print(summary_text(summary, place, [] if summary["certified"] else advise(folder)))
         if any(folder.glob(EVENTS)):
             print(printable(f"  curves: tensorboard --logdir {place}"), flush=True)
     except BrokenPipeError:  # the reader has left, as `| head` does; the files are written
@@ -57,12 +63,13 @@ def interruption_text(interruption: Interrupted, run: RunFolder, manifest: Mappi
     return printable(f"{interruption}: {what}; go on with  {run.resume_command(manifest['config'])}")
 
 
-def summary_text(summary: Summary, folder: str) -> str:
-    """The result beside the optimum, the verdict, and where the files are.
+def summary_text(summary: Summary, folder: str, advice: Sequence[str] = ()) -> str:
+    """The result beside the optimum, the verdict, what to do next, and where the files are.
 
     Args:
         summary: The content of summary.json.
         folder: The run's folder, quoted for a shell.
+        advice: Lines on what to do next.
 
     Returns:
         Several lines, printable.
@@ -70,21 +77,30 @@ def summary_text(summary: Summary, folder: str) -> str:
     agent, env, seed = summary["agent"], summary["env"], summary["seed"]
     steps, seconds = summary["timesteps"], summary["train_seconds"]
     rows = [
-        ["", "greedy", "sampled", "optimum"],
-        ["without a step limit:", "", "", ""],
+        ["", "greedy", "sampled", "optimum", ""],
+        ["without a step limit:", "", "", "", ""],
         *_rows(summary, within_limit=False),
-        [f"within {summary['max_episode_steps']:,} steps:", "", "", ""],
+        [f"within {summary['max_episode_steps']:,} steps:", "", "", "", ""],
         *_rows(summary, within_limit=True),
     ]
     lines = [
-        f"{agent} on {env}, seed {seed}: {steps:,} steps in {seconds:.1f} s",
+        f"{agent} on {env}{_made_of(summary)}, seed {seed}: {steps:,} steps in {seconds:.1f} s",
         "",
-        *(f"  {line}" for line in aligned(rows, ("<21", ">9", ">9", ">9"))),
+        *(f"  {line}" for line in aligned(rows, ("<21", ">9", ">9", ">9", "<0"))),
         "",
         f"  {verdict(summary)}",
+        *([f"  privileges: {', '.join(summary['privileges'])}"] if summary["privileges"] else []),
+        *(f"  {line}" for line in advice),
         f"  files: {folder}",
     ]
     return "\n".join(map(printable, lines))
+
+
+def _made_of(summary: Summary) -> str:
+    """Where its settings come from, if not from the agent alone."""
+    recipe, preset = summary["recipe"], summary["preset"]
+    parts = [f"recipe {recipe}"] if recipe is not None else []
+    return "".join(f", {part}" for part in [*parts, *([f"preset {preset}"] if preset != "none" else [])])
 
 
 def _rows(summary: Summary, within_limit: bool) -> list[list[str]]:
@@ -93,8 +109,14 @@ def _rows(summary: Summary, within_limit: bool) -> list[list[str]]:
         if metric.is_headline and metric.in_tables and metric.within_limit == within_limit:
             best = summary.get(f"optimal_{metric.name}", metric.known_optimum)
             found = (summary[metric.name], summary["sampled"][metric.name], best)
-            rows.append([*metric.row(*found)])
+            rows.append([*metric.row(*found), _trade(metric.name, summary)])
     return rows
+
+
+def _trade(name: str, summary: Summary) -> str:
+    """Why a policy that is worse than the optimum may reach the goal more often."""
+    is_above = name == "goal_probability" and summary[name] > summary[f"optimal_{name}"] + _ROUNDING
+    return "  more often than the optimum, later or at a price" if is_above else ""
 
 
 def verdict(summary: Summary) -> str:
@@ -102,23 +124,22 @@ def verdict(summary: Summary) -> str:
     truth = f" (world: {summary['truth']})" if "truth" in summary else ""
     if summary["certified"]:
         return f"certified optimal since step {summary['certified_since_step']:,}{truth}"
-    circles = circles_text(summary["endless_cells"], summary["timeout_probability"])
-    return f"not optimal: regret {summary['regret']:.3g}{circles}{truth}"
+    count, names = len(summary["endless_cells"]), summary["endless_states"]
+    loops = circles_text(count, names, summary["timeout_probability"])
+    return f"not optimal: regret {summary['regret']:.3g}{loops}{truth}"
 
 
-def circles_text(cells: Sequence[Sequence[int]], timeout_probability: float) -> str:
-    """Half a sentence on a policy that never ends; "" where it does.
+def circles_text(count: int, names: Sequence[str], timeout_probability: float) -> str:
+    """Half a sentence on a policy that may never end; "" where it always does.
 
     Args:
-        cells: the states in which it walks for ever: (row, column) on a map, else (number,).
-        timeout_probability: How probable it is that an episode is cut off by the step limit.
+        count: of the states in which it loops.
+        names: of the first few of them.
+        timeout_probability: that an episode is cut off by the step limit.
     """
-    if not cells:
+    if not count:
         return ""
-    are_of_a_map = len(cells[0]) == 2
-    shown = ", ".join(f"({each[0]},{each[1]})" if are_of_a_map else str(each[0]) for each in cells[:8])
-    more = f" and {len(cells) - 8} more" if len(cells) > 8 else ""
+    more = f" and {count - len(names)} more states" if count > len(names) else ""
     return (
-        f"; it walks in circles until the time is out (probability {timeout_probability:.3g}), "
-        f"in {'cells (row,column)' if are_of_a_map else 'states'} {shown}{more}"
+        f"; it loops until the step limit (probability {timeout_probability:.3g}) in {'; '.join(names)}{more}"
     )

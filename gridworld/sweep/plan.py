@@ -20,12 +20,13 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
+from gridworld.config.composition.presets import preset_words
 from gridworld.config.plain_settings import foreign, has_own_code
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig
 from gridworld.errors import InputError
 from gridworld.run.identity.fingerprint import settings_hash
-from gridworld.training.setup import check_settings, objective_note
+from gridworld.training.setup import check_settings, notes
 from gridworld.world.mdp import Mdp
 
 _LONGEST_NAME = 100  # characters of a job's folder
@@ -46,7 +47,7 @@ class Job:
     shape: str | None = None  # equal for jobs that can train as one population; None: it trains alone
     memory: int = 0  # bytes, about, that it takes while it trains
     in_fork: bool = False  # whether it may run in a fork of the process that plans it
-    note: str | None = None  # what to say before training
+    notes: tuple[str, ...] = ()  # what to say before training
 
 
 def expand(
@@ -159,25 +160,28 @@ def plan(
             worlds[key] = env.compile()
         return worlds[key]
 
-    notes: dict[str, str | None] = {}
+    known: dict[str, tuple[str, ...]] = {}
 
-    def noted(config: TrainConfig, mdp: Mdp) -> str | None:
-        key = repr((config.env, config.evaluation.gamma, getattr(config.agent, "gamma", None)))
-        if config.logging.progress and key not in notes:
-            notes[key] = objective_note(config, mdp)
-        return notes.get(key)
+    def noted(config: TrainConfig, mdp: Mdp) -> tuple[str, ...]:
+        key = repr(dataclasses.replace(config, seed=0))
+        if config.logging.progress and key not in known:
+            known[key] = tuple(notes(config, mdp))
+        return known.get(key, ())
 
     planned: dict[str, Job] = {}
     for overrides, swept in jobs:
         config = configure(overrides)
-        mistake, note, layout, memory = None, None, "", 0
+        if chosen := preset_words(config, overrides, world):
+            overrides = [*overrides, *chosen]
+            config = configure(overrides)
+        mistake, told, layout, memory = None, (), "", 0
         try:
             mdp = check_settings(config, world)
             layout, memory = (
                 mdp.text(),
                 config.agent.memory(mdp.num_states, config.n_envs, config.total_timesteps),
             )
-            note = noted(config, mdp)
+            told = noted(config, mdp)
         except InputError as error:
             mistake = str(error)
         digest = settings_hash(dataclasses.asdict(config), layout)
@@ -191,7 +195,7 @@ def plan(
             shape=shape(config),
             memory=memory,
             in_fork=_in_fork(config),
-            note=note,
+            notes=told,
         )
         planned.setdefault(digest, job)
     return list(planned.values())

@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -42,6 +43,7 @@ from gridworld.sweep.progress import sweep_progress
 _ORPHANS_END_WITHIN = 5.0  # seconds; workers of a sweep that was killed
 _STOPPED_END_WITHIN = 2.5  # seconds; those of one that is being stopped
 _POLL_SECONDS = 0.1
+_MOST_NOTES = 4  # that are printed before the jobs begin
 _STOP_WITHIN = 4.0  # seconds after a signal
 _DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT)
 
@@ -76,8 +78,11 @@ def run_sweep(
     _refuse_mistakes(jobs, settings)
     folder.check(jobs, settings.extend)
     populations([], settings, master.hydra)  # finds a mistake
-    if notes := [job.note for job in jobs if job.note is not None]:
-        tell(f"{notes[0]} (of {len(jobs)} jobs, {len(notes)} cannot be certified)")
+    counts = Counter(note for job in jobs for note in job.notes)
+    for note, count in counts.most_common(_MOST_NOTES):
+        tell(f"{note} ({count} of {len(jobs)} jobs)")
+    if len(counts) > _MOST_NOTES:
+        tell(f"and {len(counts) - _MOST_NOTES} more notes on other jobs")
     try:
         with folder.at_work():
             entries = folder.add(jobs, words)

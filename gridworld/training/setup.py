@@ -6,6 +6,7 @@ import functools
 from collections.abc import Callable
 
 from gridworld.agents import TrainingContext, WriteScalars, family
+from gridworld.config.composition.presets import LARGE, STOCHASTIC
 from gridworld.config.pictures import PICTURES
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
@@ -19,6 +20,10 @@ from gridworld.world.discounts import fitting_discounts, score_of_optimum
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 
+_PRESETS = {  # why each is chosen
+    STOCHASTIC: "since actions have several outcomes",
+    LARGE: "since there are more states than in the default world",
+}
 _QUICKLY_SOLVED = 6000  # outcomes of all states and actions
 
 
@@ -48,7 +53,14 @@ def make_context(
         stratified=config.stratified_draws,
     )
     return TrainingContext(
-        envs, observation, config.seed, config.device, config.threads, write_scalars, config.callbacks
+        envs,
+        observation,
+        config.seed,
+        config.device,
+        config.threads,
+        write_scalars,
+        config.callbacks,
+        config.observation.policy_kwargs(),
     )
 
 
@@ -84,6 +96,19 @@ def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = comp
     config.env.step_limit(mdp)
     check_recording(config, mdp)
     return mdp
+
+
+def notes(config: TrainConfig, mdp: Mdp) -> list[str]:
+    """What a user should know of the settings before training: where they come from, what they cannot do."""
+    steps = f"{config.total_timesteps:,} steps"
+    found = []
+    if config.recipe is not None:
+        found.append(f"recipe {config.recipe}: {steps}; tuned=none keeps the agent's own settings")
+    if config.preset in _PRESETS:
+        found.append(f"preset={config.preset}, {_PRESETS[config.preset]}: {steps}; preset=none keeps the agent's own settings")
+    if config.known_failure is not None:
+        found.append(f"agent={config.agent.name} in this world: {config.known_failure}")
+    return [*found, *filter(None, [objective_note(config, mdp)])]
 
 
 def objective_note(config: TrainConfig, mdp: Mdp) -> str | None:

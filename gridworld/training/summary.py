@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
-from gridworld.config.train import TrainConfig
-from gridworld.run.summary import Summary
+from gridworld.config.privileges import privileges
+from gridworld.config.train import AUTO, TrainConfig
+from gridworld.run.summary import MOST_NAMED, Summary
 from gridworld.training.learning_curve import Evaluation, LearningCurve
-from gridworld.world.exact.evaluation import Score
-from gridworld.world.mdp import EXACT
+from gridworld.world.exact.evaluation import Evaluator, Score
+from gridworld.world.mdp import EXACT, FloatArray
 from gridworld.world.metrics import numbers, optimal_numbers
 
 CLOCK = {"train_seconds", "evaluation_seconds"}  # the summary's times
@@ -34,6 +36,9 @@ def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, secon
         **_of_another_truth(evaluator.mdp.truth),
         "observation": config.observation.kind,
         "seed": config.seed,
+        "recipe": config.recipe,
+        "preset": config.preset if config.preset != AUTO else "none",
+        "privileges": privileges(TrainConfig, dataclasses.asdict(config)),
         "total_timesteps": config.total_timesteps,
         "timesteps": last.step,
         "gamma": config.evaluation.gamma,
@@ -45,10 +50,19 @@ def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, secon
         "best_regret": curve.best.regret,
         **optimal_numbers(evaluator),
         **_scores(last.greedy),
-        "endless_cells": evaluator.endless_cells(last.snapshot.greedy_policy()),
+        **_endless(evaluator, last.snapshot.greedy_policy()),
         "sampled": _scores(last.sampled),
         "train_seconds": round(seconds, 3),
         "evaluation_seconds": round(curve.seconds, 3),
+    }
+
+
+def _endless(evaluator: Evaluator, policy: FloatArray) -> dict[str, list[Any]]:
+    """The states in which a policy loops: as files have them, and the first few by their names."""
+    states = evaluator.endless_states(policy)
+    return {
+        "endless_cells": [evaluator.mdp.coordinates(state) for state in states],
+        "endless_states": [evaluator.mdp.state_name(state) for state in states[:MOST_NAMED]],
     }
 
 

@@ -26,7 +26,7 @@ from gridworld.run.writer import RunWriter
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.serialization import State, StateError
 from gridworld.training.session import Session
-from gridworld.training.setup import check_settings, make_context, objective_note
+from gridworld.training.setup import check_settings, make_context, notes
 from gridworld.training.tensorboard import EventWriter
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
@@ -66,7 +66,7 @@ def train(
     """
     with TrainLog() as log:
         mdp = check_settings(config, world)
-        if config.logging.progress and (note := objective_note(config, mdp)) is not None:
+        for note in notes(config, mdp) if config.logging.progress else ():
             tell(note)
 
         def begin() -> RunWriter:

@@ -92,6 +92,11 @@ class Mdp:
         """A."""
         return len(self.action_names)
 
+    @cached_property
+    def is_stochastic(self) -> bool:
+        """Whether an action may have more than one outcome somewhere."""
+        return bool((np.count_nonzero(self.probability > 0, axis=2) > 1).any())
+
     @property
     def num_numbers(self) -> int:
         """How many observations the environment has, of which every state has one as its number."""
@@ -172,8 +177,12 @@ class Mdp:
         return (int(self.number[state]),)
 
     def state_name(self, state: int) -> str:
-        """What messages call a state."""
-        return f"state {int(self.number[state])}"
+        """What messages call a state: its place and panel where it has them, else its number."""
+        if self.places is None or (self.places[state] < 0).any():
+            return f"state {int(self.number[state])}"
+        panel, row, col = self.places[state].tolist()
+        where = f"row {row + 1}, column {col + 1}"
+        return f"{where} ({self.panel_names[panel]})" if self.panel_names else where
 
     def rewards_text(self) -> tuple[str, str]:
         """What messages call that which pays on the way, and how it could be changed, if it can."""

@@ -13,12 +13,15 @@ from typing import Protocol
 from gridworld.world.exact.evaluation import Evaluator, Score
 
 
+_ROUNDING = 1e-12  # of a regret, which may be below 0 for it
+
+
 def _rounded(number: float) -> str:
     return f"{number:.4g}"
 
 
-def _not_negative(number: float) -> str:
-    return f"{max(0.0, number):.3g}"
+def _regret(number: float) -> str:
+    return "0" if number < _ROUNDING else f"{number:.3g}"
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,7 @@ METRICS = (
         is_headline=True,
         known_optimum=0.0,
         within_limit=False,
-        text=_not_negative,  # below zero is rounding
+        text=_regret,
     ),
     Metric(
         "certified",

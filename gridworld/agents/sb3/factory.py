@@ -47,7 +47,7 @@ def make_model(config: SB3Config, context: TrainingContext) -> BaseAlgorithm:
         InputError: what only SB3 or torch can judge, or more memory than there is.
     """
     keep_compiler_out()
-    algorithm, arguments = algorithm_and_arguments(config, context.callbacks)
+    algorithm, arguments = algorithm_and_arguments(config, context.callbacks, context.features)
     own_extractor = "features_extractor_class" in arguments.get("policy_kwargs", {})
     if arguments["policy"].__name__.endswith("CnnPolicy") and not own_extractor:
         _check_image_size(context.observation)

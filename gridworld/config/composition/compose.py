@@ -17,11 +17,10 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from gridworld.config.agents import agent_schemas
+from gridworld.config.agents import MISSING, agent_schemas
+from gridworld.config.composition.conf_folder import conf_folder
 from gridworld.config.composition.hydra_errors import refuse_added_keys
-from gridworld.config.composition.interpolations import parse_each_text_once
 from gridworld.config.composition.loader import composing_from
-from gridworld.config.composition.world_rules import register_world_rules
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.config.tune import SearchConfig
@@ -45,7 +44,6 @@ def compose(conf: Path, overrides: list[str]) -> TrainConfig:
     """
     with _leaving_hydra_as_it_was():
         _store_schemas()
-        _prepare_interpolations()
         with composing_from(conf):
             settings = hydra.compose(config_name="train", overrides=overrides)
     return to_config(settings)
@@ -87,15 +85,9 @@ def to_config(settings: DictConfig) -> TrainConfig:
 def register_schemas() -> None:
     """Register the schemas with Hydra, and with OmegaConf the functions by which `conf/` names folders."""
     _store_schemas()
-    _prepare_interpolations()
     OmegaConf.register_new_resolver("slug", slug, replace=True)
     OmegaConf.register_new_resolver("world", _world_name, replace=True)
     OmegaConf.register_new_resolver("token", lambda: secrets.token_hex(3), use_cache=True, replace=True)
-
-
-def _prepare_interpolations() -> None:
-    parse_each_text_once()
-    register_world_rules()
 
 
 @functools.cache  # they stay in Hydra's store
@@ -111,6 +103,19 @@ def _store_schemas() -> None:
         store.store(group="agent/schema", name=name, node=schema)
     for name, source in SOURCES.items():
         store.store(group="env/schema", name=name, node=_open(source))
+    studies = {file.stem for file in (conf_folder() / "experiment").glob("*.yaml")}
+    for env, agent in pairs():  # as a recipe was called before an agent in a world chose it by itself
+        if (name := f"{env}_{agent}") not in studies:
+            chosen = {"defaults": [{"override /env": env}, {"override /agent": agent}]}
+            store.store(group="experiment", name=name, package="_global_", node=chosen)
+
+
+def pairs() -> list[tuple[str, str]]:
+    """Every shipped world with every shipped agent: the names of their files in `conf/env` and `conf/agent`."""
+    conf = conf_folder()
+    envs = [file for file in sorted((conf / "env").glob("*.yaml")) if MISSING not in file.read_text("utf-8")]
+    agents = sorted((conf / "agent").glob("*.yaml"))
+    return [(env.stem, agent.stem) for env in envs for agent in agents]
 
 
 def _world_name(env: DictConfig) -> str:

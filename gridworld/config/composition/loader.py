@@ -1,4 +1,4 @@
-"""Hydra with two changes: it takes whole numbers such as 1e5 for integers, and it composes once.
+"""Hydra with three changes: whole numbers such as 1e5 for integers, presets for the world, composing once.
 
 This builds on internals of Hydra, which tests/sweep/test_config_loader.py checks one by one.
 """
@@ -22,6 +22,7 @@ from hydra.plugins.config_source import ConfigResult
 from hydra.types import RunMode, TaskFunction
 from omegaconf import DictConfig
 
+from gridworld.config.composition.presets import preset_words
 from gridworld.config.composition.words import make_whole, with_whole_numbers
 
 _VERSION_BASE = "1.3"
@@ -45,9 +46,13 @@ class Loader(ConfigLoaderImpl):
         from_shell: bool = True,
         validate_sweep_overrides: bool = True,
     ) -> DictConfig:
-        """Compose, as Hydra's loader does."""
+        """Compose, as Hydra's loader does, and again with the preset that a run's world asks for."""
         words = with_whole_numbers(overrides)
-        return super().load_configuration(config_name, words, run_mode, from_shell, validate_sweep_overrides)
+        rest = run_mode, from_shell, validate_sweep_overrides
+        found = super().load_configuration(config_name, words, *rest)
+        if config_name == "train" and run_mode is RunMode.RUN and (chosen := preset_words(found, words)):
+            return super().load_configuration(config_name, [*words, *chosen], *rest)
+        return found
 
     def _load_single_config(self, default: ResultDefault, repo: Any) -> ConfigResult:
         found = super()._load_single_config(default, repo)

@@ -28,7 +28,7 @@ from gridworld.storage.safe_read import as_text, read_bytes
 KEY = "recipe"
 TRUST = "trust"
 IN_A_STUDY = ("experiment", "winner.yaml")
-CHOSEN = ("agent", "env", "observation")
+CHOSEN = ("agent", "env", "observation", "preset", "tuned")
 _LARGEST = 2**16  # bytes
 _DEEPEST = 20  # levels
 _LARGEST_WHOLE = 2**63

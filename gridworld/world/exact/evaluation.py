@@ -95,20 +95,17 @@ class Evaluator:
         """
         return Chain(self.mdp, policy).discounted_return(self.max_episode_steps, self.solution.gamma)
 
-    def endless_cells(self, policy: FloatArray) -> list[tuple[int, ...]]:
-        """The states in which a policy may walk for ever.
+    def endless_states(self, policy: FloatArray) -> list[int]:
+        """The states in which a policy may loop for ever, ascending; empty for a policy that always ends.
 
         Args:
             policy: (S, A), action probabilities.
-
-        Returns:
-            Of each, by state, (row, column) on a map, else (number,); empty for a policy that always ends.
 
         Raises:
             InputError: it is no policy of this world.
         """
         states = Chain(self.mdp, policy).endless_states()
-        return [self.mdp.coordinates(int(state)) for state in states if not self.mdp.absorbing[state]]
+        return [int(state) for state in states if not self.mdp.absorbing[state]]
 
     def _at_start(self, values: FloatArray) -> float:
         starts = self.mdp.start_states

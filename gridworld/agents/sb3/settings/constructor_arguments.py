@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import stable_baselines3
@@ -30,6 +31,7 @@ Arguments = dict[str, Any]
 
 # Fields of the config that are ours, not arguments of the algorithm's class.
 _OWN_FIELDS = {"name", "family", "algorithm", "engine", "log_interval", "reward_scale"}
+EXTRACTOR, _ITS_KWARGS = "features_extractor_class", "features_extractor_kwargs"
 _MOST_LAYERS, _WIDEST_LAYER = 16, 4096
 _EXAMPLES: dict[type, str] = {
     BaseAlgorithm: "stable_baselines3.A2C",
@@ -49,13 +51,14 @@ _KINDS: dict[str, type] = {
 
 
 def algorithm_and_arguments(
-    config: SB3Config, callbacks: Sequence[Any] = ()
+    config: SB3Config, callbacks: Sequence[Any] = (), features: Mapping[str, Any] = MappingProxyType({})
 ) -> tuple[type[BaseAlgorithm], Arguments]:
     """Translate settings to a class of SB3's kind and its keyword arguments.
 
     Args:
         config: the agent's settings.
         callbacks: those of `config.train.TrainConfig`.
+        features: what the observation adds to the settings of an `MlpPolicy`.
 
     Returns:
         The class; its arguments but for the environments, the seed and the device.
@@ -73,6 +76,11 @@ def algorithm_and_arguments(
         fields = (field.name for field in dataclasses.fields(config) if field.name not in _OWN_FIELDS)
         arguments = _convert({name: getattr(config, name) for name in fields}, "agent.")
     arguments["policy"] = _policy(config, algorithm)
+    own = arguments.get("policy_kwargs", {})
+    if features and config.policy == "MlpPolicy" and EXTRACTOR not in own:
+        extractor = import_class("observation.features", features[EXTRACTOR], BaseFeaturesExtractor)
+        kwargs = features[_ITS_KWARGS] | own.get(_ITS_KWARGS, {})
+        arguments["policy_kwargs"] = own | {EXTRACTOR: extractor, _ITS_KWARGS: kwargs}
     return _with_engine(config, algorithm, arguments, has_own_code(list(callbacks))), arguments
 
 

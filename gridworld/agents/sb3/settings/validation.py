@@ -115,24 +115,16 @@ def _check_observation(agent: SB3Config, observation: ObservationConfig) -> None
     if not (isinstance(given, dict) or is_dataclass(given)):
         raise InputError(f"{agent.key('policy_kwargs')}={given}: must be settings, e.g. {{net_arch:[64,64]}}")
     kwargs = as_dict(given)
-    extractor = kwargs.get("features_extractor_class")
+    extractor = kwargs.get("features_extractor_class") or observation.features
     if observation.kind == "image" and agent.policy == "MlpPolicy" and extractor is None:
         raise InputError(
-            "observation=image: agent.policy=MlpPolicy cannot see images; set agent.policy=CnnPolicy"
+            "observation=image: agent.policy=MlpPolicy cannot see images without observation.features; leave "
+            "that out, or set agent.policy=CnnPolicy"
         )
     if observation.kind != "image" and agent.policy == "CnnPolicy":
         raise InputError(
             f"observation={observation.kind}: agent.policy=CnnPolicy sees images only; "
             "set observation=image or agent.policy=MlpPolicy"
-        )
-    own = kwargs.get("features_extractor_kwargs") or {}
-    side = own.get("cell_size", ObservationConfig.cell_size) if isinstance(own, dict) else None
-    is_one_of_cells = observation.kind == "image" and str(extractor).endswith(".ImageCells")
-    if is_one_of_cells and type(side) is int and side > observation.cell_size:
-        setting = f"{agent.key('policy_kwargs')}.features_extractor_kwargs.cell_size"
-        raise InputError(
-            f"observation.cell_size={observation.cell_size}: features of {side} pixels hold several cells; "
-            f"set +{setting}={observation.cell_size}"
         )
 
 

@@ -76,8 +76,9 @@ def why_not(config: SB3Config, algorithm: type[BaseAlgorithm], arguments: Mappin
         return f"agent.policy={config.policy} may compute more than a function of the state"
     for name, known, reason in _CLASSES:
         if name in classes and classes[name] not in known:
-            path = as_dict(given["policy_kwargs"])[name]
-            return f"{where}.policy_kwargs.{name}={path} {reason}"
+            own = as_dict(given.get("policy_kwargs") or {}).get(name)
+            path = f"{where}.policy_kwargs.{name}={own}" if own else f"observation.features={classes[name].__name__}"
+            return f"{path} {reason}"
     counts = arguments.get("replay_buffer_class") is ReplayCounts and issubclass(algorithm, DQN)
     for name in ("replay_buffer", "rollout_buffer"):
         is_known = arguments.get(f"{name}_class") is None or (counts and name == "replay_buffer")

@@ -7,7 +7,7 @@ and the run's certificate stands at step 0.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from gridworld.agents import PolicySnapshot, TrainingContext
 from gridworld.agents.tabular.model_file import model_bytes, read_model
 from gridworld.agents.tabular.settings import TabularConfig
+from gridworld.config.privileges import privilege
 from gridworld.config.texts import Word
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State
@@ -27,7 +28,9 @@ class ValueIterationConfig(TabularConfig):
     """The exact optimum under `gamma`; nothing is trained."""
 
     name: Word = "value_iteration"
-    algorithm: Word = "value_iteration"
+    algorithm: Word = field(
+        default="value_iteration", metadata=privilege("plans with the tables", "value_iteration")
+    )
 
 
 class ValueIteration:
