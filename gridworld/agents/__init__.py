@@ -66,7 +66,7 @@ class TrainingContext:
         threads: of its numerical library.
         write_scalars: takes the agent's own training metrics; None: they are not wanted.
         callbacks: the configured callbacks, as plain values (`config.train.TrainConfig`).
-        features: what the observation adds to the settings of an `MlpPolicy` (`config.train.ObservationConfig`).
+        features: what the observation adds to an `MlpPolicy`'s settings (`config.train.ObservationConfig`).
         only_asked: it will not learn, and needs no memory for transitions.
     """
 

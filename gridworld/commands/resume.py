@@ -37,9 +37,9 @@ def main(arguments: Sequence[str]) -> None:
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: is read-only; copy the run to where you may write and resume= the copy")
 
+    from gridworld.restore.advice import advice
     from gridworld.restore.resume import open_unfinished  # here, since it takes a second to import
     from gridworld.run.summary import train_and_tell
-    from gridworld.training.advice import advice
 
     with alone_in(folder):
         unfinished = open_unfinished(folder, words.get("trust", False))

@@ -185,9 +185,9 @@ def _stop_if_lost(folder: Path) -> None:
 
 def _run_alone(config: TrainConfig, folder: Path, overrides: list[str]) -> float:
     """Train, or resume the run, in a folder that this process holds; returns the final regret."""
+    from gridworld.restore.advice import advice
     from gridworld.restore.resume import train_or_resume
     from gridworld.run.summary import train_and_tell
-    from gridworld.training.advice import advice
 
     summary = train_and_tell(folder, lambda: train_or_resume(config, folder, overrides), advice)
     return float(summary["regret"])

@@ -83,8 +83,9 @@ def _declared() -> dict[str, Effect]:
 
 @functools.cache
 def _divided() -> frozenset[str]:
-    """The sections whose settings have not all the same effect."""
-    return frozenset(name[:at] for name in _declared() for at, sign in enumerate(name) if sign == ".")
+    """The sections whose settings have not all the same effect, or are not all as old."""
+    names = {*_declared(), *_NEWER}
+    return frozenset(name[:at] for name in names for at, sign in enumerate(name) if sign == ".")
 
 
 def _declarations(schema: type, section: str = "") -> Iterator[tuple[str, Effect]]:

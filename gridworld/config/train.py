@@ -37,7 +37,7 @@ class ObservationConfig:
     features: Optional[ClassPath] = None  # noqa: UP045
 
     def policy_kwargs(self) -> dict[str, Any]:
-        """What this adds to an `MlpPolicy`'s settings: the features extractor, for images with their cell size."""
+        """What this adds to an `MlpPolicy`'s settings: its features extractor, with an image's cell size."""
         if self.features is None:
             return {}
         own = {"cell_size": self.cell_size} if self.kind == "image" else {}

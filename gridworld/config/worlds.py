@@ -39,7 +39,7 @@ class EnvConfig:
 
     @property
     def compiles_quickly(self) -> bool:
-        """Whether the world may be compiled while settings are composed: soon, and without the user's code."""
+        """Whether it may be compiled while settings are composed: soon, and without code of the user's."""
         return True
 
     def compile(self) -> Mdp:

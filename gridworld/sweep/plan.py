@@ -20,7 +20,7 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 
-from gridworld.config.composition.presets import preset_words
+from gridworld.config.composition.presets import with_preset
 from gridworld.config.plain_settings import foreign, has_own_code
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig
@@ -170,11 +170,9 @@ def plan(
 
     planned: dict[str, Job] = {}
     for overrides, swept in jobs:
-        config = configure(overrides)
-        if chosen := preset_words(config, overrides, world):
-            overrides = [*overrides, *chosen]
-            config = configure(overrides)
-        mistake, told, layout, memory = None, (), "", 0
+        config, overrides = _configured(overrides, configure, world)
+        told: tuple[str, ...] = ()
+        mistake, layout, memory = None, "", 0
         try:
             mdp = check_settings(config, world)
             layout, memory = (
@@ -199,6 +197,14 @@ def plan(
         )
         planned.setdefault(digest, job)
     return list(planned.values())
+
+
+def _configured(
+    overrides: list[str], configure: Callable[[Sequence[str]], TrainConfig], world: Callable[[EnvConfig], Mdp]
+) -> tuple[TrainConfig, list[str]]:
+    """A job's configuration, and its overrides with the preset that its world asks for."""
+    config, chosen = with_preset(configure(overrides), lambda words: configure([*overrides, *words]), world)
+    return config, [*overrides, *chosen]
 
 
 def _in_fork(config: TrainConfig) -> bool:

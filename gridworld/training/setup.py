@@ -100,14 +100,15 @@ def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = comp
 
 def notes(config: TrainConfig, mdp: Mdp) -> list[str]:
     """What a user should know of the settings before training: where they come from, what they cannot do."""
-    steps = f"{config.total_timesteps:,} steps"
+    steps, otherwise = f"{config.total_timesteps:,} steps", "keeps the agent's own settings"
     found = []
     if config.recipe is not None:
-        found.append(f"recipe {config.recipe}: {steps}; tuned=none keeps the agent's own settings")
+        found.append(f"recipe {config.recipe}: {steps}; tuned=none {otherwise}")
     if config.preset in _PRESETS:
-        found.append(f"preset={config.preset}, {_PRESETS[config.preset]}: {steps}; preset=none keeps the agent's own settings")
+        why = _PRESETS[config.preset]
+        found.append(f"preset={config.preset}, {why}: {steps}; preset=none {otherwise}")
     if config.known_failure is not None:
-        found.append(f"agent={config.agent.name} in this world: {config.known_failure}")
+        found.append(f"agent={config.agent.name} is known to fall short: {config.known_failure}")
     return [*found, *filter(None, [objective_note(config, mdp)])]
 
 

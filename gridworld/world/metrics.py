@@ -12,7 +12,6 @@ from typing import Protocol
 
 from gridworld.world.exact.evaluation import Evaluator, Score
 
-
 _ROUNDING = 1e-12  # of a regret, which may be below 0 for it
 
 

@@ -94,13 +94,13 @@ TRAIN = [
     ("agent.train_freq=[1,episode]", "SB3 counts episodes with one environment only; set n_envs=1"),
     ("agent.exploration_fraction=0", "agent.exploration_fraction=0.0: must be a positive number"),
     (
-        "agent=dqn_sb3_defaults observation=image",
-        "agent.policy=MlpPolicy cannot see images; set agent.policy=CnnPolicy",
+        "agent=dqn_sb3_defaults observation=image observation.features=null",
+        "agent.policy=MlpPolicy cannot see images without observation.features; leave that out, or set",
     ),
     ("agent.policy=CnnPolicy", "agent.policy=CnnPolicy sees images only"),
     ("agent=sarsa_max", "agent=sarsa_max: there is no such choice; there are a2c, a2c_sb3_defaults"),
     ("experiment=cliff_qlearning", "there is no such choice; close to it are cliff_q_learning, "),
-    ("experiment=maze", "close to it are maze_a2c, maze_dqn, "),
+    ("experiment=maze", "close to it are maze_a2c, maze_a2c_sb3_defaults, maze_dqn, "),
     ("experiment=zz", "experiment=zz: there is no such choice; --help lists them all"),
     ("env=mars", "env=mars: there is no such choice; there are aima_4x3, arrays"),
     ("env=null", "Config group override must be a string or a list"),
@@ -195,24 +195,24 @@ TRAIN_WITH_SB3 = [
     ("device=abacus", "device=abacus: must be auto, cpu, cuda or cuda:N"),
     ("observation=image agent.policy=CnnPolicy observation.cell_size=4", "32 x 28 pixels are too small"),
     (
-        "observation=image observation.cell_size=4",
-        "+agent.policy_kwargs.features_extractor_kwargs.cell_size=4",
-    ),
-    (
         "observation=coordinates +agent.policy_kwargs.features_extractor_kwargs.orders=[4]",
         "FourierFeatures: orders=[4]: must be 2 whole numbers, one for each coordinate",
     ),
     (
         "observation=image +agent.policy_kwargs.features_extractor_kwargs.cell_size=abc",
-        "ImageCells: cell_size=abc: must be from 1 to the image's",
+        "PixelCNN: cell_size=abc: must be from 1 to the image's",
     ),
     (
-        "agent=a2c observation=image observation.cell_size=4",
-        "+agent.arguments.policy_kwargs.features_extractor_kwargs.cell_size=4",
+        "observation=image observation.features=FourierFeatures",
+        "observation.features=FourierFeatures: must be",
     ),
-    ("agent=a2c agent.arguments.policy_kwargs=3", "agent.arguments.policy_kwargs=3: must be settings"),
     (
-        "agent=a2c observation=image +agent.arguments.policy_kwargs.features_extractor_kwargs=3",
+        "observation=image observation.features=torch.nn.ReLU",
+        "must be the import path of a BaseFeaturesExtractor",
+    ),
+    ("agent=a2c +agent.arguments.policy_kwargs=3", "agent.arguments.policy_kwargs=3: must be settings"),
+    (
+        "agent=a2c +agent.arguments.policy_kwargs.features_extractor_kwargs=3",
         "agent.arguments.policy_kwargs.features_extractor_kwargs=3: stable_baselines3.A2C cannot be built",
     ),
 ]

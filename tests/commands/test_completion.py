@@ -35,7 +35,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("gridworld train agent=dq", "agent=dqn agent=dqn_sb3_defaults"),
         ("python3 scripts/train.py -m agent=dqn,q_", "agent=dqn,q_learning"),
         ("python scripts/train.py env=four", "env=four_rooms"),
-        ("gridworld train experiment=cliff_tr", "experiment=cliff_trpo"),
+        ("gridworld train tuned=cliff_tr", "tuned=cliff_trpo"),
         ("gridworld train --config-dir own experiment=gr", "experiment=grid"),
         ("gridworld train hydra/launcher=j", "hydra/launcher=joblib"),
         ("gridworld train -m hydra/launcher=b", "hydra/launcher=basic"),

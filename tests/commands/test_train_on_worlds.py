@@ -15,7 +15,13 @@ from gridworld.run.identity.stored_world import stored_world
 from gridworld.run.reader import read_run
 from gridworld.world.sources.gymnasium_table import compile_gymnasium
 
-TRAINED = ("agent=q_learning", "env=frozen_lake_v1", "env.kwargs.is_slippery=false", "evaluation.every=1000")
+TRAINED = (
+    "agent=q_learning",
+    "env=frozen_lake_v1",
+    "env.kwargs.is_slippery=false",
+    "evaluation.every=1000",
+    "tuned=none",
+)
 
 
 @pytest.fixture(scope="module")

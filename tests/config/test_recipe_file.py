@@ -55,14 +55,20 @@ def test_a_winner_is_the_same_by_hydra_and_as_data(agent: str, tmp_path: Path) -
     assert of_words(f"recipe={tmp_path}") == configure(*words)
 
 
-def test_the_command_line_goes_before_the_recipe() -> None:
-    recipe = f"recipe={CONF / 'experiment' / 'cliff_dqn.yaml'}"
+def a_recipe(folder: Path, agent: str, settings: str) -> str:
+    path = folder / f"{agent}.yaml"
+    path.write_text(f"defaults:\n- override /agent: {agent}\n- override /env: cliff\n{settings}\n")
+    return f"recipe={path}"
+
+
+def test_the_command_line_goes_before_the_recipe(tmp_path: Path) -> None:
+    recipe = a_recipe(tmp_path, "dqn", "total_timesteps: 80000")
     for words in (["agent.gamma=0.5", "env=maze", recipe], [recipe, "agent.gamma=0.5", "env=maze"]):
         config = of_words(*words)
         assert (config.agent.gamma, config.env.layout) == (0.5, "maze")  # type: ignore[attr-defined]
         assert config.total_timesteps == 80_000
     assert with_recipe([recipe, "-m", "seed=0,1"])[0] == "-m"
-    assert with_recipe([recipe, "--config-dir", "a=b", "seed=1"])[:3] == ["--config-dir", "a=b", "env=cliff"]
+    assert with_recipe([recipe, "--config-dir", "a=b", "seed=1"])[:3] == ["--config-dir", "a=b", "agent=dqn"]
     with pytest.raises(InputError, match=r"experiment=cliff_ppo: chooses another recipe beside recipe="):
         of_words(recipe, "experiment=cliff_ppo")
     with pytest.raises(InputError, match=r"recipe is given already"):
@@ -72,17 +78,17 @@ def test_the_command_line_goes_before_the_recipe() -> None:
 
 
 def test_a_sweep_of_a_recipe_and_a_search_from_one(tmp_path: Path) -> None:
-    recipe = f"recipe={CONF / 'experiment' / 'cliff_q_learning.yaml'}"
+    recipe = a_recipe(tmp_path, "q_learning", "agent: {gamma: 0.98}")
     words = ["-m", "seed=0,1", "total_timesteps=300", "hydra.sweep.dir=sweep", "recording.gif=false"]
     done = script("train.py", recipe, *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for seed in (0, 1):
         manifest = read_object(tmp_path / "sweep" / f"seed={seed}" / "manifest.json")
-        wanted = configure("experiment=cliff_q_learning", f"seed={seed}", "total_timesteps=300")
+        wanted = configure("env=cliff", "agent=q_learning", "agent.gamma=0.98", f"seed={seed}")
         assert manifest["config"]["agent"] == dataclasses.asdict(wanted.agent)
         assert manifest["config"]["env"] == dataclasses.asdict(wanted.env)
     asked = compose_study(ConfFolders(CONF), [recipe, "tune.trials=3"])
-    assert asked.base == configure("experiment=cliff_q_learning")
+    assert asked.base == configure("env=cliff", "agent=q_learning", "agent.gamma=0.98")
     assert (asked.choices["env"], asked.settings.trials) == ("cliff", 3)
 
 
@@ -124,7 +130,7 @@ CONTENTS = {
     "- seed": "holds no settings",
     "defaults: [{override /agent: ../../evil}]": "defaults has \"{'override /agent': '../../evil'}\"",
     "defaults: [{/hydra/job_logging: default}]": "defaults has \"{'/hydra/job_logging': 'default'}\"",
-    "defaults: [/evil]": "defaults has '/evil'; a recipe chooses agent, env, observation by their names",
+    "defaults: [/evil]": "defaults has '/evil'; a recipe chooses agent, env, observation, preset, tuned by",
     "defaults: {agent: dqn}": "defaults has \"{'agent': 'dqn'}\"; a recipe",
     "defaults: [{override /agent: null}]": "defaults has",
     "defaults: [{override /agent: dqn, b: 1}]": "defaults has",

@@ -44,7 +44,7 @@ DECLARED = {
         *("recording.visits", "recording.learning", "recording.frames", "recording.gif", "recording.mp4"),
         *("recording.cell_size", "recording.fps"),
     },
-    Effect.NOTHING: {"logging.progress", "checkpoint.every"},
+    Effect.NOTHING: {"logging.progress", "checkpoint.every", "recipe", "preset", "known_failure"},
 }
 # Who goes by a setting of each effect; the task of the report's groups has a key of its own.
 EVERYBODY = {"identity", "sweep", "hparams", "group", "recipe", "search"}
@@ -79,7 +79,8 @@ def test_every_field_affects_what_is_declared() -> None:
     assert found == DECLARED
     others = {key for key in learning if not key.startswith("agent.")}
     exploring = {"exploration_bonus", "exploring_starts", "stratified_draws"}
-    assert others == exploring | {"callbacks", "n_envs", "observation.kind", "observation.cell_size"}
+    observed = {"observation.kind", "observation.cell_size", "observation.features"}
+    assert others == exploring | observed | {"callbacks", "n_envs"}
 
 
 @pytest.mark.parametrize(("key", "agent"), FIELDS)
@@ -158,6 +159,7 @@ def test_what_a_run_is_known_by_leaves_out_what_it_may_change_on_its_way() -> No
     config = configure("agent=a2c_sb3_defaults", "env=maze")
     content = dataclasses.asdict(config)
     del content["checkpoint"], content["total_timesteps"], content["logging"]["progress"]
+    del content["recipe"], content["preset"], content["known_failure"], content["observation"]["features"]
     newer = ("callbacks", "exploration_bonus", "exploring_starts", "stratified_draws")
     assert [content.pop(key) for key in newer] == [[], 0, 0, False]  # as if there were none
     assert (

@@ -19,6 +19,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from gridworld.config.composition.compose import register_schemas, to_config
+from gridworld.config.composition.presets import with_preset
 from gridworld.config.train import TrainConfig
 from gridworld.sweep.config_loader import SweepLoader
 from gridworld.training.train import train
@@ -66,7 +67,11 @@ def configure(*overrides: str) -> TrainConfig:
 def _composed(overrides: tuple[str, ...]) -> TrainConfig:
     loader, sweep = _loader()
     try:
-        return to_config(loader.load_settings(sweep, list(overrides)))
+
+        def compose(chosen: list[str]) -> TrainConfig:
+            return to_config(loader.load_settings(sweep, [*overrides, *chosen]))
+
+        return with_preset(compose([]), compose)[0]
     finally:
         HydraConfig.instance().cfg = None
 

@@ -10,9 +10,10 @@ from pathlib import Path
 
 from gridworld.process.console.command_line import as_called
 
-EXPERIMENTS = "experiment"  # the group of recipes
+FAILS = "known_failure:"  # a setting of recipes that do not solve their task
+RECIPES = "tuned"  # the group of recipes
+SETTINGS = "settings"  # in the group of presets, which are chosen by their own names
 SPACES = "tune"  # the group of search spaces, which is tune.py's
-FAILS = "does not solve its task"  # so begins the first comment of a recipe that never does
 
 _TEXT = """\
 Train an agent on a GridWorld whose optimum is known exactly.
@@ -26,6 +27,7 @@ Choices:
 Keys, with their values: python scripts/train.py --cfg job
   seed, total_timesteps, n_envs, device, threads  the run itself
   exploration_bonus  what training pays for actions that were seldom taken; 0 for nothing
+  preset         settings for stochastic and for large worlds: auto chooses by the world
   agent.*        the algorithm's own settings, by their names in Stable-Baselines3 where it has them
   env.*          layout (a name above or a map file), slip, rewards, max_episode_steps
   observation.*  kind, cell_size of images
@@ -40,6 +42,9 @@ ends as if nothing had happened. With resume=RUN beside it:
   total_timesteps=N       make the run longer, a finished one too
   trust=true              import classes that are neither ours nor one of the libraries'
   anyway=true             with other versions or another processor: the last bits may differ
+
+An agent in a world for which it was tuned brings the recipe in by itself, below what the command line says;
+tuned=none leaves it out. experiment=TASK_AGENT, as recipes were called, is env=TASK agent=AGENT.
 
 What tune.py found, recipe=FILE (the study's folder, or the yaml in it), is read as data, whoever made it, and
 what stands beside it goes before it; trust=true as above. --config-dir FOLDER is for yaml files of your own:
@@ -59,18 +64,18 @@ Examples:
       a table over the states, trained within a second
   python scripts/train.py agent=ppo seed=3
       one run; its folder in runs/ has the model, the curve, the pictures and a summary
-  python scripts/train.py agent=dqn env=four_rooms env.slip=0.1 total_timesteps=200000
-      another world, slippery, and more time
+  python scripts/train.py agent=dqn env=four_rooms
+      another world, with the recipe that was tuned for it
+  python scripts/train.py agent=dqn env.slip=0.1
+      a slippery world, with the preset for such
   python scripts/train.py -m agent=dqn,ppo "seed=range(20)" hydra.sweep.dir=runs/mine
       a sweep of forty runs, a folder each; look at them with tensorboard --logdir runs/mine
   python scripts/train.py resume=runs/mine
       go on with a run that was interrupted
-  python scripts/train.py experiment=cliff_dqn
-      a recipe: that agent and that task, with settings that were tuned for them
   python scripts/train.py recipe=runs/tune_ppo_maze seed=3
       the winner of a study
-  python scripts/train.py -m 'experiment=glob(maze_*)' seed='range(20)'
-      every recipe of a task, with twenty seeds each
+  python scripts/train.py -m env=maze agent=dqn,ppo 'seed=range(20)'
+      two agents in a world, each with its recipe, with twenty seeds
 
 Afterwards: scripts/evaluate.py, scripts/record.py and scripts/play.py --agent, with a run's folder;
 scripts/jobs.py, with a sweep's. Before: scripts/tune.py finds settings.
@@ -85,11 +90,15 @@ def manual(conf: Path) -> str:
 
 def _choices(conf: Path) -> list[str]:
     lines = []
-    groups = {file.parent for file in conf.glob("**/*.yaml")} - {conf, conf / SPACES}
+    groups = {file.parent for file in conf.glob("**/*.yaml")} - {
+        conf,
+        conf / SPACES,
+        conf / "preset" / SETTINGS,
+    }
     for group in sorted(groups):
         lines.append(f"  {group.relative_to(conf).as_posix()}=...")
         files = sorted(group.glob("*.yaml"))
-        lines += _recipes(conf, files) if group.name == EXPERIMENTS else choices(group)
+        lines += _recipes(conf, files) if group.name == RECIPES else choices(group)
     return lines
 
 
@@ -109,21 +118,20 @@ def _about(file: Path) -> str:
 
 
 def _recipes(conf: Path, files: list[Path]) -> list[str]:
-    """A line or two per task, recipes are named TASK_AGENT; then those that fail, with what comes of them."""
-    tasks = sorted((file.stem for file in (conf / "env").glob("*.yaml")), key=len, reverse=True)
+    """A line or two per world, since recipes are named WORLD_AGENT; then those that are known to fail."""
+    worlds = sorted((file.stem for file in (conf / "env").glob("*.yaml")), key=len, reverse=True)
     agents: dict[str, list[str]] = {}
     for file in files:
-        task = next((task for task in tasks if file.stem.startswith(f"{task}_")), "")
-        agents.setdefault(task, []).append(file.stem.removeprefix(f"{task}_"))
+        world = next((world for world in worlds if file.stem.startswith(f"{world}_")), "")
+        agents.setdefault(world, []).append(file.stem.removeprefix(f"{world}_"))
     lines = []
-    for task, names in agents.items():
+    for world, names in agents.items():
         text = textwrap.fill(
-            f"{task + '_...' if task else '':<20} {', '.join(names)}",
+            f"{world + '_...' if world else '':<20} {', '.join(names)}",
             width=100,
             initial_indent="    ",
             subsequent_indent=" " * 25,
         )
         lines += text.splitlines()
-    told = [(file.stem, _about(file)) for file in files]
-    failing = [f"      {name:<24} {about}" for name, about in told if about.startswith(FAILS)]
-    return [*lines, "    These fail:", *failing] if failing else lines
+    failing = [file.stem for file in files if FAILS in file.read_text("utf-8")]
+    return [*lines, f"    Known to fail: {', '.join(failing)}"] if failing else lines

@@ -111,7 +111,7 @@ def _store_schemas() -> None:
 
 
 def pairs() -> list[tuple[str, str]]:
-    """Every shipped world with every shipped agent: the names of their files in `conf/env` and `conf/agent`."""
+    """Every shipped world with every shipped agent, by the names of their files in `conf`."""
     conf = conf_folder()
     envs = [file for file in sorted((conf / "env").glob("*.yaml")) if MISSING not in file.read_text("utf-8")]
     agents = sorted((conf / "agent").glob("*.yaml"))

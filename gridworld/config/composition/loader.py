@@ -22,7 +22,7 @@ from hydra.plugins.config_source import ConfigResult
 from hydra.types import RunMode, TaskFunction
 from omegaconf import DictConfig
 
-from gridworld.config.composition.presets import preset_words
+from gridworld.config.composition.presets import with_preset
 from gridworld.config.composition.words import make_whole, with_whole_numbers
 
 _VERSION_BASE = "1.3"
@@ -49,9 +49,10 @@ class Loader(ConfigLoaderImpl):
         """Compose, as Hydra's loader does, and again with the preset that a run's world asks for."""
         words = with_whole_numbers(overrides)
         rest = run_mode, from_shell, validate_sweep_overrides
-        found = super().load_configuration(config_name, words, *rest)
-        if config_name == "train" and run_mode is RunMode.RUN and (chosen := preset_words(found, words)):
-            return super().load_configuration(config_name, [*words, *chosen], *rest)
+        load = super().load_configuration
+        found = load(config_name, words, *rest)
+        if config_name == "train" and run_mode is RunMode.RUN:
+            found, _ = with_preset(found, lambda chosen: load(config_name, [*words, *chosen], *rest))
         return found
 
     def _load_single_config(self, default: ResultDefault, repo: Any) -> ConfigResult:

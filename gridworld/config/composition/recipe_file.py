@@ -199,6 +199,8 @@ def harmless_words(words: Sequence[str], config: TrainConfig) -> Iterator[str]:
         place: Any = settings
         for name in key.split("."):
             place = place.get(name, MISSING) if isinstance(place, dict) else MISSING
+        if key == KEY:
+            continue
         if removed:
             yield f"~{key}"
         elif key in (*CHOSEN, IN_A_STUDY[0]):

@@ -77,7 +77,11 @@ def why_not(config: SB3Config, algorithm: type[BaseAlgorithm], arguments: Mappin
     for name, known, reason in _CLASSES:
         if name in classes and classes[name] not in known:
             own = as_dict(given.get("policy_kwargs") or {}).get(name)
-            path = f"{where}.policy_kwargs.{name}={own}" if own else f"observation.features={classes[name].__name__}"
+            path = (
+                f"{where}.policy_kwargs.{name}={own}"
+                if own
+                else f"observation.features={classes[name].__name__}"
+            )
             return f"{path} {reason}"
     counts = arguments.get("replay_buffer_class") is ReplayCounts and issubclass(algorithm, DQN)
     for name in ("replay_buffer", "rollout_buffer"):

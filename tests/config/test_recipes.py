@@ -1,33 +1,28 @@
-"""The recipes: one for every agent on every task, each of them runs, the command line has the last word."""
+"""The recipes: found by themselves, each runs, the command line has the last word; and the studies."""
 
 import csv
+import dataclasses
 import inspect
+import json
 import re
 import statistics
 from pathlib import Path
 
 import pytest
 import stable_baselines3
-from helpers.support import CONF, configure, train_in
+from helpers.support import CONF, configure, script, train_in
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from gridworld.agents import family
 from gridworld.agents.sb3.settings.constructor_arguments import algorithm_and_arguments
 from gridworld.commands.shell.help import manual
-from gridworld.config.composition.recipe_file import with_recipe
+from gridworld.config.composition.compose import pairs
 from gridworld.config.train import check
 
-AGENTS = sorted(file.stem for file in (CONF / "agent").glob("*.yaml"))
-EVERY = {agent for agent in AGENTS if not agent.endswith("_sb3_defaults")}
-OF_OTHER_SOURCES = {"q_learning", "sarsa", "expected_sarsa", "dqn", "ppo"}
-TASKS = {
-    **dict.fromkeys(("aima_4x3", "classic", "cliff", "four_rooms", "frozen_lake_4x4", "maze"), EVERY),
-    **dict.fromkeys(("frozen_lake_v1", "frozen_lake_v1_dry", "cliff_walking_v1"), OF_OTHER_SOURCES),
-    **dict.fromkeys(("taxi_v4", "deep_sea", "river_swim"), OF_OTHER_SOURCES),
-}
-RECIPES = sorted(file.stem for file in (CONF / "experiment").glob("*.yaml"))
+RECIPES = sorted(file.stem for file in (CONF / "tuned").glob("*.yaml") if file.stem != "none")
+STUDIES = sorted(file.stem for file in (CONF / "experiment").glob("*.yaml"))
 # Not those of larger worlds, whose runs take seconds; the others have every one of their settings.
-TRAINED = [recipe for recipe in RECIPES if not re.match("frozen_lake_v1|cliff_walking_v1|taxi|deep", recipe)]
+TRAINED = [recipe for recipe in RECIPES if not re.match("frozen_lake_v1|cliff_walking|taxi|deep", recipe)]
 NO_FILES = (
     *("recording.frames=false", "recording.gif=false", "recording.policy_map=false"),
     *("recording.learning=false", "recording.q_error=false", "recording.visits=false"),
@@ -35,85 +30,100 @@ NO_FILES = (
 )
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_every_agent_has_a_recipe_for_the_task(task: str) -> None:
-    assert {f"{task}_{agent}" for agent in TASKS[task]} <= set(RECIPES)
+def pair(recipe: str) -> tuple[str, str]:
+    """The world and the agent that a recipe is for."""
+    [found] = [(env, agent) for env, agent in pairs() if f"{env}_{agent}" == recipe]
+    return found
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
-def test_a_recipe_is_what_its_name_says_and_trains(recipe: str, tmp_path: Path) -> None:
-    """Long enough for a first update: past learning_starts, and through a rollout."""
-    config = configure(f"experiment={recipe}")
+def test_an_agent_in_a_world_brings_its_recipe(recipe: str, tmp_path: Path) -> None:
+    """It trains long enough for a first update: past learning_starts, and through a rollout."""
+    env, agent = pair(recipe)
+    words = f"env={env}", f"agent={agent}"
+    config = configure(*words)
     check(config)
     family(config.agent).check(config)
-    task = recipe.removesuffix(f"_{config.agent.name}")
-    # The textbook's recipes are of its own rule for the same task.
-    world = "cliff_walking" if config.agent.name.endswith("_textbook") else task
-    assert recipe == f"{task}_{config.agent.name}"
-    assert config.env == configure(f"env={world}").env
-    if "textbook" not in recipe:  # those have an interpolation
-        path = CONF / "experiment" / f"{recipe}.yaml"
-        assert configure(*with_recipe([f"recipe={path}"])) == config  # it is the same as data
+    assert (config.recipe, config.preset, config.agent.name) == (recipe, "auto", agent)
+    assert configure(f"experiment={recipe}") == config  # as it was called before
+    without = configure(*words, "tuned=none")
+    assert (without.recipe, without.env) == (None, config.env)
+    assert dataclasses.replace(without, recipe=recipe, preset="auto") != config  # it says something
     if recipe in TRAINED:
-        summary = train_in(tmp_path, f"experiment={recipe}", "total_timesteps=200", *NO_FILES)
-        assert summary["timesteps"] == 0 or int(summary["timesteps"]) >= 200
+        summary = train_in(tmp_path, *words, "total_timesteps=200", *NO_FILES)
+        assert summary["recipe"] == recipe
+        assert int(summary["timesteps"]) >= 200
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
-def test_a_recipe_tells_what_comes_of_it(recipe: str) -> None:
-    header, result, *_ = (CONF / "experiment" / f"{recipe}.yaml").read_text("utf-8").splitlines()
+def test_a_recipe_has_plain_numbers_and_says_what_came_of_them(recipe: str) -> None:
+    text = (CONF / "tuned" / f"{recipe}.yaml").read_text("utf-8")
+    header, result, *_ = text.splitlines()
     assert header == "# @package _global_"
-    assert result.startswith("# ")
-    assert any(word in result for word in ("certified", "regret"))
+    assert result.startswith("# certified on ")
+    assert f"\nrecipe: {recipe}\n" in text
+    assert "${" not in text
+
+
+def test_settings_are_plain_values() -> None:
+    """What is left of interpolations names files and folders, in train.yaml and for Hydra."""
+    groups = ("agent", "env", "observation", "preset", "tuned")
+    files = [file for group in groups for file in (CONF / group).rglob("*.yaml")]
+    assert [file for file in files if "${" in file.read_text("utf-8")] == []
 
 
 def test_the_command_line_beats_the_recipe_and_the_recipe_the_agent() -> None:
-    recipe = configure("experiment=cliff_dqn")
+    recipe = configure("env=cliff", "agent=dqn")
     assert configure("agent=dqn").agent.gamma == 0.9
     assert recipe.agent.gamma == 0.99
-    assert configure("experiment=cliff_dqn", "agent.gamma=0.5").agent.gamma == 0.5
-    assert configure("agent.gamma=0.5", "experiment=cliff_dqn").agent.gamma == 0.5
-    assert configure("experiment=cliff_dqn", "env.slip=0.25").env.slip == 0.25
+    for words in (["env=cliff", "agent.gamma=0.5"], ["agent.gamma=0.5", "experiment=cliff_dqn"]):
+        assert configure(*words).agent.gamma == 0.5
     assert recipe.total_timesteps != configure("agent=dqn").total_timesteps
     assert recipe.agent.learning_rate == configure("agent=dqn").agent.learning_rate  # it says nothing of that
 
 
-def test_the_command_line_chooses_over_the_recipe() -> None:
+def test_each_job_of_a_sweep_has_the_recipe_of_its_pair(tmp_path: Path) -> None:
+    sweep = ["-m", "agent=q_learning,sarsa", "env=cliff,classic", f"hydra.sweep.dir={tmp_path}/sweep"]
+    script("train.py", *sweep, "total_timesteps=100", *NO_FILES, cwd=tmp_path)
+    summaries = [json.loads(file.read_text()) for file in (tmp_path / "sweep").glob("*/summary.json")]
+    found = {(each["agent"], each["env"], each["recipe"]) for each in summaries}
+    assert found == {
+        *(("q_learning", "cliff", "cliff_q_learning"), ("sarsa", "cliff", "cliff_sarsa")),
+        *(("q_learning", "classic", None), ("sarsa", "classic", None)),
+    }
+
+
+def test_the_command_line_chooses_over_an_experiment() -> None:
     config = configure("experiment=cliff_q_learning", "agent=sarsa", "env=maze")
-    assert (config.agent.name, config.env.layout) == ("sarsa", "maze")
-    assert config.agent.initial_value == 0  # its values stay
+    assert (config.agent.name, config.env.layout, config.recipe) == ("sarsa", "maze", "maze_sarsa")
     assert configure("experiment=cliff_dqn", "observation=coordinates").observation.kind == "coordinates"
     assert configure("experiment=cliff_q_learning").observation.kind == "none"  # as the agent chooses
 
 
-def test_no_recipe_is_the_default() -> None:
+def test_a_study_leaves_recipes_and_presets_out() -> None:
+    for study in STUDIES:
+        config = configure(f"experiment={study}")
+        check(config)
+        assert (config.recipe, config.preset in ("none", "auto")) == (None, True)
     assert configure("~experiment") == configure()
 
 
-def test_the_manual_has_a_line_per_task() -> None:
-    _, shown = manual(CONF).split("experiment=...\n", 1)
-    shown = re.split(r"^  \S+=\.\.\.$", shown, flags=re.MULTILINE)[0]
-    shown, failing = shown.split("    These fail:\n")
+def test_the_manual_has_a_line_per_world() -> None:
+    _, shown = manual(CONF).split("tuned=...\n", 1)
+    shown = shown.split("\n\n", 1)[0]
     assert max(map(len, shown.splitlines())) <= 100
     found = set()
-    for word in shown.replace(",", "").split():
+    for word in shown.split("    Known to fail: ")[0].replace(",", "").split():
         if word.endswith("_..."):
-            task = word.removesuffix("...")
+            world = word.removesuffix("...")
         else:
-            found.add(task + word)
-    assert found == set(RECIPES)
-    comments = {name: (CONF / "experiment" / f"{name}.yaml").read_text("utf-8") for name in RECIPES}
-    expected = [name for name, text in comments.items() if re.search("^# .*(on none of| 0 of)", text, re.M)]
-    lines = [line.split(maxsplit=1) for line in failing.splitlines()]
-    assert [name for name, _ in lines] == expected
-    for name, about in lines:
-        assert about.startswith("does not solve its task: ")
-        assert f"\n# {about}\n" in comments[name]
+            found.add(world + word if word != "none" else word)
+    assert found == {*RECIPES, "none"}
 
 
 @pytest.mark.parametrize("name", ["dqn", "ppo", "a2c"])
 def test_the_default_settings_are_the_librarys_own(name: str) -> None:
-    config = configure(f"experiment=classic_{name}_sb3_defaults")
+    config = configure(f"agent={name}_sb3_defaults")
     arguments = algorithm_and_arguments(config.agent)[1]
     parameters = inspect.signature(getattr(stable_baselines3, name.upper()).__init__).parameters
     for key, value in arguments.items():
@@ -122,7 +132,12 @@ def test_the_default_settings_are_the_librarys_own(name: str) -> None:
     assert config.n_envs == 1
 
 
-ON_POLICY = [recipe for recipe in RECIPES if re.search("_(a2c|ppo|trpo)(_sb3_defaults)?$", recipe)]
+ON_POLICY = [
+    f"{env}_{agent}"
+    for env, agent in pairs()
+    if re.fullmatch("(a2c|ppo|trpo)(_sb3_defaults)?", agent)
+    and (f"{env}_{agent}" in RECIPES or env == "classic")
+]
 
 
 @pytest.mark.parametrize("recipe", ON_POLICY)
@@ -145,7 +160,7 @@ def test_a_tables_own_curves_have_tens_of_points(agent: str, tmp_path: Path) -> 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("task", ["cliff", "four_rooms"])
 def test_q_learning_is_certified(task: str, seed: int, tmp_path: Path) -> None:
-    summary = train_in(tmp_path, f"experiment={task}_q_learning", f"seed={seed}", *NO_FILES)
+    summary = train_in(tmp_path, f"env={task}", "agent=q_learning", f"seed={seed}", *NO_FILES)
     assert summary["certified"]
     assert int(summary["certified_since_step"]) < int(summary["total_timesteps"])
 

@@ -1,0 +1,141 @@
+"""Presets: plain numbers for stochastic and for large worlds, chosen by one rule, named and stored."""
+
+import json
+from pathlib import Path
+
+import pytest
+from helpers.support import CONF, configure, script, train_in
+
+import gridworld
+from gridworld.config.agents import REPLAY_COUNTS
+from gridworld.config.train import TrainConfig, check
+from gridworld.training.setup import check_settings, notes
+
+SETTINGS = sorted(file.stem for file in (CONF / "preset" / "settings").glob("*.yaml"))
+QUIET = [
+    f"recording.{name}=false" for name in ("frames", "gif", "learning", "policy_map", "visits", "q_error")
+]
+QUIET += ["logging.tensorboard=false", "logging.progress=false"]
+LARGE = ["env.num_rows=9", "env.num_cols=9"]
+
+
+def chosen(*words: str) -> tuple[str | None, str]:
+    config = configure(*words)
+    return config.recipe, config.preset
+
+
+@pytest.mark.parametrize(
+    ("words", "recipe", "preset"),
+    [
+        ([], None, "auto"),
+        (["env.slip=0.1"], None, "stochastic"),
+        (["env.slip=0.1", "agent=ppo"], None, "stochastic"),
+        (["env.slip=0.1", "agent=q_learning"], None, "stochastic"),
+        (["env.slip=0.1", "agent=value_iteration"], None, "auto"),  # it has no such settings
+        (["env.slip=0.1", "agent=dqn_sb3_defaults"], None, "auto"),
+        (LARGE, None, "large"),
+        (["env.num_rows=4", "env.num_cols=4"], None, "auto"),
+        (["env.slip=0.1", "agent.gamma=0.5"], None, "stochastic"),  # settings of the agent go before it
+        # What a preset's numbers rest on is given, or the engine that they are made for is not used.
+        (["env.slip=0.1", "total_timesteps=1000"], None, "auto"),
+        (["env.slip=0.1", "n_envs=8"], None, "auto"),
+        (["env.slip=0.1", "agent.engine=stock"], None, "auto"),
+        (["env.slip=0.1", "callbacks=[{_target_: mine.Own}]"], None, "auto"),
+        # By name.
+        (["env.slip=0.1", "preset=none"], None, "none"),
+        (["preset=stochastic"], None, "stochastic"),
+        (["env.slip=0.1", "preset=large"], None, "large"),
+        # A recipe is for the world as its yaml has it.
+        (["env=cliff"], "cliff_dqn", "auto"),
+        (["env=cliff", "env.max_episode_steps=50"], "cliff_dqn", "auto"),
+        (["env=cliff", "env.step_reward=-0.5"], "cliff_dqn", "auto"),
+        (["env=cliff", "env.slip=0.1"], None, "stochastic"),
+        (["env=cliff", "env.slip=0.1", "preset=none"], "cliff_dqn", "none"),
+        (["env=cliff", "tuned=none"], None, "large"),
+        (["env=frozen_lake_4x4"], "frozen_lake_4x4_dqn", "auto"),
+        # Settings that make no world: the check before training says what is wrong with them.
+        (["env.slip=3"], None, "auto"),
+        (["env.layout=nothing"], None, "auto"),
+        (["env=built", "env.builder=nothing.at_all"], None, "auto"),
+    ],
+)
+def test_one_rule_chooses(words: list[str], recipe: str | None, preset: str) -> None:
+    assert chosen(*words) == (recipe, preset)
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_the_numbers_of_a_preset_pass_the_checks(name: str) -> None:
+    agent, _, preset = name.rpartition("_")
+    config = configure(f"agent={agent}", f"preset={preset}")
+    check(config)
+    check_settings(config)
+    assert config.preset == preset
+    assert config != configure(f"agent={agent}", "preset=none")
+
+
+def test_what_the_command_line_says_goes_before_a_preset() -> None:
+    config = configure("agent=dqn", "env.slip=0.1", "agent.batch_size=4096", "exploring_starts=0.25")
+    agent = vars(config.agent)
+    assert (agent["batch_size"], config.exploring_starts) == (4096, 0.25)
+    assert (agent["replay_buffer_class"], config.stratified_draws) == (REPLAY_COUNTS, True)
+
+
+def test_a_preset_is_chosen_alike_from_python_and_by_the_command(tmp_path: Path) -> None:
+    by_call = gridworld.compose("agent=dqn", {"env.slip": 0.1})
+    assert by_call == configure("agent=dqn", "env.slip=0.1")
+    shown = script("train.py", "--cfg", "job", "agent=ppo", "env.slip=0.1", cwd=tmp_path).stdout
+    assert "${" not in shown
+    assert "preset: stochastic" in shown
+    assert "total_timesteps: 24000000" in shown
+
+
+def test_each_job_of_a_sweep_has_its_own_preset_and_a_line_says_so(tmp_path: Path) -> None:
+    words = ["-m", "agent=q_learning", "env.slip=0,0.1", "seed=0,1", f"hydra.sweep.dir={tmp_path}/s"]
+    done = script("train.py", *words, *QUIET[:-1], cwd=tmp_path)
+    files = sorted((tmp_path / "s").glob("*/manifest.json"))
+    manifests = [json.loads(file.read_text()) for file in files]
+    found = {(each["config"]["env"]["slip"], each["config"]["preset"]) for each in manifests}
+    assert found == {(0.0, "auto"), (0.1, "stochastic")}
+    assert [file.parent.name for file in files] == [
+        f"env.slip={s},seed={n}" for s in ("0", "0.1") for n in "01"
+    ]
+    assert "preset=stochastic, since actions have several outcomes: " in done.stderr
+    assert "(2 of 4 jobs)" in done.stderr
+    again = script("train.py", *words, *QUIET[:-1], cwd=tmp_path)  # finds its jobs again
+    assert "4 jobs: 4 done; 0 to run" in again.stderr
+
+
+def lines(config: TrainConfig) -> list[str]:
+    return notes(config, check_settings(config))
+
+
+def test_the_line_before_training() -> None:
+    assert lines(configure("agent=dqn")) == []
+    assert lines(configure("agent=dqn", "env=cliff")) == [
+        "recipe cliff_dqn: 80,000 steps; tuned=none keeps the agent's own settings"
+    ]
+    assert lines(configure("agent=dqn", "env.slip=0.1")) == [
+        "preset=stochastic, since actions have several outcomes: 9,600,000 steps; "
+        "preset=none keeps the agent's own settings"
+    ]
+    [line] = lines(configure("agent=ppo_sb3_defaults", "env.num_rows=4"))
+    assert line.startswith("agent=ppo_sb3_defaults is known to fall short: certified on none of 20")
+
+
+@pytest.mark.parametrize("agent", ["dqn", "ppo", "a2c", "trpo", "qrdqn"])
+def test_what_is_seen_changes_the_features_alone(agent: str) -> None:
+    plain, *others = (
+        configure(f"agent={agent}", f"observation={kind}") for kind in ("one_hot", "coordinates", "image")
+    )
+    names = [other.observation.features for other in others]
+    assert names == [f"gridworld.agents.sb3.features.{name}" for name in ("FourierFeatures", "PixelCNN")]
+    for other in others:
+        other.observation = plain.observation
+        assert other == plain
+
+
+def test_a_small_stochastic_world_is_certified(tmp_path: Path) -> None:
+    world = ["env.num_rows=4", "env.num_cols=4", "env.slip=0.1", "env.step_reward=-0.1"]
+    summary = train_in(tmp_path, "agent=q_learning", *world, *QUIET)
+    assert (summary["certified"], summary["preset"]) == (True, "stochastic")
+    assert summary["privileges"] == ["starts anywhere"]
