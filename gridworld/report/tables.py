@@ -40,7 +40,10 @@ def results_table(tasks: Sequence[TaskAnalysis], reasons: Reasons) -> Table:
 def _counting(
     groups: Sequence[Group], name: str, caption: str, columns: list[str], rows: list[list[Cell]]
 ) -> Table:
-    """A table with a row for each group, and a column for how many of its runs are counted if not all."""
+    """A table with a row for each group, and what any of them asks for: its privileges, the runs counted."""
+    if any(group.privileges for group in groups):
+        columns = [*columns, "privileges"]
+        rows = [[*row, group.privileges] for row, group in zip(rows, groups, strict=True)]
     if short := shortfall(groups):
         columns = [*columns, "counted"]
         rows = [[*row, group.shortfall or "all"] for row, group in zip(rows, groups, strict=True)]

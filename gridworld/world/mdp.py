@@ -56,6 +56,7 @@ class Mdp:
             where a transition into it ends the episode and another one does not.
         places: (S, 3), int64, or None: panel, row and column of each state in pictures, -1 where it has none.
         panel_names: what pictures call each panel; none: they do not name them.
+        state_names: what messages call the state of each number; none: by its place or its number.
         max_episode_steps: the step limit that belongs to the world; None: it has none of its own.
         own_observation: (S, ...), or None: what the environment itself shows of each state.
         truth: where the tables come from, as tables and pictures say it.
@@ -74,6 +75,7 @@ class Mdp:
     number: IntArray
     places: IntArray | None = None
     panel_names: tuple[str, ...] = ()
+    state_names: tuple[str, ...] = ()
     max_episode_steps: int | None = None
     own_observation: NDArray[Any] | None = field(default=None, repr=False)
     truth: str = EXACT
@@ -177,7 +179,9 @@ class Mdp:
         return (int(self.number[state]),)
 
     def state_name(self, state: int) -> str:
-        """What messages call a state: its place and panel where it has them, else its number."""
+        """What messages call a state: its name, else its place and panel, else its number."""
+        if self.state_names:
+            return self.state_names[int(self.number[state])]
         if self.places is None or (self.places[state] < 0).any():
             return f"state {int(self.number[state])}"
         panel, row, col = self.places[state].tolist()

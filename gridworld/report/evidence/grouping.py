@@ -41,6 +41,11 @@ class Group:
     perhaps: tuple[Unusable, ...] = ()  # the same, but they may be of another group
 
     @property
+    def privileges(self) -> str:
+        """What its runs had and a learner in the world would not have; "" where that is nothing."""
+        return ", ".join(dict.fromkeys(each for run in self.runs for each in run.privileges))
+
+    @property
     def seeds(self) -> str:
         """How many of its seeds are counted, "4 of 5 seeds"; "" for all of them."""
         runs = len(self.runs)

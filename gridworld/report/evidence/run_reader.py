@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 
 from gridworld.config.flatten import flat
+from gridworld.config.privileges import privileges
 from gridworld.config.settings_by_effect import is_newer
+from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import printable
 from gridworld.report.evidence.curve_reader import read_curve
@@ -50,6 +52,7 @@ class Evidence:
         curve: Columns (evaluations,): those of `curve_reader.REQUIRED`, and optional ones that the file has.
         pictures: As `RunReader.pictures`.
         step_limit: Of an episode, as the summary has it.
+        privileges: As `config.privileges` finds them in its settings.
         damage: A sentence for each of its other files that is not the one that it wrote.
     """
 
@@ -68,6 +71,7 @@ class Evidence:
     curve: Mapping[str, FloatArray]
     pictures: Mapping[str, str | None]
     step_limit: Any = None
+    privileges: Sequence[str] = ()
     damage: tuple[str, ...] = ()
 
     @property
@@ -187,6 +191,7 @@ def _evidence(run: RunReader) -> Evidence:
         curve=curve,
         pictures=run.pictures(),
         step_limit=summary.get("max_episode_steps"),
+        privileges=privileges(TrainConfig, config),
     )
     _check_agreement(evidence, summary)
     return evidence

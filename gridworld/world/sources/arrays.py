@@ -46,6 +46,7 @@ from gridworld.world.sources.verification import checked_text, verified
 _TABLES = ("next_state", "probability", "reward", "terminated", "success")
 _NEEDED = ("next_state", "reward", "terminated", "start")
 _OPTIONAL = ("probability", "success", "action_names", "places", "max_episode_steps", "name")
+_LISTS = ("panel_names", "state_names")  # of names, which most worlds do not have
 _MOST_BYTES = 4 * 2**30
 _FORMAT = np.array("gridworld world 1")
 
@@ -194,8 +195,9 @@ def world_bytes(mdp: Mdp) -> bytes:
         value = getattr(mdp, field.name)
         if value is not None:
             arrays[field.name] = np.ascontiguousarray(value) if np.ndim(value) else np.array(value)
-    if not mdp.panel_names:
-        del arrays["panel_names"]
+    for key in _LISTS:
+        if not getattr(mdp, key):
+            del arrays[key]
     return npz_bytes(arrays)
 
 
@@ -223,7 +225,7 @@ def _from_fields(found: dict[str, NDArray[Any]], where: str) -> Mdp:
     for key in ("name", "truth"):
         if key in found:
             values[key] = checked_text(where, key, found[key])
-    for key in ("action_names", "panel_names"):
+    for key in ("action_names", *_LISTS):
         values[key] = tuple(_names(where, key, found.get(key)) or ())
     values["max_episode_steps"] = _whole(where, "max_episode_steps", found.get("max_episode_steps"))
     tables = {key: frozen(value) for key, value in values.items() if isinstance(value, np.ndarray)}

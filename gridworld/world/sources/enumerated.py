@@ -116,6 +116,8 @@ def _compile(name: str, subject: Subject, graph: Graph, limit: int | None) -> Md
         max_episode_steps=limit,
         own_observation=observations,
     )
+    if graph.names[0]:
+        mdp = replace(mdp, state_names=tuple(graph.names))
     told = f" without {', '.join(subject.ignore)} as told" if subject.ignore else ""
     return replace(mdp, truth=f"enumerated, {mdp.num_states:,} states{told}")
 

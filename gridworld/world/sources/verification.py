@@ -69,6 +69,8 @@ def verified(mdp: Mdp, where: str) -> Mdp:
     _check_ends(mdp, where)
     _check_thresholds(mdp, where)
     _check_numbers(mdp, where)
+    if mdp.state_names and len(mdp.state_names) != mdp.num_numbers:
+        raise InputError(f"{where}: state_names must be one for each of {mdp.num_numbers} numbers")
     return mdp
 
 

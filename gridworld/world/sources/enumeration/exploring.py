@@ -27,6 +27,7 @@ _DEEPEST = 10_000  # steps from the start
 _MANY_STATES = 20_000  # from which on their number is told
 _MOST_BYTES = 2**31  # of all copies and observations together
 _SAMPLED = 16  # of so many states the copy of one is kept, to tell what keeps changing
+_FACING = ("right", "down", "left", "up")  # minigrid's directions
 _SEEDS = 8  # resets that must lead to the same state
 _FIXED = "; take an environment with a fixed layout and start, or name in env.ignore what nothing depends on"
 
@@ -124,6 +125,18 @@ class Subject:
             raise self.refusal(f"a step draws a random number, so it is not deterministic{self._remedy}")
         return found
 
+    def state_name(self) -> str:
+        """What a reader calls its state, by the attributes that minigrid's environments have; else ""."""
+        place, direction = (getattr(self.env, name, None) for name in ("agent_pos", "agent_dir"))
+        try:
+            (col, row), facing = place, _FACING[direction]  # type: ignore[misc, index]
+            name = f"row {int(row) + 1}, column {int(col) + 1}, facing {facing}"
+        except (TypeError, ValueError, IndexError):
+            return ""
+        carried = getattr(getattr(self.env, "carrying", None), "type", None)
+        time = "" if "step_count" in self.ignore else f", step {getattr(self.env, 'step_count', '?')}"
+        return f"{name}{f', carrying a {carried}' if carried else ''}{time}"
+
     def changing(self, snapshots: Sequence[bytes]) -> str:
         """The attributes with the most values in copies of states, that of the elapsed time among them."""
         values: dict[str, set[bytes]] = {}
@@ -153,6 +166,7 @@ class Graph:
         keys: N keys.
         seen: N digests of observations.
         observations: N observations, as arrays; empty where they are none.
+        names: N names, all empty where nothing is known of the environment's attributes.
     """
 
     next_state: IntArray
@@ -164,6 +178,7 @@ class Graph:
     keys: list[bytes]
     seen: list[bytes]
     observations: list[NDArray[Any]]
+    names: list[str]
 
 
 def explore(subject: Subject, most_states: int, limit: int | None) -> Graph:
@@ -212,6 +227,7 @@ class _Search:
         self._state: dict[bytes, int] = {}  # by its key
         self._seen: list[bytes] = []
         self._observations: list[NDArray[Any]] = []
+        self._names: list[str] = []
         self._snapshots: list[bytes] = []
         self._num_bytes = 0
         observation, _ = subject.env.reset(seed=0)
@@ -275,6 +291,7 @@ class _Search:
         self.depth.append(depth)
         self._snapshots.append(copy)
         self._seen.append(seen)
+        self._names.append(self.subject.state_name())
         self._num_bytes += len(copy)
         array = self._as_array(observation)
         if array is not None:
@@ -317,6 +334,7 @@ class _Search:
             keys=list(self._state)[:size],
             seen=self._seen[:size],
             observations=self._observations[:size],
+            names=self._names[:size],
         )
 
 
