@@ -46,7 +46,7 @@ examples:
   python scripts/tune.py agent=ppo env=four_rooms
       a hundred trials of three seeds; then
   python scripts/train.py recipe=runs/tune_ppo_four_rooms
-  python scripts/tune.py experiment=maze_ppo tune.trials=300 tune.study=maze
+  python scripts/tune.py agent=ppo env=maze tune.trials=300 tune.study=maze
       begins from a recipe
   python scripts/tune.py agent=ppo tune=mine --config-dir my_conf
       a search space of your own, my_conf/tune/mine.yaml

@@ -1,4 +1,4 @@
-"""Features extractors without parameters: fixed functions of what an agent sees, which a network learns from.
+"""Features extractors: functions of what an agent sees, which a network learns from; all but one are fixed.
 
 Two numbers, or thousands of pixels of which few differ, are hard to tell apart for a small network. Here each
 observation becomes a vector of length 1, and those of different cells are at right angles, or nearly, as the
@@ -16,8 +16,8 @@ from typing import Any
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from torch import Tensor
-from torch.nn.functional import max_pool2d, normalize
+from torch import Tensor, nn
+from torch.nn.functional import embedding, layer_norm, max_pool2d, normalize, pad, relu
 
 from gridworld.envs.observations import IMAGE_CELL_SIZE
 from gridworld.errors import InputError
@@ -83,8 +83,8 @@ class FourierFeatures(BaseFeaturesExtractor):
         return f"orders={self.orders}"
 
 
-class ImageCells(BaseFeaturesExtractor):
-    """The brightest colours of an image's cells.
+class AgentByColour(BaseFeaturesExtractor):
+    """The brightest colours of an image's squares, nearly where the agent stands: nothing is learned.
 
     What counts of a pixel is by how much red, green or blue exceeds the other two: white and greys are 0. The
     features are the largest of each colour in each square of pixels, divided by the length of all.
@@ -98,18 +98,9 @@ class ImageCells(BaseFeaturesExtractor):
     """
 
     def __init__(self, observation_space: spaces.Space[Any], cell_size: int = IMAGE_CELL_SIZE) -> None:
-        shape = observation_space.shape or ()
-        if len(shape) != 3 or shape[0] != 3:
-            raise InputError(
-                "ImageCells: the observation must be an image of shape (3, height, width); it is "
-                f"{observation_space}"
-            )
-        if not (type(cell_size) is int and 0 < cell_size <= min(shape[1:])):
-            raise InputError(
-                f"ImageCells: cell_size={cell_size}: must be from 1 to the image's {min(shape[1:])} pixels"
-            )
+        colours, height, width = _image_shape("AgentByColour", observation_space, cell_size)
         self.cell_size = cell_size
-        super().__init__(observation_space, 3 * (shape[1] // cell_size) * (shape[2] // cell_size))
+        super().__init__(observation_space, colours * (height // cell_size) * (width // cell_size))
 
     def forward(self, observations: Tensor) -> Tensor:
         """The features (n, m) of images (n, 3, height, width), from 0 to 1."""
@@ -122,4 +113,92 @@ class ImageCells(BaseFeaturesExtractor):
         return f"cell_size={self.cell_size}"
 
 
-FIXED = (FourierFeatures, ImageCells)  # functions of an observation alone, which never change
+class PixelCNN(BaseFeaturesExtractor):
+    """A small convolutional network that learns from an image's pixels.
+
+    Two convolutions, of squares of pixels side by side and of one square's channels. Each channel of each is
+    scaled to mean 0 and variance 1 over the image's squares, image by image, and rectified. So the sizes of
+    the weights do not matter, and no optimiser's step is too long for them. The third power lets what stands
+    out in an image, as the agent does, weigh more than what fills it. The features are scaled to one length.
+
+    The first convolution is computed as a product of matrices, since squares do not overlap. What depends on
+    no parameter (`patches`) is apart from what is learned (`learn`), so that it can be computed once.
+
+    D. Ulyanov, A. Vedaldi, V. Lempitsky: Instance Normalization, 2016.
+
+    Args:
+        observation_space: of images, (channels, height, width).
+        cell_size: side of a square, in pixels; sides that are no multiples of it are padded with black.
+        channels: of the two convolutions.
+        length: of a feature vector. With 1, values as large as -100 are learned too slowly.
+
+    Raises:
+        InputError: another space, or squares that are larger than the image.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        cell_size: int = IMAGE_CELL_SIZE,
+        channels: Sequence[int] = (16, 32),
+        length: float = 3.0,
+    ) -> None:
+        depth, height, width = _image_shape("PixelCNN", observation_space, cell_size)
+        self.rows, self.cols = -(-height // cell_size), -(-width // cell_size)
+        first, second = channels
+        super().__init__(observation_space, self.rows * self.cols * second)
+        self.cell_size, self.length = cell_size, length
+        self.padding = 0, self.cols * cell_size - width, 0, self.rows * cell_size - height
+        self.first = nn.Linear(depth * cell_size**2, first, bias=False)
+        self.second = nn.Linear(first, second, bias=False)
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """The features (n, m) of images (n, channels, height, width), from 0 to 1."""
+        return self.learn(self.patches(observations))
+
+    def patches(self, images: Tensor) -> Tensor:
+        """The squares (n, P, k) of images (n, channels, height, width), row by row."""
+        side, whole = self.cell_size, pad(images, self.padding)
+        cut = whole.view(len(images), -1, self.rows, side, self.cols, side)
+        return cut.permute(0, 2, 4, 1, 3, 5).reshape(len(images), self.rows * self.cols, -1)
+
+    def learn(self, patches: Tensor, where: Tensor | None = None) -> Tensor:
+        """The features (n, m) of images.
+
+        Args:
+            patches: their squares, (n, P, k); or (D, k), the distinct ones.
+            where: (n, P), integers: which of D each square is.
+        """
+        hidden = self.first(patches)
+        if where is not None:
+            hidden = embedding(where, hidden)
+        hidden = _standing_out(hidden.transpose(1, 2))
+        hidden = _standing_out(self.second(hidden.transpose(1, 2)).transpose(1, 2))
+        return self.length * normalize((hidden**3).flatten(1))
+
+    def extra_repr(self) -> str:
+        """Its settings, by which networks are told apart."""
+        return f"cell_size={self.cell_size}, length={self.length:g}"
+
+
+def _standing_out(channels: Tensor) -> Tensor:
+    """By how much each channel (n, c, P) exceeds its mean over an image, in standard deviations."""
+    return relu(layer_norm(channels, channels.shape[2:]))
+
+
+def _image_shape(name: str, space: spaces.Space[Any], cell_size: int) -> tuple[int, int, int]:
+    shape = space.shape or ()
+    if len(shape) != 3:
+        raise InputError(
+            f"{name}: the observation must be an image of shape (channels, height, width); it is {space}"
+        )
+    if not (type(cell_size) is int and 0 < cell_size <= min(shape[1:])):
+        raise InputError(
+            f"{name}: cell_size={cell_size}: must be from 1 to the image's {min(shape[1:])} pixels"
+        )
+    return shape[0], shape[1], shape[2]
+
+
+ImageCells = AgentByColour  # as it was called in runs of before
+FIXED = (FourierFeatures, AgentByColour)  # functions of an observation alone, which never change
+LEARNED = (PixelCNN,)  # functions of an observation and of parameters, of nothing else

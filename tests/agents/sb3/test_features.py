@@ -1,4 +1,4 @@
-"""Features extractors without parameters: what they make of coordinates and of images."""
+"""Features extractors: what they make of coordinates and of images, and that a network learns from pixels."""
 
 from itertools import product
 from pathlib import Path
@@ -13,7 +13,7 @@ from stable_baselines3 import DQN, PPO
 from torch import Tensor
 
 import gridworld
-from gridworld.agents.sb3.features import FourierFeatures, ImageCells
+from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 
@@ -65,7 +65,7 @@ def test_a_state_without_a_place_is_none_of_the_cells() -> None:
 def test_images_of_different_cells_are_far_apart(layout: str, cell_size: int) -> None:
     mdp = gridworld.compose(f"env={layout}").env.compile()
     images = make_observation(mdp, "image", cell_size)
-    features = ImageCells(images.space)(torch.tensor(images.table()) / 255)
+    features = AgentByColour(images.space)(torch.tensor(images.table()) / 255)
     assert torch.allclose(features.norm(dim=1), torch.ones(mdp.num_states))
     inside = features[~torch.tensor(mdp.absorbing)]
     distances = torch.cdist(inside, inside) + 9 * torch.eye(len(inside))
@@ -77,12 +77,52 @@ def test_an_images_cells_are_their_brightest_colours() -> None:
     image[0, :, 0, 0] = 0.7  # grey
     image[0, :, 1, 1] = torch.tensor([0.2, 0.3, 0.9])
     image[0, :, 3, 2] = torch.tensor([0.8, 0.4, 0.0])
-    cells = ImageCells(spaces.Box(0, 255, (3, 5, 4), np.uint8), cell_size=2)
+    cells = AgentByColour(spaces.Box(0, 255, (3, 5, 4), np.uint8), cell_size=2)
     found = cells(image).reshape(3, 2, 2) * np.hypot(0.6, 0.4)
     expected = torch.zeros(3, 2, 2)
     expected[2, 0, 0], expected[0, 1, 1] = 0.6, 0.4
     assert torch.allclose(found, expected)
     assert torch.equal(cells(torch.ones(1, 3, 5, 4)), torch.zeros(1, 12))
+
+
+def an_image_network(**arguments: Any) -> tuple[PixelCNN, torch.Tensor]:
+    images = make_observation(gridworld.compose("env=four_rooms").env.compile(), "image", 8)
+    torch.manual_seed(0)
+    return PixelCNN(images.space, **arguments), torch.tensor(images.table()) / 255
+
+
+@pytest.mark.parametrize("cell_size", [8, 5, 3])  # of which the frame is no multiple
+def test_a_convolution_of_squares_is_a_product_of_their_pixels(cell_size: int) -> None:
+    network, images = an_image_network(cell_size=cell_size)
+    kernel = network.first.weight.reshape(16, 3, cell_size, cell_size)
+    rows, cols = (-(-side // cell_size) for side in images.shape[2:])
+    padded = torch.zeros(len(images), 3, rows * cell_size, cols * cell_size)
+    padded[:, :, : images.shape[2], : images.shape[3]] = images
+    expected = torch.nn.functional.conv2d(padded, kernel, stride=cell_size).flatten(2)
+    found = network.first(network.patches(images)).transpose(1, 2)
+    assert torch.allclose(found, expected, atol=1e-5)
+
+
+def test_learned_features_have_one_length_and_follow_from_distinct_squares() -> None:
+    network, images = an_image_network(length=2.0)
+    features = network(images)
+    assert features.shape == (len(images), network.features_dim)
+    assert torch.allclose(features.norm(dim=1), torch.tensor(2.0))
+    patches = network.patches(images)
+    distinct, where = patches.flatten(0, 1).unique(dim=0, return_inverse=True)
+    assert len(distinct) < 20 < len(images)
+    assert torch.allclose(network.learn(distinct, where.view(patches.shape[:2])), features, atol=1e-6)
+    assert torch.equal(network(images[3:5]), features[3:5])  # of one image alone
+    features.sum().backward()
+    assert all(weight.grad is not None and weight.grad.any() for weight in network.parameters())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("agent", "seed"), [("dqn", 0), ("dqn", 1), ("ppo", 0), ("ppo", 1)])
+def test_it_learns_from_pixels(agent: str, seed: int, tmp_path: Path) -> None:
+    quiet = [f"recording.{name}=false" for name in ("frames", "gif", "learning", "policy_map", "q_error")]
+    summary = train_in(tmp_path, f"agent={agent}", "observation=image", f"seed={seed}", *quiet)
+    assert summary["certified"]
 
 
 @pytest.mark.parametrize(
@@ -96,9 +136,23 @@ def test_an_images_cells_are_their_brightest_colours() -> None:
         ),
         (lambda: FourierFeatures(PLANE, [[1, 2], 3]), "orders=[[1, 2], 3]: must be 2 whole numbers"),
         (lambda: FourierFeatures(PLANE, [True, 2]), "orders=[True, 2]: must be 2 whole numbers"),
-        (lambda: ImageCells(spaces.Box(0, 255, (3, 8, 9), np.uint8), True), "cell_size=True: must be from 1"),
-        (lambda: ImageCells(PLANE), "must be an image of shape (3, height, width)"),
-        (lambda: ImageCells(spaces.Box(0, 255, (3, 8, 9), np.uint8), 10), "from 1 to the image's 8 pixels"),
+        (
+            lambda: AgentByColour(spaces.Box(0, 255, (3, 8, 9), np.uint8), True),
+            "cell_size=True: must be from 1",
+        ),
+        (
+            lambda: PixelCNN(PLANE),
+            "PixelCNN: the observation must be an image of shape (channels, height, width)",
+        ),
+        (
+            lambda: PixelCNN(spaces.Box(0, 255, (3, 8, 9), np.uint8), 0),
+            "PixelCNN: cell_size=0: must be from 1",
+        ),
+        (lambda: AgentByColour(PLANE), "must be an image of shape (channels, height, width)"),
+        (
+            lambda: AgentByColour(spaces.Box(0, 255, (3, 8, 9), np.uint8), 10),
+            "from 1 to the image's 8 pixels",
+        ),
     ],
 )
 def test_what_they_cannot_take(make: Any, words: str) -> None:

@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from gridworld import GridWorldVectorEnv
 from gridworld.agents.sb3 import check
-from gridworld.agents.sb3.features import FourierFeatures, ImageCells
+from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
 from gridworld.agents.sb3.settings.constructor_arguments import algorithm_and_arguments
 from gridworld.agents.sb3.settings.schemas import SB3Config
 from gridworld.agents.sb3.tabulated import off_policy
@@ -120,7 +120,8 @@ def share_rollout(ours: Any, theirs: Any, is_moved: bool = True) -> None:
 
 SEPARATE = {"policy_kwargs": {"share_features_extractor": False}}
 FOURIER = {"policy_kwargs": {"features_extractor_class": FourierFeatures}}
-CELLS = {"policy_kwargs": {"features_extractor_class": ImageCells, "net_arch": [16]}}
+CELLS = {"policy_kwargs": {"features_extractor_class": AgentByColour, "net_arch": [16]}}
+PIXELS = {"policy_kwargs": {"features_extractor_class": PixelCNN, "net_arch": [16]}}
 APART = {"policy_kwargs": {**FOURIER["policy_kwargs"], "share_features_extractor": False}}
 LINEAR = {"policy_kwargs": {"net_arch": []}}
 TWO_SIZES = {"policy_kwargs": {"net_arch": {"pi": [8], "vf": [16, 16]}}}
@@ -140,7 +141,7 @@ FROM_ROLLOUTS: dict[tuple[type, type], list[tuple[str, dict[str, Any]]]] = {
         ("one_hot", {"n_epochs": 3, "batch_size": 100}),
         ("one_hot", {"n_epochs": 3, "batch_size": 10_000}),
         *[("none", LINEAR), ("coordinates", TWO_SIZES), ("coordinates", SEPARATE), ("image", SEPARATE)],
-        *[("coordinates", FOURIER), ("image", CELLS), ("coordinates", APART)],
+        *[("coordinates", FOURIER), ("image", CELLS), ("image", PIXELS), ("coordinates", APART)],
         ("one_hot", {"policy_kwargs": RELU}),
     ],
     (TabulatedA2C, A2C): [
@@ -148,6 +149,8 @@ FROM_ROLLOUTS: dict[tuple[type, type], list[tuple[str, dict[str, Any]]]] = {
         ("one_hot", {"ent_coef": 0.3, "vf_coef": 0.1, "gae_lambda": 0.9, "normalize_advantage": True}),
         ("one_hot", {"use_rms_prop": False, "max_grad_norm": 0.01}),
         *[("none", LINEAR), ("coordinates", TWO_SIZES), ("image", SEPARATE), ("coordinates", FOURIER)],
+        # Its own optimiser's first steps are of full size, however small a gradient is.
+        ("image", {"policy_kwargs": {**PIXELS["policy_kwargs"], "optimizer_class": torch.optim.SGD}}),
     ],
     (TabulatedTRPO, TRPO): [
         *[(kind, {}) for kind in KINDS if kind != "image"],
@@ -332,7 +335,7 @@ FROM_REPLAY: dict[tuple[type, type], list[tuple[str, dict[str, Any]]]] = {
         *[(kind, {}) for kind in KINDS],
         ("one_hot", {"max_grad_norm": 1e-3, "gamma": 0.5}),
         ("one_hot", LINEAR),
-        *[("coordinates", FOURIER), ("image", CELLS)],
+        *[("coordinates", FOURIER), ("image", CELLS), ("image", PIXELS)],
         ("none", {"policy_kwargs": {"net_arch": [8], "activation_fn": torch.nn.Tanh}}),
         ("one_hot", {"policy_kwargs": {"activation_fn": torch.nn.PReLU}}),
     ],

@@ -83,7 +83,7 @@ class TabulatedOffPolicy(OffPolicyAlgorithm):
         """
         layers = getattr(network, self.network)
         extract = functools.partial(network.extract_features, features_extractor=network.features_extractor)
-        features = self.inputs.features(states, extract, layers)
+        features = self.inputs.features(states, extract, layers, extractors=[network.features_extractor])
         return forward(layers, leaves, features) if leaves else self.inputs.latent(layers, states, features)
 
     def outputs_of_all(self, leaves: Leaves | None = None) -> tuple[Tensor]:

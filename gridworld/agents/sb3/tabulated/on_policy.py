@@ -66,7 +66,11 @@ class TabulatedOnPolicy(OnPolicyAlgorithm):
         """
         policy, extractor = self.policy, self.policy.mlp_extractor
         nets = (extractor.policy_net, extractor.value_net)
-        features = self.inputs.features(states, policy.extract_features, *nets)
+        names = ["features_extractor"]
+        if not policy.share_features_extractor:
+            names = ["pi_features_extractor", "vf_features_extractor"]
+        extractors = [getattr(policy, name) for name in names]
+        features = self.inputs.features(states, policy.extract_features, *nets, extractors=extractors)
         actor, critic = features if isinstance(features, tuple) else (features, features)
         if leaves:
             logits = forward([*nets[0], policy.action_net], leaves, actor)

@@ -10,7 +10,8 @@ So one forward and one backward pass over the distinct states give the loss and 
 batch, exactly: the same sums as sample by sample, added up in another order. While the parameters stand
 still, the outputs are a table, and acting is looking up.
 
-Features that no parameter has a part in, as those of `features.FIXED`, are a table as well, made once.
+Features that no parameter has a part in, as those of `features.FIXED`, are a table as well, made once. So
+are the distinct squares of pixels of all images, which is what those of `features.LEARNED` begin with.
 
 A one-hot row times the first layer's weights is a column of these weights. So for one-hot observations that
 layer is a look-up as well, and no matrix of S x S is ever made.
@@ -19,7 +20,7 @@ layer is a look-up as well, and no matrix of S x S is ever made.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -28,10 +29,11 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from torch import Tensor, nn
 
-from gridworld.agents.sb3.features import FIXED
+from gridworld.agents.sb3.features import FIXED, LEARNED
 from gridworld.agents.sb3.replay_counts import ReplayCounts
 from gridworld.agents.sb3.settings.schemas import SB3ClassConfig, SB3Config, as_dict
 from gridworld.agents.sb3.tabulated.flat_optimizer import ELEMENTWISE
@@ -50,7 +52,7 @@ ACTIVATIONS = (
 # Of a policy's classes: those that are known to fit, and why another one need not.
 _CLASSES: tuple[tuple[str, tuple[type, ...], str], ...] = (
     ("activation_fn", ACTIVATIONS, "is not known to give the same for the same number always"),
-    ("features_extractor_class", FIXED, "may keep more than a function of the state"),
+    ("features_extractor_class", (*FIXED, *LEARNED), "may keep more than a function of the state"),
     ("optimizer_class", ELEMENTWISE, "may look at more than a weight at a time"),
 )
 _FEW_STATES = 1024  # up to here all states are cheaper than finding out which ones a batch holds
@@ -126,13 +128,16 @@ class StateInputs:
         extractors = {type(each) for each in policy.modules() if isinstance(each, BaseFeaturesExtractor)}
         self._one_hot = extractors == {FlattenExtractor} and _is_look_up(observation)
         self._is_fixed = extractors <= {FlattenExtractor, *FIXED}
+        self._is_learned = extractors <= set(LEARNED)  # `learn` of `patches`
         self._all: Any = None  # of all states, the features if these never change, else the observations
 
     @functools.cached_property
     def kind(self) -> Hashable:
         """Equal for policies that can be run side by side: of one shape, with the same inputs."""
         may_agree = self._policy.device.type == "cpu"
-        if self.num_states > _FEW_STATES or not (may_agree or self.mixes) or not can_stand(self._policy):
+        if self._is_learned or self.num_states > _FEW_STATES or not (may_agree or self.mixes):
+            return id(self)
+        if not can_stand(self._policy):
             return id(self)
         rows = b"" if self._one_hot else self._observation.rows(np.arange(self.num_states)).tobytes()
         return type(self._policy), repr(self._policy), self.num_states, self._observation.kind, rows
@@ -169,7 +174,11 @@ class StateInputs:
         return hidden
 
     def features(
-        self, states: IntArray | None, extract: Callable[[Tensor], Any], *networks: nn.Sequential
+        self,
+        states: IntArray | None,
+        extract: Callable[[Tensor], Any],
+        *networks: nn.Sequential,
+        extractors: Sequence[Any],
     ) -> Any:
         """What the networks are run on, of some states; computed once if no parameter has a part in it.
 
@@ -177,6 +186,7 @@ class StateInputs:
             states: (U,), integers; None: all.
             extract: makes features of observations (U, *shape).
             networks: those to run on them.
+            extractors: the modules by which `extract` makes features, with the same settings.
 
         Returns:
             What `extract` returns; None where all these networks begin with a look-up.
@@ -185,12 +195,28 @@ class StateInputs:
             return None
         if states is not None:
             return extract(self._tensor(states))
+        if self._is_learned:
+            if self._all is None:
+                self._all = self._distinct_patches(extractors[0])
+            found = [each.learn(*self._all) for each in extractors]
+            return found[0] if len(found) == 1 else tuple(found)
         if self._all is None:
             self._all = self._tensor(np.arange(self.num_states))
             if self._is_fixed:
                 with torch.no_grad():
                     self._all = extract(self._all)
         return self._all if self._is_fixed else extract(self._all)
+
+    def _distinct_patches(self, extractor: Any) -> tuple[Tensor, Tensor]:
+        """The squares that occur in the states' images, (D, k), and which are in each image, (S, P).
+
+        Images of one world share nearly all their squares, so that few pixels are left to run the network on.
+        """
+        patches = extractor.patches(self._tensor(np.arange(self.num_states)))
+        distinct, where = patches.flatten(0, 1).unique(dim=0, return_inverse=True)
+        seen = preprocess_obs(distinct, self._policy.observation_space, self._policy.normalize_images)
+        assert isinstance(seen, Tensor)
+        return seen, where.view(patches.shape[:2])
 
     def _tensor(self, states: IntArray) -> Tensor:
         tensor, _ = self._policy.obs_to_tensor(self._observation.rows(states))
