@@ -121,7 +121,14 @@ def share_rollout(ours: Any, theirs: Any, is_moved: bool = True) -> None:
 SEPARATE = {"policy_kwargs": {"share_features_extractor": False}}
 FOURIER = {"policy_kwargs": {"features_extractor_class": FourierFeatures}}
 CELLS = {"policy_kwargs": {"features_extractor_class": AgentByColour, "net_arch": [16]}}
-PIXELS = {"policy_kwargs": {"features_extractor_class": PixelCNN, "net_arch": [16]}}
+# Where a square is the same in an image everywhere, rounding is what is scaled to variance 1: no Adam here.
+PIXELS = {
+    "policy_kwargs": {
+        "features_extractor_class": PixelCNN,
+        "net_arch": [16],
+        "optimizer_class": torch.optim.SGD,
+    }
+}
 APART = {"policy_kwargs": {**FOURIER["policy_kwargs"], "share_features_extractor": False}}
 LINEAR = {"policy_kwargs": {"net_arch": []}}
 TWO_SIZES = {"policy_kwargs": {"net_arch": {"pi": [8], "vf": [16, 16]}}}
@@ -149,8 +156,7 @@ FROM_ROLLOUTS: dict[tuple[type, type], list[tuple[str, dict[str, Any]]]] = {
         ("one_hot", {"ent_coef": 0.3, "vf_coef": 0.1, "gae_lambda": 0.9, "normalize_advantage": True}),
         ("one_hot", {"use_rms_prop": False, "max_grad_norm": 0.01}),
         *[("none", LINEAR), ("coordinates", TWO_SIZES), ("image", SEPARATE), ("coordinates", FOURIER)],
-        # Its own optimiser's first steps are of full size, however small a gradient is.
-        ("image", {"policy_kwargs": {**PIXELS["policy_kwargs"], "optimizer_class": torch.optim.SGD}}),
+        ("image", PIXELS),
     ],
     (TabulatedTRPO, TRPO): [
         *[(kind, {}) for kind in KINDS if kind != "image"],
