@@ -124,7 +124,7 @@ def test_two_optima_that_differ_are_told_apart() -> None:
 def test_on_policy_control_learns_what_is_best_for_one_that_explores() -> None:
     explores = ["agent.exploration_initial_eps=0.5", "agent.exploration_final_eps=0.5"]
     run = gridworld.train(
-        "agent=sarsa", "env=cliff", "total_timesteps=60000", *explores, seed=0, progress=False
+        "agent=sarsa", "env=cliff", "tuned=none", "total_timesteps=60000", *explores, seed=0, progress=False
     )
     assert gridworld.diagnose(run).cause == "epsilon"
 

@@ -81,7 +81,7 @@ def test_wandb(place: Path) -> None:
     assert not run.host
     config = {item.key: json.loads(item.value_json) for item in run.config.update}
     assert config["env.slip"] == 0.1
-    assert config["agent.gamma"] == 0.95  # what follows the slip
+    assert config["agent.gamma"] == 0.9
     rows = [values_of(each.item) for each in found["history"]]
     curve = curve_of(place)
     assert [row["_step"] for row in rows] == [int(row["step"]) for row in curve]

@@ -185,7 +185,7 @@ def test_a_policy_that_walks_in_circles_is_reported_not_waited_for() -> None:
     curve, _ = follow([False])
     assert curve.newest is not None
     assert curve.newest.greedy.outcome.timeout == 1
-    assert curve.evaluator.endless_cells(one_hot_policy(curve.newest.snapshot.greedy, 4)) == [(0, 0)]
+    assert curve.evaluator.endless_states(one_hot_policy(curve.newest.snapshot.greedy, 4)) == [0]
 
 
 def test_one_policy_earns_one_certificate_however_often_it_is_met(tmp_path: Path) -> None:

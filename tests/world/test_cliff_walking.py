@@ -85,7 +85,7 @@ def test_its_known_returns():
     falling = one_hot_policy(np.full(48, RIGHT), 4)
     outcome = evaluator.score(falling).outcome
     assert (outcome.timeout, outcome.trap, outcome.expected_return) == (1, 0, -100_000)
-    assert evaluator.endless_cells(falling) == [(3, 0)]
+    assert evaluator.endless_states(falling) == [3 * 12]
 
 
 def test_a_fall_may_be_the_way_to_an_end():

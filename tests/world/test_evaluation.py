@@ -217,7 +217,7 @@ def test_circles_are_found_without_being_walked() -> None:
     actions = np.zeros(30, dtype=int)
     actions[0], actions[1], actions[7], actions[6] = 1, 2, 3, 0  # round the first square
     policy = one_hot_policy(actions, 4)
-    assert CLASSIC.endless_cells(policy) == [(0, 0), (0, 1), (1, 0), (1, 1)]
+    assert CLASSIC.endless_states(policy) == [0, 1, 6, 7]
     assert CLASSIC.score(policy).outcome.timeout == 1
     assert len(play_episode(CLASSIC.mdp, policy, 100, seed=0)) == 101
 
