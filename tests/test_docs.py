@@ -16,7 +16,7 @@ from gridworld.config.flatten import flat
 
 CLAIMS: dict[str, tuple[str, list[str]]] = {  # by a part of a command: what it prints, and words to add
     "classic_ppo_sb3_defaults": ("not optimal", []),
-    "evaluate.py runs/defaults": ("it walks in circles until the time is out (probability 1)", []),
+    "evaluate.py runs/defaults": ("it loops until the step limit (probability 1)", []),
     "observation=coordinates": ("certified optimal since step", ["evaluation.stop_after=1"]),
     "observation=image": ("certified optimal since step", ["evaluation.stop_after=1"]),
     "train.py --help": ("Choices:", []),
