@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +19,6 @@ from gridworld.config.composition.conf_folder import conf_folder
 from gridworld.config.composition.hydra_errors import sentence
 from gridworld.config.plain_settings import check_foreign
 from gridworld.config.train import TrainConfig
-from gridworld.config.worlds import MapConfig
 from gridworld.diagnosis.verdict import Diagnosis, Trial
 from gridworld.errors import InputError
 from gridworld.restore.saved_run import SavedRun
@@ -74,16 +72,13 @@ def check_trusted(saved: SavedRun, found: Diagnosis, trust: bool) -> None:
 
 
 def _settings(saved: SavedRun, words: tuple[str, ...], trust: bool) -> TrainConfig:
-    """Compose an offer; the rules that follow the world see the stored one."""
-    with tempfile.TemporaryDirectory(prefix="gridworld-") as folder:
-        layout = Path(folder) / "layout.txt"
-        layout.write_text("\n".join(saved.run.manifest["layout"]))
-        stored = [f"env.layout={layout}"] if isinstance(saved.config.env, MapConfig) else []
-        try:
-            composed = compose(conf_folder(), [*words, *stored])
-        except (HydraException, OmegaConfBaseException) as error:
-            raise InputError(sentence(error)) from None
-        config = dataclasses.replace(composed, env=saved.config.env)
+    """Compose an offer for the stored world, whatever its settings describe by now."""
+    named = any(word.startswith("preset=") for word in words)  # what `auto` had chosen is a word already
+    try:
+        composed = compose(conf_folder(), [*words, *([] if named else ["preset=none"])])
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(sentence(error)) from None
+    config = dataclasses.replace(composed, env=saved.config.env)
     if not trust:
         _check(config, saved)
     return config
