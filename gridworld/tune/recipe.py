@@ -12,9 +12,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from gridworld.config.composition.compose import without_hydra
 from gridworld.config.composition.recipe_file import IN_A_STUDY, overrides
@@ -53,15 +53,9 @@ def write_recipe(
     lines += ["  - _self_", ""]
     path = make_inside(folder, EXPERIMENT) / _FILE
     own = dataclasses.replace(folders, own=(*folders.own, folder))
-    while True:  # a rule may give another value beside the values than it did without them
-        text = OmegaConf.to_yaml(values) if values else ""
-        write_text(path, "\n".join([*lines, text]), durable=True)
-        again = without_hydra(compose_in(own, "train", [f"experiment={RECIPE}"]))
-        left = _difference(_relevant(again), _relevant(config))
-        merged = cast(DictConfig, OmegaConf.merge(values, left))
-        if merged == values:
-            break
-        values = merged
+    text = OmegaConf.to_yaml(values) if values else ""
+    write_text(path, "\n".join([*lines, text]), durable=True)
+    again = without_hydra(compose_in(own, "train", [f"experiment={RECIPE}"]))
     for found in (again, without_hydra(compose_in(own, "train", overrides(path, trust=True)))):
         assert _relevant(found) == _relevant(config), f"{path} does not say what the winner is"
     return path

@@ -28,7 +28,7 @@ from gridworld.config.composition.compose import register_schemas, slug, without
 from gridworld.config.composition.hydra_errors import sentence
 from gridworld.config.composition.loader import composing_from
 from gridworld.config.composition.recipe_file import CHOSEN, with_recipe
-from gridworld.config.train import TrainConfig
+from gridworld.config.train import AUTO, TrainConfig
 from gridworld.config.tune import TuneConfig
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import program
@@ -104,6 +104,8 @@ def compose_study(folders: ConfFolders, words: Sequence[str]) -> StudySpec:
         of_search, of_run = _divide(with_recipe(words))
         whole = compose_in(folders, "train", of_run)
         choices = {group: str(whole.hydra.runtime.choices[group]) for group in CHOSEN}
+        if choices["preset"] == AUTO:  # nothing was chosen, and nothing is to be for the winner
+            choices["preset"] = "none"
         base = without_hydra(whole)
         if not any(override.key_or_group == "tune" for override in of_search):
             of_search = [*of_search, *_parse([f"tune={choices['agent']}"])]

@@ -134,8 +134,9 @@ def test_what_is_seen_changes_the_features_alone(agent: str) -> None:
         assert other == plain
 
 
+@pytest.mark.slow
 def test_a_small_stochastic_world_is_certified(tmp_path: Path) -> None:
     world = ["env.num_rows=4", "env.num_cols=4", "env.slip=0.1", "env.step_reward=-0.1"]
     summary = train_in(tmp_path, "agent=q_learning", *world, *QUIET)
     assert (summary["certified"], summary["preset"]) == (True, "stochastic")
-    assert summary["privileges"] == ["starts anywhere"]
+    assert summary["privileges"] == ["starts anywhere", "stratified draws"]

@@ -48,6 +48,8 @@ def of_words(*words: str) -> TrainConfig:
 def test_a_winner_is_the_same_by_hydra_and_as_data(agent: str, tmp_path: Path) -> None:
     register_schemas()
     choices = {"agent": agent, "env": "cliff", "observation": "coordinates" if agent == "ppo" else "one_hot"}
+    choices |= {"preset": "stochastic" if agent == "ppo" else "none"}
+    choices |= {"tuned": "none" if agent == "ppo" else f"cliff_{agent}"}
     words = [*(f"{group}={choice}" for group, choice in choices.items()), *WINNERS[agent]]
     path = write_recipe(tmp_path, ConfFolders(CONF), choices, configure(*words), "a winner")
     by_hydra = compose_in(ConfFolders(CONF, (tmp_path,)), "train", ["experiment=winner"])
