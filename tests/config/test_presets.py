@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from helpers.support import CONF, configure, script, train_in
+from helpers.support import CONF, NO_FILES, configure, script, train_in
 
 import gridworld
 from gridworld.config.agents import REPLAY_COUNTS
@@ -12,10 +12,6 @@ from gridworld.config.train import TrainConfig, check
 from gridworld.training.setup import check_settings, notes
 
 SETTINGS = sorted(file.stem for file in (CONF / "preset" / "settings").glob("*.yaml"))
-QUIET = [
-    f"recording.{name}=false" for name in ("frames", "gif", "learning", "policy_map", "visits", "q_error")
-]
-QUIET += ["logging.tensorboard=false", "logging.progress=false"]
 LARGE = ["env.num_rows=9", "env.num_cols=9"]
 
 
@@ -91,7 +87,7 @@ def test_a_preset_is_chosen_alike_from_python_and_by_the_command(tmp_path: Path)
 
 def test_each_job_of_a_sweep_has_its_own_preset_and_a_line_says_so(tmp_path: Path) -> None:
     words = ["-m", "agent=q_learning", "env.slip=0,0.1", "seed=0,1", f"hydra.sweep.dir={tmp_path}/s"]
-    done = script("train.py", *words, *QUIET[:-1], cwd=tmp_path)
+    done = script("train.py", *words, *NO_FILES[:-1], cwd=tmp_path)
     files = sorted((tmp_path / "s").glob("*/manifest.json"))
     manifests = [json.loads(file.read_text()) for file in files]
     found = {(each["config"]["env"]["slip"], each["config"]["preset"]) for each in manifests}
@@ -101,7 +97,7 @@ def test_each_job_of_a_sweep_has_its_own_preset_and_a_line_says_so(tmp_path: Pat
     ]
     assert "preset=stochastic, since actions have several outcomes: " in done.stderr
     assert "(2 of 4 jobs)" in done.stderr
-    again = script("train.py", *words, *QUIET[:-1], cwd=tmp_path)  # finds its jobs again
+    again = script("train.py", *words, *NO_FILES[:-1], cwd=tmp_path)  # finds its jobs again
     assert "4 jobs: 4 done; 0 to run" in again.stderr
 
 
@@ -137,6 +133,6 @@ def test_what_is_seen_changes_the_features_alone(agent: str) -> None:
 @pytest.mark.slow
 def test_a_small_stochastic_world_is_certified(tmp_path: Path) -> None:
     world = ["env.num_rows=4", "env.num_cols=4", "env.slip=0.1", "env.step_reward=-0.1"]
-    summary = train_in(tmp_path, "agent=q_learning", *world, *QUIET)
+    summary = train_in(tmp_path, "agent=q_learning", *world, *NO_FILES)
     assert (summary["certified"], summary["preset"]) == (True, "stochastic")
     assert summary["privileges"] == ["starts anywhere", "stratified draws"]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import stable_baselines3
-from helpers.support import CONF, configure, script, train_in
+from helpers.support import CONF, NO_FILES, configure, script, train_in
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from gridworld.agents import family
@@ -23,11 +23,6 @@ RECIPES = sorted(file.stem for file in (CONF / "tuned").glob("*.yaml") if file.s
 STUDIES = sorted(file.stem for file in (CONF / "experiment").glob("*.yaml"))
 # Not those of larger worlds, whose runs take seconds; the others have every one of their settings.
 TRAINED = [recipe for recipe in RECIPES if not re.match("frozen_lake_v1|cliff_walking|taxi|deep", recipe)]
-NO_FILES = (
-    *("recording.frames=false", "recording.gif=false", "recording.policy_map=false"),
-    *("recording.learning=false", "recording.q_error=false", "recording.visits=false"),
-    *("logging.tensorboard=false", "logging.progress=false"),
-)
 
 
 def pair(recipe: str) -> tuple[str, str]:

@@ -50,6 +50,12 @@ SHORT = {
     },
     "value_iteration": ["agent=value_iteration"],
 }
+# Of a run whose result alone is looked at.
+NO_FILES = (
+    *("recording.frames=false", "recording.gif=false", "recording.policy_map=false"),
+    *("recording.learning=false", "recording.q_error=false", "recording.visits=false"),
+    *("logging.tensorboard=false", "logging.progress=false"),
+)
 DEEP = ["dqn", "ppo"]  # those with a tabulated engine
 LEARNING = [agent for agent in SHORT if agent != "value_iteration"]
 
