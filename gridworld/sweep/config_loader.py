@@ -36,6 +36,8 @@ _NUMBERED = "${hydra.job.num}"  # hydra.sweep.subdir unless it is set; the sweep
 class SweepLoader(Loader):
     """Replaces Hydra's loader in a launcher."""
 
+    chooses_presets = False  # the plan does, which makes it a word of the job
+
     def __init__(self, loader: ConfigLoader) -> None:
         super().__init__(loader)
         self._bases: dict[tuple[str, ...], bytes] = {}

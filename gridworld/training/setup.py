@@ -20,10 +20,6 @@ from gridworld.world.discounts import fitting_discounts, score_of_optimum
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 
-_PRESETS = {  # why each is chosen
-    STOCHASTIC: "since actions have several outcomes",
-    LARGE: "since there are more states than in the default world",
-}
 _QUICKLY_SOLVED = 6000  # outcomes of all states and actions
 
 
@@ -104,9 +100,10 @@ def notes(config: TrainConfig, mdp: Mdp) -> list[str]:
     found = []
     if config.recipe is not None:
         found.append(f"recipe {config.recipe}: {steps}; tuned=none {otherwise}")
-    if config.preset in _PRESETS:
-        why = _PRESETS[config.preset]
-        found.append(f"preset={config.preset}, {why}: {steps}; preset=none {otherwise}")
+    if config.preset in (STOCHASTIC, LARGE):
+        size = f"{mdp.name} has {mdp.num_states:,} states"
+        why = f"{mdp.name} is stochastic" if mdp.is_stochastic else size
+        found.append(f"{why}: preset={config.preset}, {steps}; preset=none {otherwise}")
     if config.known_failure is not None:
         found.append(f"agent={config.agent.name} is known to fall short: {config.known_failure}")
     return [*found, *filter(None, [objective_note(config, mdp)])]

@@ -102,6 +102,8 @@ TRAIN = [
     ("experiment=cliff_qlearning", "there is no such choice; close to it are cliff_q_learning, "),
     ("experiment=maze", "close to it are maze_a2c, maze_a2c_sb3_defaults, maze_dqn, "),
     ("experiment=zz", "experiment=zz: there is no such choice; --help lists them all"),
+    ("tuned=cliff_dq", "tuned=cliff_dq: there is no such recipe; close to it are cliff_dqn"),
+    ("preset=slippery", "preset=slippery: there is no such choice; there are auto, large, none, stochastic"),
     ("env=mars", "env=mars: there is no such choice; there are aima_4x3, arrays"),
     ("env=null", "Config group override must be a string or a list"),
     ("ganma=1", "Key 'ganma' not in 'TrainConfig'"),

@@ -30,6 +30,8 @@ def chosen(*words: str) -> tuple[str | None, str]:
         (["env.slip=0.1", "agent=value_iteration"], None, "auto"),  # it has no such settings
         (["env.slip=0.1", "agent=dqn_sb3_defaults"], None, "auto"),
         (LARGE, None, "large"),
+        ([*LARGE, "total_timesteps=1000"], None, "auto"),
+        (["env=cliff", "tuned=none", "total_timesteps=1000"], None, "auto"),
         (["env.num_rows=4", "env.num_cols=4"], None, "auto"),
         (["env.slip=0.1", "agent.gamma=0.5"], None, "stochastic"),  # settings of the agent go before it
         # What a preset's numbers rest on is given, or the engine that they are made for is not used.
@@ -95,7 +97,7 @@ def test_each_job_of_a_sweep_has_its_own_preset_and_a_line_says_so(tmp_path: Pat
     assert [file.parent.name for file in files] == [
         f"env.slip={s},seed={n}" for s in ("0", "0.1") for n in "01"
     ]
-    assert "preset=stochastic, since actions have several outcomes: " in done.stderr
+    assert "classic is stochastic: preset=stochastic, " in done.stderr
     assert "(2 of 4 jobs)" in done.stderr
     again = script("train.py", *words, *NO_FILES[:-1], cwd=tmp_path)  # finds its jobs again
     assert "4 jobs: 4 done; 0 to run" in again.stderr
@@ -111,7 +113,7 @@ def test_the_line_before_training() -> None:
         "recipe cliff_dqn: 80,000 steps; tuned=none keeps the agent's own settings"
     ]
     assert lines(configure("agent=dqn", "env.slip=0.1")) == [
-        "preset=stochastic, since actions have several outcomes: 9,600,000 steps; "
+        "classic is stochastic: preset=stochastic, 9,600,000 steps; "
         "preset=none keeps the agent's own settings"
     ]
     [line] = lines(configure("agent=ppo_sb3_defaults", "env.num_rows=4"))

@@ -6,6 +6,7 @@ This builds on internals of Hydra, which tests/sweep/test_config_loader.py check
 from __future__ import annotations
 
 import contextlib
+import difflib
 import os
 import re
 from collections.abc import Iterator
@@ -24,6 +25,7 @@ from omegaconf import DictConfig
 
 from gridworld.config.composition.presets import with_preset
 from gridworld.config.composition.words import make_whole, with_whole_numbers
+from gridworld.errors import InputError
 
 _VERSION_BASE = "1.3"
 _WITHOUT_MODE = ("pkg://hydra.conf", "structured://")  # Hydra's own files, and the schemas
@@ -34,6 +36,8 @@ _WORD_MAY_SET_MODE = re.compile(r"^\W*hydra\s*(=|@)|\bmode\b|\bsearchpath\b|@")
 
 class Loader(ConfigLoaderImpl):
     """Hydra's loader, which also takes a float that is a whole number where a setting is an integer."""
+
+    chooses_presets = True  # where it composes all of a command line
 
     def __init__(self, loader: ConfigLoader) -> None:
         super().__init__(loader.get_search_path())
@@ -48,12 +52,22 @@ class Loader(ConfigLoaderImpl):
     ) -> DictConfig:
         """Compose, as Hydra's loader does, and again with the preset that a run's world asks for."""
         words = with_whole_numbers(overrides)
+        self._check_recipe(words)
         rest = run_mode, from_shell, validate_sweep_overrides
         load = super().load_configuration
         found = load(config_name, words, *rest)
-        if config_name == "train" and run_mode is RunMode.RUN:
+        if config_name == "train" and run_mode is RunMode.RUN and self.chooses_presets:
             found, _ = with_preset(found, lambda chosen: load(config_name, [*words, *chosen], *rest))
         return found
+
+    def _check_recipe(self, words: list[str]) -> None:
+        """Refuse a recipe that there is not, which the defaults list would leave out without a word."""
+        for name in (word.removeprefix("tuned=") for word in words if word.startswith("tuned=")):
+            if re.fullmatch(r"\w+", name) and not self.repository.config_exists(f"tuned/{name}"):
+                known = self.get_group_options("tuned")
+                near = difflib.get_close_matches(name, known)
+                hint = f"; close to it are {', '.join(near)}" if near else ""
+                raise InputError(f"tuned={name}: there is no such recipe{hint}; --help lists them all")
 
     def _load_single_config(self, default: ResultDefault, repo: Any) -> ConfigResult:
         found = super()._load_single_config(default, repo)
