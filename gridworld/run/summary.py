@@ -115,8 +115,10 @@ def _rows(summary: Summary, within_limit: bool) -> list[list[str]]:
 
 def _trade(name: str, summary: Summary) -> str:
     """Why a policy that is worse than the optimum may reach the goal more often."""
-    is_above = name == "goal_probability" and summary[name] > summary[f"optimal_{name}"] + _ROUNDING
-    return "  more often than the optimum, later or at a price" if is_above else ""
+    if name != "goal_probability" or summary["certified"]:
+        return ""
+    is_above = summary[name] > summary[f"optimal_{name}"] + _ROUNDING
+    return "  more often than the optimum, for less value" if is_above else ""
 
 
 def verdict(summary: Summary) -> str:

@@ -20,6 +20,7 @@ from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import classic
 
 NUMBERS = st.floats() | st.sampled_from([-0.0001381, 1e-300, -1e-300, -1.234e300, float("-inf"), 0.0])
+PLAIN = {"recipe": None, "preset": "none", "privileges": []}  # of a run with an agent's own settings
 WORDS = st.text("ab-.0", min_size=1, max_size=30)
 
 
@@ -47,6 +48,7 @@ def test_the_table_at_the_end_of_a_run(numbers: list[float], regrets: tuple[floa
     keys = ("value", "goal_probability", "length")
     greedy, sampled, best = (dict(zip(keys, numbers[i : i + 3], strict=True)) for i in (0, 3, 6))
     summary = {
+        **PLAIN,
         **greedy,
         **{f"optimal_{key}": value for key, value in best.items()},
         "sampled": {**sampled, "regret": regrets[1]},
@@ -71,6 +73,7 @@ def test_the_table_at_the_end_of_a_run(numbers: list[float], regrets: tuple[floa
 
 def test_the_table_at_the_end_of_a_usual_run() -> None:
     summary = {
+        **PLAIN,
         "agent": "dqn",
         "env": "classic",
         "seed": 0,
@@ -149,3 +152,28 @@ def test_the_list_of_a_sweeps_jobs(
         "seed=2            pending",
         "3 jobs: 1 pending, 1 done, 1 interrupted",
     ]
+
+
+def test_a_goal_that_is_reached_more_often_for_less_is_explained() -> None:
+    """A policy may keep away from the fastest way, and be sure of the goal."""
+    scores = {"value": 0.5, "regret": 0.2, "goal_probability": 1.0, "length": 30.0}
+    summary: dict[str, object] = {
+        "agent": "a",
+        "env": "w",
+        "seed": 0,
+        "timesteps": 1,
+        "train_seconds": 0.0,
+        "max_episode_steps": 9,
+        **PLAIN,
+        "certified": False,
+        "endless_cells": [],
+        "endless_states": [],
+        "timeout_probability": 0.0,
+        **scores,
+        "sampled": scores,
+        "optimal_value": 0.7,
+        "optimal_goal_probability": 0.9863,
+        "optimal_length": 8.0,
+    }
+    [line] = [line for line in summary_text(summary, "x").splitlines() if "goal probability" in line]
+    assert line.endswith("0.9863   more often than the optimum, for less value")
