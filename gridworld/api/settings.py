@@ -79,7 +79,7 @@ def compose_words(words: list[str]) -> TrainConfig:
     """
     try:
         return composition.compose(conf_folder(), words)
-    except (HydraException, OmegaConfBaseException, YAMLError, OSError) as error:
+    except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError) as error:
         raise InputError(sentence(error)) from None
 
 

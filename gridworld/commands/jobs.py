@@ -15,6 +15,7 @@ from gridworld.process.memory_budget import limited
 from gridworld.sweep.console import counts_text
 from gridworld.sweep.folder import open_sweep
 from gridworld.sweep.job_table import JOBS_CSV, STATUSES, JobRow, JobTable
+from gridworld.world.metrics import regret_text
 
 
 @limited()
@@ -44,7 +45,7 @@ def main(arguments: Sequence[str]) -> None:
 def _cells(row: JobRow, verified: JobRow | None) -> list[str]:
     """The columns of a job; an error that its own folder does not confirm is marked."""
     seconds = f"{row.seconds} s" if row.seconds else ""
-    regret = f" regret {float(row.objective):.3g}" if row.objective else ""
+    regret = f" regret {regret_text(float(row.objective))}" if row.objective else ""
     error = f" {row.error}" if row.error else ""
     if verified is not None and verified.error != row.error:
         error += f" (says {JOBS_CSV} alone)"

@@ -120,6 +120,11 @@ class GymnasiumConfig(EnvConfig):
     kwargs: Kwargs = field(default_factory=dict)  # of gymnasium.make
 
     @property
+    def compiles_quickly(self) -> bool:
+        """See `EnvConfig.compiles_quickly`; an id with a colon imports a module."""
+        return ":" not in self.id
+
+    @property
     def name(self) -> str:
         """See `EnvConfig.name`."""
         return self.id

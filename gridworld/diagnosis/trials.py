@@ -72,10 +72,9 @@ def check_trusted(saved: SavedRun, found: Diagnosis, trust: bool) -> None:
 
 
 def _settings(saved: SavedRun, words: tuple[str, ...], trust: bool) -> TrainConfig:
-    """Compose an offer for the stored world, whatever its settings describe by now."""
-    named = any(word.startswith("preset=") for word in words)  # what `auto` had chosen is a word already
+    """Compose an offer as it is printed, for the stored world, whatever its settings describe by now."""
     try:
-        composed = compose(conf_folder(), [*words, *([] if named else ["preset=none"])])
+        composed = compose(conf_folder(), list(words))
     except (HydraException, OmegaConfBaseException) as error:
         raise InputError(sentence(error)) from None
     config = dataclasses.replace(composed, env=saved.config.env)

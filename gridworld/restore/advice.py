@@ -2,58 +2,75 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import shlex
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from gridworld.config.composition.conf_folder import conf_folder
+from gridworld.config.composition.conf_folder import conf_folder, own_conf_folders
 from gridworld.config.composition.presets import fitting_preset, is_world
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console.columns import aligned
 from gridworld.process.console.command_line import command
 from gridworld.restore.saved_run import SavedRun
-from gridworld.run.folder import shown
+from gridworld.run.folder import SWEEP_JSON, RunFolder, shown
 from gridworld.run.reader import LARGEST_RESULT, RunReader
 
 _FALLS = 0.95  # the regret of the last quarter of a curve beside the quarter before it
 _FEWEST = 8  # evaluations
 _NO_PRESET = (AUTO, "none")
+_WHY = "what it costs, and why:"
 _REPLACED = ("total_timesteps", "n_envs", "preset", "tuned")
 
 
 def advice(folder: Path) -> list[str]:
     """Lines to print below the verdict on a finished run that is not certified."""
+    if not RunFolder(folder).manifest_file.exists():
+        return []
+    place = shlex.quote(shown(folder))
     try:
-        saved = SavedRun(folder)
-        rows = list(_commands(saved))
-    except (InputError, OSError, ValueError):  # the run was just made, but anybody may have touched it since
+        rows = list(_commands(SavedRun(folder), place))
+    except InputError:  # it has a class of one's own, which is imported with trust only
+        rows = [[_WHY, f"{command('diagnose')} {place} --trust"]]
+    except (OSError, ValueError):  # the run was just made, but anybody may have touched it since
         return []
     return ["try:", *(f"  {line}" for line in aligned(rows, ("<0", "<0")))]
 
 
-def _commands(saved: SavedRun) -> Iterator[list[str]]:
+def _commands(saved: SavedRun, place: str) -> Iterator[list[str]]:
+    """(why, command) of what may help."""
     run, config = saved.run, saved.config
-    place = shlex.quote(shown(run.folder))
+    words = [word for word in saved.overrides if _key(word) not in _REPLACED]
     if config.recipe is None and (env := _world_with_recipe(config)) is not None:
-        yield [_train([f"agent={config.agent.name}", f"env={env}"]), "its recipe"]
-    elif config.preset in _NO_PRESET and (preset := fitting_preset(config, lambda: saved.mdp)) is not None:
-        yield [_train([*_without(saved.overrides), f"preset={preset}"]), f"settings for {preset} worlds"]
-    yield [f"{command('diagnose')} {place}", "what costs how much, and why"]
-    if _still_falls(run):
-        longer = f"total_timesteps={2 * config.total_timesteps}"
-        yield [f"{command('train')} resume={place} {longer}", "its regret still falls"]
+        own = [word for word in words if _key(word).partition(".")[0] not in ("env", "experiment", "agent")]
+        yield ["its recipe:", _train([f"agent={config.agent.name}", f"env={env}", *own])]
+    elif (preset := _unused_preset(saved)) is not None and "experiment" not in map(_key, words):
+        yield [f"for {preset} worlds:", _train([*words, f"preset={preset}"])]
+    yield [_WHY, f"{command('diagnose')} {place}"]
+    if not (run.folder.parent / SWEEP_JSON).exists() and _still_falls(run):  # a job's length is the sweep's
+        resume = run.resume_command(dataclasses.asdict(config))
+        yield ["its regret still falls:", f"{resume} total_timesteps={2 * config.total_timesteps}"]
+
+
+def _unused_preset(saved: SavedRun) -> str | None:
+    config = saved.config
+    if config.recipe is not None or config.preset not in _NO_PRESET:
+        return None
+    return fitting_preset(config, lambda: saved.mdp)
 
 
 def _train(words: Sequence[str]) -> str:
-    return f"{command('train')} {shlex.join(words)}"
+    folders = [f"--config-dir={folder}" for folder in own_conf_folders(sys.argv[1:])]
+    return f"{command('train')} {shlex.join([*folders, *words])}"
 
 
-def _without(words: Sequence[str]) -> list[str]:
-    return [word for word in words if word.lstrip("+~").partition("=")[0] not in _REPLACED]
+def _key(word: str) -> str:
+    return word.lstrip("+~").partition("=")[0]
 
 
 def _world_with_recipe(config: TrainConfig) -> str | None:

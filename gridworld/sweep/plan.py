@@ -203,7 +203,11 @@ def _configured(
     overrides: list[str], configure: Callable[[Sequence[str]], TrainConfig], world: Callable[[EnvConfig], Mdp]
 ) -> tuple[TrainConfig, list[str]]:
     """A job's configuration, and its overrides with the preset that its world asks for."""
-    config, chosen = with_preset(configure(overrides), lambda words: configure([*overrides, *words]), world)
+
+    def compose(words: list[str]) -> TrainConfig:
+        return configure([*overrides, *words])
+
+    config, chosen = with_preset(configure(overrides), overrides, compose, world)
     return config, [*overrides, *chosen]
 
 

@@ -6,9 +6,9 @@ import functools
 from collections.abc import Callable
 
 from gridworld.agents import TrainingContext, WriteScalars, family
-from gridworld.config.composition.presets import LARGE, STOCHASTIC
+from gridworld.config.composition.presets import LARGE, STOCHASTIC, fitting_preset, is_recipe_for
 from gridworld.config.pictures import PICTURES
-from gridworld.config.train import TrainConfig, check
+from gridworld.config.train import AUTO, TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.frames.rendering import frame_size
 from gridworld.envs.observations import ObservationTable
@@ -97,12 +97,18 @@ def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = comp
 def notes(config: TrainConfig, mdp: Mdp) -> list[str]:
     """What a user should know of the settings before training: where they come from, what they cannot do."""
     steps, otherwise = f"{config.total_timesteps:,} steps", "keeps the agent's own settings"
+    size = f"{mdp.name} has {mdp.num_states:,} states"
+    why = f"{mdp.name} is stochastic" if mdp.is_stochastic else size
     found = []
     if config.recipe is not None:
-        found.append(f"recipe {config.recipe}: {steps}; tuned=none {otherwise}")
+        is_its = is_recipe_for(config.recipe, config.agent.name, config.env)
+        elsewhere = "" if is_its else ", tuned in another world"
+        found.append(f"recipe {config.recipe}{elsewhere}: {steps}; tuned=none {otherwise}")
+    elif config.preset == AUTO and (fitting := fitting_preset(config, lambda: mdp)) is not None:
+        found.append(
+            f"{why}: preset={fitting} is made for that; auto leaves it out beside the given settings"
+        )
     if config.preset in (STOCHASTIC, LARGE):
-        size = f"{mdp.name} has {mdp.num_states:,} states"
-        why = f"{mdp.name} is stochastic" if mdp.is_stochastic else size
         found.append(f"{why}: preset={config.preset}, {steps}; preset=none {otherwise}")
     if config.known_failure is not None:
         found.append(f"agent={config.agent.name} is known to fall short: {config.known_failure}")

@@ -19,7 +19,8 @@ def _rounded(number: float) -> str:
     return f"{number:.4g}"
 
 
-def _regret(number: float) -> str:
+def regret_text(number: float) -> str:
+    """A regret as messages have it; what is 0 but for rounding is 0."""
     return "0" if number < _ROUNDING else f"{number:.3g}"
 
 
@@ -85,7 +86,7 @@ METRICS = (
         is_headline=True,
         known_optimum=0.0,
         within_limit=False,
-        text=_regret,
+        text=regret_text,
     ),
     Metric(
         "certified",

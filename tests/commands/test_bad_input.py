@@ -105,7 +105,7 @@ TRAIN = [
     ("tuned=cliff_dq", "tuned=cliff_dq: there is no such recipe; close to it are cliff_dqn"),
     ("preset=slippery", "preset=slippery: there is no such choice; there are auto, large, none, stochastic"),
     ("env=mars", "env=mars: there is no such choice; there are aima_4x3, arrays"),
-    ("env=null", "Config group override must be a string or a list"),
+    ("env=null", "a choice is a name, and null is none: write preset=none, tuned=none, or ~experiment"),
     ("ganma=1", "Key 'ganma' not in 'TrainConfig'"),
     ("agent.learning_rat=1", "Key 'learning_rat' not in 'DQNConfig'; did you mean learning_rate"),
     ("+agent.learning_rat=1", "agent.learning_rat: there is no such key; did you mean learning_rate"),

@@ -28,6 +28,9 @@ def chosen(*words: str) -> tuple[str | None, str]:
         (["env.slip=0.1", "agent=ppo"], None, "stochastic"),
         (["env.slip=0.1", "agent=q_learning"], None, "stochastic"),
         (["env.slip=0.1", "agent=value_iteration"], None, "auto"),  # it has no such settings
+        (["env.slip=0.1", "agent=sarsa"], None, "auto"),
+        (["preset=stochastic", "agent=sarsa"], None, "none"),
+        (["env.slip=0.1", "total_timesteps=9600000"], None, "auto"),
         (["env.slip=0.1", "agent=dqn_sb3_defaults"], None, "auto"),
         (LARGE, None, "large"),
         ([*LARGE, "total_timesteps=1000"], None, "auto"),
@@ -49,7 +52,9 @@ def chosen(*words: str) -> tuple[str | None, str]:
         (["env=cliff", "env.step_reward=-0.5"], "cliff_dqn", "auto"),
         (["env=cliff", "env.slip=0.1"], None, "stochastic"),
         (["env=cliff", "env.slip=0.1", "preset=none"], "cliff_dqn", "none"),
-        (["env=cliff", "tuned=none"], None, "large"),
+        (["env=cliff", "tuned=none"], None, "auto"),
+        (["env=cliff", "env.slip=0.1", "tuned=cliff_dqn"], "cliff_dqn", "auto"),
+        (["env.layout=cliff"], None, "large"),
         (["env=frozen_lake_4x4"], "frozen_lake_4x4_dqn", "auto"),
         # Settings that make no world: the check before training says what is wrong with them.
         (["env.slip=3"], None, "auto"),

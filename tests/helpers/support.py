@@ -77,7 +77,7 @@ def _composed(overrides: tuple[str, ...]) -> TrainConfig:
         def compose(chosen: list[str]) -> TrainConfig:
             return to_config(loader.load_settings(sweep, [*overrides, *chosen]))
 
-        return with_preset(compose([]), compose)[0]
+        return with_preset(compose([]), overrides, compose)[0]
     finally:
         HydraConfig.instance().cfg = None
 

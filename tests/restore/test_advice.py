@@ -16,14 +16,14 @@ SHORT = ["total_timesteps=200", "evaluation.every=20", *NO_FILES]
 @pytest.mark.parametrize(
     ("words", "reason", "command"),
     [
-        (["env=cliff", "tuned=none"], "its recipe", "train.py agent=q_learning env=cliff"),
-        (["env.layout=four_rooms"], "its recipe", "train.py agent=q_learning env=four_rooms"),
+        (["env=cliff", "tuned=none"], "its recipe:", "train.py agent=q_learning env=cliff"),
+        (["env.layout=four_rooms"], "its recipe:", "train.py agent=q_learning env=four_rooms"),
         (
             ["env.slip=0.1", "seed=3"],
-            "settings for stochastic worlds",
+            "for stochastic worlds:",
             "train.py agent=q_learning env.slip=0.1 seed=3",
         ),
-        (["env.num_rows=9"], "settings for large worlds", "train.py agent=q_learning env.num_rows=9"),
+        (["env.num_rows=9"], "for large worlds:", "train.py agent=q_learning env.num_rows=9"),
     ],
 )
 def test_the_recipe_or_the_preset_comes_first(

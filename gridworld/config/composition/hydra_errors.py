@@ -42,6 +42,8 @@ def sentence(error: BaseException) -> str:
         key = missing.group(1)
         key = key if "." in key else getattr(error, "full_key", None) or key
         return f"{key}: has no value; give {key}=..., or have the yaml that is chosen for it do so"
+    if "Config group override must be a string" in message:
+        return "a choice is a name, and null is none: write preset=none, tuned=none, or ~experiment"
     if "Could not find" in message and "Available options in" in message:
         return _unknown_choice(message)
     if added := re.search(

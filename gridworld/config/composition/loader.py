@@ -57,7 +57,7 @@ class Loader(ConfigLoaderImpl):
         load = super().load_configuration
         found = load(config_name, words, *rest)
         if config_name == "train" and run_mode is RunMode.RUN and self.chooses_presets:
-            found, _ = with_preset(found, lambda chosen: load(config_name, [*words, *chosen], *rest))
+            found, _ = with_preset(found, words, lambda more: load(config_name, [*words, *more], *rest))
         return found
 
     def _check_recipe(self, words: list[str]) -> None:

@@ -1,14 +1,16 @@
 """`preset=auto`: settings for worlds that the agents' own numbers are not made for, chosen by one rule.
 
-The agents' yaml files are made for the default world. `conf/preset/settings` has plain numbers of each agent
-for stochastic and for larger worlds. Where `preset` is `auto`, which is the default:
+The agents' yaml files are made for the default world. `conf/preset/settings` has plain numbers of some agents
+for stochastic and for larger worlds. Where `preset` is `auto`, which is the default, it comes to
 
-1. `none` with a recipe in the world that it was made for; where that is made another, stochastic one, the
-   recipe is left out;
-2. `stochastic` where an action may have several outcomes;
-3. `large` where there are more states than in the default world, and no recipe;
-4. `none` otherwise; and where the command line or an experiment gives `total_timesteps` or `n_envs`, which a
-   preset's numbers rest on, or has Stable-Baselines3's own loop train, for which they are too large.
+1. `none` where the command line or an experiment gives `total_timesteps` or `n_envs`, which a preset's
+   numbers rest on, or chooses a recipe by `tuned=`; and where Stable-Baselines3's own loop trains, for which
+   the numbers are too large;
+2. `none` with a recipe in the world that it was made for; where the command line makes that world a
+   stochastic one, the recipe is left out;
+3. `stochastic` where an action may have several outcomes;
+4. `large` where there are more states than in the default world, and no recipe;
+5. `none`.
 
 What is chosen becomes a word of the run's command line, as if it had been typed.
 """
@@ -16,7 +18,8 @@ What is chosen becomes a word of the run's command line, as if it had been typed
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import yaml
@@ -37,12 +40,14 @@ _WITHOUT_RECIPE = "tuned=none"
 _DEFAULT_STATES = 30  # of the default world
 _ENGINE = "tabulated"  # the only one for which the numbers are made
 _SIZE = ("total_timesteps", "n_envs")
+_CHOSEN_BY_HAND = re.compile(rf"\+*({'|'.join(_SIZE)}|tuned)=")
 
 Settings = TypeVar("Settings", TrainConfig, DictConfig)
 
 
 def with_preset(
     config: Settings,
+    words: Sequence[str],
     compose: Callable[[list[str]], Settings],
     world: Callable[[EnvConfig], Mdp] = compiled,
 ) -> tuple[Settings, list[str]]:
@@ -50,29 +55,29 @@ def with_preset(
 
     Args:
         config: what the command line composes to, as dataclasses or as Hydra has it.
-        compose: composes the command line with further words.
+        words: the command line.
+        compose: composes it with further words.
         world: makes the configured world, or returns one that there is.
 
     Returns:
         The settings; the words that were added, none where no preset is needed.
     """
-    if config.preset != AUTO:
+    if config.preset != AUTO or any(map(_CHOSEN_BY_HAND.match, words)):
         return config, []
     try:
         env: Any = OmegaConf.to_object(config.env) if isinstance(config.env, DictConfig) else config.env
     except OmegaConfBaseException:  # something is missing, which composing says
         return config, []
     recipe: str | None = config.recipe
-    if recipe is not None and is_world(env, recipe.removesuffix(f"_{config.agent.name}")):
+    if recipe is not None and is_recipe_for(recipe, config.agent.name, env):
         return config, []
     preset = fitting_preset(config, lambda: world(env) if env.compiles_quickly else None)
     if preset is None or (recipe is not None and preset != STOCHASTIC):
         return config, []
-    words = [*([_WITHOUT_RECIPE] if recipe is not None else []), f"preset={preset}"]
-    again = compose(words)
-    numbers = _numbers(config.agent.name, preset)
+    chosen = [*([_WITHOUT_RECIPE] if recipe is not None else []), f"preset={preset}"]
+    again, numbers = compose(chosen), _numbers(config.agent.name, preset)
     is_whole = all(getattr(again, key) == numbers.get(key, getattr(config, key)) for key in _SIZE)
-    return (again, words) if is_whole else (config, [])
+    return (again, chosen) if is_whole else (config, [])
 
 
 def fitting_preset(config: TrainConfig | DictConfig, world: Callable[[], Mdp | None]) -> str | None:
@@ -100,6 +105,12 @@ def fitting_preset(config: TrainConfig | DictConfig, world: Callable[[], Mdp | N
     return name if _numbers(config.agent.name, name) else None
 
 
+def is_recipe_for(recipe: str, agent: str, env: EnvConfig) -> bool:
+    """Whether a recipe was made for a world, which of one's own recipes nobody can tell."""
+    name = recipe.removesuffix(f"_{agent}")
+    return is_world(env, name) or not (conf_folder() / "env" / f"{name}.yaml").is_file()
+
+
 def is_world(env: EnvConfig, name: str) -> bool:
     """Whether a world is the one that `env=name` chooses, whatever the step limit."""
     file = conf_folder() / "env" / f"{name}.yaml"
@@ -113,5 +124,6 @@ def is_world(env: EnvConfig, name: str) -> bool:
 
 def _numbers(agent: str, preset: str) -> dict[str, Any]:
     """What the preset says of the agent; nothing where it says nothing."""
-    file = conf_folder() / "preset" / "settings" / f"{agent}_{preset}.yaml"
-    return dict(yaml.safe_load(file.read_text("utf-8"))) if file.is_file() else {}
+    files = {file.stem: file for file in (conf_folder() / "preset" / "settings").glob("*.yaml")}
+    file = files.get(f"{agent}_{preset}")
+    return {} if file is None else dict(yaml.safe_load(file.read_text("utf-8")))
