@@ -107,6 +107,8 @@ def compose_study(folders: ConfFolders, words: Sequence[str]) -> StudySpec:
         if choices["preset"] == AUTO:  # nothing was chosen, and nothing is to be for the winner
             choices["preset"] = "none"
         base = without_hydra(whole)
+        if base.recipe is None:  # the pair has none
+            choices["tuned"] = "none"
         if not any(override.key_or_group == "tune" for override in of_search):
             of_search = [*of_search, *_parse([f"tune={choices['agent']}"])]
         search = compose_in(folders, "tune", of_search)

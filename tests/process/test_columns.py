@@ -133,7 +133,7 @@ def test_the_list_of_a_sweeps_jobs(
 ) -> None:
     rows = [
         JobRow("seed=0", "", "interrupted", "12345678.90", "", "it was stopped"),
-        JobRow("seed=1,agent=dqn", "", "done", "0.10", "-1e-300", ""),
+        JobRow("seed=1,agent=dqn", "", "done", "0.10", "-1e-300", ""),  # rounding
         JobRow("seed=2", "", "pending", "", "", ""),
     ]
     (tmp_path / "sweep.json").write_text(
@@ -148,7 +148,7 @@ def test_the_list_of_a_sweeps_jobs(
     jobs_command.main([str(tmp_path)])
     assert capsys.readouterr().out.splitlines() == [
         "seed=0            interrupted 12345678.90 s  it was stopped",
-        "seed=1,agent=dqn  done               0.10 s  regret -1e-300",
+        "seed=1,agent=dqn  done               0.10 s  regret 0",
         "seed=2            pending",
         "3 jobs: 1 pending, 1 done, 1 interrupted",
     ]
