@@ -127,6 +127,22 @@ class Agent(Protocol):
         """
 
 
+@dataclass(eq=False)
+class Learning:
+    """A run that is about to learn.
+
+    Attributes:
+        agent: ready to learn.
+        total_timesteps: see `Agent.learn`, as for all others.
+    """
+
+    agent: Agent
+    total_timesteps: int
+    on_step: Callable[[int], int]
+    on_safe_point: Callable[[int], None] | None = None
+    state: State | None = None
+
+
 class Family(Protocol):
     """The functions of an algorithm family's package."""
 

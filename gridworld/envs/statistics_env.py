@@ -62,7 +62,7 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
 
     def __init__(self, num_envs: int, *, exploration_bonus: float = 0.0, **settings: Any) -> None:
         super().__init__(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
-        self._bonus = exploration_bonus
+        self.exploration_bonus = exploration_bonus
         self._visits = np.zeros((self.mdp.num_states, self.mdp.num_actions), dtype=np.int64)
         self._flat_visits = self._visits.reshape(-1)
         self._ended = NO_EPISODES  # since they were last taken
@@ -98,7 +98,7 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
             return
         self._counted = end
         pairs, rewards = rolled.pairs[first:end], rolled.rewards[first:end]
-        if self._bonus:
+        if self.exploration_bonus:
             for each in zip(pairs, rewards, strict=True):
                 self._count(*each)
         else:
@@ -108,10 +108,28 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
         if end == len(rolled.pairs):
             self._rolled = None
 
+    def count(self, pairs: NDArray[Any], rewards: FloatArray) -> None:
+        """Count n steps of all environments, and add the exploration bonus to their rewards.
+
+        Args:
+            pairs: (n, num_envs), state * A + action.
+            rewards: (n, num_envs), changed in place.
+        """
+        if self.exploration_bonus:
+            for each in zip(pairs, rewards, strict=True):
+                self._count(*each)
+        else:
+            np.add.at(self._flat_visits, pairs.ravel(), 1)
+
+    def add_returns(self, steps: NDArray[Any], returns: FloatArray) -> None:
+        """Add the returns (m,) of episodes that ended, of which `steps` (m,), ascending, tells the step."""
+        bounds = np.flatnonzero(np.diff(steps)) + 1
+        self._add_returns(part for part in np.split(returns, bounds) if len(part))
+
     def _count(self, pairs: NDArray[Any], rewards: FloatArray) -> None:
         np.add.at(self._flat_visits, pairs, 1)
-        if self._bonus:
-            rewards += self._bonus / np.sqrt(self._flat_visits.take(pairs))
+        if self.exploration_bonus:
+            rewards += self.exploration_bonus / np.sqrt(self._flat_visits.take(pairs))
 
     def _add_returns(self, of_steps: Iterable[FloatArray]) -> None:
         """Add the returns of the episodes that each of some steps ended."""

@@ -132,7 +132,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         self.render_mode = render_mode
         self.cell_size = positive_int("cell_size", cell_size)
         self.metadata = {**self.metadata, "autoreset_mode": self._autoreset}
-        self._stratified = stratified
+        self.stratified = stratified
         self.single_observation_space = spaces.Discrete(self.mdp.num_states)
         self.single_action_space = spaces.Discrete(self.mdp.num_actions)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -297,6 +297,15 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         self._any_over = bool(self._over.any())
 
     @property
+    def episode_state(self) -> tuple[StateArray, NDArray[np.int64], FloatArray]:
+        """(num_envs,) each: the states, and the steps and returns of the current episodes so far."""
+        return self._state, self._elapsed, self._returns
+
+    def set_episode_state(self, states: StateArray, elapsed: NDArray[np.int64], returns: FloatArray) -> None:
+        """Mirrors `episode_state`."""
+        self._state, self._elapsed, self._returns = states.copy(), elapsed.copy(), returns.copy()
+
+    @property
     def under_way(self) -> tuple[StateArray, NDArray[np.int64], FloatArray]:
         """(num_envs,) each: the states, and the steps and returns of the episodes under way so far."""
         return self._state, self._elapsed, self._returns
@@ -332,7 +341,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         Returns:
             (n,), evenly spread over each situation where the batch is stratified, else independent.
         """
-        if self._stratified:
+        if self.stratified:
             return stratified_numbers(situations, self.np_random)
         return self.np_random.random(len(situations))
 

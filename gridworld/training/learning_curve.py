@@ -132,7 +132,7 @@ class LearningCurve:
         if self._held is not None and self._held.step < self._total:
             self._write_held()
 
-    def on_step(self, step: int) -> bool:
+    def on_step(self, step: int) -> int:
         """Evaluate if it is due.
 
         The last step is left to the evaluation after training, since an update may still follow it. Which one
@@ -143,7 +143,8 @@ class LearningCurve:
             step: environment steps so far.
 
         Returns:
-            False once the certificate has held for long enough (`evaluation.stop_after`).
+            The steps by which it is to be called again; 0 once the certificate has held for long enough
+            (`evaluation.stop_after`).
         """
         self._write_held()
         if self._next <= step:
@@ -153,7 +154,9 @@ class LearningCurve:
                 self._evaluate(step, self._agent.snapshot, self._agent.model_file, self._due)
             else:
                 self._held = self._hold(step, self._agent.snapshot())
-        return self._stop_after is None or self.certificate.streak < self._stop_after
+        if self._stop_after is not None and self.certificate.streak >= self._stop_after:
+            return 0
+        return self._next if self._held is None else step + 1
 
     def evaluate(self, step: int) -> Evaluation:
         """Evaluate both policies before the first or after the last step, once a step.

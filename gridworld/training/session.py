@@ -191,7 +191,7 @@ class Session:
         on_safe_point = None if self._pace.never else self._on_safe_point
         self._parts.agent.learn(self._config.total_timesteps, self._on_step, on_safe_point)
 
-    def _on_step(self, steps: int) -> bool:
+    def _on_step(self, steps: int) -> int:
         self._steps = steps
         return self._parts.curve.on_step(steps)
 

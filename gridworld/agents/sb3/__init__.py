@@ -63,8 +63,11 @@ def rehearse(config: TrainConfig, make_context: Callable[[int], TrainingContext]
 def build(config: AgentConfig, context: TrainingContext) -> Agent:
     """See `gridworld.agents.Family.build`."""
     from gridworld.agents.sb3.agent import SB3Agent
+    from gridworld.agents.sb3.engine_agent import EngineAgent
+    from gridworld.agents.sb3.settings.engine import learns_in_engine
 
-    return SB3Agent(config, context)
+    assert isinstance(config, SB3Config)
+    return (EngineAgent if learns_in_engine(config, context) else SB3Agent)(config, context)
 
 
 def weights(path: Path, most: int) -> dict[str, NDArray[Any]]:

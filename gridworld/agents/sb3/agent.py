@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.save_util import recursive_getattr
 
@@ -17,17 +18,15 @@ from gridworld.agents import PolicySnapshot, TrainingContext, WriteScalars
 from gridworld.agents.sb3.factory import make_model
 from gridworld.agents.sb3.falling_setting import falling_settings
 from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters, reason
-from gridworld.agents.sb3.policy_outputs import Reading, epsilon_greedy, of_q, read, read_states
+from gridworld.agents.sb3.policy_outputs import Reading, epsilon_greedy, read, read_states
 from gridworld.agents.sb3.settings.callbacks import make_callbacks
 from gridworld.agents.sb3.settings.schemas import SB3Config, reward_scale
 from gridworld.agents.sb3.snapshot.callback import CheckpointCallback, check_finite, diverged
-from gridworld.agents.sb3.tabulated.off_policy import TabulatedOffPolicy
-from gridworld.agents.sb3.tabulated.on_policy import TabulatedOnPolicy
 from gridworld.bounds import within
 from gridworld.config.agents import AgentConfig
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State
-from gridworld.world.mdp import IntArray
+from gridworld.world.mdp import FloatArray, IntArray
 
 # A model file holds the optimiser's numbers beside every weight, and what SB3 pickles: the last
 # observations, say.
@@ -47,7 +46,7 @@ class SB3Agent:
         InputError: settings that only SB3 itself can judge, or a clock with which it writes no models.
     """
 
-    def __init__(self, config: AgentConfig, context: TrainingContext) -> None:
+    def __init__(self, config: AgentConfig, context: TrainingContext, with_buffers: bool = True) -> None:
         assert isinstance(config, SB3Config)
         if (today := time.localtime()).tm_year < _FIRST_YEAR:
             raise InputError(
@@ -57,11 +56,17 @@ class SB3Agent:
         torch.set_num_threads(context.threads)
         self.config = config
         self.observation = context.observation
+        self._envs = context.envs
         self._loaded = False
-        self.model = make_model(config, context)
+        self._model = make_model(config, context, with_buffers and not context.only_asked)
         self._callbacks = make_callbacks(context.callbacks)
         writers = [] if context.write_scalars is None else [_ScalarsOnly(context.write_scalars)]
-        self.model.set_logger(Logger(folder=None, output_formats=list(writers)))
+        self._model.set_logger(Logger(folder=None, output_formats=list(writers)))
+
+    @property
+    def model(self) -> BaseAlgorithm:
+        """SB3's."""
+        return self._model
 
     def learn(
         self,
@@ -77,11 +82,11 @@ class SB3Agent:
         )
         self._callback.state = state
         try:
-            self.model.learn(total_timesteps, callback=self._callback, log_interval=self.config.log_interval)
+            self._model.learn(total_timesteps, callback=self._callback, log_interval=self.config.log_interval)
         except FloatingPointError as error:
-            raise diverged(self.model, str(error)) from None
+            raise diverged(self._model, str(error)) from None
         except ValueError:  # torch's distributions refuse NaN, which SB3 lets through
-            check_finite(self.model)
+            check_finite(self._model)
             raise
 
     def get_state(self) -> State:
@@ -93,6 +98,9 @@ class SB3Agent:
         values, probabilities, q = read_states(self.observation.num_states, self._read)
         if probabilities is not None:
             return PolicySnapshot(np.argmax(probabilities, axis=1), probabilities, values)
+        return self._of_q(values, q)
+
+    def _of_q(self, values: FloatArray, q: FloatArray | None) -> PolicySnapshot:
         assert q is not None
         if (scale := reward_scale(self.config)) != 1:
             values, q = values / scale, q / scale
@@ -100,24 +108,19 @@ class SB3Agent:
 
     def _exploration_rate(self) -> float:
         """That of DQN; SB3 acts at random until learning starts, while its own attribute still says 0."""
-        warmup = getattr(self.model, "learning_starts", 0)
-        if not self._loaded and self.model.num_timesteps < max(warmup, 1):
+        warmup = getattr(self._model, "learning_starts", 0)
+        if not self._loaded and self._model.num_timesteps < max(warmup, 1):
             return 1.0
-        return float(getattr(self.model, "exploration_rate", 0.0))
+        return float(getattr(self._model, "exploration_rate", 0.0))
 
     def _read(self, states: IntArray) -> Reading:
-        if isinstance(self.model, TabulatedOnPolicy):
-            logits, values = self.model.outputs(states)
-            return Reading(values[:, 0], logits.softmax(dim=1), None)
-        if isinstance(self.model, TabulatedOffPolicy):
-            return of_q(self.model.q_values(states))
-        observations, _ = self.model.policy.obs_to_tensor(self.observation.rows(states))
-        return read(self.model.policy, observations)
+        observations, _ = self._model.policy.obs_to_tensor(self.observation.rows(states))
+        return read(self._model.policy, observations)
 
     def model_file(self) -> bytes:
         """See `gridworld.agents.Agent.model_file`."""
         content = io.BytesIO()
-        self.model.save(content)
+        self._model.save(content)
         return content.getvalue()
 
     def load(self, path: Path) -> None:
@@ -125,15 +128,15 @@ class SB3Agent:
 
         Reads tensors and one number: nothing in the file is unpickled as SB3 would, or run.
         """
-        own = self.model.get_parameters()
-        modules = [name for name in own if isinstance(recursive_getattr(self.model, name), torch.nn.Module)]
+        own = self._model.get_parameters()
+        modules = [name for name in own if isinstance(recursive_getattr(self._model, name), torch.nn.Module)]
         expected = flat({name: own[name] for name in modules})
         most = _SPARE_BYTES + _BYTES_A_BYTE * sum(weights.nbytes for weights in expected.values())
         try:
             parameters, rate = read_parameters(path, most)
             found = {name: parameters.get(name, {}) for name in modules}
             check_weights(flat(found), expected)
-            self.model.set_parameters(found, exact_match=False, device=self.model.device)
+            self._model.set_parameters(found, exact_match=False, device=self._model.device)
         except InputError:
             raise
         except Exception as error:  # zipfile, torch and SB3, each in their way
@@ -143,7 +146,7 @@ class SB3Agent:
         self._loaded = True
         if rate is not None:
             within(f"{path}: exploration_rate", rate, 0, 1)
-            self.model.exploration_rate = rate  # type: ignore[attr-defined]
+            self._model.exploration_rate = rate  # type: ignore[attr-defined]
 
 
 class _ScalarsOnly(KVWriter):

@@ -40,14 +40,19 @@ def said(error: Exception) -> str:
     return lines[0] if lines else type(error).__name__
 
 
-def make_model(config: SB3Config, context: TrainingContext) -> BaseAlgorithm:
+def make_model(config: SB3Config, context: TrainingContext, with_buffers: bool = True) -> BaseAlgorithm:
     """Build a model on the context's environments.
+
+    Args:
+        config: its settings.
+        context: what it learns on.
+        with_buffers: whether it is to keep what it meets.
 
     Raises:
         InputError: what only SB3 or torch can judge, or more memory than there is.
     """
     keep_compiler_out()
-    algorithm, arguments = algorithm_and_arguments(config, context.callbacks, context.features)
+    algorithm, arguments = algorithm_and_arguments(config, context.features)
     own_extractor = "features_extractor_class" in arguments.get("policy_kwargs", {})
     if arguments["policy"].__name__.endswith("CnnPolicy") and not own_extractor:
         _check_image_size(context.observation)
@@ -55,8 +60,9 @@ def make_model(config: SB3Config, context: TrainingContext) -> BaseAlgorithm:
     envs = GridWorldVecEnv(context.envs, context.observation, reward_scale(config))
     try:
         with weighed(config.name, context.observation), warnings.catch_warnings():
-            if context.only_asked:
-                warnings.simplefilter("ignore")  # of rollouts that there will not be
+            if not with_buffers:
+                if context.only_asked:
+                    warnings.simplefilter("ignore")  # of rollouts that there will not be
                 arguments |= _without_buffers(algorithm)
             model = algorithm(env=envs, seed=context.seed, device=device, **arguments)
     except InputError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -19,12 +19,8 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from gridworld.agents.sb3.settings.schemas import SB3CheckedConfig, SB3ClassConfig, SB3Config, as_dict
 from gridworld.agents.sb3.settings.validation import FALLING, SCHEDULES
-from gridworld.agents.sb3.tabulated.state_inputs import why_not
-from gridworld.agents.sb3.tabulated.versions import tabulated_version
 from gridworld.config.agents import falls, parse_schedule
-from gridworld.config.plain_settings import has_own_code
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import tell
 from gridworld.process.import_path import imported
 
 Arguments = dict[str, Any]
@@ -51,13 +47,12 @@ _KINDS: dict[str, type] = {
 
 
 def algorithm_and_arguments(
-    config: SB3Config, callbacks: Sequence[Any] = (), features: Mapping[str, Any] = MappingProxyType({})
+    config: SB3Config, features: Mapping[str, Any] = MappingProxyType({})
 ) -> tuple[type[BaseAlgorithm], Arguments]:
     """Translate settings to a class of SB3's kind and its keyword arguments.
 
     Args:
         config: the agent's settings.
-        callbacks: those of `config.train.TrainConfig`.
         features: what the observation adds to the settings of an `MlpPolicy`.
 
     Returns:
@@ -81,26 +76,7 @@ def algorithm_and_arguments(
         extractor = import_class("observation.features", features[EXTRACTOR], BaseFeaturesExtractor)
         kwargs = features[_ITS_KWARGS] | own.get(_ITS_KWARGS, {})
         arguments["policy_kwargs"] = own | {EXTRACTOR: extractor, _ITS_KWARGS: kwargs}
-    return _with_engine(config, algorithm, arguments, has_own_code(list(callbacks))), arguments
-
-
-def _with_engine(
-    config: SB3Config,
-    algorithm: type[BaseAlgorithm],
-    arguments: Arguments,
-    has_own_callbacks: bool,
-) -> type[BaseAlgorithm]:
-    """SB3's own class, or the one that runs the network once per state where that gives the same."""
-    tabulated = tabulated_version(algorithm)
-    if config.engine != "tabulated" or tabulated is None:
-        return algorithm
-    reason = why_not(config, algorithm, arguments)
-    if has_own_callbacks:
-        reason = "a callback of your own may read or change what only SB3's own loop has"
-    if reason is None:
-        return tabulated
-    tell(f"engine: stock, since {reason}")
-    return algorithm
+    return algorithm, arguments
 
 
 def _check_arguments(config: SB3ClassConfig, algorithm: type[BaseAlgorithm]) -> None:

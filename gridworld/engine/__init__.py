@@ -1,0 +1,20 @@
+"""Training as arrays: P runs of one algorithm at once, of which a single run is the case P = 1.
+
+In a finite world a network needs to be run once per state, not once per sample. Whatever a loss makes of the
+outputs f_θ(x_s), it depends on the parameters θ only through these S outputs:
+
+    L(θ) = l(f_θ(x_1), ..., f_θ(x_S)),    ∂L/∂θ = Σ_s ∂l/∂f(x_s) · ∂f_θ(x_s)/∂θ
+
+So one pass over the states gives the loss and the gradient of any number of samples, and while the parameters
+stand still, the outputs are a table and acting is looking up.
+
+All arrays have a leading axis P. A run has its own random generators and its own row, and no number of it
+depends on the other rows. An algorithm is one file:
+
+    ppo.py a2c.py trpo.py   on `on_policy`: a rollout, then an update
+    dqn.py qrdqn.py         on `off_policy`: steps into a replay buffer, then an update
+
+and what they share is in `run` (what a run has to itself), `population` (the runs, their hooks, their state),
+`environments`, `replay`, `inputs`, `networks`, `optimizer` and `losses`. `sb3_format` is the border to
+Stable-Baselines3, whose own classes make the first network and whose files are read and written.
+"""

@@ -1,0 +1,49 @@
+"""A2C: V. Mnih et al., Asynchronous methods for deep reinforcement learning, 2016; without the asynchrony.
+
+At the policy that it starts from, PPO's clipped surrogate has the slope of A2C's loss, -A log π(a|s): the
+ratio is 1 there, and nothing is clipped. So an update is PPO's first one on the whole rollout.
+S. Huang et al., A2C is a special case of PPO, 2022.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from gridworld.engine.losses import Array, Coefficients, log_softmax, losses_of, normalized, slopes_of, sum_up
+from gridworld.engine.on_policy import OnPolicy
+from gridworld.engine.population import FEW_STATES
+from gridworld.world.mdp import IntArray
+
+
+class A2C(OnPolicy):
+    """P runs of A2C."""
+
+    def update(self, old: tuple[Array, Array], pairs: IntArray, advantages: Array, returns: Array) -> None:
+        """See `OnPolicy.update`."""
+        if self.normalize_advantage:
+            advantages = normalized(advantages)
+        states, shape = None, (self.num_states, self.num_actions)
+        if self.num_states > max(FEW_STATES, pairs.shape[1]):
+            states, distinct = self.distinct(pairs[0])
+            pairs, shape = distinct[None], (len(states), self.num_actions)
+        sums = sum_up(pairs, advantages, returns, shape)
+        logits, values = self.networks.run(states)
+        new = log_softmax(logits), values[..., 0]
+        nothing = np.zeros((len(self.runs), 1, 1))
+        coefficients = Coefficients(nothing, None, self.column("ent_coef"), self.column("vf_coef"))
+        slopes = slopes_of(new, new, sums, coefficients)
+        self.networks.backward(slopes[0], slopes[1][..., None])
+        finite = self.optimizer.step(self.settings("learning_rate"), self.active)
+        self.check_gradients(finite)
+        self._log(losses_of(new, new, sums, coefficients), new[0], sums.positive + sums.negative)
+
+    def _log(self, losses: dict[str, Array], log_prob: Array, gains: Array) -> None:
+        policy_loss = -(gains * log_prob).sum(axis=(-2, -1))
+        for run in itertools.compress(self.runs, self.active.tolist()):
+            run.model._n_updates += 1
+            run.record("train/entropy_loss", float(losses["entropy_loss"][run.row]))
+            run.record("train/policy_loss", float(policy_loss[run.row]))
+            run.record("train/value_loss", float(losses["value_loss"][run.row]))
+        self.check_losses(losses["loss"])

@@ -1,0 +1,176 @@
+"""P x E environments that step together, by look-ups in the tables of one world.
+
+Each run draws slips and starts from its own generator, in the order in which `GridWorldVectorEnv` draws them.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gridworld.envs.statistics_env import StatisticsVectorEnv
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Step:
+    """One step; arrays are (P · E,).
+
+    Attributes:
+        index: (state · A + action) · K + outcome, in the tables.
+        last_states: where the steps led to, before the reset of episodes that ended.
+        rewards: float64.
+        terminated: bool.
+        over: bool, terminated or at the step limit.
+        which: (m,), ascending, where the m episodes that ended were.
+        returns: (m,), theirs, undiscounted.
+        lengths: (m,), theirs.
+    """
+
+    pairs: IntArray
+    last_states: IntArray
+    rewards: FloatArray
+    terminated: BoolArray
+    over: BoolArray
+    which: IntArray
+    returns: FloatArray
+    lengths: IntArray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rollout:
+    """n steps; arrays are (n, P, E), pairs are state · A + action.
+
+    Attributes:
+        truncated: cut off by the step limit alone.
+        final_states: (P, E), after the last step.
+        ended: of each run, (step, environment, return, length) of its episodes that ended, in this order.
+    """
+
+    pairs: IntArray
+    rewards: FloatArray
+    last_states: IntArray
+    terminated: BoolArray
+    truncated: BoolArray
+    final_states: IntArray
+    ended: list[tuple[IntArray, IntArray, FloatArray, IntArray]]
+
+
+class Environments:
+    """The environments of P runs in one world, which reset in the step that ends an episode.
+
+    Args:
+        batches: of the runs; they are stale until `put_back`, but for their statistics.
+    """
+
+    def __init__(self, batches: Sequence[StatisticsVectorEnv]) -> None:
+        first = batches[0]
+        self._batches, self.num_envs = batches, first.num_envs
+        self.num_actions, self._num_outcomes = first.mdp.next_state.shape[1:]
+        self._tables = first.tables
+        self._thresholds = first.tables.of_pairs() if self._num_outcomes > 1 else np.zeros(0)
+        self._terminal, self._start_states = first.mdp.terminal, first.mdp.start_states
+        self._limit = first.step_limit
+        self._bounds = np.arange(len(batches) + 1) * self.num_envs
+        states, elapsed, returns = zip(*(batch.episode_state for batch in batches), strict=True)
+        self.states = np.concatenate(states)  # (P · E,)
+        self._elapsed, self._returns = np.concatenate(elapsed), np.concatenate(returns)
+
+    def put_back(self) -> None:
+        """Let the runs' own batches stand where these environments are."""
+        for run, batch in enumerate(self._batches):
+            part = slice(*self._bounds[run : run + 2])
+            batch.set_episode_state(self.states[part], self._elapsed[part], self._returns[part])
+
+    def step(self, actions: IntArray) -> Step:
+        """Move all environments once; actions are (P · E,)."""
+        pairs = self.states * self.num_actions
+        pairs += actions
+        index = pairs
+        if self._num_outcomes > 1:
+            index = pairs * self._num_outcomes
+            index += self._outcomes(pairs)
+        last_states, rewards = self._tables.next_state.take(index), self._tables.reward.take(index)
+        terminated = self._tables.terminated.take(index)
+        self._elapsed += 1
+        self._returns += rewards
+        over = self._elapsed >= self._limit
+        over |= terminated
+        which = np.flatnonzero(over)
+        ended = which, self._returns.take(which), self._elapsed.take(which)
+        self.states = last_states
+        if len(which):
+            self.states = last_states.copy()
+            self.states[which] = self._starts(which)
+            self._returns[which] = 0.0
+            self._elapsed[which] = 0
+        return Step(pairs, last_states, rewards, terminated, over, *ended)
+
+    def roll(self, policies: FloatArray, draws: NDArray[np.float32]) -> Rollout:
+        """Step n times.
+
+        Args:
+            policies: (P, S, A), probabilities of actions.
+            draws: (n, P · E), uniform: a draw means the action that is the number of thresholds it reaches.
+        """
+        runs, num_states, num_actions = policies.shape
+        limits = np.ascontiguousarray(policies.cumsum(axis=2).reshape(-1, num_actions).T[:-1])
+        first = np.repeat(np.arange(runs) * num_states, self.num_envs)
+        steps = []
+        for draw in draws:
+            beyond = draw >= limits.take(self.states + first, axis=1)
+            steps.append(self.step(np.add.reduce(beyond, axis=0, dtype=np.int64)))
+        shape = len(draws), runs, self.num_envs
+        pairs, rewards, last_states, terminated, over = (
+            np.stack([getattr(step, name) for step in steps]).reshape(shape)
+            for name in ("pairs", "rewards", "last_states", "terminated", "over")
+        )
+        finals = self.states.reshape(runs, -1)
+        ended = self._ended(steps, runs)
+        return Rollout(pairs, rewards, last_states, terminated, over & ~terminated, finals, ended)
+
+    def _ended(
+        self, steps: Sequence[Step], runs: int
+    ) -> list[tuple[IntArray, IntArray, FloatArray, IntArray]]:
+        step = np.repeat(np.arange(len(steps)), [len(each.which) for each in steps])
+        which, returns, lengths = (
+            np.concatenate([getattr(each, name) for each in steps]) for name in ("which", "returns", "lengths")
+        )
+        run, env = np.divmod(which, self.num_envs)
+        order = np.argsort(run, kind="stable")
+        cuts = np.searchsorted(run[order], np.arange(runs + 1))
+        columns = [column[order] for column in (step, env, returns, lengths)]
+        return [
+            (columns[0][a:b], columns[1][a:b], columns[2][a:b], columns[3][a:b])
+            for a, b in itertools.pairwise(cuts)
+        ]
+
+    def _outcomes(self, pairs: IntArray) -> IntArray:
+        """(P · E,), drawn where an environment moves."""
+        moving = np.flatnonzero(~self._terminal.take(self.states))
+        situations = pairs[moving]
+        draws = self._draws(moving, situations)
+        thresholds = self._thresholds.take(situations, axis=1)
+        drawn = (draws >= thresholds[0]).astype(np.int64)
+        for each in thresholds[1:]:
+            drawn += draws >= each
+        outcomes = np.zeros(len(pairs), dtype=np.int64)
+        outcomes[moving] = drawn
+        return outcomes
+
+    def _starts(self, which: IntArray) -> IntArray:
+        if len(self._start_states) == 1:
+            return np.full(len(which), self._start_states[0])
+        cuts = np.searchsorted(which, self._bounds).tolist()
+        parts = zip(self._batches, itertools.pairwise(cuts), strict=True)
+        return np.concatenate([batch.draw_starts(end - start) for batch, (start, end) in parts])
+
+    def _draws(self, which: IntArray, situations: IntArray) -> FloatArray:
+        """A number in [0, 1) for each of these environments, ascending, from its run's generator."""
+        cuts = np.searchsorted(which, self._bounds).tolist()
+        parts = zip(self._batches, itertools.pairwise(cuts), strict=True)
+        return np.concatenate([batch.draw_numbers(situations[start:end]) for batch, (start, end) in parts])

@@ -1,0 +1,206 @@
+"""P networks of one shape, run at once on the states of a world.
+
+Row p of `weights` (P, W) holds network p as Stable-Baselines3 does: the parameters in its optimiser's order,
+each (out, in), one behind the other. So a model file is a row that is cut up, and a gradient's norm adds up
+in the same order. Rows begin at multiples of 64 bytes, as tensors of their own would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from gridworld.world.mdp import IntArray
+
+Array = NDArray[Any]
+ALIGNMENT = 16  # float32 numbers in 64 bytes
+_FORWARD: dict[type[nn.Module], Callable[[Tensor], Tensor]] = {nn.Tanh: torch.tanh, nn.ReLU: torch.relu}
+_BACKWARD: dict[type[nn.Module], Any] = {  # (slope after, output) -> slope before
+    nn.Tanh: torch.ops.aten.tanh_backward,
+    nn.ReLU: lambda slope, output: torch.ops.aten.threshold_backward(slope, output, 0),
+}
+
+
+def aligned(vectors: Tensor) -> Tensor:
+    """A copy of (P, W) of which every row begins at a multiple of 64 bytes."""
+    count, width = vectors.shape
+    room = vectors.new_zeros(count, -(-width // ALIGNMENT) * ALIGNMENT)
+    return room[:, :width].copy_(vectors)
+
+
+def cut(vectors: Tensor, shapes: Sequence[torch.Size]) -> list[Tensor]:
+    """Views (..., *shape) of vectors (..., W), one behind the other."""
+    parts = torch.split(vectors, [shape.numel() for shape in shapes], dim=-1)
+    return [part.view(*part.shape[:-1], *shape) for part, shape in zip(parts, shapes, strict=True)]
+
+
+def copy_row(row: Tensor, parameters: Sequence[Tensor]) -> None:
+    """Copy a row (W,) of weights into parameters of these shapes."""
+    with torch.no_grad():
+        parts = cut(row, [parameter.shape for parameter in parameters])
+        for parameter, part in zip(parameters, parts, strict=True):
+            parameter.copy_(part)
+
+
+class Networks(Protocol):
+    """P networks; each has one or more outputs for a state.
+
+    Attributes:
+        weights: (P, W).
+        gradients: (P, W), of the last `backward`.
+    """
+
+    weights: Tensor
+    gradients: Tensor
+
+    def run(self, states: IntArray | None = None) -> tuple[Array, ...]:
+        """Run the networks.
+
+        Args:
+            states: (U,), which states; only where P is 1. None: all.
+
+        Returns:
+            (P, U, n) of each output, float32; views that the next run may overwrite.
+        """
+
+    def backward(self, *slopes: Array) -> None:
+        """Set `gradients` to those of losses with these slopes in the outputs of the last run."""
+
+
+class DenseNetworks:
+    """Linear layers with tanh or ReLU between them, differentiated by hand.
+
+    A layer is a batched product of (P, U, in) with (P, in, out), which makes for each network the product
+    that it makes alone. The first layer's product with a unit vector is a column of its weights.
+
+    Args:
+        vectors: (P, W), the weights.
+        parameters: those of one network, in the order of a row.
+        nets: the layers of each output.
+        features: (S, n), what the first layers see of each state; None: its unit vector.
+    """
+
+    def __init__(
+        self,
+        vectors: Tensor,
+        parameters: Sequence[Tensor],
+        nets: Sequence[Sequence[nn.Module]],
+        features: Tensor | None,
+    ) -> None:
+        self.weights, self.gradients = aligned(vectors), aligned(torch.zeros_like(vectors))
+        self._features = None if features is None else features.expand(len(vectors), *features.shape)
+        place = {id(parameter): number for number, parameter in enumerate(parameters)}
+        shapes = [parameter.shape for parameter in parameters]
+        weights, gradients = cut(self.weights, shapes), cut(self.gradients, shapes)
+        self._nets, self._slopes = [], []
+        for layers in nets:
+            linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
+            pairs = [(place[id(layer.weight)], place[id(layer.bias)]) for layer in linear]
+            self._nets.append([(weights[weight], weights[bias]) for weight, bias in pairs])
+            self._slopes.append([(gradients[weight], gradients[bias]) for weight, bias in pairs])
+        kinds = {type(layer) for layers in nets for layer in layers if not isinstance(layer, nn.Linear)}
+        self._activation = kinds.pop() if kinds else nn.Tanh
+        self._passes: list[list[Tensor | None]] = []
+        self._states: Tensor | None = None
+
+    @staticmethod
+    def fit(nets: Iterable[Sequence[nn.Module]], parameters: Sequence[Tensor]) -> bool:
+        """Whether networks are made of such layers alone, and have no other parameters."""
+        layers = [layer for net in nets for layer in net]
+        linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
+        kinds = {type(layer) for layer in layers} - {nn.Linear}
+        own = {id(each) for layer in linear for each in (layer.weight, layer.bias)}
+        alternate = all(
+            isinstance(layer, nn.Linear) == (place % 2 == 0) for net in nets for place, layer in enumerate(net)
+        )
+        known = len(kinds) <= 1 and kinds <= _FORWARD.keys()
+        return known and alternate and own == {id(each) for each in parameters}
+
+    def run(self, states: IntArray | None = None) -> tuple[Array, ...]:
+        """See `Networks.run`."""
+        self._states = None if states is None else torch.as_tensor(states, device=self.weights.device)
+        self._passes = [self._run(net) for net in self._nets]
+        return tuple(np.asarray(passed[-1].cpu()) for passed in self._passes if passed[-1] is not None)
+
+    def _run(self, net: list[tuple[Tensor, Tensor]]) -> list[Tensor | None]:
+        """The inputs of all layers, and the output behind the last one."""
+        states, features = self._states, self._features
+        found: list[Tensor | None] = [
+            features if features is None or states is None else features.index_select(1, states)
+        ]
+        for number, (weight, bias) in enumerate(net, 1):
+            inputs = found[-1]
+            if inputs is None:
+                columns = weight if states is None else weight.index_select(2, states)
+                outputs = columns.transpose(1, 2) + bias[:, None]
+            elif weight.shape[1] == 1:  # a batch of these adds up as one alone does; of those below it would not
+                outputs = torch.bmm(weight, inputs.transpose(1, 2)).transpose(1, 2) + bias[:, None]
+            else:
+                outputs = torch.baddbmm(bias[:, None], inputs, weight.transpose(1, 2))
+            found.append(_FORWARD[self._activation](outputs) if number < len(net) else outputs)
+        return found
+
+    def backward(self, *slopes: Array) -> None:
+        """See `Networks.backward`."""
+        for given, net, passed, gradients in zip(slopes, self._nets, self._passes, self._slopes, strict=True):
+            slope = torch.as_tensor(given.astype(np.float32), device=self.weights.device)
+            for number in range(len(net) - 1, -1, -1):
+                (weight, _), (of_weight, of_bias) = net[number], gradients[number]
+                inputs = passed[number]
+                if inputs is not None:
+                    of_weight.copy_(torch.bmm(slope.transpose(1, 2), inputs))
+                elif self._states is None:
+                    of_weight.copy_(slope.transpose(1, 2))
+                else:
+                    of_weight.zero_()
+                    of_weight.index_copy_(2, self._states, slope.transpose(1, 2))
+                if inputs is None and self._states is None:
+                    of_bias.copy_(of_weight.sum(2))
+                else:
+                    of_bias.copy_(slope.sum(1))
+                if number:
+                    slope = _BACKWARD[self._activation](torch.bmm(slope, weight), inputs)
+
+
+class ModuleNetworks:
+    """Any network of one run, differentiated by torch.
+
+    Args:
+        vector: (W,), the weights.
+        parameters: in the order of a row; they become views of it.
+        forward: runs it on some states, or on all: outputs (U, n).
+    """
+
+    def __init__(
+        self,
+        vector: Tensor,
+        parameters: Sequence[Tensor],
+        forward: Callable[[IntArray | None], tuple[Tensor, ...]],
+    ) -> None:
+        self.weights, self.gradients = aligned(vector[None]), aligned(torch.zeros_like(vector)[None])
+        shapes = [each.shape for each in parameters]
+        rows = zip(parameters, cut(self.weights[0], shapes), cut(self.gradients[0], shapes), strict=True)
+        for parameter, data, grad in rows:
+            parameter.data, parameter.grad = data, grad
+        self._forward = forward
+        self._outputs: tuple[Tensor, ...] = ()
+
+    def run(self, states: IntArray | None = None) -> tuple[Array, ...]:
+        """See `Networks.run`."""
+        with torch.enable_grad():
+            self._outputs = self._forward(states)
+        return tuple(output.detach().cpu().numpy()[None] for output in self._outputs)
+
+    def backward(self, *slopes: Array) -> None:
+        """See `Networks.backward`."""
+        self.gradients.zero_()
+        given = [
+            torch.as_tensor(slope, dtype=output.dtype, device=output.device).view_as(output)
+            for slope, output in zip(slopes, self._outputs, strict=True)
+        ]
+        torch.autograd.backward(self._outputs, given)

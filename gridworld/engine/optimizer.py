@@ -1,0 +1,114 @@
+"""One of torch's elementwise optimisers for P networks, each a parameter of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gridworld.world.mdp import BoolArray
+
+# Those that look at every weight by itself.
+ELEMENTWISE: tuple[type[torch.optim.Optimizer], ...] = (
+    *(torch.optim.Adadelta, torch.optim.Adagrad, torch.optim.Adam, torch.optim.AdamW, torch.optim.Adamax),
+    *(torch.optim.NAdam, torch.optim.RAdam, torch.optim.RMSprop, torch.optim.SGD),
+)
+_SMALLEST = math.ulp(0.0)  # a denormal number
+
+
+class Optimizer:
+    """Steps on gradients that are clipped by each network's norm, as Stable-Baselines3 clips them.
+
+    Each row of the weights is a parameter, and one that makes no step has no gradient: torch skips it. So
+    every run has its own count of steps, and its numbers are those of an optimiser of its own.
+
+    Args:
+        own: the optimiser of each run, for its class and settings; equal but for the learning rate.
+        weights: (P, W).
+        gradients: (P, W), which it steps on.
+        max_norms: (P,), inf where nothing is clipped.
+    """
+
+    def __init__(
+        self,
+        own: Sequence[torch.optim.Optimizer],
+        weights: Tensor,
+        gradients: Tensor,
+        max_norms: Sequence[float],
+    ) -> None:
+        self._rows, self._slopes, self._gradients = list(weights), list(gradients), gradients
+        self._max_norms = torch.tensor(max_norms, dtype=torch.float64, device=weights.device)
+        self._may_clip = min(max_norms) < math.inf
+        settings = {key: value for key, value in own[0].param_groups[0].items() if key != "params"}
+        if isinstance(own[0], torch.optim.Adam) and weights.device.type == "cpu":
+            settings["fused"] = True
+        make: Any = type(own[0])
+        self._optimizer: torch.optim.Optimizer = make([{**settings, "params": [row]} for row in self._rows])
+        self._groups = self._optimizer.param_groups
+        self._rates: list[float] = []
+        self._active: list[bool] = []
+
+    def step(self, learning_rates: Sequence[float], active: BoolArray) -> BoolArray:
+        """Make a step of the networks that are active.
+
+        Args:
+            learning_rates: (P,).
+            active: (P,).
+
+        Returns:
+            (P,), which of them had finite gradients; the others made no step.
+        """
+        norms = torch.linalg.vector_norm(self._gradients, dim=1)
+        if self._may_clip:
+            scales = torch.clamp(self._max_norms / (norms.double() + 1e-6), max=1.0)
+            self._gradients *= scales.float()[:, None]
+        finite: BoolArray = active & torch.isfinite(norms).cpu().numpy()
+        if self._rates != (rates := list(learning_rates)):
+            self._set_rates(rates)
+        if self._active != (now := finite.tolist()):
+            self._active = now
+            for row, slope, steps in zip(self._rows, self._slopes, now, strict=True):
+                row.grad = slope if steps else None
+        with _flushing_denormals():
+            self._optimizer.step()
+        return finite
+
+    def _set_rates(self, rates: list[float]) -> None:
+        """Put rows of one learning rate into one group, which the optimiser steps on at once."""
+        self._rates, settings = rates, {**self._groups[0]}
+        groups: dict[float, list[Tensor]] = {}
+        for row, rate in zip(self._rows, rates, strict=True):
+            groups.setdefault(rate, []).append(row)
+        self._groups[:] = [{**settings, "lr": rate, "params": rows} for rate, rows in groups.items()]
+
+    def get_state(self, run: int) -> dict[str, Any]:
+        """Each number that the optimiser keeps of a run; none before its first step."""
+        state = self._optimizer.state.get(self._rows[run], {})
+        return {name: value.cpu().numpy().copy() for name, value in state.items()}
+
+    def set_state(self, run: int, state: dict[str, Any]) -> None:
+        """Mirrors `get_state`."""
+        if state:
+            row = self._rows[run]
+            self._optimizer.state[row] = {
+                name: torch.as_tensor(np.array(value), device=row.device if np.ndim(value) else None)
+                for name, value in state.items()
+            }
+
+
+@contextlib.contextmanager
+def _flushing_denormals() -> Iterator[None]:
+    """Take denormal numbers for 0 within: moments of weights without a gradient shrink to them and are slow."""
+    if _SMALLEST * 1.0 == 0:  # they are already, by somebody else's wish
+        yield
+        return
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(False)

@@ -1,0 +1,244 @@
+"""P runs of one algorithm that train as arrays: what they share, their hooks, their state."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gridworld.engine.environments import Environments
+from gridworld.engine.networks import Array, DenseNetworks, ModuleNetworks, Networks
+from gridworld.engine.optimizer import Optimizer
+from gridworld.engine.run import Run
+from gridworld.process.console.terminal import tell
+from gridworld.storage.serialization import State, fill
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray
+
+FEW_STATES = 1024  # up to here all states are cheaper than finding out which ones a batch holds
+
+
+class Population:
+    """P runs of one algorithm in one world.
+
+    A run that has ended keeps its row, which changes no more, until the others make a smaller population.
+
+    Args:
+        runs: equal by `kind`.
+        states: of `get_state`, to continue from; None: from the start.
+
+    Attributes:
+        active: (P,), the runs that have not ended.
+        num_timesteps: environment steps of each run.
+    """
+
+    same: ClassVar[tuple[str, ...]]  # SB3's settings that runs of one population have in common
+
+    def __init__(self, runs: Sequence[Run], states: Sequence[State | None]) -> None:
+        self.runs = runs
+        for row, run in enumerate(runs):
+            run.population, run.row = self, row
+        first = runs[0]
+        mdp = first.envs.mdp
+        self.num_envs, self.num_states, self.num_actions = first.envs.num_envs, mdp.num_states, mdp.num_actions
+        self.active: BoolArray = np.ones(len(runs), dtype=np.bool_)
+        self.networks = make_networks(runs)
+        self.optimizer = self._optimizer()
+        for run, state in zip(runs, states, strict=True):
+            if state is not None:
+                self.set_state(run, state)
+        self.num_timesteps = int(first.model.num_timesteps)
+        self.environments = Environments([run.envs for run in runs])
+
+    @classmethod
+    def kind(cls, run: Run, num_timesteps: Any) -> Hashable:
+        """Equal for runs that can form a population; of runs in large worlds each is of its own kind."""
+        model, envs, mdp = run.model, run.envs, run.envs.mdp
+        if mdp.num_states > FEW_STATES or not DenseNetworks.fit(run.nets, run.parameters):
+            return id(run)
+        settings = [repr(getattr(model, name)) for name in cls.same]
+        optimizer = {**model.policy.optimizer.param_groups[0], "lr": None, "params": None}
+        return (
+            *(cls, mdp.text(), envs.num_envs, envs.step_limit, envs.stratified, envs.exploration_bonus),
+            *(repr(model.policy), str(model.device), repr(optimizer), run.reward_scale, run.inputs.digest()),
+            *(num_timesteps, run.total_timesteps, *settings),
+        )
+
+    def _optimizer(self) -> Optimizer:
+        own = [run.model.policy.optimizer for run in self.runs]
+        return Optimizer(own, self.networks.weights, self.networks.gradients, self._max_norms())
+
+    def _max_norms(self) -> list[float]:
+        norms = [getattr(run.model, "max_grad_norm", None) for run in self.runs]
+        return [np.inf if norm is None else float(norm) for norm in norms]
+
+    def settings(self, name: str) -> list[float]:
+        """(P,), a setting of each run at this time of training."""
+        return [run.setting(name, self.progress(run)) for run in self.runs]
+
+    def progress(self, run: Run) -> float:
+        """The share of a run's training that is done."""
+        return self.num_timesteps / run.total_timesteps
+
+    def column(self, name: str) -> FloatArray:
+        """(P, 1, 1), of `settings`."""
+        return np.array(self.settings(name)).reshape(-1, 1, 1)
+
+    def learn(self, total_timesteps: int) -> None:
+        """Train until all runs have ended, or have made so many environment steps."""
+        population: Self | None = self
+        while (population := population.safe_point()) and population.num_timesteps < total_timesteps:
+            population.iterate()
+
+    def iterate(self) -> None:
+        """Make some environment steps, and an update."""
+        raise NotImplementedError
+
+    def distinct(self, pairs: IntArray) -> tuple[IntArray, IntArray]:
+        """The states (U,) that occur in a batch of pairs (B,), and the pairs with these numbered in turn."""
+        states, actions = np.divmod(pairs, self.num_actions)
+        which, index = np.unique(states, return_inverse=True)
+        return which, index * self.num_actions + actions
+
+    def end(self, run: Run) -> None:
+        """Let a run take no further part."""
+        self.active[run.row] = False
+
+    def fitted(self, run: Run) -> Sequence[Tensor]:
+        """The parameters of SB3's model that the optimiser steps on."""
+        return run.parameters
+
+    def put_target(self, run: Run) -> None:
+        """Give SB3's model the target network that the run has, if there is one."""
+
+    def snapshot(self, run: Run) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
+        """What a run's network says of all states: values (S,), probabilities (S, A), Q (S, A), float64."""
+        raise NotImplementedError
+
+    def remaining(self) -> Self | None:
+        """The population of the runs that have not ended; None: all have. Those that have are on their own."""
+        if self.active.all():
+            return self
+        self.environments.put_back()
+        going, make = self.active, type(self)
+        states = [self.get_state(run) for run in self.runs]
+        pairs = list(zip(self.runs, states, strict=True))
+        for run, state in pairs:
+            if not going[run.row]:
+                make([run], [state])
+        left = [pair for pair, goes in zip(pairs, going, strict=True) if goes]
+        return make(*map(list, zip(*left, strict=True))) if left else None  # type: ignore[arg-type]
+
+    def safe_point(self) -> Self | None:
+        """Let all runs be saved, as nothing is half done; returns the population of those that go on."""
+        finite = np.isfinite(self.networks.weights.sum(dim=1).cpu().numpy())
+        for run in self.runs:
+            if not finite[run.row] and not torch.isfinite(self.networks.weights[run.row]).all():
+                run.diverge("the network's weights are no finite number")
+                continue
+            run.safe_point(self.num_timesteps)
+        return self.remaining()
+
+    def check_losses(self, losses: Array) -> None:
+        """End the runs whose loss (P,) is no finite number."""
+        for row in np.flatnonzero(~np.isfinite(losses) & self.active):
+            self.runs[row].diverge("a loss is no finite number")
+
+    def check_gradients(self, finite: BoolArray) -> None:
+        """End the runs whose gradients were no finite numbers."""
+        for row in np.flatnonzero(~finite & self.active):
+            self.runs[row].diverge("the gradient is no finite number")
+
+    def get_state(self, run: Run) -> State:
+        """All that a run's next steps depend on."""
+        self.environments.put_back()
+        return {
+            **run.get_state(),
+            "weights": self.networks.weights[run.row].cpu().numpy().copy(),
+            "optimizer": self.optimizer.get_state(run.row),
+        }
+
+    def set_state(self, run: Run, state: State) -> None:
+        """Mirrors `get_state`."""
+        run.set_state(state)
+        fill_tensor(self.networks.weights[run.row], state["weights"], "weights")
+        self.optimizer.set_state(run.row, state["optimizer"])
+
+
+def make_networks(runs: Sequence[Run]) -> Networks:
+    """The networks of some runs, with the weights that SB3's models have."""
+    first, vectors = runs[0], [run.vector() for run in runs]
+    table = first.inputs.table()
+    if DenseNetworks.fit(first.nets, first.parameters) and (first.inputs.is_look_up or table is not None):
+        return DenseNetworks(torch.stack(vectors), first.parameters, first.nets, table)
+    (vector,) = vectors
+    return ModuleNetworks(vector, first.parameters, first.inputs.forward)
+
+
+def fill_tensor(tensor: Tensor, values: Any, name: str) -> None:
+    """Copy an array of the same shape and type into a tensor.
+
+    Raises:
+        StateError: it is none.
+    """
+    own = tensor.cpu().numpy()
+    fill(own, values, name)
+    tensor.copy_(torch.from_numpy(own))
+
+
+def train(runs: Sequence[Run], states: Sequence[State | None]) -> None:
+    """Train runs until each has ended, those of one kind as a population; what went wrong is in their `error`.
+
+    Args:
+        runs: with their hooks; `Run.begin` was called.
+        states: of `get_state`, to continue from; None: from the start.
+    """
+    groups: dict[Hashable, list[tuple[Run, State | None]]] = {}
+    for run, state in zip(runs, states, strict=True):
+        kind = type(run.population).kind(run, 0 if state is None else state.get("num_timesteps"))
+        groups.setdefault(kind, []).append((run, state))
+    for group in groups.values():
+        make = type(group[0][0].population)
+        for part in [group] if agree([run for run, _ in group]) else [[each] for each in group]:
+            population = make(*map(list, zip(*part, strict=True)))  # type: ignore[arg-type]
+            population.learn(part[0][0].total_timesteps)
+
+
+
+
+_agreed: dict[Hashable, bool] = {}  # by kind, number of runs and threads
+
+
+def agree(runs: Sequence[Run]) -> bool:
+    """Whether these networks at once give the numbers of each alone, to the last bit.
+
+    A batched product calls for each matrix the routine that it calls for one alone, on most processors and for
+    most shapes. It is tried out once in a process for each kind and number of networks, in both directions.
+    """
+    key = type(runs[0].population).kind(runs[0], None), len(runs), torch.get_num_threads()
+    if len(runs) > 1 and key not in _agreed:
+        _agreed[key] = _try_out(runs)
+        if not _agreed[key]:
+            tell(
+                "population: this processor or torch adds up otherwise for several networks like these at "
+                "once; such runs train one by one"
+            )
+    return len(runs) == 1 or _agreed[key]
+
+
+def _try_out(runs: Sequence[Run]) -> bool:
+    generator = np.random.default_rng(0)
+    together = make_networks(runs)
+    outputs = [output.copy() for output in together.run()]
+    slopes = [generator.normal(size=output.shape) for output in outputs]
+    together.backward(*slopes)
+    for row, run in enumerate(runs):
+        alone = make_networks([run])
+        if not all(np.array_equal(own[0], all_[row]) for own, all_ in zip(alone.run(), outputs, strict=True)):
+            return False
+        alone.backward(*(slope[row : row + 1] for slope in slopes))
+        if not torch.equal(alone.gradients[0], together.gradients[row]):
+            return False
+    return True

@@ -1,0 +1,145 @@
+"""PPO: J. Schulman et al., Proximal Policy Optimization Algorithms, 2017; as Stable-Baselines3 has it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from gridworld.engine.losses import (
+    Array,
+    Coefficients,
+    Sums,
+    divergence,
+    log_softmax,
+    losses_of,
+    normalized,
+    slopes_of,
+    sum_up,
+)
+from gridworld.engine.on_policy import OnPolicy
+from gridworld.engine.population import FEW_STATES
+from gridworld.engine.run import Run
+from gridworld.storage.serialization import State
+from gridworld.world.mdp import IntArray
+
+
+class PPO(OnPolicy):
+    """P runs of PPO."""
+
+    same: ClassVar[tuple[str, ...]] = (*OnPolicy.same, "batch_size", "n_epochs")
+
+    def __init__(self, runs: Sequence[Run], states: Sequence[State | None]) -> None:
+        super().__init__(runs, states)
+        model = runs[0].model
+        self.batch_size, self.n_epochs = model.batch_size, model.n_epochs
+        self.clips_values = model.clip_range_vf is not None
+        limits = [np.inf if run.model.target_kl is None else 1.5 * run.model.target_kl for run in runs]
+        self.most_divergence = np.array(limits) if min(limits) < np.inf else None
+
+    def update(self, old: tuple[Array, Array], pairs: IntArray, advantages: Array, returns: Array) -> None:
+        """See `OnPolicy.update`."""
+        coefficients = Coefficients(
+            self.column("clip_range"),
+            self.column("clip_range_vf") if self.clips_values else None,
+            self.column("ent_coef"),
+            self.column("vf_coef"),
+        )
+        learning_rates = self.settings("learning_rate")
+        active, whole = self.active.copy(), None  # those that have not ended their epochs
+        log = _Log(len(self.runs))
+        for _ in range(self.n_epochs):
+            if not active.any():
+                break
+            log.begin_epoch(active)
+            if self.batch_size >= pairs.shape[1]:  # whatever their order
+                whole = whole or list(self._summed_up(pairs[:, None], advantages[:, None], returns[:, None]))
+                minibatches: Iterator[tuple[IntArray | None, Sums]] = iter(whole)
+            else:
+                minibatches = self._minibatches(active, pairs, advantages, returns)
+            for states, sums in minibatches:
+                logits, values = self.networks.run(states)
+                new = log_softmax(logits), values[..., 0]
+                before = old if states is None else (old[0][:, states], old[1][:, states])
+                log.add(active, losses_of(new, before, sums, coefficients))
+                if self.most_divergence is not None:
+                    active &= divergence(new[0], before[0], sums.pairs) <= self.most_divergence
+                slopes = slopes_of(new, before, sums, coefficients)
+                self.networks.backward(slopes[0], slopes[1][..., None])
+                finite = self.optimizer.step(learning_rates, active)
+                self.check_gradients(finite | ~active)
+                active &= finite
+        self._log(log)
+
+    def _minibatches(
+        self, active: np.ndarray, *samples: Array
+    ) -> Iterator[tuple[IntArray | None, Sums]]:
+        """The minibatches of an epoch, in SB3's own draw of their order."""
+        (runs, count), size = samples[0].shape, self.batch_size
+        order = np.zeros((runs, count), dtype=np.int64)
+        for row in np.flatnonzero(active):
+            order[row] = self.runs[row].numpy_generator.permutation(count)
+        order += count * np.arange(runs)[:, None]
+        full = count // size * size
+        yield from self._summed_up(*(each.take(order[:, :full].reshape(runs, -1, size)) for each in samples))
+        if full < count:
+            yield from self._summed_up(*(each.take(order[:, None, full:]) for each in samples))
+
+    def _summed_up(
+        self, pairs: IntArray, advantages: Array, returns: Array
+    ) -> Iterator[tuple[IntArray | None, Sums]]:
+        """The states to run the network on, None for all, and the sums there, of K minibatches (P, K, B)."""
+        if self.normalize_advantage and pairs.shape[-1] > 1:
+            advantages = normalized(advantages)
+        if self.num_states <= max(FEW_STATES, pairs.shape[-1]):
+            sums = sum_up(pairs, advantages, returns, (self.num_states, self.num_actions))
+            yield from ((None, sums.of(number)) for number in range(pairs.shape[1]))
+            return
+        for number in range(pairs.shape[1]):
+            which, pair = self.distinct(pairs[0, number])
+            yield which, sum_up(pair[None], advantages[:, number], returns[:, number], (len(which), self.num_actions))
+
+    def _log(self, log: _Log) -> None:
+        means = log.means()
+        names = ["clip_range", "clip_range_vf"] if self.clips_values else ["clip_range"]
+        means |= {name: np.array(self.settings(name)) for name in names}
+        for row in np.flatnonzero(self.active):
+            run = self.runs[row]
+            run.model._n_updates += int(log.epochs[row])
+            for name, mean in means.items():
+                run.record(f"train/{name}", float(mean[row]))
+        self.check_losses(means["loss"])
+
+
+class _Log:
+    """The losses of an update, of which SB3 logs the means.
+
+    Attributes:
+        epochs: (P,), that each run began.
+    """
+
+    def __init__(self, runs: int) -> None:
+        self.epochs = np.zeros(runs, dtype=np.int64)
+        self._losses: list[dict[str, Array]] = []
+        self._epoch: list[Array] = []  # of each step, that of each run; 0 where it had ended
+
+    def begin_epoch(self, active: np.ndarray) -> None:
+        self.epochs += active
+
+    def add(self, active: np.ndarray, losses: dict[str, Array]) -> None:
+        self._losses.append(losses)
+        self._epoch.append(np.where(active, self.epochs, 0))
+
+    def means(self) -> dict[str, Array]:
+        """(P,) each; SB3 has the divergence of the last epoch, and the loss of the last minibatch."""
+        epoch = np.stack(self._epoch, axis=1)
+        taken, last = epoch > 0, epoch == epoch.max(axis=1, keepdims=True)
+        found = {}
+        for name in self._losses[0]:
+            losses = np.stack([each[name] for each in self._losses], axis=1)
+            chosen = last if name == "approx_kl" else taken
+            if name == "loss":
+                chosen = np.arange(epoch.shape[1]) == taken.sum(axis=1, keepdims=True) - 1
+            found[name] = np.where(chosen, losses, 0).sum(axis=1) / np.maximum(chosen.sum(axis=1), 1)
+        return found

@@ -1,0 +1,128 @@
+"""The border to Stable-Baselines3: its own classes make the first network, and write and read model files."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import pkgutil
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import FloatSchedule
+from torch import nn
+
+import gridworld.engine
+from gridworld.config.agents import Decay
+from gridworld.engine.inputs import Inputs
+from gridworld.engine.networks import copy_row, cut
+from gridworld.engine.population import Population
+from gridworld.engine.run import Run
+from gridworld.envs.observations import ObservationTable
+from gridworld.envs.statistics_env import StatisticsVectorEnv
+from gridworld.storage.rng_state import independent_generator
+
+Kind = Literal["flat", "fixed", "patches", "any"]
+
+
+def algorithm_of(model_class: type[BaseAlgorithm]) -> type[Population] | None:
+    """The algorithm of this package that learns what a class of SB3 or sb3-contrib learns.
+
+    It is the class of the same name in the module of the name that SB3's module has.
+
+    Returns:
+        The algorithm; None: there is none for this class.
+    """
+    library, _, rest = model_class.__module__.partition(".")
+    name = rest.rpartition(".")[2]
+    known = {module.name for module in pkgutil.iter_modules(gridworld.engine.__path__)}
+    if library not in ("stable_baselines3", "sb3_contrib") or name not in known:
+        return None
+    module = importlib.import_module(f"gridworld.engine.{name}")
+    found: type[Population] | None = getattr(module, model_class.__name__, None)
+    return found
+
+
+def make_run(
+    model: BaseAlgorithm,
+    observation: ObservationTable,
+    envs: StatisticsVectorEnv,
+    seed: int,
+    kind: Kind,
+    reward_scale: float = 1.0,
+    falling: Mapping[str, Decay] = MappingProxyType({}),
+    log_interval: int = 1,
+) -> Run:
+    """A run of a model that SB3 has just made, so that its generators are where `learn` would find them.
+
+    Args:
+        model: SB3's.
+        observation: what it sees of a state.
+        envs: what it learns in.
+        seed: of the run.
+        kind: of its features extractors, see `Inputs`.
+        reward_scale: rewards are multiplied by it.
+        falling: settings that fall over training in ways that SB3 has not.
+        log_interval: as SB3's `learn` takes it.
+    """
+    torch_generator, numpy_generator = torch.Generator(), np.random.RandomState()
+    torch_generator.set_state(torch.get_rng_state())
+    numpy_generator.set_state(np.random.get_state())
+    envs.np_random = independent_generator(seed)
+    envs.reset()
+    nets, extractors, extract = _parts(model.policy)
+    inputs = Inputs(model.policy, observation, nets, extractors, extract, kind)
+    parameters = model.policy.optimizer.param_groups[0]["params"]
+    return Run(
+        model, parameters, inputs, nets, envs, reward_scale, falling, torch_generator, numpy_generator, log_interval
+    )
+
+
+def _parts(policy: Any) -> tuple[Sequence[Sequence[nn.Module]], Sequence[Any], Any]:
+    """The layers of each output, the features extractors, and what makes features of observations."""
+    if isinstance(policy, ActorCriticPolicy):
+        own = policy.mlp_extractor
+        nets = [[*own.policy_net, policy.action_net], [*own.value_net, policy.value_net]]
+        names = ["features_extractor"]
+        if not policy.share_features_extractor:
+            names = ["pi_features_extractor", "vf_features_extractor"]
+        return nets, [getattr(policy, name) for name in names], policy.extract_features
+    network = getattr(policy, "q_net", None) or policy.quantile_net
+    layers = [*(network.q_net if hasattr(network, "q_net") else network.quantile_net)]
+    extractor = network.features_extractor
+    return [layers], [extractor], lambda rows: network.extract_features(rows, extractor)
+
+
+def put_weights(run: Run) -> None:
+    """Give SB3's model the weights, the optimiser's state and the settings that the run has."""
+    population, model, optimizer = run.population, run.model, run.model.policy.optimizer
+    progress = 1 - model._current_progress_remaining
+    for name in run.falling:
+        value = run.setting(name, progress)
+        if name == "learning_rate":  # so that SB3's `load` reads the file anywhere
+            model.lr_schedule = FloatSchedule(value)
+        else:
+            setattr(model, name, value)
+    optimizer.param_groups[0]["lr"] = run.setting("learning_rate", progress)
+    copy_row(population.networks.weights[run.row], run.parameters)
+    shapes = [parameter.shape for parameter in population.fitted(run)]
+    state = {name: torch.as_tensor(value) for name, value in population.optimizer.get_state(run.row).items()}
+    cuts = {name: cut(value, shapes) for name, value in state.items() if value.dim()}
+    for number, parameter in enumerate(population.fitted(run) if state else ()):
+        optimizer.state[parameter] = {
+            name: (cuts[name][number] if name in cuts else value).to(parameter.device if name in cuts else "cpu")
+            for name, value in state.items()
+        }
+    population.put_target(run)
+
+
+def model_file(run: Run) -> bytes:
+    """The content of SB3's model file."""
+    put_weights(run)
+    content = io.BytesIO()
+    run.model.save(content, exclude=["rollout_buffer_class", "replay_buffer_class", "replay_buffer_kwargs"])
+    return content.getvalue()
