@@ -167,14 +167,17 @@ class Population:
         self.optimizer.set_state(run.row, state["optimizer"])
 
 
-def make_networks(runs: Sequence[Run]) -> Networks:
-    """The networks of some runs, with the weights that SB3's models have."""
-    first, vectors = runs[0], [run.vector() for run in runs]
+def make_networks(runs: Sequence[Run], is_target: bool = False) -> Networks:
+    """The networks of some runs, or their target networks, with the weights that SB3's models have."""
+    first = runs[0]
+    of_runs = [run.target_parameters if is_target else run.parameters for run in runs]
+    vectors = [torch.cat([each.detach().reshape(-1) for each in parameters]) for parameters in of_runs]
     table = first.inputs.table()
     if DenseNetworks.fit(first.nets, first.parameters) and (first.inputs.is_look_up or table is not None):
         return DenseNetworks(torch.stack(vectors), first.parameters, first.nets, table)
-    (vector,) = vectors
-    return ModuleNetworks(vector, first.parameters, first.inputs.forward)
+    inputs = first.target if is_target else first.inputs
+    assert inputs is not None and len(runs) == 1
+    return ModuleNetworks(vectors[0], of_runs[0], inputs.forward)
 
 
 def fill_tensor(tensor: Tensor, values: Any, name: str) -> None:

@@ -39,6 +39,9 @@ class Run:
         torch_generator: where SB3 draws from torch's own.
         numpy_generator: where SB3 draws from numpy's own.
         log_interval: as SB3's `learn` takes it.
+        target: what its target network sees of each state, where it has one.
+        target_parameters: of that, in the same order.
+        counts_transitions: whether its replay counts transitions.
     """
 
     model: Any
@@ -51,6 +54,9 @@ class Run:
     torch_generator: torch.Generator
     numpy_generator: np.random.RandomState
     log_interval: int = 1
+    target: Inputs | None = None
+    target_parameters: Sequence[nn.Parameter] = ()
+    counts_transitions: bool = False
     population: Population = field(init=False, repr=False)
     row: int = field(init=False, default=0)
     total_timesteps: int = field(init=False, default=0)
@@ -67,9 +73,6 @@ class Run:
         model.ep_info_buffer = deque(maxlen=model._stats_window_size)
         model.ep_success_buffer = deque(maxlen=model._stats_window_size)
 
-    def vector(self) -> Tensor:
-        """(W,), the weights of SB3's model."""
-        return torch.cat([each.detach().reshape(-1) for each in self.parameters])
 
     def setting(self, name: str, progress: float) -> float:
         """A setting after this share of training, from 0 to 1."""

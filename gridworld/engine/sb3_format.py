@@ -74,27 +74,45 @@ def make_run(
     numpy_generator.set_state(np.random.get_state())
     envs.np_random = independent_generator(seed)
     envs.reset()
-    nets, extractors, extract = _parts(model.policy)
-    inputs = Inputs(model.policy, observation, nets, extractors, extract, kind)
-    parameters = model.policy.optimizer.param_groups[0]["params"]
-    return Run(
-        model, parameters, inputs, nets, envs, reward_scale, falling, torch_generator, numpy_generator, log_interval
+    policy: Any = model.policy
+    nets, inputs = _inputs(policy, observation, kind)
+    run = Run(
+        model,
+        policy.optimizer.param_groups[0]["params"],
+        inputs,
+        nets,
+        envs,
+        reward_scale,
+        falling,
+        torch_generator,
+        numpy_generator,
+        log_interval,
     )
+    for name in ("q_net_target", "quantile_net_target"):
+        if hasattr(policy, name):
+            _, run.target = _inputs(policy, observation, kind, getattr(policy, name))
+            run.target_parameters = list(getattr(policy, name).parameters())
+    return run
 
 
-def _parts(policy: Any) -> tuple[Sequence[Sequence[nn.Module]], Sequence[Any], Any]:
-    """The layers of each output, the features extractors, and what makes features of observations."""
+def _inputs(
+    policy: Any, observation: ObservationTable, kind: Kind, network: Any = None
+) -> tuple[Sequence[Sequence[nn.Module]], Inputs]:
+    """The layers of each output, and what feeds them; `network`: one of several, None for the policy's own."""
     if isinstance(policy, ActorCriticPolicy):
         own = policy.mlp_extractor
         nets = [[*own.policy_net, policy.action_net], [*own.value_net, policy.value_net]]
         names = ["features_extractor"]
         if not policy.share_features_extractor:
             names = ["pi_features_extractor", "vf_features_extractor"]
-        return nets, [getattr(policy, name) for name in names], policy.extract_features
-    network = getattr(policy, "q_net", None) or policy.quantile_net
-    layers = [*(network.q_net if hasattr(network, "q_net") else network.quantile_net)]
+        extractors = [getattr(policy, name) for name in names]
+        return nets, Inputs(policy, observation, nets, extractors, policy.extract_features, kind)
+    network = network or (policy.q_net if hasattr(policy, "q_net") else policy.quantile_net)
+    nets = [[*(network.q_net if hasattr(network, "q_net") else network.quantile_net)]]
     extractor = network.features_extractor
-    return [layers], [extractor], lambda rows: network.extract_features(rows, extractor)
+    return nets, Inputs(
+        policy, observation, nets, [extractor], lambda rows: network.extract_features(rows, extractor), kind
+    )
 
 
 def put_weights(run: Run) -> None:

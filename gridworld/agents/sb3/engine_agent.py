@@ -14,7 +14,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from gridworld.agents import Learning, PolicySnapshot, TrainingContext
 from gridworld.agents.sb3.agent import SB3Agent
 from gridworld.agents.sb3.features import FIXED, LEARNED
-from gridworld.agents.sb3.settings.schemas import SB3Config, reward_scale
+from gridworld.agents.sb3.settings.schemas import SB3Config, counts_transitions, reward_scale
 from gridworld.agents.sb3.settings.validation import FALLING
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.config.agents import falls, parse_schedule
@@ -51,6 +51,7 @@ class EngineAgent(SB3Agent):
             falling,
             config.log_interval,
         )
+        self.run.counts_transitions = counts_transitions(given)
         self._algorithm([self.run], [None])
 
     @property
