@@ -136,8 +136,11 @@ class DenseNetworks:
         for number, (weight, bias) in enumerate(net, 1):
             inputs = found[-1]
             if inputs is None:
-                columns = weight if states is None else weight.index_select(2, states)
-                outputs = columns.transpose(1, 2) + bias[:, None]
+                columns = weight.transpose(1, 2)
+                outputs = (columns if states is None else columns[:, states]) + bias[:, None]
+            elif weight.shape[1] == 1 and inputs.stride(1) == 1:  # columns of weights, which a batch adds up otherwise
+                rows = zip(inputs, weight, bias, strict=True)
+                outputs = torch.stack([nn.functional.linear(*row) for row in rows])
             elif weight.shape[1] == 1:  # a batch of these adds up as one alone does; of those below it would not
                 outputs = torch.bmm(weight, inputs.transpose(1, 2)).transpose(1, 2) + bias[:, None]
             else:
@@ -158,7 +161,7 @@ class DenseNetworks:
                     of_weight.copy_(slope.transpose(1, 2))
                 else:
                     of_weight.zero_()
-                    of_weight.index_copy_(2, self._states, slope.transpose(1, 2))
+                    of_weight[:, :, self._states] = slope.transpose(1, 2)
                 if inputs is None and self._states is None:
                     of_bias.copy_(of_weight.sum(2))
                 else:

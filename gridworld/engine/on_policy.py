@@ -57,6 +57,8 @@ class OnPolicy(Population):
         self.num_timesteps += self.n_steps * self.num_envs
         for run in itertools.compress(self.runs, self.active.tolist()):
             self._log_rollout(run)
+        if not self.active.any():
+            return
         advantages, returns = self._advantages(rollout, values, np.array(gae_lambda))
         samples = [_by_run(each) for each in (rollout.pairs, advantages, returns)]
         self._outputs = None
