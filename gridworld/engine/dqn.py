@@ -166,7 +166,7 @@ class DQN(Population):
                 going &= self.optimizer.step(learning_rates, going)
                 self._outputs = self._greedy = None
         self.check_gradients(going)
-        mean = np.mean(losses, axis=0)
+        mean = np.stack(losses, axis=1).mean(axis=1)
         for run in itertools.compress(self.runs, self.active.tolist()):
             run.model._n_updates += steps
             run.record("train/learning_rate", learning_rates[run.row])

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import preprocess_obs
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from gridworld.envs.observations import ObservationTable
@@ -53,9 +54,13 @@ class Inputs:
         self._is_learned = kind == "patches"
         self._all: Any = None  # of all states, the features if these never change, else the observations
 
+    def rows(self, states: IntArray) -> NDArray[Any]:
+        """The observations (U, *shape) of states (U,)."""
+        return self._observation.rows(states)
+
     def digest(self) -> str:
         """Equal where the same is seen of all states."""
-        rows = self._observation.rows(np.arange(self._observation.num_states))
+        rows = self.rows(np.arange(self._observation.num_states))
         return f"{self._observation.kind} {hashlib.sha256(np.ascontiguousarray(rows)).hexdigest()}"
 
     def table(self) -> Tensor | None:

@@ -36,6 +36,11 @@ class OnPolicy(Population):
             self._outputs = logits, values[..., 0]
         return self._outputs
 
+    def log_policy(self) -> tuple[Array, Array]:
+        """log π (P, S, A) and values (P, S) of all states."""
+        logits, values = self.outputs
+        return log_softmax(logits), values
+
     def snapshot(self, run: Run) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
         """See `Population.snapshot`."""
         logits, values = self.outputs
@@ -48,8 +53,7 @@ class OnPolicy(Population):
         for run, value in zip(self.runs, gae_lambda, strict=True):
             if "gae_lambda" in run.falling:
                 run.record("train/gae_lambda", value)
-        logits, values = self.outputs
-        old = log_softmax(logits), values
+        old = self.log_policy()
         draws = [torch.rand(self.n_steps, self.num_envs, generator=run.torch_generator) for run in self.runs]
         rollout = self.environments.roll(np.exp(old[0]), torch.cat(draws, dim=1).numpy())
         for run in self.runs:
@@ -59,7 +63,7 @@ class OnPolicy(Population):
             self._log_rollout(run)
         if not self.active.any():
             return
-        advantages, returns = self._advantages(rollout, values, np.array(gae_lambda))
+        advantages, returns = self._advantages(rollout, old[1], np.array(gae_lambda))
         samples = [_by_run(each) for each in (rollout.pairs, advantages, returns)]
         self._outputs = None
         self.update(old, *samples)

@@ -61,7 +61,7 @@ class Population:
         settings = [repr(getattr(model, name)) for name in cls.same]
         optimizer = {**model.policy.optimizer.param_groups[0], "lr": None, "params": None}
         return (
-            *(cls, mdp.text(), envs.num_envs, envs.step_limit, envs.stratified, envs.exploration_bonus),
+            *(cls, mdp.text(), envs.num_envs, envs.step_limit, envs.stratified),
             *(repr(model.policy), str(model.device), repr(optimizer), run.reward_scale, run.inputs.digest()),
             *(num_timesteps, run.total_timesteps, *settings),
         )

@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from gridworld.engine.population import Population
 
 
+def _go_on(steps: int) -> int:
+    return steps + 1
+
+
 @dataclass(eq=False)
 class Run:
     """A run.
@@ -61,7 +65,7 @@ class Run:
     row: int = field(init=False, default=0)
     total_timesteps: int = field(init=False, default=0)
     next_call: int = field(init=False, default=0)  # the steps by which `on_step` wants to be called
-    on_step: Callable[[int], int] = field(init=False, default=lambda steps: steps + 1)
+    on_step: Callable[[int], int] = field(init=False, default_factory=lambda: _go_on)
     on_safe_point: Callable[[int], None] | None = field(init=False, default=None)
     error: BaseException | None = field(init=False, default=None)
 
@@ -145,7 +149,9 @@ class Run:
             "num_episodes": int(model._episode_num),
             "recent_episodes": [[each["r"], each["l"]] for each in model.ep_info_buffer],
             "seconds": (time.time_ns() - model.start_time) / 1e9,
-            "logged": {name: [float(value), bool(excluded[name])] for name, value in logged.items()},
+            "logged": {
+                name: [float(value), "tensorboard" in (excluded[name] or ())] for name, value in logged.items()
+            },
         }
 
     def set_state(self, state: State) -> None:

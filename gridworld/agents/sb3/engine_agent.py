@@ -46,7 +46,7 @@ class EngineAgent(SB3Agent):
             context.observation,
             context.envs,
             context.seed,
-            _kind(self._model),
+            extractors_kind(self._model),
             reward_scale(config),
             falling,
             config.log_interval,
@@ -110,7 +110,7 @@ def learn_together(learnings: Sequence[Learning]) -> list[BaseException | None]:
     return [run.error for run in runs]
 
 
-def _kind(model: Any) -> Kind:
+def extractors_kind(model: Any) -> Kind:
     """Of a model's features extractors, see `engine.inputs.Inputs`."""
     kinds = {type(each) for each in model.policy.modules() if isinstance(each, BaseFeaturesExtractor)}
     if kinds == {FlattenExtractor}:
