@@ -7,8 +7,6 @@ S. Huang et al., A2C is a special case of PPO, 2022.
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 
 from gridworld.engine.losses import Array, Coefficients, log_softmax, losses_of, normalized, slopes_of, sum_up
@@ -41,7 +39,7 @@ class A2C(OnPolicy):
 
     def _log(self, losses: dict[str, Array], log_prob: Array, gains: Array) -> None:
         policy_loss = -(gains * log_prob).sum(axis=(-2, -1))
-        for run in itertools.compress(self.runs, self.active.tolist()):
+        for run in self.going():
             run.model._n_updates += 1
             run.record("train/entropy_loss", float(losses["entropy_loss"][run.row]))
             run.record("train/policy_loss", float(policy_loss[run.row]))

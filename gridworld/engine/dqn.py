@@ -1,4 +1,4 @@
-"""DQN: V. Mnih et al., Human-level control through deep reinforcement learning, 2015; as Stable-Baselines3 has it.
+"""DQN: V. Mnih et al., Human-level control through deep reinforcement learning, 2015; as SB3 has it.
 
 The loss of a minibatch, the mean Huber distance of Q(s_i, a_i) to its target y_i, touches the network only
 through the table Q, and there its slope is a sum over samples:
@@ -11,9 +11,8 @@ Greedy actions and targets are look-ups in tables, which are made anew when a ne
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Hashable, Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -25,7 +24,7 @@ from gridworld.engine.population import FEW_STATES, Population, fill_tensor, mak
 from gridworld.engine.replay import CountedReplay, Replay, Transitions, UniformReplay
 from gridworld.engine.run import Run
 from gridworld.storage.serialization import State
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray
+from gridworld.world.mdp import FloatArray, IntArray
 
 _DRAWN_AT_ONCE = 2**13  # transitions of a run
 
@@ -54,10 +53,10 @@ class DQN(Population):
         super().__init__(runs, states)
 
     @classmethod
-    def kind(cls, run: Run, num_timesteps: Any) -> Hashable:
+    def kind(cls, run: Run) -> Hashable:
         """See `Population.kind`; runs that count episodes make steps of their own."""
         by_episode = run.model.train_freq.unit is TrainFrequencyUnit.EPISODE
-        return id(run) if by_episode else super().kind(run, num_timesteps)
+        return id(run) if by_episode else super().kind(run)
 
     def iterate(self) -> None:
         """See `Population.iterate`: some steps into the replay, and an update by it."""
@@ -65,7 +64,7 @@ class DQN(Population):
         by_episode = self.train_freq.unit is TrainFrequencyUnit.EPISODE
         while (episodes if by_episode else steps) < self.train_freq.frequency:
             states, actions = self.environments.states, self._act()
-            step = self.environments.step(actions)
+            step = self.environments.step(actions.astype(np.int64, copy=False))
             steps, episodes = steps + 1, episodes + len(step.which)
             self.num_timesteps += self.num_envs
             self._count(step, is_last=steps == self.train_freq.frequency)
@@ -82,9 +81,10 @@ class DQN(Population):
         """(P · E,), uniformly random at first; then one coin decides for a run's whole batch, as in SB3."""
         actions = np.empty((len(self.runs), self.num_envs), dtype=np.int64)
         states = self.environments.states.reshape(actions.shape)
-        for run in itertools.compress(self.runs, self.active.tolist()):
+        for run in self.going():
             is_random = (
-                self.num_timesteps < self.learning_starts or run.numpy_generator.rand() < run.model.exploration_rate
+                self.num_timesteps < self.learning_starts
+                or run.numpy_generator.rand() < run.model.exploration_rate
             )
             if is_random:
                 generator = run.model.action_space.np_random
@@ -98,17 +98,18 @@ class DQN(Population):
         if self.num_states > max(FEW_STATES, len(states)):
             which, index = np.unique(states, return_inverse=True)
             self._outputs = None
-            found: IntArray = self.q_of(self._shaped(self.networks.run(which)[0]))[row].argmax(axis=-1)[index]
-            return found
+            found: IntArray = self.q_of(self._shaped(self.networks.run(which)[0]))[row].argmax(axis=-1)
+            return found[index]
         if self._greedy is None:
             self._greedy = self.q_of(self.outputs).argmax(axis=-1)
-        return self._greedy[row].take(states)
+        greedy: IntArray = self._greedy[row].take(states)
+        return greedy
 
     def _count(self, step: Step, is_last: bool) -> None:
         """Count a step of each run, and call what wants to be called after it."""
         pairs, rewards = step.pairs.reshape(len(self.runs), -1), step.rewards.reshape(len(self.runs), -1)
         cuts = np.searchsorted(step.which, np.arange(len(self.runs) + 1) * self.num_envs).tolist()
-        for run in itertools.compress(self.runs, self.active.tolist()):
+        for run in self.going():
             row, part = run.row, slice(cuts[run.row], cuts[run.row + 1])
             run.envs.count(pairs[row][None], rewards[row][None])
             run.envs.add_returns(np.zeros(part.stop - part.start), step.returns[part])
@@ -135,7 +136,7 @@ class DQN(Population):
             target[rows] = (target[rows] * (1 - model.tau)).add(own[rows], alpha=model.tau)
             self._best = None
         ended = np.bincount(step.which // self.num_envs, minlength=len(self.runs))
-        for run in itertools.compress(self.runs, self.active.tolist()):
+        for run in self.going():
             model = run.model
             model._current_progress_remaining = 1 - self.progress(run)
             model.exploration_rate = model.exploration_schedule(model._current_progress_remaining)
@@ -155,19 +156,23 @@ class DQN(Population):
         gamma = np.array([run.model.gamma for run in self.runs], dtype=np.float32)[:, None]
         at_once, losses = max(1, _DRAWN_AT_ONCE // self.replay.width(self.batch_size)), []
         for first in range(0, steps, at_once):
-            generators = [run.numpy_generator if goes else None for run, goes in zip(self.runs, going, strict=True)]
+            generators = [
+                run.numpy_generator if goes else None for run, goes in zip(self.runs, going, strict=True)
+            ]
             drawn = self.replay.draw(generators, min(at_once, steps - first), self.batch_size)
             targets = self._targets(drawn, best, gamma)
             for number in range(len(drawn.states)):
                 shares = None if drawn.shares is None else drawn.shares[number]
-                found, slopes = self._slopes(drawn.states[number], drawn.actions[number], targets[number], shares)
+                found, slopes = self._slopes(
+                    drawn.states[number], drawn.actions[number], targets[number], shares
+                )
                 losses.append(found)
                 self.networks.backward(slopes)
                 going &= self.optimizer.step(learning_rates, going)
                 self._outputs = self._greedy = None
         self.check_gradients(going)
         mean = np.stack(losses, axis=1).mean(axis=1)
-        for run in itertools.compress(self.runs, self.active.tolist()):
+        for run in self.going():
             run.model._n_updates += steps
             run.record("train/learning_rate", learning_rates[run.row])
             run.record("train/n_updates", run.model._n_updates, for_tensorboard=False)

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.envs.statistics_env import StatisticsVectorEnv
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray
+from gridworld.envs.vector_env import StateArray
+from gridworld.world.mdp import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -31,14 +32,14 @@ class Step:
         lengths: (m,), theirs.
     """
 
-    pairs: IntArray
-    last_states: IntArray
+    pairs: StateArray
+    last_states: StateArray
     rewards: FloatArray
     terminated: BoolArray
     over: BoolArray
-    which: IntArray
+    which: StateArray
     returns: FloatArray
-    lengths: IntArray
+    lengths: StateArray
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -48,16 +49,16 @@ class Rollout:
     Attributes:
         truncated: cut off by the step limit alone.
         final_states: (P, E), after the last step.
-        ended: of each run, (step, environment, return, length) of its episodes that ended, in this order.
+        ended: of each run, (step, return, length) of its episodes that ended, in this order.
     """
 
-    pairs: IntArray
+    pairs: StateArray
     rewards: FloatArray
-    last_states: IntArray
+    last_states: StateArray
     terminated: BoolArray
     truncated: BoolArray
-    final_states: IntArray
-    ended: list[tuple[IntArray, IntArray, FloatArray, IntArray]]
+    final_states: StateArray
+    ended: list[tuple[StateArray, FloatArray, StateArray]]
 
 
 class Environments:
@@ -86,7 +87,7 @@ class Environments:
             part = slice(*self._bounds[run : run + 2])
             batch.set_episode_state(self.states[part], self._elapsed[part], self._returns[part])
 
-    def step(self, actions: IntArray) -> Step:
+    def step(self, actions: StateArray) -> Step:
         """Move all environments once; actions are (P · E,)."""
         pairs = self.states * self.num_actions
         pairs += actions
@@ -133,23 +134,19 @@ class Environments:
         ended = self._ended(steps, runs)
         return Rollout(pairs, rewards, last_states, terminated, over & ~terminated, finals, ended)
 
-    def _ended(
-        self, steps: Sequence[Step], runs: int
-    ) -> list[tuple[IntArray, IntArray, FloatArray, IntArray]]:
+    def _ended(self, steps: Sequence[Step], runs: int) -> list[tuple[StateArray, FloatArray, StateArray]]:
         step = np.repeat(np.arange(len(steps)), [len(each.which) for each in steps])
         which, returns, lengths = (
-            np.concatenate([getattr(each, name) for each in steps]) for name in ("which", "returns", "lengths")
+            np.concatenate([getattr(each, name) for each in steps])
+            for name in ("which", "returns", "lengths")
         )
-        run, env = np.divmod(which, self.num_envs)
+        run = which // self.num_envs
         order = np.argsort(run, kind="stable")
         cuts = np.searchsorted(run[order], np.arange(runs + 1))
-        columns = [column[order] for column in (step, env, returns, lengths)]
-        return [
-            (columns[0][a:b], columns[1][a:b], columns[2][a:b], columns[3][a:b])
-            for a, b in itertools.pairwise(cuts)
-        ]
+        of_runs = (order[a:b] for a, b in itertools.pairwise(cuts))
+        return [(step[part], returns[part], lengths[part]) for part in of_runs]
 
-    def _outcomes(self, pairs: IntArray) -> IntArray:
+    def _outcomes(self, pairs: StateArray) -> StateArray:
         """(P · E,), drawn where an environment moves."""
         moving = np.flatnonzero(~self._terminal.take(self.states))
         situations = pairs[moving]
@@ -162,14 +159,14 @@ class Environments:
         outcomes[moving] = drawn
         return outcomes
 
-    def _starts(self, which: IntArray) -> IntArray:
+    def _starts(self, which: StateArray) -> StateArray:
         if len(self._start_states) == 1:
             return np.full(len(which), self._start_states[0])
         cuts = np.searchsorted(which, self._bounds).tolist()
         parts = zip(self._batches, itertools.pairwise(cuts), strict=True)
         return np.concatenate([batch.draw_starts(end - start) for batch, (start, end) in parts])
 
-    def _draws(self, which: IntArray, situations: IntArray) -> FloatArray:
+    def _draws(self, which: StateArray, situations: StateArray) -> FloatArray:
         """A number in [0, 1) for each of these environments, ascending, from its run's generator."""
         cuts = np.searchsorted(which, self._bounds).tolist()
         parts = zip(self._batches, itertools.pairwise(cuts), strict=True)

@@ -2,7 +2,7 @@
 
 Features that no parameter has a part in are a table, made once. So are the distinct squares of pixels of all
 images, which is what a network begins with that learns from pixels. A one-hot row times the first layer's
-weights is a column of these: for one-hot observations that layer is a look-up, and no matrix of S x S is made.
+weights is a column of these: for one-hot observations that layer is a look-up, without a matrix of S x S.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import Any, Literal, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import preprocess_obs
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from gridworld.envs.observations import ObservationTable
@@ -33,8 +33,8 @@ class Inputs:
         nets: the layers of each of its outputs.
         extractors: the modules that make features of observations, one, or one for each output.
         extract: makes features of observations (U, *shape): a tensor, or one for each output.
-        kind: of the extractors: `flat` changes nothing, `fixed` learns nothing, `patches` learns from squares of
-            pixels (`agents.sb3.features.PixelCNN`), and `any` may do whatever.
+        kind: of the extractors: `flat` changes nothing, `fixed` learns nothing, `patches` learns from squares
+            of pixels (`agents.sb3.features.PixelCNN`), and `any` may do whatever.
     """
 
     def __init__(
@@ -61,10 +61,10 @@ class Inputs:
     def digest(self) -> str:
         """Equal where the same is seen of all states."""
         rows = self.rows(np.arange(self._observation.num_states))
-        return f"{self._observation.kind} {hashlib.sha256(np.ascontiguousarray(rows)).hexdigest()}"
+        return f"{self._observation.kind} {hashlib.sha256(rows.tobytes()).hexdigest()}"
 
     def table(self) -> Tensor | None:
-        """The features (S, n) of all states, where no parameter has a part in them and they fit into memory."""
+        """The features (S, n) of all states; None where a parameter has a part in them, or they are large."""
         size = self._extractors[0].features_dim * self._observation.num_states
         if not self._is_fixed or self.is_look_up or size > _LARGEST_TABLE:
             return None

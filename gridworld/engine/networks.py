@@ -116,7 +116,9 @@ class DenseNetworks:
         kinds = {type(layer) for layer in layers} - {nn.Linear}
         own = {id(each) for layer in linear for each in (layer.weight, layer.bias)}
         alternate = all(
-            isinstance(layer, nn.Linear) == (place % 2 == 0) for net in nets for place, layer in enumerate(net)
+            isinstance(layer, nn.Linear) == (place % 2 == 0)
+            for net in nets
+            for place, layer in enumerate(net)
         )
         known = len(kinds) <= 1 and kinds <= _FORWARD.keys()
         return known and alternate and own == {id(each) for each in parameters}
@@ -138,10 +140,14 @@ class DenseNetworks:
             if inputs is None:
                 columns = weight.transpose(1, 2)
                 outputs = (columns if states is None else columns[:, states]) + bias[:, None]
-            elif weight.shape[1] == 1 and inputs.stride(1) == 1:  # columns of weights, which a batch adds up otherwise
+            elif (
+                weight.shape[1] == 1 and inputs.stride(1) == 1
+            ):  # columns of weights, which a batch adds up otherwise
                 rows = zip(inputs, weight, bias, strict=True)
                 outputs = torch.stack([nn.functional.linear(*row) for row in rows])
-            elif weight.shape[1] == 1:  # a batch of these adds up as one alone does; of those below it would not
+            elif (
+                weight.shape[1] == 1
+            ):  # a batch of these adds up as one alone does; of those below it would not
                 outputs = torch.bmm(weight, inputs.transpose(1, 2)).transpose(1, 2) + bias[:, None]
             else:
                 outputs = torch.baddbmm(bias[:, None], inputs, weight.transpose(1, 2))

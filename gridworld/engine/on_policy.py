@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -59,7 +58,7 @@ class OnPolicy(Population):
         for run in self.runs:
             self._count(run, rollout)
         self.num_timesteps += self.n_steps * self.num_envs
-        for run in itertools.compress(self.runs, self.active.tolist()):
+        for run in self.going():
             self._log_rollout(run)
         if not self.active.any():
             return
@@ -84,7 +83,7 @@ class OnPolicy(Population):
         """Count a run's steps, and call what wants to be called after one of them."""
         started, size = self.num_timesteps, self.num_envs
         pairs, rewards = rollout.pairs[:, run.row], rollout.rewards[:, run.row]
-        steps, _, returns, lengths = rollout.ended[run.row]
+        steps, returns, lengths = rollout.ended[run.row]
         first = 0
         while first < self.n_steps:
             due = -(-(run.next_call - started) // size)  # steps of the rollout
@@ -98,9 +97,7 @@ class OnPolicy(Population):
             run.keep_episodes(returns[a:b], lengths[a:b])
             first = end
 
-    def _advantages(
-        self, rollout: Rollout, values: Array, gae_lambda: FloatArray
-    ) -> tuple[Array, Array]:
+    def _advantages(self, rollout: Rollout, values: Array, gae_lambda: FloatArray) -> tuple[Array, Array]:
         """Generalised advantages and returns (n, P, E), float32, as SB3 computes them.
 
         J. Schulman et al., High-dimensional continuous control using generalized advantage estimation, 2016.
@@ -132,7 +129,7 @@ class OnPolicy(Population):
         total = returns.var(axis=1)
         total[total == 0] = np.nan
         explained = (1 - advantages.var(axis=1) / total).tolist()
-        for run in itertools.compress(self.runs, self.active.tolist()):
+        for run in self.going():
             run.record("train/explained_variance", explained[run.row])
             run.record("train/n_updates", run.model._n_updates, for_tensorboard=False)
 

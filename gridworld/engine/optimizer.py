@@ -7,10 +7,10 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from gridworld.storage.serialization import StateError, fill
 from gridworld.world.mdp import BoolArray
 
 # Those that look at every weight by itself.
@@ -92,18 +92,36 @@ class Optimizer:
         return {name: value.cpu().numpy().copy() for name, value in state.items()}
 
     def set_state(self, run: int, state: dict[str, Any]) -> None:
-        """Mirrors `get_state`."""
-        if state:
-            row = self._rows[run]
-            self._optimizer.state[row] = {
-                name: torch.as_tensor(np.array(value), device=row.device if np.ndim(value) else None)
-                for name, value in state.items()
-            }
+        """Mirrors `get_state`.
+
+        Raises:
+            StateError: it is of another kind of optimiser, or of other weights.
+        """
+        if not state:
+            return
+        row = self._rows[run]
+        found = self._after_a_step(row)
+        if state.keys() != found.keys():
+            raise StateError(f"the optimiser's state has {', '.join(state)}, must have {', '.join(found)}")
+        for name, value in found.items():
+            own = value.cpu().numpy()
+            fill(own, state[name], f"the optimiser's {name}")
+            found[name] = torch.as_tensor(own, device=value.device)
+        self._optimizer.state[row] = found
+
+    def _after_a_step(self, row: Tensor) -> dict[str, Tensor]:
+        """What the optimiser keeps of a row after a step, for names, shapes and types."""
+        make: Any = type(self._optimizer)
+        other = torch.zeros_like(row)
+        other.grad = torch.zeros_like(row)
+        optimizer = make([{**self._groups[0], "params": [other]}])
+        optimizer.step()
+        return dict(optimizer.state[other])
 
 
 @contextlib.contextmanager
 def _flushing_denormals() -> Iterator[None]:
-    """Take denormal numbers for 0 within: moments of weights without a gradient shrink to them and are slow."""
+    """Take denormal numbers, which are slow, for 0: moments of weights without a gradient shrink to them."""
     if _SMALLEST * 1.0 == 0:  # they are already, by somebody else's wish
         yield
         return

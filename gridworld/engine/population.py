@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Hashable, Sequence
 from typing import Any, ClassVar, Self
 
@@ -14,7 +15,7 @@ from gridworld.engine.networks import Array, DenseNetworks, ModuleNetworks, Netw
 from gridworld.engine.optimizer import Optimizer
 from gridworld.engine.run import Run
 from gridworld.process.console.terminal import tell
-from gridworld.storage.serialization import State, fill
+from gridworld.storage.serialization import State, StateError, fill, fitting
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 FEW_STATES = 1024  # up to here all states are cheaper than finding out which ones a batch holds
@@ -42,7 +43,11 @@ class Population:
             run.population, run.row = self, row
         first = runs[0]
         mdp = first.envs.mdp
-        self.num_envs, self.num_states, self.num_actions = first.envs.num_envs, mdp.num_states, mdp.num_actions
+        self.num_envs, self.num_states, self.num_actions = (
+            first.envs.num_envs,
+            mdp.num_states,
+            mdp.num_actions,
+        )
         self.active: BoolArray = np.ones(len(runs), dtype=np.bool_)
         self.networks = make_networks(runs)
         self.optimizer = self._optimizer()
@@ -53,7 +58,7 @@ class Population:
         self.environments = Environments([run.envs for run in runs])
 
     @classmethod
-    def kind(cls, run: Run, num_timesteps: Any) -> Hashable:
+    def kind(cls, run: Run) -> Hashable:
         """Equal for runs that can form a population; of runs in large worlds each is of its own kind."""
         model, envs, mdp = run.model, run.envs, run.envs.mdp
         if mdp.num_states > FEW_STATES or not DenseNetworks.fit(run.nets, run.parameters):
@@ -63,7 +68,7 @@ class Population:
         return (
             *(cls, mdp.text(), envs.num_envs, envs.step_limit, envs.stratified),
             *(repr(model.policy), str(model.device), repr(optimizer), run.reward_scale, run.inputs.digest()),
-            *(num_timesteps, run.total_timesteps, *settings),
+            *(model.num_timesteps, run.total_timesteps, *settings),
         )
 
     def _optimizer(self) -> Optimizer:
@@ -88,13 +93,18 @@ class Population:
 
     def learn(self, total_timesteps: int) -> None:
         """Train until all runs have ended, or have made so many environment steps."""
-        population: Self | None = self
-        while (population := population.safe_point()) and population.num_timesteps < total_timesteps:
+        population: Population | None = self.safe_point()
+        while population is not None and population.num_timesteps < total_timesteps:
             population.iterate()
+            population = population.safe_point()
 
     def iterate(self) -> None:
         """Make some environment steps, and an update."""
         raise NotImplementedError
+
+    def going(self, chosen: BoolArray | bool = True) -> list[Run]:
+        """The runs that have not ended, of those that are chosen (P,)."""
+        return list(itertools.compress(self.runs, (self.active & chosen).tolist()))
 
     def distinct(self, pairs: IntArray) -> tuple[IntArray, IntArray]:
         """The states (U,) that occur in a batch of pairs (B,), and the pairs with these numbered in turn."""
@@ -118,7 +128,7 @@ class Population:
         raise NotImplementedError
 
     def remaining(self) -> Self | None:
-        """The population of the runs that have not ended; None: all have. Those that have are on their own."""
+        """The population of the runs that have not ended, None if all have; the others are on their own."""
         if self.active.all():
             return self
         self.environments.put_back()
@@ -129,7 +139,7 @@ class Population:
             if not going[run.row]:
                 make([run], [state])
         left = [pair for pair, goes in zip(pairs, going, strict=True) if goes]
-        return make(*map(list, zip(*left, strict=True))) if left else None  # type: ignore[arg-type]
+        return make(*map(list, zip(*left, strict=True))) if left else None
 
     def safe_point(self) -> Self | None:
         """Let all runs be saved, as nothing is half done; returns the population of those that go on."""
@@ -143,13 +153,13 @@ class Population:
 
     def check_losses(self, losses: Array) -> None:
         """End the runs whose loss (P,) is no finite number."""
-        for row in np.flatnonzero(~np.isfinite(losses) & self.active):
-            self.runs[row].diverge("a loss is no finite number")
+        for run in self.going(~np.isfinite(losses)):
+            run.diverge("a loss is no finite number")
 
     def check_gradients(self, finite: BoolArray) -> None:
         """End the runs whose gradients were no finite numbers."""
-        for row in np.flatnonzero(~finite & self.active):
-            self.runs[row].diverge("the gradient is no finite number")
+        for run in self.going(~finite):
+            run.diverge("the gradient is no finite number")
 
     def get_state(self, run: Run) -> State:
         """All that a run's next steps depend on."""
@@ -167,6 +177,30 @@ class Population:
         self.optimizer.set_state(run.row, state["optimizer"])
 
 
+def train(runs: Sequence[Run], states: Sequence[State | None]) -> None:
+    """Train runs until each has ended, those of one kind as a population; errors are in their `error`.
+
+    Args:
+        runs: with their hooks; `Run.begin` was called.
+        states: of `get_state`, to continue from; None: from the start.
+    """
+    groups: dict[Hashable, list[Run]] = {}
+    for run, state in zip(runs, states, strict=True):
+        if state is not None:
+            try:
+                with fitting():
+                    type(run.population)([run], [state])
+            except StateError as error:
+                run.fail(error)
+                continue
+        groups.setdefault(run.population.kind(run), []).append(run)
+    for group in groups.values():
+        if len(group) > 1 and agree(group):
+            type(group[0].population)(group, [run.population.get_state(run) for run in group])
+        for population in dict.fromkeys(run.population for run in group):
+            population.learn(group[0].total_timesteps)
+
+
 def make_networks(runs: Sequence[Run], is_target: bool = False) -> Networks:
     """The networks of some runs, or their target networks, with the weights that SB3's models have."""
     first = runs[0]
@@ -176,7 +210,8 @@ def make_networks(runs: Sequence[Run], is_target: bool = False) -> Networks:
     if DenseNetworks.fit(first.nets, first.parameters) and (first.inputs.is_look_up or table is not None):
         return DenseNetworks(torch.stack(vectors), first.parameters, first.nets, table)
     inputs = first.target if is_target else first.inputs
-    assert inputs is not None and len(runs) == 1
+    assert inputs is not None
+    assert len(runs) == 1
     return ModuleNetworks(vectors[0], of_runs[0], inputs.forward)
 
 
@@ -191,36 +226,16 @@ def fill_tensor(tensor: Tensor, values: Any, name: str) -> None:
     tensor.copy_(torch.from_numpy(own))
 
 
-def train(runs: Sequence[Run], states: Sequence[State | None]) -> None:
-    """Train runs until each has ended, those of one kind as a population; what went wrong is in their `error`.
-
-    Args:
-        runs: with their hooks; `Run.begin` was called.
-        states: of `get_state`, to continue from; None: from the start.
-    """
-    groups: dict[Hashable, list[tuple[Run, State | None]]] = {}
-    for run, state in zip(runs, states, strict=True):
-        kind = type(run.population).kind(run, 0 if state is None else state.get("num_timesteps"))
-        groups.setdefault(kind, []).append((run, state))
-    for group in groups.values():
-        make = type(group[0][0].population)
-        for part in [group] if agree([run for run, _ in group]) else [[each] for each in group]:
-            population = make(*map(list, zip(*part, strict=True)))  # type: ignore[arg-type]
-            population.learn(part[0][0].total_timesteps)
-
-
-
-
 _agreed: dict[Hashable, bool] = {}  # by kind, number of runs and threads
 
 
 def agree(runs: Sequence[Run]) -> bool:
     """Whether these networks at once give the numbers of each alone, to the last bit.
 
-    A batched product calls for each matrix the routine that it calls for one alone, on most processors and for
-    most shapes. It is tried out once in a process for each kind and number of networks, in both directions.
+    A batched product calls for each matrix the routine that it calls for one alone, on most processors and
+    for most shapes. It is tried out once in a process for each kind and number of networks.
     """
-    key = type(runs[0].population).kind(runs[0], None), len(runs), torch.get_num_threads()
+    key = runs[0].population.kind(runs[0]), len(runs), torch.get_num_threads()
     if len(runs) > 1 and key not in _agreed:
         _agreed[key] = _try_out(runs)
         if not _agreed[key]:

@@ -22,7 +22,7 @@ from gridworld.engine.on_policy import OnPolicy
 from gridworld.engine.population import FEW_STATES
 from gridworld.engine.run import Run
 from gridworld.storage.serialization import State
-from gridworld.world.mdp import IntArray
+from gridworld.world.mdp import BoolArray, IntArray
 
 
 class PPO(OnPolicy):
@@ -72,14 +72,12 @@ class PPO(OnPolicy):
                 active &= finite
         self._log(log)
 
-    def _minibatches(
-        self, active: np.ndarray, *samples: Array
-    ) -> Iterator[tuple[IntArray | None, Sums]]:
+    def _minibatches(self, active: BoolArray, *samples: Array) -> Iterator[tuple[IntArray | None, Sums]]:
         """The minibatches of an epoch, in SB3's own draw of their order."""
         (runs, count), size = samples[0].shape, self.batch_size
         order = np.zeros((runs, count), dtype=np.int64)
-        for row in np.flatnonzero(active):
-            order[row] = self.runs[row].numpy_generator.permutation(count)
+        for run in self.going(active):
+            order[run.row] = run.numpy_generator.permutation(count)
         order += count * np.arange(runs)[:, None]
         full = count // size * size
         yield from self._summed_up(*(each.take(order[:, :full].reshape(runs, -1, size)) for each in samples))
@@ -98,17 +96,19 @@ class PPO(OnPolicy):
             return
         for number in range(pairs.shape[1]):
             which, pair = self.distinct(pairs[0, number])
-            yield which, sum_up(pair[None], advantages[:, number], returns[:, number], (len(which), self.num_actions))
+            yield (
+                which,
+                sum_up(pair[None], advantages[:, number], returns[:, number], (len(which), self.num_actions)),
+            )
 
     def _log(self, log: _Log) -> None:
         means = log.means()
         names = ["clip_range", "clip_range_vf"] if self.clips_values else ["clip_range"]
         means |= {name: np.array(self.settings(name)) for name in names}
-        for row in np.flatnonzero(self.active):
-            run = self.runs[row]
-            run.model._n_updates += int(log.epochs[row])
+        for run in self.going():
+            run.model._n_updates += int(log.epochs[run.row])
             for name, mean in means.items():
-                run.record(f"train/{name}", float(mean[row]))
+                run.record(f"train/{name}", float(mean[run.row]))
         self.check_losses(means["loss"])
 
 
@@ -124,10 +124,10 @@ class _Log:
         self._losses: list[dict[str, Array]] = []
         self._epoch: list[Array] = []  # of each step, that of each run; 0 where it had ended
 
-    def begin_epoch(self, active: np.ndarray) -> None:
+    def begin_epoch(self, active: BoolArray) -> None:
         self.epochs += active
 
-    def add(self, active: np.ndarray, losses: dict[str, Array]) -> None:
+    def add(self, active: BoolArray, losses: dict[str, Array]) -> None:
         self._losses.append(losses)
         self._epoch.append(np.where(active, self.epochs, 0))
 

@@ -1,7 +1,7 @@
 """QR-DQN: W. Dabney et al., Distributional Reinforcement Learning with Quantile Regression, 2017.
 
-As DQN, with N quantiles of the return in place of its mean: the best action is that of the largest mean, and a
-sample's targets are the quantiles of the next state's best action. With τ_n = (n - 1/2) / N the level of
+As DQN, with N quantiles of the return in place of its mean: the best action is that of the largest mean, and
+a sample's targets are the quantiles of the next state's best action. With τ_n = (n - 1/2) / N the level of
 quantile θ_n(s, a), the N targets y_m of a sample, δ = y_m - θ_n, and h the Huber function, of which
 clip(δ, -1, 1) is the derivative,
 
@@ -48,7 +48,9 @@ class QRDQN(DQN):
 
     def _targets(self, drawn: Transitions, best: Array, gamma: Array) -> Array:
         """(n, P, N, B)."""
-        following = np.stack([of_run.take(drawn.following[:, run], axis=-1) for run, of_run in enumerate(best)])
+        following = np.stack(
+            [of_run.take(drawn.following[:, run], axis=-1) for run, of_run in enumerate(best)]
+        )
         values = following.transpose(2, 0, 1, 3)
         discounts = ((1 - drawn.ends) * gamma)[:, :, None]
         targets: Array = drawn.rewards[:, :, None] + discounts * values

@@ -93,7 +93,7 @@ class UniformReplay:
         return size
 
     def draw(self, generators: Sequence[np.random.RandomState | None], count: int, size: int) -> Transitions:
-        """See `Replay.draw`; of each minibatch in turn the steps, then the environments, as SB3 draws them."""
+        """See `Replay.draw`; of each minibatch the steps, then the environments, as SB3 draws them."""
         bounds = np.array([[self._rows if self._is_full else self._position], [self._num_envs]])
         which = np.zeros((count, len(generators), size), dtype=np.int64)
         for run, generator in enumerate(generators):
@@ -102,7 +102,12 @@ class UniformReplay:
                 which[:, run] = (run * self._rows + drawn[:, 0]) * self._num_envs + drawn[:, 1]
         states, actions, following, rewards, ends = (each.take(which) for each in self._columns.values())
         return Transitions(
-            states.astype(np.int64), actions, following.astype(np.int64), rewards, ends.astype(np.float32), None
+            states.astype(np.int64),
+            actions,
+            following.astype(np.int64),
+            rewards,
+            ends.astype(np.float32),
+            None,
         )
 
     def get_state(self, run: int) -> State:
@@ -162,7 +167,10 @@ class CountedReplay:
     def draw(self, generators: Sequence[np.random.RandomState | None], count: int, size: int) -> Transitions:
         """See `Replay.draw`; columns of runs that have met fewer end in transitions of no share."""
         shape = count, len(generators), self.width(size)
-        found = [np.zeros(shape, kind) for kind in (np.int64, np.int64, np.int64, np.float32, np.float32, np.float64)]
+        found = [
+            np.zeros(shape, kind)
+            for kind in (np.int64, np.int64, np.int64, np.float32, np.float32, np.float64)
+        ]
         for run, generator in enumerate(generators):
             if generator is None:
                 continue
@@ -178,7 +186,11 @@ class CountedReplay:
     def get_state(self, run: int) -> State:
         """See `Replay.get_state`."""
         met = self._met[run]
-        return {"transitions": met.real.copy(), "rewards": met.imag.copy(), "counts": self._counts[run].copy()}
+        return {
+            "transitions": met.real.copy(),
+            "rewards": met.imag.copy(),
+            "counts": self._counts[run].copy(),
+        }
 
     def set_state(self, run: int, state: State) -> None:
         """See `Replay.set_state`."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from gridworld.config.agents import Decay
 from gridworld.engine.inputs import Inputs
@@ -76,7 +76,6 @@ class Run:
         model.start_time = time.time_ns()
         model.ep_info_buffer = deque(maxlen=model._stats_window_size)
         model.ep_success_buffer = deque(maxlen=model._stats_window_size)
-
 
     def setting(self, name: str, progress: float) -> float:
         """A setting after this share of training, from 0 to 1."""
@@ -150,7 +149,8 @@ class Run:
             "recent_episodes": [[each["r"], each["l"]] for each in model.ep_info_buffer],
             "seconds": (time.time_ns() - model.start_time) / 1e9,
             "logged": {
-                name: [float(value), "tensorboard" in (excluded[name] or ())] for name, value in logged.items()
+                name: [float(value), "tensorboard" in (excluded[name] or ())]
+                for name, value in logged.items()
             },
         }
 

@@ -98,7 +98,7 @@ def make_run(
 def _inputs(
     policy: Any, observation: ObservationTable, kind: Kind, network: Any = None
 ) -> tuple[Sequence[Sequence[nn.Module]], Inputs]:
-    """The layers of each output, and what feeds them; `network`: one of several, None for the policy's own."""
+    """The layers of each output, and what feeds them; `network`: None for the policy's own."""
     if isinstance(policy, ActorCriticPolicy):
         own = policy.mlp_extractor
         nets = [[*own.policy_net, policy.action_net], [*own.value_net, policy.value_net]]
@@ -132,7 +132,9 @@ def put_weights(run: Run) -> None:
     cuts = {name: cut(value, shapes) for name, value in state.items() if value.dim()}
     for number, parameter in enumerate(population.fitted(run) if state else ()):
         optimizer.state[parameter] = {
-            name: (cuts[name][number] if name in cuts else value).to(parameter.device if name in cuts else "cpu")
+            name: (cuts[name][number] if name in cuts else value).to(
+                parameter.device if name in cuts else "cpu"
+            )
             for name, value in state.items()
         }
     population.put_target(run)

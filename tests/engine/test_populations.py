@@ -65,7 +65,7 @@ class Learned:
         self.logged.append((step, kept))
 
     def found(self) -> Found:
-        """All that learning leaves: weights, optimiser, replay, visits, what was logged, random generators."""
+        """All that learning leaves: weights, optimiser, replay, visits, what was logged, generators."""
         state = self.agent.get_state()
         del state["seconds"]
         return dict(flat({**state, "logged": self.logged}))
@@ -181,7 +181,13 @@ DIFFERENT: dict[str, list[list[str]]] = {  # of each argument; the empty one is 
 }
 # Settings of which the runs of a population have one value.
 OF_SHAPE = {
-    *("target_update_interval=2", "target_update_interval=8", "tau=0.5", "learning_starts=0", "buffer_size=40"),
+    *(
+        "target_update_interval=2",
+        "target_update_interval=8",
+        "tau=0.5",
+        "learning_starts=0",
+        "buffer_size=40",
+    ),
     "clip_range_vf=0.01",
 }
 OBSERVATIONS: list[Words] = [(), ("observation=coordinates",), ("observation=none",), ("observation=image",)]

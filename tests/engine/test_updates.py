@@ -1,4 +1,4 @@
-"""An update of the engine is Stable-Baselines3's: the same weights and the same logged values, to rounding."""
+"""An update of the engine is Stable-Baselines3's: the same weights and logged values, to rounding."""
 
 import copy
 from typing import Any
@@ -83,7 +83,11 @@ def assert_same(run: Run, theirs: Any) -> None:
     for model in (run.model, theirs):
         model.logger.dump()
     logged, expected = (
-        {key: value for key, value in model.logger.output_formats[0].values.items() if key.startswith("train/")}
+        {
+            key: value
+            for key, value in model.logger.output_formats[0].values.items()
+            if key.startswith("train/")
+        }
         for model in (run.model, theirs)
     )
     of_the_rollout = {"train/explained_variance", "train/n_updates", "train/learning_rate"}
@@ -158,9 +162,7 @@ def test_updates_from_rollouts(
     move_away(run, theirs)
     np.random.set_state(run.numpy_generator.get_state())
     theirs.train()
-    run.population.update(
-        (log_prob, values), (states * 4 + actions)[None], advantages[None], returns[None]
-    )
+    run.population.update((log_prob, values), (states * 4 + actions)[None], advantages[None], returns[None])
     assert run.error is None
     assert_same(run, theirs)
 
@@ -216,7 +218,11 @@ def test_updates_from_replay(
 @pytest.mark.parametrize("algorithm", [DQN, QRDQN])
 def test_the_same_seed_walks_and_learns_the_same(algorithm: Any) -> None:
     """The same random and greedy actions, the same minibatches: the weights agree after as many updates."""
-    settings: dict[str, Any] = {"exploration_fraction": 0.5, "buffer_size": 2000, "target_update_interval": 160}
+    settings: dict[str, Any] = {
+        "exploration_fraction": 0.5,
+        "buffer_size": 2000,
+        "target_update_interval": 160,
+    }
     settings |= {"learning_starts": 0, "batch_size": 32, "learning_rate": 0.05, "train_freq": 1}
     run, theirs = twins(algorithm, "one_hot", **settings, policy_kwargs=SGD)
     run.total_timesteps = 640
