@@ -41,10 +41,9 @@ def cut(vectors: Tensor, shapes: Sequence[torch.Size]) -> list[Tensor]:
 
 def copy_row(row: Tensor, parameters: Sequence[Tensor]) -> None:
     """Copy a row (W,) of weights into parameters of these shapes."""
-    with torch.no_grad():
-        parts = cut(row, [parameter.shape for parameter in parameters])
-        for parameter, part in zip(parameters, parts, strict=True):
-            parameter.copy_(part)
+    parts = cut(row, [parameter.shape for parameter in parameters])
+    for parameter, part in zip(parameters, parts, strict=True):
+        parameter.data.copy_(part)  # which may be a view of the row, and leaves a graph as it is
 
 
 class Networks(Protocol):
