@@ -1,0 +1,178 @@
+"""Which settings the engine learns with; what it leaves is what Stable-Baselines3's own loop leaves."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from helpers.support import DEEP, SHORT, configure, train_in
+from sb3_contrib import QRDQN, TRPO
+from stable_baselines3 import A2C, DQN, PPO
+
+from gridworld.agents import Agent, TrainingContext, family
+from gridworld.agents.sb3 import check
+from gridworld.agents.sb3.agent import SB3Agent
+from gridworld.agents.sb3.engine_agent import EngineAgent
+from gridworld.agents.sb3.settings.engine import ACTIVATIONS
+from gridworld.envs.observations import make_observation
+from gridworld.errors import InputError
+from gridworld.training.setup import make_context
+
+
+def built(*words: str, **changes: Any) -> Agent:
+    config = configure(*words)
+    mdp = config.env.compile()
+    observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
+    context: TrainingContext = make_context(config, mdp, observation)
+    return family(config.agent).build(config.agent, context)
+
+
+SB3S = {"dqn": DQN, "ppo": PPO, "a2c": A2C, "qrdqn": QRDQN, "trpo": TRPO}
+
+
+@pytest.mark.parametrize("agent", SB3S)
+def test_the_model_is_sb3s_own_and_learns_on(agent: str, tmp_path: Path) -> None:
+    words = [*SHORT[agent], "n_envs=4"]
+    trained = built(*words)
+    trained.learn(200, lambda steps: steps + 1)
+    file, model = tmp_path / "model.zip", trained.model
+    file.write_bytes(trained.model_file())
+    loaded = SB3S[agent].load(file, device="cpu")
+    assert type(model) is type(loaded) is SB3S[agent]
+    for mine, theirs in zip(model.policy.parameters(), loaded.policy.parameters(), strict=True):
+        assert torch.equal(mine, theirs)
+    greedy = loaded.predict(model.env.observation.table(), deterministic=True)[0]
+    assert np.array_equal(greedy, trained.snapshot().greedy)
+    assert model.num_timesteps >= 200
+    for each in (model, loaded.set_env(model.env) or loaded):
+        before = each.num_timesteps
+        each.learn(100, reset_num_timesteps=False)
+        assert each.num_timesteps >= before + 100
+
+
+@pytest.mark.parametrize("agent", [*DEEP, "a2c", "qrdqn", "trpo"])
+def test_both_engines_train_and_leave_the_same_kind_of_run(agent: str, tmp_path: Path) -> None:
+    runs = [
+        train_in(tmp_path / engine, *SHORT[agent], f"agent.engine={engine}")
+        for engine in ("stock", "tabulated")
+    ]
+    assert runs[0].keys() == runs[1].keys()
+    assert runs[0]["timesteps"] == runs[1]["timesteps"]
+
+
+OWN_MODULES = """
+import torch
+from stable_baselines3.dqn.policies import DQNPolicy
+from torch import nn
+
+class Calm(nn.Module):  # draws at random, in either mode
+    def forward(self, x):
+        return x.relu() + 0.1 * torch.randn_like(x)
+
+class Centred(nn.Module):  # looks at the other rows
+    def forward(self, x):
+        return x - x.mean(dim=0)
+
+class ReLU(nn.ReLU):  # is not what it is called
+    def forward(self, x):
+        return super().forward(x) + self.training
+
+class Policy(DQNPolicy):
+    pass
+
+class Adam(torch.optim.Adam):
+    pass
+"""
+
+
+@pytest.fixture
+def own_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Makes `own_modules` importable."""
+    (tmp_path / "modules").mkdir()
+    (tmp_path / "modules" / "own_modules.py").write_text(OWN_MODULES)
+    monkeypatch.syspath_prepend(str(tmp_path / "modules"))
+    yield
+    sys.modules.pop("own_modules", None)
+
+
+REASONS = {
+    "agent.n_steps=3": "agent.n_steps above 1",
+    **{
+        f"agent.policy_kwargs.activation_fn={name}": f"agent.policy_kwargs.activation_fn={name} is not known"
+        for name in (
+            *("torch.nn.RReLU", "torch.nn.Dropout", "torch.nn.Softmax", "own_modules.Calm"),
+            *("own_modules.Centred", "own_modules.ReLU"),
+        )
+    },
+    "agent.policy=own_modules.Policy": "agent.policy=own_modules.Policy may compute more",
+    "agent.policy_kwargs.optimizer_class=own_modules.Adam": "agent.policy_kwargs.optimizer_class=own_mo",
+    "agent.policy_kwargs.optimizer_class=torch.optim.Rprop": "agent.policy_kwargs.optimizer_class=torch",
+    "agent.replay_buffer_class=stable_baselines3.common.buffers.ReplayBuffer": (
+        "agent.replay_buffer_class is not the plain replay buffer"
+    ),
+}
+
+
+@pytest.mark.parametrize(("setting", "reason"), REASONS.items())
+@pytest.mark.usefixtures("own_modules")
+def test_what_it_does_not_cover_falls_back_and_says_why(
+    setting: str, reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    agent = built("agent=dqn", setting)
+    assert type(agent) is SB3Agent
+    assert type(agent.model) is DQN
+    assert f"engine: stock, since {reason}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        [],
+        ["agent.policy_kwargs.activation_fn=torch.nn.modules.activation.GELU"],
+        ["agent.policy_kwargs.optimizer_class=torch.optim.adamw.AdamW", "agent.policy_kwargs.net_arch=[]"],
+    ],
+)
+@pytest.mark.parametrize("agent", ["dqn", "ppo"])
+def test_what_is_known_is_covered(agent: str, settings: list[str]) -> None:
+    assert type(built(f"agent={agent}", *settings)) is EngineAgent
+
+
+@pytest.mark.parametrize("agent", ["a2c", "qrdqn", "trpo"])
+def test_a_class_with_its_arguments_is_covered_as_well(
+    agent: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    without = [f"~agent.arguments.{name}" for name in vars(configure(f"agent={agent}").agent)["arguments"]]
+    assert type(built(f"agent={agent}")) is EngineAgent
+    assert type(built(f"agent={agent}", "agent.engine=stock")) is SB3Agent
+    other = built(f"agent={agent}", "agent.algorithm=sb3_contrib.MaskablePPO", *without)
+    assert type(other) is SB3Agent
+    assert capsys.readouterr().err == ""
+    refused = built(f"agent={agent}", "+agent.arguments.policy_kwargs.activation_fn=torch.nn.RReLU")
+    assert type(refused) is SB3Agent
+    reason = "agent.arguments.policy_kwargs.activation_fn=torch.nn.RReLU is not known to give"
+    assert f"engine: stock, since {reason}" in capsys.readouterr().err
+    with pytest.raises(InputError, match=r"agent\.engine=fast: must be tabulated or stock"):
+        check(configure(f"agent={agent}", "agent.engine=fast"))
+
+
+def test_a_policy_of_sb3s_by_its_path_is_covered() -> None:
+    for agent, path in (("dqn", "dqn.policies.DQNPolicy"), ("ppo", "common.policies.ActorCriticPolicy")):
+        assert type(built(f"agent={agent}", f"agent.policy=stable_baselines3.{path}")) is EngineAgent
+
+
+@pytest.mark.parametrize("kind", ACTIVATIONS)
+def test_an_activation_that_is_covered_is_a_function_of_each_number(kind: type[torch.nn.Module]) -> None:
+    """The same in both modes, alone and among others, time and again, and nothing is drawn."""
+    chance, module = torch.get_rng_state(), kind()
+    x = torch.linspace(-4, 4, 42).reshape(6, 7)
+    expected = module.train()(x)
+    for _ in range(2):
+        assert torch.equal(module(x), expected)
+    module.eval()
+    assert torch.allclose(module(x.flip(0).t().contiguous()).t().flip(0), expected, atol=1e-6)
+    assert torch.allclose(torch.stack([module(row) for row in x]), expected, atol=1e-6)
+    assert torch.equal(torch.get_rng_state(), chance)
+    assert not list(module.buffers())
