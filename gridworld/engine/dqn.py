@@ -19,8 +19,8 @@ import torch
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from gridworld.engine.environments import Step
-from gridworld.engine.networks import Array, copy_row
-from gridworld.engine.population import FEW_STATES, Population, fill_tensor, make_networks
+from gridworld.engine.networks import Array, Networks
+from gridworld.engine.population import FEW_STATES, Population, make_networks
 from gridworld.engine.replay import CountedReplay, Replay, Transitions, UniformReplay
 from gridworld.engine.run import Run
 from gridworld.storage.serialization import State
@@ -41,7 +41,7 @@ class DQN(Population):
         self._outputs: Array | None = None  # of the networks as they are, of all states
         self._greedy: IntArray | None = None  # (P, S), by these
         self._best: Array | None = None  # of the target networks
-        self.target = make_networks(runs, is_target=True)
+        self.target = make_networks(runs, lambda run: run.target_parameters, is_target=True)
         model, envs = runs[0].model, runs[0].envs
         self.replay: Replay = (
             CountedReplay(len(runs), envs.mdp.num_states, envs.mdp.num_actions)
@@ -258,15 +258,14 @@ class DQN(Population):
         q = self.q_of(self.outputs)[run.row].astype(np.float64)
         return q.max(axis=-1), None, q
 
-    def put_target(self, run: Run) -> None:
-        """See `Population.put_target`."""
-        copy_row(self.target.weights[run.row], run.target_parameters)
+    def weights(self, run: Run) -> dict[str, tuple[Networks, Sequence[torch.Tensor]]]:
+        """See `Population.weights`."""
+        return {**super().weights(run), "target_weights": (self.target, run.target_parameters)}
 
     def get_state(self, run: Run) -> State:
         """See `Population.get_state`."""
         return {
             **super().get_state(run),
-            "target_weights": self.target.weights[run.row].cpu().numpy().copy(),
             "exploration_rate": float(run.model.exploration_rate),
             "replay": self.replay.get_state(run.row),
         }
@@ -274,6 +273,5 @@ class DQN(Population):
     def set_state(self, run: Run, state: State) -> None:
         """Mirrors `get_state`."""
         super().set_state(run, state)
-        fill_tensor(self.target.weights[run.row], state["target_weights"], "target_weights")
         run.model.exploration_rate = float(state["exploration_rate"])
         self.replay.set_state(run.row, state["replay"])

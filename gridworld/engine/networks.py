@@ -70,6 +70,9 @@ class Networks(Protocol):
     def backward(self, *slopes: Array) -> None:
         """Set `gradients` to those of losses with these slopes in the outputs of the last run."""
 
+    def push(self, changes: Tensor) -> tuple[Array, ...]:
+        """How the outputs of the last run change, to first order, with changes (P, W) of the weights."""
+
 
 class DenseNetworks:
     """Linear layers with tanh or ReLU between them, differentiated by hand.
@@ -96,10 +99,12 @@ class DenseNetworks:
         place = {id(parameter): number for number, parameter in enumerate(parameters)}
         shapes = [parameter.shape for parameter in parameters]
         weights, gradients = cut(self.weights, shapes), cut(self.gradients, shapes)
+        self._shapes, self._places = shapes, []
         self._nets, self._slopes = [], []
         for layers in nets:
             linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
             pairs = [(place[id(layer.weight)], place[id(layer.bias)]) for layer in linear]
+            self._places.append(pairs)
             self._nets.append([(weights[weight], weights[bias]) for weight, bias in pairs])
             self._slopes.append([(gradients[weight], gradients[bias]) for weight, bias in pairs])
         kinds = {type(layer) for layers in nets for layer in layers if not isinstance(layer, nn.Linear)}
@@ -174,6 +179,37 @@ class DenseNetworks:
                 if number:
                     slope = _BACKWARD[self._activation](torch.bmm(slope, weight), inputs)
 
+    def push(self, changes: Tensor) -> tuple[Array, ...]:
+        """See `Networks.push`."""
+        views = cut(changes, self._shapes)
+        return tuple(
+            self._push(net, passed, [(views[weight], views[bias]) for weight, bias in pairs]).cpu().numpy()
+            for net, passed, pairs in zip(self._nets, self._passes, self._places, strict=True)
+        )
+
+    def _push(
+        self,
+        net: list[tuple[Tensor, Tensor]],
+        passed: list[Tensor | None],
+        changes: list[tuple[Tensor, Tensor]],
+    ) -> Tensor:
+        moved: Tensor | None = None  # the change of the layer's inputs
+        for number, ((weight, _), (of_weight, of_bias)) in enumerate(zip(net, changes, strict=True)):
+            inputs = passed[number]
+            if inputs is None:
+                columns = of_weight.transpose(1, 2)
+                outputs = columns if self._states is None else columns[:, self._states]
+            else:
+                outputs = torch.bmm(inputs, of_weight.transpose(1, 2))
+            outputs = outputs + of_bias[:, None]
+            if moved is not None:
+                outputs = outputs + torch.bmm(moved, weight.transpose(1, 2))
+            if number + 1 < len(net):
+                outputs = _BACKWARD[self._activation](outputs, passed[number + 1])
+            moved = outputs
+        assert moved is not None
+        return moved
+
 
 class ModuleNetworks:
     """Any network of one run, differentiated by torch.
@@ -195,7 +231,7 @@ class ModuleNetworks:
         rows = zip(parameters, cut(self.weights[0], shapes), cut(self.gradients[0], shapes), strict=True)
         for parameter, data, grad in rows:
             parameter.data, parameter.grad = data, grad
-        self._forward = forward
+        self._forward, self._parameters = forward, parameters
         self._outputs: tuple[Tensor, ...] = ()
 
     def run(self, states: IntArray | None = None) -> tuple[Array, ...]:
@@ -211,4 +247,15 @@ class ModuleNetworks:
             torch.as_tensor(slope, dtype=output.dtype, device=output.device).view_as(output)
             for slope, output in zip(slopes, self._outputs, strict=True)
         ]
-        torch.autograd.backward(self._outputs, given)
+        torch.autograd.backward(self._outputs, given, retain_graph=True, inputs=self._parameters)
+
+    def push(self, changes: Tensor) -> tuple[Array, ...]:
+        """See `Networks.push`: a pass back through the pass back, which is linear in the slopes."""
+        given = cut(changes[0], [each.shape for each in self._parameters])
+        return tuple(self._push(output, given).cpu().numpy()[None] for output in self._outputs)
+
+    def _push(self, output: Tensor, changes: Sequence[Tensor]) -> Tensor:
+        slopes = torch.zeros_like(output, requires_grad=True)
+        pulled = torch.autograd.grad(output, self._parameters, slopes, create_graph=True)
+        (moved,) = torch.autograd.grad(pulled, slopes, list(changes))
+        return moved

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Hashable, Sequence
-from typing import Any, ClassVar, Self
+from collections.abc import Callable, Hashable, Sequence
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from gridworld.engine.environments import Environments
 from gridworld.engine.networks import Array, DenseNetworks, ModuleNetworks, Networks
@@ -49,7 +49,7 @@ class Population:
             mdp.num_actions,
         )
         self.active: BoolArray = np.ones(len(runs), dtype=np.bool_)
-        self.networks = make_networks(runs)
+        self.networks = self._make_networks()
         self.optimizer = self._optimizer()
         for run, state in zip(runs, states, strict=True):
             if state is not None:
@@ -70,6 +70,9 @@ class Population:
             *(repr(model.policy), str(model.device), repr(optimizer), run.reward_scale, run.inputs.digest()),
             *(model.num_timesteps, run.total_timesteps, *settings),
         )
+
+    def _make_networks(self) -> Networks:
+        return make_networks(self.runs)
 
     def _optimizer(self) -> Optimizer:
         own = [run.model.policy.optimizer for run in self.runs]
@@ -120,8 +123,9 @@ class Population:
         """The parameters of SB3's model that the optimiser steps on."""
         return run.parameters
 
-    def put_target(self, run: Run) -> None:
-        """Give SB3's model the target network that the run has, if there is one."""
+    def weights(self, run: Run) -> dict[str, tuple[Networks, Sequence[Tensor]]]:
+        """The networks that a run has a row of, by their names in a state, and SB3's parameters for it."""
+        return {"weights": (self.networks, run.parameters)}
 
     def snapshot(self, run: Run) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
         """What a run's network says of all states: values (S,), probabilities (S, A), Q (S, A), float64."""
@@ -166,14 +170,20 @@ class Population:
         self.environments.put_back()
         return {
             **run.get_state(),
-            "weights": self.networks.weights[run.row].cpu().numpy().copy(),
             "optimizer": self.optimizer.get_state(run.row),
+            **{
+                name: networks.weights[run.row].cpu().numpy().copy()
+                for name, (networks, _) in self.weights(run).items()
+            },
         }
 
     def set_state(self, run: Run, state: State) -> None:
         """Mirrors `get_state`."""
         run.set_state(state)
-        fill_tensor(self.networks.weights[run.row], state["weights"], "weights")
+        for name, (networks, _) in self.weights(run).items():
+            own = networks.weights[run.row].cpu().numpy()
+            fill(own, state[name], name)
+            networks.weights[run.row] = torch.as_tensor(own)
         self.optimizer.set_state(run.row, state["optimizer"])
 
 
@@ -201,29 +211,30 @@ def train(runs: Sequence[Run], states: Sequence[State | None]) -> None:
             population.learn(group[0].total_timesteps)
 
 
-def make_networks(runs: Sequence[Run], is_target: bool = False) -> Networks:
-    """The networks of some runs, or their target networks, with the weights that SB3's models have."""
-    first = runs[0]
-    of_runs = [run.target_parameters if is_target else run.parameters for run in runs]
-    vectors = [torch.cat([each.detach().reshape(-1) for each in parameters]) for parameters in of_runs]
-    table = first.inputs.table()
-    if DenseNetworks.fit(first.nets, first.parameters) and (first.inputs.is_look_up or table is not None):
-        return DenseNetworks(torch.stack(vectors), first.parameters, first.nets, table)
-    inputs = first.target if is_target else first.inputs
-    assert inputs is not None
-    assert len(runs) == 1
-    return ModuleNetworks(vectors[0], of_runs[0], inputs.forward)
+def make_networks(
+    runs: Sequence[Run],
+    parameters: Callable[[Run], Sequence[nn.Parameter]] = lambda run: run.parameters,
+    outputs: slice = slice(None),
+    is_target: bool = False,
+) -> Networks:
+    """The networks of some runs, with the weights that SB3's models have.
 
-
-def fill_tensor(tensor: Tensor, values: Any, name: str) -> None:
-    """Copy an array of the same shape and type into a tensor.
-
-    Raises:
-        StateError: it is none.
+    Args:
+        runs: the runs.
+        parameters: of a run's network.
+        outputs: which of its outputs.
+        is_target: whether it is the target network.
     """
-    own = tensor.cpu().numpy()
-    fill(own, values, name)
-    tensor.copy_(torch.from_numpy(own))
+    first, of_runs = runs[0], [parameters(run) for run in runs]
+    vectors = [torch.cat([each.detach().reshape(-1) for each in own]) for own in of_runs]
+    inputs, nets = (first.target if is_target else first.inputs), first.nets[outputs]
+    assert inputs is not None
+    table = inputs.table()
+    if DenseNetworks.fit(first.nets, first.parameters) and (inputs.is_look_up or table is not None):
+        own = first.parameters if is_target else of_runs[0]
+        return DenseNetworks(torch.stack(vectors), own, nets, table)
+    assert len(runs) == 1
+    return ModuleNetworks(vectors[0], of_runs[0], lambda states: inputs.forward(states)[outputs])
 
 
 _agreed: dict[Hashable, bool] = {}  # by kind, number of runs and threads

@@ -126,7 +126,8 @@ def put_weights(run: Run) -> None:
         else:
             setattr(model, name, value)
     optimizer.param_groups[0]["lr"] = run.setting("learning_rate", progress)
-    copy_row(population.networks.weights[run.row], run.parameters)
+    for networks, parameters in population.weights(run).values():
+        copy_row(networks.weights[run.row], parameters)
     shapes = [parameter.shape for parameter in population.fitted(run)]
     state = {name: torch.as_tensor(value) for name, value in population.optimizer.get_state(run.row).items()}
     cuts = {name: cut(value, shapes) for name, value in state.items() if value.dim()}
@@ -137,7 +138,6 @@ def put_weights(run: Run) -> None:
             )
             for name, value in state.items()
         }
-    population.put_target(run)
 
 
 def model_file(run: Run) -> bytes:
