@@ -12,7 +12,7 @@ import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 from gridworld.config.agents import MISSING
 from gridworld.errors import InputError
@@ -91,7 +91,7 @@ class Agent(Protocol):
     def learn(
         self,
         total_timesteps: int,
-        on_step: Callable[[int], bool],
+        on_step: Callable[[int], int],
         on_safe_point: Callable[[int], None] | None = None,
         state: State | None = None,
     ) -> None:
@@ -99,8 +99,8 @@ class Agent(Protocol):
 
         Args:
             total_timesteps: environment steps, from the very start; a whole last batch counts.
-            on_step: called with the steps so far after every batch of steps; learning ends when it returns
-                False.
+            on_step: called with the steps so far after a batch of steps; it returns the steps by which it is
+                to be called again at the latest, and 0 where learning is to end. It may be called sooner.
             on_safe_point: called with the steps so far where nothing is half done, so that `get_state` is
                 complete, and once more at the end if that is such a point.
             state: of `get_state`, to go on from; None: from the start.
@@ -143,6 +143,41 @@ class Learning:
     state: State | None = None
 
 
+@runtime_checkable
+class InPopulations(Protocol):
+    """An agent that can learn as one of a population."""
+
+    def learn_together(self, learnings: Sequence[Learning]) -> list[BaseException | None]:
+        """See `learn_together`; all agents are of this one's class."""
+
+
+def learn_together(learnings: Sequence[Learning]) -> list[BaseException | None]:
+    """Let agents learn, those that fit into one population as one.
+
+    Returns:
+        What each ended with; None where it came to its end.
+    """
+    found: dict[int, BaseException | None] = {}
+    classes: dict[type, list[int]] = {}
+    for place, learning in enumerate(learnings):
+        if isinstance(learning.agent, InPopulations):
+            classes.setdefault(type(learning.agent), []).append(place)
+            continue
+        try:
+            learning.agent.learn(
+                learning.total_timesteps, learning.on_step, learning.on_safe_point, learning.state
+            )
+            found[place] = None
+        except BaseException as error:
+            found[place] = error
+    for places in classes.values():
+        members = [learnings[place] for place in places]
+        agent = members[0].agent
+        assert isinstance(agent, InPopulations)
+        found |= dict(zip(places, agent.learn_together(members), strict=True))
+    return [found[place] for place in range(len(learnings))]
+
+
 class Family(Protocol):
     """The functions of an algorithm family's package."""
 
@@ -161,17 +196,6 @@ class Family(Protocol):
 
     def on_processor(self, device: str) -> bool:
         """Whether a run with this `device` computes on the processor, not on a GPU."""
-
-    def rehearse(self, config: TrainConfig, make_context: Callable[[int], TrainingContext]) -> None:
-        """Try out the settings that `check` cannot judge.
-
-        Args:
-            config: a run's settings.
-            make_context: makes a context with so many environments.
-
-        Raises:
-            InputError: a setting fails.
-        """
 
     def build(self, config: AgentConfig, context: TrainingContext) -> Agent:
         """Build an agent that is ready to learn.

@@ -4,25 +4,15 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import time
 from collections.abc import Iterator
 from functools import partial
-from typing import Any
 
 import torch
 
-from gridworld.agents import family
-from gridworld.agents.sb3.interop.make_vec_env import make_vec_env
-from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
 from gridworld.benchmark import peers
 from gridworld.benchmark.end_to_end import run, train
 from gridworld.benchmark.measure import Comparison, Workload
-from gridworld.benchmark.training import PPO_LARGE
-from gridworld.config.composition.compose import compose
-from gridworld.config.composition.conf_folder import conf_folder
-from gridworld.envs.observations import make_observation
-from gridworld.process.parallel.together import run_together
-from gridworld.training.setup import make_context
+from gridworld.benchmark.training import PPO_LARGE, steps_per_second
 
 _LARGE_ENVS, _LARGE_ROLLOUTS = 1024, 16
 
@@ -74,22 +64,7 @@ def _seconds(command: list[str]) -> float:
 
 def _shipped(agent: str, seeds: int) -> float:
     """Environment steps a second of so many seeds of an agent as it is shipped."""
-    learners = [_learner(agent, seed) for seed in range(seeds)]
-    started = time.perf_counter()
-    steps = sum(_result(found) for found in run_together([partial(_learn, *each) for each in learners]))
-    return steps / (time.perf_counter() - started)
-
-
-def _learner(agent: str, seed: int) -> tuple[Any, int]:
-    config = compose(conf_folder(), [f"agent={agent}", f"seed={seed}"])
-    mdp = config.env.compile()
-    context = make_context(config, mdp, make_observation(mdp, config.observation.kind))
-    return family(config.agent).build(config.agent, context), config.total_timesteps
-
-
-def _learn(agent: Any, total_timesteps: int) -> int:
-    agent.learn(total_timesteps, lambda steps: True)
-    return int(agent.model.num_timesteps)
+    return steps_per_second([(f"agent={agent}", f"seed={seed}") for seed in range(seeds)])
 
 
 def _on_all_cores(cores: int, seeds: int) -> float:
@@ -101,22 +76,5 @@ def _on_all_cores(cores: int, seeds: int) -> float:
 
 def _large(seeds: int) -> float:
     torch.set_num_threads(1)
-    models = []
-    for seed in range(seeds):
-        envs = make_vec_env(n_envs=_LARGE_ENVS)
-        models.append(TabulatedPPO("MlpPolicy", envs, seed=seed, device="cpu", **PPO_LARGE))
-    steps = _LARGE_ENVS * PPO_LARGE["n_steps"] * _LARGE_ROLLOUTS
-
-    def learn(model: TabulatedPPO) -> int:
-        model.learn(steps)
-        return int(model.num_timesteps)
-
-    started = time.perf_counter()
-    made = sum(_result(found) for found in run_together([partial(learn, model) for model in models]))
-    return made / (time.perf_counter() - started)
-
-
-def _result(found: int | Exception) -> int:
-    if isinstance(found, Exception):
-        raise found
-    return found
+    steps = f"total_timesteps={_LARGE_ENVS * 32 * _LARGE_ROLLOUTS}"
+    return steps_per_second([(*PPO_LARGE, steps, f"seed={seed}") for seed in range(seeds)])

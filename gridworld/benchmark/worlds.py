@@ -13,21 +13,27 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env as dummy_vec_env
 
-from gridworld.agents.sb3.interop.make_vec_env import make_vec_env
-from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
-from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
 from gridworld.benchmark.measure import Comparison, Workload
-from gridworld.benchmark.training import DQN_BATCH, PPO_LARGE, learner
+from gridworld.benchmark.training import DQN_BATCH, PPO_LARGE, STOCK, learner, sb3_learner
 from gridworld.config.worlds import GymnasiumConfig
 
 WORLDS = ("FrozenLake-v1", "CliffWalking-v1", "Taxi-v4")
 ENVS = 1024
 # Each transition is replayed 8 times, as by SB3's defaults. With 8 environments, rollouts are as large, and
 # as many transitions lie between two updates.
-DQN_LARGE: dict[str, Any] = {**DQN_BATCH, "batch_size": 8 * ENVS}
-LEARNERS: tuple[tuple[type[BaseAlgorithm], type[BaseAlgorithm], dict[str, Any], str], ...] = (
-    (TabulatedPPO, PPO, PPO_LARGE, "n_steps"),
-    (TabulatedDQN, DQN, DQN_LARGE, "train_freq"),
+DQN_LARGE = (*DQN_BATCH, f"n_envs={ENVS}", f"agent.batch_size={8 * ENVS}")
+_PPO: dict[str, Any] = {"n_steps": 32 * ENVS // 8, "batch_size": 8192, "n_epochs": 4}
+_DQN: dict[str, Any] = {
+    "batch_size": 8 * ENVS,
+    "train_freq": ENVS // 8,
+    "learning_starts": 512,
+    "buffer_size": 100_000,
+    "target_update_interval": 1280,
+    "learning_rate": 3e-3,
+}
+LEARNERS: tuple[tuple[type[BaseAlgorithm], tuple[str, ...], dict[str, Any]], ...] = (
+    (PPO, PPO_LARGE, _PPO),
+    (DQN, DQN_LARGE, _DQN),
 )
 
 
@@ -46,19 +52,17 @@ def comparisons(workload: Workload) -> Iterator[Comparison]:
     for world in worlds:
         mdp = world.compile()
         limit = world.step_limit(mdp)
-        batch = partial(make_vec_env, n_envs=ENVS, mdp=mdp, max_episode_steps=limit)
         usual = partial(dummy_vec_env, world.id, n_envs=8, env_kwargs={"max_episode_steps": limit})
-        for fast, stock, settings, per_env in LEARNERS:
-            ours = learner(fast, batch, 4 * workload.steps, **settings)
-            of_8 = {**settings, per_env: settings[per_env] * ENVS // 8}
+        for stock, words, of_8 in LEARNERS:
+            words = (*words, f"env.max_episode_steps={limit}")
             for peer, theirs in (
-                ("8 envs in DummyVecEnv", learner(stock, usual, workload.steps, **of_8)),
-                ("same batch", learner(stock, batch, workload.steps, **settings)),
+                ("8 envs in DummyVecEnv", sb3_learner(stock, usual, workload.steps, **of_8)),
+                ("same batch", learner((*words, STOCK), workload.steps, mdp)),
             ):
                 yield Comparison(
                     "training, environment steps per second",
                     f"{stock.__name__}, {world.id}",
-                    ours,
+                    learner(words, 4 * workload.steps, mdp),
                     f"stock SB3, same settings, {peer}",
                     theirs,
                 )

@@ -22,9 +22,8 @@ from omegaconf.errors import OmegaConfBaseException
 from gridworld.commands import run
 from gridworld.commands.shell.help import manual
 from gridworld.commands.shell.output_folder import check_settings_of, check_sweep_folder, run_folder
-from gridworld.config.composition.compose import register_schemas
+from gridworld.config.composition.compose import register_schemas, to_config
 from gridworld.config.composition.conf_folder import conf_folder, own_conf_folders
-from gridworld.config.composition.for_all_seeds import converted
 from gridworld.config.composition.hydra_errors import sentence, unreadable_file
 from gridworld.config.composition.loader import run_hydra
 from gridworld.config.composition.words import refuse_dashes
@@ -38,6 +37,7 @@ from gridworld.run.claim import claimed
 from gridworld.run.folder import SWEEP_JSON, shown
 from gridworld.storage.file_lock import check_ours
 from gridworld.storage.safe_read import check_yaml
+from gridworld.training.together import Training, run_alone
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 _job_started = threading.Event()  # set when this process starts its first job
@@ -145,22 +145,31 @@ def run_job(settings: DictConfig) -> float:
     Returns:
         The final policy's regret, for sweepers.
     """
+    return run_alone(training(settings))
+
+
+def training(settings: DictConfig) -> Training[float]:
+    """The same as a generator, for the jobs of a population."""
     with called_from(Path(HydraConfig.get().runtime.cwd)):  # hydra.job.chdir=true changes the current folder
-        return _run_job(settings)
+        return (yield from _training(settings))
 
 
-def _run_job(settings: DictConfig) -> float:
+run_job.training = training  # type: ignore[attr-defined]  # where `sweep.hydra_job` finds it
+
+
+def _training(settings: DictConfig) -> Training[float]:
     context = HydraConfig.get()
     _job_started.set()
     folder = Path(context.runtime.output_dir)
     overrides = cast("list[str]", OmegaConf.to_container(context.overrides.task))
     is_one_of_many = context.mode is RunMode.MULTIRUN
     try:
-        config = converted(settings)
+        config = to_config(settings)
         if is_one_of_many and (folder.parent / SWEEP_JSON).exists():
             from gridworld.sweep.job import run_in_sweep
 
-            return run_in_sweep(config, folder, overrides, context.sweeper.stop_at_first_failure)
+            stop_at_failure = context.sweeper.stop_at_first_failure
+            return (yield from run_in_sweep(config, folder, overrides, stop_at_failure))
         with claimed(folder) if is_one_of_many else contextlib.nullcontext():
             return _run_alone(config, folder, overrides)
     except (InputError, OSError, OmegaConfBaseException) as error:

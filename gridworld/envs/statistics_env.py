@@ -13,9 +13,8 @@ processes, 2008 (MBIE-EB); M. Bellemare et al., Unifying count-based exploration
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -24,9 +23,6 @@ from numpy.typing import NDArray
 from gridworld.envs.vector_env import Advance, GridWorldVectorEnv
 from gridworld.storage.serialization import State, fill
 from gridworld.world.mdp import FloatArray
-
-if TYPE_CHECKING:
-    from gridworld.envs.joint_rollout import Rollout
 
 
 class Returns(NamedTuple):
@@ -66,13 +62,10 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
         self._visits = np.zeros((self.mdp.num_states, self.mdp.num_actions), dtype=np.int64)
         self._flat_visits = self._visits.reshape(-1)
         self._ended = NO_EPISODES  # since they were last taken
-        self._rolled: Rollout | None = None
-        self._counted = self._passed = 0  # steps of this rollout
 
     @property
     def visits(self) -> NDArray[np.int64]:
         """See the class."""
-        self.catch_up()
         return self._visits
 
     def advance(self, actions: NDArray[Any]) -> Advance:
@@ -84,29 +77,6 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
         if step[4] is not None:
             self._add_returns([step[4].returns])
         return step
-
-    def passed(self, rolled: Rollout, steps: int) -> None:
-        """See `GridWorldVectorEnv.passed`; adds the exploration bonus to the rewards when it counts."""
-        if rolled is not self._rolled:  # of the one before, steps may be left that never passed
-            self._rolled, self._counted = rolled, 0
-        self._passed = steps
-
-    def catch_up(self) -> None:
-        """See `GridWorldVectorEnv.catch_up`."""
-        rolled, first, end = self._rolled, self._counted, self._passed
-        if rolled is None or first == end:
-            return
-        self._counted = end
-        pairs, rewards = rolled.pairs[first:end], rolled.rewards[first:end]
-        if self.exploration_bonus:
-            for each in zip(pairs, rewards, strict=True):
-                self._count(*each)
-        else:
-            self._count(pairs.ravel(), rewards)
-        bounds = itertools.pairwise(rolled.first_ended[first : end + 1])
-        self._add_returns(rolled.returns[start:stop] for start, stop in bounds if start < stop)
-        if end == len(rolled.pairs):
-            self._rolled = None
 
     def count(self, pairs: NDArray[Any], rewards: FloatArray) -> None:
         """Count n steps of all environments, and add the exploration bonus to their rewards.
@@ -151,12 +121,10 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
     def set_state(self, state: State) -> None:
         """See `GridWorldVectorEnv.set_state`."""
         super().set_state(state)
-        self._rolled = None
         fill(self._visits, state["visits"], "visits")
         self._ended = Returns(int(state["ended"]), float(state["ended_return"]))
 
     def take_returns(self) -> Returns:
         """The returns of the episodes that ended since the last call, or since the start."""
-        self.catch_up()
         taken, self._ended = self._ended, NO_EPISODES
         return taken

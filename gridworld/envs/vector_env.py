@@ -8,7 +8,7 @@ object of its own.
 from __future__ import annotations
 
 from os import PathLike
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -26,9 +26,6 @@ from gridworld.storage.serialization import State, StateError, fill
 from gridworld.world.grid import mdp_or_compiled
 from gridworld.world.layout import CLASSIC, NUM_COLS, NUM_ROWS, Layout, positive_int
 from gridworld.world.mdp import BoolArray, FloatArray, Mdp
-
-if TYPE_CHECKING:
-    from gridworld.envs.joint_rollout import Rollout
 
 StateArray = NDArray[np.int64]
 Step = tuple[StateArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]
@@ -304,26 +301,6 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
     def set_episode_state(self, states: StateArray, elapsed: NDArray[np.int64], returns: FloatArray) -> None:
         """Mirrors `episode_state`."""
         self._state, self._elapsed, self._returns = states.copy(), elapsed.copy(), returns.copy()
-
-    @property
-    def under_way(self) -> tuple[StateArray, NDArray[np.int64], FloatArray]:
-        """(num_envs,) each: the states, and the steps and returns of the episodes under way so far."""
-        return self._state, self._elapsed, self._returns
-
-    def go_on_from(self, states: StateArray, elapsed: NDArray[np.int64], returns: FloatArray) -> None:
-        """Put back what `under_way` returned, or what has become of it."""
-        self._state, self._elapsed, self._returns = states.copy(), elapsed.copy(), returns.copy()
-
-    def passed(self, rolled: Rollout, steps: int) -> None:
-        """So many steps of a rollout (`joint_rollout`) have passed, for a subclass that counts steps.
-
-        Args:
-            rolled: whose rewards a subclass may add to, by what it pays for exploring.
-            steps: from its first on.
-        """
-
-    def catch_up(self) -> None:
-        """Count the steps that have passed, which takes less time for many at once."""
 
     def draw_starts(self, count: int) -> Any:
         """The states in which so many new episodes begin, (count,), or the one in which all do."""

@@ -161,8 +161,7 @@ def _set_alarm(seconds: float) -> None:
 class StopRequest:
     """Whether SIGINT or SIGTERM has asked training to stop.
 
-    Of trainings that run together (`process.parallel.together`) each has its own, and a signal asks all of
-    them.
+    Of trainings that run together (`training.together`) each has its own, and a signal asks all of them.
 
     Attributes:
         number: of the signal; None as long as there was none.
@@ -219,7 +218,6 @@ class _Listeners:
 
     def __init__(self, outer: StopRequest | None) -> None:
         self.outer = outer
-        self.at_once: Interrupted | None = None  # what was raised in the one that ran, for the others
         self._requests: list[StopRequest] = []
 
     def add(self, request: StopRequest) -> None:
@@ -248,20 +246,14 @@ class _Listeners:
         again = self._requests[0].number is not None
         for request in self._requests:
             request.number = number
-        if again:
-            self._stop(number)
-        if running in self._requests and not running.patient:
+        if again or (running in self._requests and not running.patient):
             raise Interrupted(number)
         _set_alarm(_SECONDS_TO_SAFE_POINT)
 
     def _late(self, number: int, frame: FrameType | None) -> None:
         asked = self._requests[0].number
         if asked is not None:
-            self._stop(asked)
-
-    def _stop(self, number: int) -> None:
-        self.at_once = Interrupted(number)
-        raise self.at_once
+            raise Interrupted(asked)
 
 
 def _interruption_behind(error: BaseException | None) -> Interrupted | None:
@@ -273,8 +265,3 @@ def _interruption_behind(error: BaseException | None) -> Interrupted | None:
 
 _inside: ContextVar[StopRequest | None] = ContextVar("inside", default=None)
 _listeners: list[_Listeners] = []  # the innermost last
-
-
-def stopped() -> Interrupted | None:
-    """What trainings that run together are to be ended with at once, if one of them was."""
-    return _listeners[-1].at_once if _listeners else None

@@ -19,7 +19,7 @@ from typing import Any
 from gridworld.config.pictures import RecordingConfig
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.parallel.together import mixing, run_together
+from gridworld.process.parallel.together import mixing
 from gridworld.restore.resume import open_unfinished
 from gridworld.restore.saved_run import settings_of
 from gridworld.run.folder import MANIFEST
@@ -27,7 +27,9 @@ from gridworld.run.identity.fingerprint import settings_hash
 from gridworld.run.identity.stored_world import stored_world
 from gridworld.run.manifest import NUMBERS_DEPEND_ON
 from gridworld.run.reader import RunReader, read_run
-from gridworld.training.train import train
+from gridworld.run.summary import Summary
+from gridworld.training.together import Training, run_alone, run_together
+from gridworld.training.train import training
 from gridworld.world.mdp import Mdp
 
 
@@ -142,17 +144,21 @@ def repeat(
     first, *longer = lengths(then, config)
     overrides = then.manifest.get("overrides") or []
     config = dataclasses.replace(config, total_timesteps=first)
-    own = partial(train, config, folder, overrides, lambda env: mdp)
+    own = partial(training, config, folder, overrides, lambda env: mdp)
     if members:
         _together(then, own, config, members, trust)
     else:
-        own()
+        run_alone(own())
     for length in longer:
         open_unfinished(folder, trust).resume(length)
 
 
 def _together(
-    then: RunReader, own: Callable[[], Any], config: TrainConfig, members: Sequence[RunReader], trust: bool
+    then: RunReader,
+    own: Callable[[], Training[Summary]],
+    config: TrainConfig,
+    members: Sequence[RunReader],
+    trust: bool,
 ) -> None:
     """Train a run by `own`, and its members beside it."""
     names = [run.folder.name for run in members]
@@ -166,7 +172,7 @@ def _together(
         raise error
 
 
-def _beside(run: RunReader, beside: Path, like: TrainConfig, trust: bool) -> Callable[[], Any]:
+def _beside(run: RunReader, beside: Path, like: TrainConfig, trust: bool) -> Callable[[], Training[Summary]]:
     """What trains a run again in a folder of its own, on the machine's part that another is trained on."""
     settings = settings_of(run, trust)
     config = dataclasses.replace(
@@ -177,4 +183,4 @@ def _beside(run: RunReader, beside: Path, like: TrainConfig, trust: bool) -> Cal
     )
     mdp, folder = stored_world(run, config.env), beside / run.folder.name
     folder.mkdir()
-    return partial(train, config, folder, [], lambda env: mdp)
+    return partial(training, config, folder, [], lambda env: mdp)

@@ -41,7 +41,8 @@ from gridworld.storage.serialization import State, StateError
 from gridworld.training.session import CONTENT, FORMAT, LOGS
 from gridworld.training.setup import check_settings
 from gridworld.training.sinks import CURVE_COLUMNS
-from gridworld.training.train import OnBuilt, carry_out, ignore, train
+from gridworld.training.together import Training, run_alone
+from gridworld.training.train import OnBuilt, carry_out, ignore, training
 from gridworld.world.mdp import Mdp
 
 _LONGEST_HEADER = 2**12  # bytes
@@ -62,12 +63,19 @@ def train_or_resume(
         InputError: The folder holds another run, or a setting is wrong.
         Interrupted: Training was asked to stop.
     """
+    return run_alone(training_or_resumption(config, folder, overrides, on_built))
+
+
+def training_or_resumption(
+    config: TrainConfig, folder: Path, overrides: list[str], on_built: OnBuilt = ignore
+) -> Training[Summary]:
+    """The same as a generator, for `run_together`."""
     if is_started(folder):
-        return unfinished_of(folder, config).resume(on_built=on_built)
+        return (yield from unfinished_of(folder, config).resumption(on_built=on_built))
     is_empty = os.path.lexists(folder / MANIFEST)
     if is_empty:
         tell(f"{folder / MANIFEST}: is empty, and nothing of the run was saved; it begins anew")
-    return train(config, folder, overrides, replace=is_empty, on_built=on_built)
+    return (yield from training(config, folder, overrides, replace=is_empty, on_built=on_built))
 
 
 def open_unfinished(folder: Path, trust: bool = False) -> Unfinished:
@@ -154,12 +162,22 @@ class Unfinished:
             InputError: The run cannot be resumed in this way.
             Interrupted: Training was asked to stop.
         """
+        return run_alone(self.resumption(total_timesteps, anyway, progress, on_built))
+
+    def resumption(
+        self,
+        total_timesteps: int | None = None,
+        anyway: bool = False,
+        progress: bool = True,
+        on_built: OnBuilt = ignore,
+    ) -> Training[Summary]:
+        """The same as a generator, for `run_together`."""
         with TrainLog() as log:
-            return self._resume(log, total_timesteps, anyway, progress, on_built)
+            return (yield from self._resume(log, total_timesteps, anyway, progress, on_built))
 
     def _resume(
         self, log: TrainLog, total_timesteps: int | None, anyway: bool, progress: bool, on_built: OnBuilt
-    ) -> Summary:
+    ) -> Training[Summary]:
         run, old_total = self.run, self.config.total_timesteps
         if total_timesteps is None and run.is_finished and Checkpoints(run.folder).files():
             raise InputError(
@@ -180,7 +198,9 @@ class Unfinished:
         if state is None:
             self._check_restart(config)
             start = partial(self._restart, config)
-            return carry_out(config, run.folder, mdp, start, log, self.is_trusted, on_built=on_built)
+            return (
+                yield from carry_out(config, run.folder, mdp, start, log, self.is_trusted, on_built=on_built)
+            )
         differs = _differences(state["environment"], config.agent, run, anyway)
         steps = state["steps"]
         self._check_length(config, steps)
@@ -190,7 +210,9 @@ class Unfinished:
         def begin() -> RunWriter:
             return RunWriter.resume(run, steps, config.total_timesteps, differs)
 
-        return carry_out(config, run.folder, mdp, begin, log, self.is_trusted, (run, state), on_built)
+        return (
+            yield from carry_out(config, run.folder, mdp, begin, log, self.is_trusted, (run, state), on_built)
+        )
 
     def _tell_if_map_changed(self) -> None:
         env = self.config.env

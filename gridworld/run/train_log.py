@@ -24,7 +24,7 @@ class TrainLog(logging.Handler):
     """Takes Python's warnings, what is logged as one, and what is told on standard error, inside its block.
 
     The lines are kept until there is a file. What goes to the terminal is the same as without it. Of runs
-    that train together (`process.parallel.together`), each has its own, which takes what comes while its
+    that train together (`training.together`), each has its own, which takes what comes while its
     run is at work.
     """
 

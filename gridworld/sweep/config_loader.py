@@ -11,7 +11,7 @@ from __future__ import annotations
 import pickle
 import re
 from collections.abc import Sequence
-from functools import partial
+from dataclasses import replace
 from typing import Any, cast
 
 from hydra._internal.config_loader_impl import get_overrides_dirname
@@ -22,7 +22,6 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from gridworld.config.composition.compose import to_config
-from gridworld.config.composition.for_all_seeds import ForAllSeeds
 from gridworld.config.composition.loader import Loader
 from gridworld.config.composition.words import with_whole_numbers
 from gridworld.config.train import TrainConfig
@@ -124,7 +123,7 @@ class Configurations:
     def __init__(self, loader: SweepLoader, master: DictConfig) -> None:
         self._loader = loader
         self._master = master
-        self._known = ForAllSeeds()
+        self._known: dict[tuple[str, ...], bytes] = {}  # pickled, so that no two share a dictionary
 
     def __call__(self, overrides: Sequence[str]) -> TrainConfig:
         """Compose a job's overrides.
@@ -133,13 +132,22 @@ class Configurations:
             InputError, HydraException: as `SweepLoader.load_settings` and `to_config`.
         """
         seeds = [int(found[1]) for word in overrides if (found := _SEED.fullmatch(word)) is not None]
-        if len(seeds) != 1:
-            return to_config(self._load(overrides))
         others = tuple(word for word in overrides if _SEED.fullmatch(word) is None)
-        return self._known.config(others, seeds[0], partial(self._load, overrides))
+        if len(seeds) == 1 and others in self._known:
+            known: TrainConfig = pickle.loads(self._known[others])
+            return replace(known, seed=seeds[0])
+        settings = self._loader.load_settings(self._master, list(overrides))
+        config = to_config(settings)
+        if len(seeds) == 1 and not _depends_on_seed(OmegaConf.to_container(settings, resolve=False)):
+            self._known[others] = pickle.dumps(config)
+        return config
 
-    def _load(self, overrides: Sequence[str]) -> DictConfig:
-        return self._loader.load_settings(self._master, list(overrides))
+
+def _depends_on_seed(node: object) -> bool:
+    """Whether an interpolation names what is another for each seed."""
+    if isinstance(node, dict | list):
+        return any(map(_depends_on_seed, node.values() if isinstance(node, dict) else node))
+    return isinstance(node, str) and "${" in node and ("seed" in node or "hydra" in node)
 
 
 def _refuse_own_lists(settings: DictConfig, master: DictConfig) -> None:

@@ -22,6 +22,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf._utils import get_omega_conf_dumper
 
 from gridworld.process.garbage import collect_less_often
+from gridworld.training.together import Training
 
 _MOST_ENTRIES = 4096
 
@@ -30,18 +31,18 @@ _jobs = itertools.count()  # that began in this process
 _entries: dict[tuple[object, ...], str] = {}  # YAML by what it is of
 
 
-def run_job(
+def job(
     task_function: TaskFunction,
     config: DictConfig,
     job_dir_key: str,
     job_subdir_key: str,
     hydra_context: HydraContext,
     configures_logging: bool = True,
-) -> JobReturn:
+) -> Training[JobReturn]:
     """Run a job.
 
     Args:
-        task_function: takes the job's settings.
+        task_function: takes the job's settings; its attribute `training`, if any, makes a generator of them.
         config: all of its configuration, which nobody else uses.
         job_dir_key: where the configuration has the sweep's folder.
         job_subdir_key: where it has the job's, in there.
@@ -75,7 +76,11 @@ def run_job(
         with env_override(config.hydra.job.env_set):
             hydra_context.callbacks.on_job_start(config=config, task_function=task_function)
             try:
-                done.return_value, done.status = task_function(settings), JobStatus.COMPLETED
+                if (training := getattr(task_function, "training", None)) is None:
+                    done.return_value = task_function(settings)
+                else:
+                    done.return_value = yield from training(settings)
+                done.status = JobStatus.COMPLETED
             except Exception as error:
                 done.return_value, done.status = error, JobStatus.FAILED
         done.task_name = JobRuntime.instance().get("name")

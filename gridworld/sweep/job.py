@@ -13,7 +13,7 @@ from pathlib import Path
 from gridworld.config.train import TrainConfig
 from gridworld.errors import FolderLostError, InputError, MachineError, reason
 from gridworld.process.signals import Interrupted
-from gridworld.restore.resume import train_or_resume
+from gridworld.restore.resume import training_or_resumption
 from gridworld.run.folder import ERROR_FILE, LOCK, MANIFEST
 from gridworld.run.reader import read_run
 from gridworld.run.recovery import find_run
@@ -31,6 +31,7 @@ from gridworld.sweep.job_table import (
     outcome,
     run_status,
 )
+from gridworld.training.together import Training
 
 _TO_GO_ON_WITH = ("running", "interrupted")  # statuses of runs that were stopped from outside
 
@@ -43,7 +44,9 @@ class StopSweep(BaseException):
     """The job failed, and the sweep is to stop. No `Exception`: after one, launchers go on."""
 
 
-def run_in_sweep(config: TrainConfig, folder: Path, overrides: list[str], stop_at_failure: bool) -> float:
+def run_in_sweep(
+    config: TrainConfig, folder: Path, overrides: list[str], stop_at_failure: bool
+) -> Training[float]:
     """Train in the job's folder, unless that is done or another process does it.
 
     An interrupted run goes on from its checkpoint; a failed one is replaced.
@@ -69,7 +72,7 @@ def run_in_sweep(config: TrainConfig, folder: Path, overrides: list[str], stop_a
             return math.nan
         table.set(folder.name, status=RUNNING, seconds="", objective="", error="")
         try:
-            return _run(config, folder, overrides, table)
+            return (yield from _run(config, folder, overrides, table))
         except JobError as error:
             if stop_at_failure:
                 raise StopSweep(str(error)) from None
@@ -99,12 +102,12 @@ def _make_ready(folder: Path, table: JobTable) -> bool:
     return True
 
 
-def _run(config: TrainConfig, folder: Path, overrides: list[str], table: JobTable) -> float:
+def _run(config: TrainConfig, folder: Path, overrides: list[str], table: JobTable) -> Training[float]:
     started, job = time.monotonic(), folder.name
     # The sweep has a progress line of its own.
     config = replace(config, logging=replace(config.logging, progress=False))
     try:
-        summary = train_or_resume(config, folder, overrides)
+        summary = yield from training_or_resumption(config, folder, overrides)
     except Interrupted as interruption:
         table.set(job, status=INTERRUPTED, **outcome(read_run(folder)))
         sys.exit(interruption.exit_code)

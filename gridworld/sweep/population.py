@@ -2,8 +2,8 @@
 
 A launcher gets one job for each population: the first of its jobs, with the names of all in
 `hydra.sweeper.together`. Where that runs, `PopulationTask` runs them all, each as it would run alone, with
-files and a folder of its own; `process.parallel.together` has them meet where the networks are updated. On
-CUDA they are updated at once only if a number of runs is asked for: there their numbers depend on each other.
+files and a folder of its own (`training.together`). On CUDA they form a population only if a number of runs
+is asked for: there their numbers depend on each other.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from omegaconf import DictConfig
 
 from gridworld.agents import family
 from gridworld.config.composition.compose import to_config
-from gridworld.config.composition.for_all_seeds import converting_once
 from gridworld.config.sweep import SweepConfig
 from gridworld.errors import InputError
 from gridworld.process.parallel.forks import can_fork
 from gridworld.process.parallel.machine import file_limit, free_memory, worker_count
-from gridworld.process.parallel.together import LARGEST, mixing, run_together
+from gridworld.process.parallel.together import LARGEST, mixing
 from gridworld.sweep.folder import JobEntry, SweepFolder
 from gridworld.sweep.plan import Job
+from gridworld.training.together import run_together
 
 AUTO = "auto"
 _SHARE_OF_MEMORY = 4  # a population takes a fourth of what is free, shared by the workers
@@ -74,7 +74,7 @@ class PopulationTask:
         try:
             entries = {entry.job: entry for entry in SweepFolder(folder).entries.values()}
             jobs = [(int(number), entries[name]) for number, name in together]
-            with mixing(self._mixed(settings, [entry for _, entry in jobs])), converting_once():
+            with mixing(self._mixed(settings, [entry for _, entry in jobs])):
                 results = self._run_all(folder, jobs)
         finally:
             shared.cfg = before
@@ -99,7 +99,7 @@ class PopulationTask:
         runner = JobRunner(self.context, self.task, self.config)
         return run_together(
             [
-                partial(runner.run, line(folder, entry), number, configures_logging=False)
+                partial(runner.job, line(folder, entry), number, configures_logging=False)
                 for number, entry in jobs
             ]
         )

@@ -13,7 +13,7 @@ import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from gridworld.agents import Agent, TrainingContext
+from gridworld.agents import Agent, Learning, TrainingContext
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console.progress import Progress
@@ -33,6 +33,7 @@ from gridworld.training.pictures import Pictures
 from gridworld.training.sinks import CHARTS, CurveFile, CurveScalars, ProgressLine, read_curve
 from gridworld.training.summary import CLOCK, as_json, summarise
 from gridworld.training.tensorboard import EventWriter, as_markdown, hparams
+from gridworld.training.together import Training
 from gridworld.world.exact.evaluation import Evaluator
 
 _log = logging.getLogger("gridworld")
@@ -53,12 +54,12 @@ class Learner:
         """Continue from a state."""
         self._state = state
 
-    def learn(
-        self, total: int, on_step: Callable[[int], bool], on_safe_point: Callable[[int], None] | None
-    ) -> None:
-        """See `agents.Agent.learn`."""
+    def learning(
+        self, total: int, on_step: Callable[[int], int], on_safe_point: Callable[[int], None] | None
+    ) -> Learning:
+        """What is to be learnt from here on."""
         state, self._state = self._state, None  # it may be large
-        self.agent.learn(total, on_step, on_safe_point, state)
+        return Learning(self.agent, total, on_step, on_safe_point, state)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +82,7 @@ class Parts:
 
 PARTS = tuple(field.name for field in dataclasses.fields(Parts))
 LOGS = {"curve": CURVE, "events": EVENTS}  # that a checkpoint has marks of, and the pattern of their names
-FORMAT = 3  # of a checkpoint; a number more where a part's state has other keys or another meaning
+FORMAT = 4  # of a checkpoint; a number more where a part's state has other keys or another meaning
 CONTENT = {  # the type of each key of a checkpoint
     "format": int,
     "identity": str,
@@ -143,7 +144,7 @@ class Session:
         curve = LearningCurve(evaluator, agent, config, sinks, context.envs)
         self._parts = Parts(Learner(agent), curve, pictures)
 
-    def run(self) -> Summary:
+    def run(self) -> Training[Summary]:
         """Train, evaluate, record.
 
         Returns:
@@ -159,7 +160,7 @@ class Session:
             with self._stop.listening():
                 self._begin()
                 self._stop.patient = not self._pace.never
-                self._learn()
+                yield self._learning()
                 self._stop.patient = False
                 self._stop.obey()
                 summary = self._finish()
@@ -187,12 +188,14 @@ class Session:
             self._events.text("run/settings", as_markdown(dataclasses.asdict(self._config)), 0)
         self._parts.curve.evaluate(0)
 
-    def _learn(self) -> None:
+    def _learning(self) -> Learning:
         on_safe_point = None if self._pace.never else self._on_safe_point
-        self._parts.agent.learn(self._config.total_timesteps, self._on_step, on_safe_point)
+        return self._parts.agent.learning(self._config.total_timesteps, self._on_step, on_safe_point)
 
     def _on_step(self, steps: int) -> int:
         self._steps = steps
+        if self._pace.never:  # else a safe point will come
+            self._stop.obey()
         return self._parts.curve.on_step(steps)
 
     def _on_safe_point(self, steps: int) -> None:

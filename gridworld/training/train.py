@@ -9,10 +9,10 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from gridworld.agents import Agent, TrainingContext, family
+from gridworld.agents import Agent, family
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, compiled
-from gridworld.envs.observations import ObservationTable, make_observation
+from gridworld.envs.observations import make_observation
 from gridworld.errors import FolderLostError, InputError, MachineError, reason
 from gridworld.process.console.command_line import recorded_command_line
 from gridworld.process.console.terminal import tell
@@ -28,6 +28,7 @@ from gridworld.storage.serialization import State, StateError
 from gridworld.training.session import Session
 from gridworld.training.setup import check_settings, make_context, notes
 from gridworld.training.tensorboard import EventWriter
+from gridworld.training.together import Training, run_alone
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 
@@ -64,6 +65,18 @@ def train(
         MachineError: where files cannot be written.
         Interrupted: by a signal, after a checkpoint.
     """
+    return run_alone(training(config, folder, overrides, world, replace, on_built))
+
+
+def training(
+    config: TrainConfig,
+    folder: Path,
+    overrides: list[str],
+    world: Callable[[EnvConfig], Mdp] = compiled,
+    replace: bool = False,
+    on_built: OnBuilt = ignore,
+) -> Training[Summary]:
+    """The same as a generator, for `run_together`."""
     with TrainLog() as log:
         mdp = check_settings(config, world)
         for note in notes(config, mdp) if config.logging.progress else ():
@@ -72,7 +85,7 @@ def train(
         def begin() -> RunWriter:
             return RunWriter.start(folder, dataclasses.asdict(config), mdp, overrides, replace)
 
-        return carry_out(config, folder, mdp, begin, log, world is compiled, on_built=on_built)
+        return (yield from carry_out(config, folder, mdp, begin, log, world is compiled, on_built=on_built))
 
 
 def carry_out(
@@ -84,7 +97,7 @@ def carry_out(
     is_trusted: bool,
     earlier: tuple[RunReader, State] | None = None,
     on_built: OnBuilt = ignore,
-) -> Summary:
+) -> Training[Summary]:
     """Train from the start or continue from a state, with settings that were checked.
 
     Args:
@@ -107,8 +120,6 @@ def carry_out(
     evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
     before = None if earlier is None else FilesBefore(*earlier)
     state = None if earlier is None else earlier[1]
-    if state is None:
-        _rehearse(config, mdp, observation)
     events = None
     if config.logging.tensorboard:
         events = EventWriter(folder, None if state is None else state["marks"]["events"])
@@ -128,7 +139,7 @@ def carry_out(
         session = Session(config, run, evaluator, agent, context, events, state, is_trusted)
         if before is not None and before.has_result():
             session.checkpoints.held = before.steps
-        summary = session.run()
+        summary = yield from session.run()
     except Interrupted as interruption:
         run.end("interrupted", str(interruption), **_progress(session))
         log.add(interruption_text(interruption, run, run.manifest))
@@ -182,15 +193,6 @@ def _note_failure(
     if failed and not isinstance(error, InputError | StateError):
         write_text(run.error_file, traceback.format_exc())
     run.end(status, reason(error), **progress)
-
-
-def _rehearse(config: TrainConfig, mdp: Mdp, observation: ObservationTable) -> None:
-    """Have the agent's family try out what it cannot judge otherwise, on environments of its own."""
-
-    def context(num_envs: int) -> TrainingContext:
-        return make_context(dataclasses.replace(config, n_envs=num_envs), mdp, observation)
-
-    family(config.agent).rehearse(config, context)
 
 
 def _unwritable(folder: Path, config: TrainConfig, error: OSError) -> MachineError:

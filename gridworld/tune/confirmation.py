@@ -30,6 +30,7 @@ from gridworld.storage.symlinks import check_no_links, make_inside, names_inside
 from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.job_table import FAILED, JobTable, run_status
 from gridworld.sweep.plan import plan, shape
+from gridworld.training.together import Training, run_alone
 from gridworld.tune.search.worker import become_worker, is_stopped, run_all
 from gridworld.tune.search.worker_pool import share
 from gridworld.world.mdp import FloatArray
@@ -114,20 +115,20 @@ def run_held_out(all_runs: HeldOutRuns, worker: int, parent: int) -> None:
     left = [run for run in all_runs.runs if run not in part]
     for start in range(0, len(part), together):
         some = [] if is_stopped() else part[start : start + together]
-        ran = run_all([partial(_run, run) for run in some])
+        ran: list[bool] = run_all([partial(_run, run) for run in some])
         left += [run for run, is_well in zip(some, ran, strict=True) if is_well]
     while left and not is_stopped():
         # Some may be running elsewhere, in this study's other workers or in another command's.
         left = [run for run in left if run_status(run.folder) not in _ENDED]
-        left = [run for run in left if is_stopped() or _run(run)]
+        left = [run for run in left if is_stopped() or run_alone(_run(run))]
     sys.exit(0)
 
 
-def _run(run: HeldOutRun) -> bool:
+def _run(run: HeldOutRun) -> Training[bool]:
     """Run it; False where it failed in this process."""
     make_inside(run.folder.parents[1], CONFIRM, run.folder.name)
     try:
-        run_in_sweep(run.config, run.folder, [], stop_at_failure=False)
+        yield from run_in_sweep(run.config, run.folder, [], stop_at_failure=False)
     except JobError as error:
         print(printable(f"{run.folder}: {error}"), file=sys.stderr, flush=True)
         return False

@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Any
 from gridworld.errors import InputError, reason
 from gridworld.process.console.terminal import tell
 from gridworld.process.parallel.together import LARGEST
-from gridworld.tune.search.objective import SEEDS, Objective, SeedScore, Stopped, learn, read_score, score
+from gridworld.training.together import Training
+from gridworld.tune.search.objective import SEEDS, Objective, SeedScore, Stopped, learning, read_score, score
 from gridworld.tune.search.worker import StudyContext, become_worker, is_stopped, run_all, study_of
 from gridworld.tune.search.worker_pool import share
 
@@ -94,9 +95,11 @@ def _run_missing(runs: FinalRuns, study: Study, worker: int) -> None:
         run_all(tasks[start : start + together])
 
 
-def _run(objective: Objective, study: Study, number: int, values: Mapping[str, Any], seed: int) -> None:
+def _run(
+    objective: Objective, study: Study, number: int, values: Mapping[str, Any], seed: int
+) -> Training[None]:
     try:
-        result = learn(objective.config(values), seed, is_stopped)
+        result = yield from learning(objective.config(values), seed, is_stopped)
     except Exception as error:  # the run failed, though its trial did not
         tell(f"trial {number} on the final seed {seed} failed, and counts as not certified: {reason(error)}")
         if not isinstance(error, InputError | ArithmeticError):

@@ -8,12 +8,11 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING
 
-from gridworld.agents.sb3.settings.schemas import SCHEMAS, SB3CheckedConfig, SB3Config
-from gridworld.agents.sb3.settings.validation import check, left_to_the_class
+from gridworld.agents.sb3.settings.schemas import SCHEMAS, SB3Config
+from gridworld.agents.sb3.settings.validation import check
 from gridworld.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
     from typing import Any
 
@@ -21,9 +20,8 @@ if TYPE_CHECKING:
 
     from gridworld.agents import Agent, TrainingContext
     from gridworld.config.agents import AgentConfig
-    from gridworld.config.train import TrainConfig
 
-__all__ = ["build", "check", "import_for", "on_processor", "rehearse", "schemas", "weights"]
+__all__ = ["build", "check", "import_for", "on_processor", "schemas", "weights"]
 
 
 def schemas() -> dict[str, type[AgentConfig]]:
@@ -51,15 +49,6 @@ def on_processor(device: str) -> bool:
         return True
 
 
-def rehearse(config: TrainConfig, make_context: Callable[[int], TrainingContext]) -> None:
-    """See `gridworld.agents.Family.rehearse`: a copy makes a first update, where only its class can judge."""
-    if isinstance(config.agent, SB3CheckedConfig) and not left_to_the_class(config.agent):
-        return
-    from gridworld.agents.sb3.rehearsal import rehearse
-
-    rehearse(config, make_context)
-
-
 def build(config: AgentConfig, context: TrainingContext) -> Agent:
     """See `gridworld.agents.Family.build`."""
     from gridworld.agents.sb3.agent import SB3Agent
@@ -67,7 +56,9 @@ def build(config: AgentConfig, context: TrainingContext) -> Agent:
     from gridworld.agents.sb3.settings.engine import learns_in_engine
 
     assert isinstance(config, SB3Config)
-    return (EngineAgent if learns_in_engine(config, context) else SB3Agent)(config, context)
+    if learns_in_engine(config, context):
+        return EngineAgent(config, context)
+    return SB3Agent(config, context)
 
 
 def weights(path: Path, most: int) -> dict[str, NDArray[Any]]:

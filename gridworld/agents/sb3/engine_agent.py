@@ -69,9 +69,21 @@ class EngineAgent(SB3Agent):
         state: State | None = None,
     ) -> None:
         """See `gridworld.agents.Agent.learn`."""
-        (error,) = learn_together([Learning(self, total_timesteps, on_step, on_safe_point, state)])
+        (error,) = self.learn_together([Learning(self, total_timesteps, on_step, on_safe_point, state)])
         if error is not None:
             raise error
+
+    def learn_together(self, learnings: Sequence[Learning]) -> list[BaseException | None]:
+        """See `gridworld.agents.learn_together`."""
+        runs = []
+        for learning in learnings:
+            assert isinstance(learning.agent, EngineAgent)
+            run = learning.agent.run
+            run.begin(learning.total_timesteps)
+            run.on_step, run.on_safe_point = learning.on_step, learning.on_safe_point
+            runs.append(run)
+        train(runs, [learning.state for learning in learnings])
+        return [run.error for run in runs]
 
     def get_state(self) -> State:
         """See `gridworld.agents.Agent.get_state`."""
@@ -92,22 +104,6 @@ class EngineAgent(SB3Agent):
         """See `gridworld.agents.Agent.load`."""
         super().load(path)
         self._algorithm([self.run], [None])
-
-
-def learn_together(learnings: Sequence[Learning]) -> list[BaseException | None]:
-    """Learn; runs that fit into one population train as one.
-
-    Returns:
-        What each ended with.
-    """
-    runs = []
-    for learning in learnings:
-        run = learning.agent.run
-        run.begin(learning.total_timesteps)
-        run.on_step, run.on_safe_point = learning.on_step, learning.on_safe_point
-        runs.append(run)
-    train(runs, [learning.state for learning in learnings])
-    return [run.error for run in runs]
 
 
 def extractors_kind(model: Any) -> Kind:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from gridworld.config.agents import AgentConfig
     from gridworld.config.train import TrainConfig
 
-__all__ = ["build", "check", "import_for", "on_processor", "rehearse", "schemas", "weights"]
+__all__ = ["build", "check", "import_for", "on_processor", "schemas", "weights"]
 
 
 def schemas() -> dict[str, type[AgentConfig]]:
@@ -58,10 +57,6 @@ def import_for(config: AgentConfig) -> None:
 def on_processor(device: str) -> bool:
     """See `gridworld.agents.Family.on_processor`."""
     return True
-
-
-def rehearse(config: TrainConfig, make_context: Callable[[int], TrainingContext]) -> None:
-    """See `gridworld.agents.Family.rehearse`. `check` judges every setting, so nothing is left to try out."""
 
 
 def build(config: AgentConfig, context: TrainingContext) -> Agent:

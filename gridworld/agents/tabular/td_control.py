@@ -124,7 +124,7 @@ class TabularControl(ABC):
     def learn(
         self,
         total_timesteps: int,
-        on_step: Callable[[int], bool],
+        on_step: Callable[[int], int],
         on_safe_point: Callable[[int], None] | None = None,
         state: State | None = None,
     ) -> None:
@@ -157,7 +157,7 @@ class TabularControl(ABC):
                 "train/learning_rate": step_size.rate,
             }
             self._log.add(ended, error, rates, steps)
-            goes_on = on_step(steps)
+            goes_on = on_step(steps) > 0
             if on_safe_point is not None and goes_on:
                 on_safe_point(steps)
 

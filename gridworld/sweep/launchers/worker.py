@@ -22,8 +22,9 @@ from omegaconf import DictConfig, open_dict
 from gridworld.process.signals import exiting, handling, send_sigterm
 from gridworld.storage.atomic_write import write_bytes
 from gridworld.sweep.folder import STOP
-from gridworld.sweep.hydra_job import run_job
+from gridworld.sweep.hydra_job import job
 from gridworld.sweep.job import StopSweep
+from gridworld.training.together import Training, run_alone
 
 _THIS_PROCESS = uuid.uuid4().hex  # a number would not do: on another machine it may be in use too
 
@@ -47,7 +48,13 @@ class JobRunner:
 
         return bytes(cloudpickle.dumps((_THIS_PROCESS, os.getcwd(), Singleton.get_state(), self)))
 
-    def run(self, overrides: Sequence[str], number: int, configures_logging: bool = True) -> JobReturn:
+    def run(self, overrides: Sequence[str], number: int) -> JobReturn:
+        """Run a job, see `job`."""
+        return run_alone(self.job(overrides, number))
+
+    def job(
+        self, overrides: Sequence[str], number: int, configures_logging: bool = True
+    ) -> Training[JobReturn]:
         """Run a job.
 
         Args:
@@ -66,7 +73,7 @@ class JobRunner:
         with open_dict(config):
             config.hydra.job.id = f"{config.hydra.job.name}_{number}"
             config.hydra.job.num = number
-        return run_job(
+        return job(
             hydra_context=self.context,
             task_function=self.task,
             config=config,

@@ -26,13 +26,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from gridworld.agents import family
+from gridworld.agents import Learning, family
 from gridworld.config.train import TrainConfig
 from gridworld.envs.observations import make_observation
-from gridworld.process.parallel.together import run_together
 from gridworld.sweep.plan import shape
 from gridworld.training.learning_curve import LearningCurve
 from gridworld.training.setup import check_settings, make_context
+from gridworld.training.together import Training, run_alone, run_together
 from gridworld.tune.search.search_space import SearchSpace, Values, with_values
 from gridworld.world.exact.evaluation import Evaluator
 
@@ -124,15 +124,14 @@ class Objective:
             Stopped: this process was asked to end.
             Exception: what training raises.
         """
-        config = self.config(self.space.suggest(trial))
-        seeds = _Seeds(trial, self)
-        tasks = [partial(seeds.train, place, config, is_stopped) for place in range(len(self.seeds))]
-        if shape(config) is None:
-            for task in tasks:
-                task()
-        else:
-            run_together(tasks)
+        seeds = self.begin(trial)
+        for group in seeds.trainings(is_stopped):
+            run_together(group)
         return seeds.score()
+
+    def begin(self, trial: Trial) -> Seeds:
+        """Choose a trial's settings, to train them on its seeds."""
+        return Seeds(trial, self, self.config(self.space.suggest(trial)))
 
     def can_join(self) -> bool:
         """Whether trials can train together, as far as the settings that the search begins from tell."""
@@ -143,11 +142,12 @@ class _LeftError(Exception):
     """The trial has ended without this seed."""
 
 
-class _Seeds:
+class Seeds:
     """A trial's seeds while they train. Optuna is told of each when those before it have ended."""
 
-    def __init__(self, trial: Trial, objective: Objective) -> None:
+    def __init__(self, trial: Trial, objective: Objective, config: TrainConfig) -> None:
         self._trial = trial
+        self._config = config
         self._objective = objective
         self._ended: list[SeedScore] = []  # those that Optuna has been told of
         self._untold: list[deque[tuple[float, SeedScore]]] = [deque() for _ in objective.seeds]
@@ -155,7 +155,15 @@ class _Seeds:
         self._error: Exception | None = None  # that the trial ends with
         self._reporter = _Reporter(trial, objective, [])
 
-    def train(self, place: int, config: TrainConfig, is_stopped: IsStopped) -> None:
+    def trainings(self, is_stopped: IsStopped) -> list[list[Callable[[], Training[None]]]]:
+        """What trains the seeds: groups, one after the other, of those that can train together."""
+        places = range(len(self._objective.seeds))
+        all_of_them: list[Callable[[], Training[None]]] = [
+            partial(self._training, place, is_stopped) for place in places
+        ]
+        return [[each] for each in all_of_them] if shape(self._config) is None else [all_of_them]
+
+    def _training(self, place: int, is_stopped: IsStopped) -> Training[None]:
         """Train the seed at this place, unless the trial ends without it; raises nothing but `Stopped`."""
 
         def is_over() -> bool:
@@ -169,7 +177,8 @@ class _Seeds:
 
         try:
             is_over()
-            self._results[place] = learn(config, self._objective.seeds[place], is_over, on_evaluation)
+            seed = self._objective.seeds[place]
+            self._results[place] = yield from learning(self._config, seed, is_over, on_evaluation)
         except _LeftError:
             return
         except Exception as error:
@@ -249,6 +258,16 @@ def learn(
         Stopped: this process was asked to end.
         Exception: what training raises.
     """
+    return run_alone(learning(config, seed, is_stopped, on_evaluation))
+
+
+def learning(
+    config: TrainConfig,
+    seed: int,
+    is_stopped: IsStopped,
+    on_evaluation: OnEvaluation = lambda share, standing: None,
+) -> Training[SeedScore]:
+    """The same as a generator, for `run_together`."""
     config = dataclasses.replace(config, seed=seed)
     mdp = check_settings(config)
     observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
@@ -262,18 +281,18 @@ def learn(
         assert curve.newest is not None
         return SeedScore(config.seed, curve.certificate.certified_since_step, curve.newest.greedy.regret)
 
-    def on_step(done: int) -> bool:
+    def on_step(done: int) -> int:
         nonlocal steps
         steps = done
         if is_stopped():
             raise Stopped
         before = curve.newest
-        goes_on = curve.on_step(done)
+        next_call = curve.on_step(done)
         if curve.newest is not None and curve.newest is not before:
             on_evaluation(curve.newest.step / config.total_timesteps, standing())
-        return goes_on
+        return next_call
 
     curve.evaluate(0)
-    agent.learn(config.total_timesteps, on_step)
+    yield Learning(agent, config.total_timesteps, on_step)
     curve.evaluate(steps)
     return standing()

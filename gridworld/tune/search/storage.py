@@ -13,6 +13,7 @@ import contextlib
 import itertools
 import json
 import math
+import threading
 import time
 import warnings
 import zlib
@@ -143,18 +144,10 @@ class StudyStorage:
 
     def load(self) -> optuna.Study:
         """The study that `begin` has made. Raises `StorageLostError` where it is gone since."""
-        return self.load_several(1)[0]
-
-    def load_several(self, count: int) -> list[optuna.Study]:
-        """The same, so many times over one connection: each can be in a trial of its own."""
         storage = optuna.storages.get_storage(self.connect())
         try:
             with _quiet():
-                pruner = _pruner(self.settings)
-                return [
-                    optuna.load_study(storage=storage, study_name=self.name, pruner=pruner)
-                    for _ in range(count)
-                ]
+                return optuna.load_study(storage=storage, study_name=self.name, pruner=_pruner(self.settings))
         except KeyError:
             raise StorageLostError(f"it has no study {self.name}") from None
 
@@ -223,6 +216,25 @@ def sign_on(trial: optuna.Trial, draw: int, worker: str) -> None:
     cast(Any, trial.storage).record_heartbeat(trial._trial_id)
     trial.set_user_attr(DRAW, draw)
     trial.set_user_attr(WORKER, worker)
+
+
+@contextlib.contextmanager
+def beating(trials: Sequence[optuna.Trial], every: float) -> Iterator[None]:
+    """Show for the block that this process runs some trials, by a sign of life every so many seconds."""
+    is_over = threading.Event()
+
+    def beat() -> None:
+        while not is_over.wait(every):
+            for trial in trials:
+                cast(Any, trial.storage).record_heartbeat(trial._trial_id)
+
+    thread = threading.Thread(target=beat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        thread.join()
 
 
 def give_up_running(study: optuna.Study) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import os
 import signal
@@ -11,19 +12,17 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from gridworld.errors import reason
 from gridworld.process.parallel.parent_watch import end_with
-from gridworld.process.parallel.together import run_together
 from gridworld.process.signals import set_on
 from gridworld.storage.file_lock import locked
 from gridworld.sweep.job_table import one_line
-from gridworld.tune.search.objective import ERROR, STOPPED, Objective, Stopped
+from gridworld.training.together import Training, run_together
+from gridworld.tune.search.objective import ERROR, STOPPED, Objective, Seeds, Stopped
 from gridworld.tune.search.worker_pool import UNREACHABLE, StorageLostError
 
 if TYPE_CHECKING:
@@ -56,12 +55,10 @@ class StudyContext:
 def run_trials(context: StudyContext, worker: int, parent: int) -> None:
     """A worker's process: run trials until there are enough. See `worker_pool.WorkerMain`."""
     become_worker(parent)
-    count = context.storage.settings.together or 1
-    own: set[int] = set()
     with study_of(context) as storage, contextlib.suppress(Stopped):
-        studies = storage.load_several(count)
-        with among_workers(studies[0], context):
-            run_all([partial(_run_trials, study, context, own) for study in studies])
+        study = storage.load()
+        with among_workers(study, context):
+            search(study, context)
     sys.exit(0)
 
 
@@ -82,14 +79,12 @@ def among_workers(study: Study, context: StudyContext) -> Iterator[None]:
         yield
 
 
-def run_all(tasks: Sequence[Callable[[], T]]) -> list[T]:
-    """Run tasks, together where they are several; returns what each returned.
+def run_all(tasks: Sequence[Callable[[], Training[T]]]) -> list[T]:
+    """Run trainings together; returns what each returned.
 
     Raises:
         Exception: what the first of them raised that failed, after the others have ended.
     """
-    if len(tasks) == 1:
-        return [tasks[0]()]
     found = []
     for result in run_together(tasks):
         if isinstance(result, Exception):
@@ -98,9 +93,20 @@ def run_all(tasks: Sequence[Callable[[], T]]) -> list[T]:
     return found
 
 
-def _run_trials(study: Study, context: StudyContext, own: set[int]) -> None:
-    while not is_stopped() and time.time() < context.deadline and _run_next(study, context, own):
-        pass
+def search(study: Study, context: StudyContext) -> None:
+    """Run trials, some at a time, until there are enough or it is time to end.
+
+    Raises:
+        Stopped: this process was asked to end.
+    """
+    while not is_stopped() and time.time() < context.deadline:
+        begun, is_over = _begin(study, context)
+        if begun:
+            _run(begun, context)
+        elif is_over:
+            return
+        else:
+            _stopped.wait(_POLL_SECONDS)  # for those that others run
 
 
 @contextlib.contextmanager
@@ -131,65 +137,81 @@ def is_stopped() -> bool:
     return _stopped.is_set()
 
 
-def _run_next(study: Study, context: StudyContext, own: set[int]) -> bool:
-    """Run a trial, or wait for those that others run; False once there are enough.
+def _begin(study: Study, context: StudyContext) -> tuple[list[Begun], bool]:
+    """Begin as many trials as train at once, or are missing; returns them, and whether there are enough."""
+    from gridworld.tune.search.storage import count_trials, give_up_stale, next_draw, seed_sampler, sign_on
 
-    Args:
-        study: the study, loaded for this trial and those after it.
-        context: what is run.
-        own: the numbers of the trials that this process runs, which are not waited for.
-    """
-    from gridworld.tune.search.storage import count_trials, give_up_stale, next_draw, seed_sampler, show_ended
-
-    settings = context.storage.settings
-    with ExitStack() as turn:
-        turn.enter_context(locked(context.folder / TURN))
-        give_up_stale(study, settings)
-        counts = count_trials(study)
-        if counts.ended >= settings.trials:
-            return False
-        if counts.ended + counts.running < settings.trials:
-            begun: list[int] = []
+    settings, begun = context.storage.settings, list[Begun]()
+    while len(begun) < (settings.together or 1):
+        with locked(context.folder / TURN):
+            give_up_stale(study, settings)
+            counts = count_trials(study)
+            if counts.ended + counts.running >= settings.trials:
+                return begun, counts.ended >= settings.trials
             draw = next_draw(study)
             place = f"{socket.gethostname()}:{context.folder.absolute()}" if settings.storage else ""
             seed_sampler(study, settings, draw, place)
             if draw == 0 and context.first is not None and counts.waiting == 0:
                 study.enqueue_trial(context.first)
-            run = partial(_run, objective=context.objective, draw=draw, turn=turn, begun=begun, own=own)
-            try:
-                study.optimize(run, n_trials=1, catch=(Exception,))
-            finally:
-                own.difference_update(begun)
-                show_ended(study)
-            return True
-    if own:
-        return False
-    _stopped.wait(_POLL_SECONDS)
-    return True
+            trial = study.ask()
+            sign_on(trial, draw, f"{socket.gethostname()}:{os.getpid()}")
+        try:
+            begun.append(Begun(study, trial, context.objective.begin(trial)))
+        except Exception as error:
+            _fail(study, trial, error)
+    return begun, False
 
 
-def _run(
-    trial: Trial, objective: Objective, draw: int, turn: ExitStack, begun: list[int], own: set[int]
-) -> float:
-    """Evaluate the objective; note the reason where it fails."""
+@dataclass(frozen=True)
+class Begun:
+    """A trial that has begun."""
+
+    study: Study
+    trial: Trial
+    seeds: Seeds
+
+    def end(self) -> None:
+        """Tell Optuna what it has come to; note the reason where it failed."""
+        import optuna
+
+        try:
+            value = self.seeds.score()
+            if math.isnan(value):
+                raise ArithmeticError("the objective is NaN")
+        except optuna.TrialPruned:
+            self.study.tell(self.trial, state=optuna.trial.TrialState.PRUNED)
+        except Exception as error:
+            _fail(self.study, self.trial, error)
+        else:
+            self.study.tell(self.trial, value)
+
+
+def _fail(study: Study, trial: Trial, error: Exception) -> None:
     import optuna
 
-    from gridworld.tune.search.storage import sign_on
+    trial.set_user_attr(ERROR, one_line(reason(error)))
+    study.tell(trial, state=optuna.trial.TrialState.FAIL)
 
-    begun.append(trial.number)
-    own.add(trial.number)
-    sign_on(trial, draw, f"{socket.gethostname()}:{os.getpid()}")
-    turn.close()
+
+def _run(begun: Sequence[Begun], context: StudyContext) -> None:
+    """Train trials that have begun, together where they can."""
+    import optuna
+
+    from gridworld.tune.search.storage import beating, show_ended
+
+    groups = [each.seeds.trainings(is_stopped) for each in begun]
     try:
-        value = objective(trial, is_stopped)
-    except optuna.TrialPruned:
+        with beating([each.trial for each in begun], context.storage.settings.heartbeat):
+            if all(len(group) == 1 for group in groups):
+                run_all([training for group in groups for training in group[0]])
+            else:
+                for part in itertools.chain.from_iterable(groups):
+                    run_all(part)
+    except BaseException:
+        for each in begun:
+            each.trial.set_user_attr(STOPPED, True)
+            each.study.tell(each.trial, state=optuna.trial.TrialState.FAIL)
         raise
-    except Stopped:
-        trial.set_user_attr(STOPPED, True)
-        raise
-    except Exception as error:
-        trial.set_user_attr(ERROR, one_line(reason(error)))
-        raise
-    if math.isnan(value):
-        trial.set_user_attr(ERROR, "the objective is NaN")
-    return value
+    for each in begun:
+        each.end()
+    show_ended(begun[0].study)

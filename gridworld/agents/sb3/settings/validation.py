@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import is_dataclass
 from typing import Any
@@ -85,29 +84,6 @@ def _check_rewards(env: EnvConfig) -> None:
         value, why = getattr(env, name), ", for networks calculate in 32 bits"
         if math.isfinite(value):  # or the world says so
             within_size(f"env.{name}", value, _LEAST_REWARD, _MOST_RETURN / times, why)
-
-
-def left_to_the_class(agent: SB3CheckedConfig) -> list[str]:
-    """The names of the settings that only SB3 or torch can judge, by making an update with them."""
-    plain = type(agent)()
-    return [
-        field.name
-        for field in dataclasses.fields(agent)
-        if not _is_judged(field.name, getattr(agent, field.name), getattr(plain, field.name))
-    ]
-
-
-def _is_judged(name: str, value: Any, default: Any) -> bool:
-    """Whether the checks here are all there is to say of it."""
-    if value == default or name in ("name", "family", "algorithm", "engine", "train_freq"):
-        return True
-    if name == "policy":
-        return "." not in value
-    if counts_transitions({name: value}):
-        return True
-    if name in (*SCHEDULES, *FALLING):
-        return parse_schedule(name, value).initial <= _ORDINARY
-    return isinstance(value, int) or (isinstance(value, float) and abs(value) <= _ORDINARY)
 
 
 def _check_observation(agent: SB3Config, observation: ObservationConfig) -> None:

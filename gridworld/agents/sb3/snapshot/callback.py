@@ -38,7 +38,7 @@ class CheckpointCallback(BaseCallback):
     state: before it is put back, and after it is saved.
 
     Args:
-        on_step: takes the steps so far; training ends when it returns False.
+        on_step: takes the steps so far; training ends when it returns 0.
         on_safe_point: takes the steps so far; None: nothing is to be saved.
         observation: of the model's environments.
         root: the code of the function that calls `learn()`.
@@ -51,7 +51,7 @@ class CheckpointCallback(BaseCallback):
 
     def __init__(
         self,
-        on_step: Callable[[int], bool],
+        on_step: Callable[[int], int],
         on_safe_point: Callable[[int], None] | None,
         observation: ObservationTable,
         root: types.CodeType,
@@ -81,7 +81,7 @@ class CheckpointCallback(BaseCallback):
                 other.init_callback(self.model)
 
     def _on_step(self) -> bool:
-        self.goes_on = self._hook(self.num_timesteps)
+        self.goes_on = self._hook(self.num_timesteps) > 0
         for index, other in enumerate(self._others):
             if not other.on_step():
                 self.goes_on = False

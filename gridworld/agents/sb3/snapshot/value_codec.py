@@ -18,7 +18,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gridworld.agents.sb3.tabulated.state_inputs import smallest_integer
 from gridworld.envs.observations import ObservationTable
 from gridworld.process.memory_budget import check_memory
 from gridworld.storage.rng_state import generator_state, plain_state, set_generator_state, set_plain_state
@@ -193,7 +192,7 @@ class ValueCodec:
         if len(flat) < _FEW_ROWS or not array.flags.c_contiguous:
             return None
         count = -(-filled(flat) // (flat[0].nbytes or 1))
-        states = np.empty(count, dtype=smallest_integer(self._observation.num_states - 1))
+        states = np.empty(count, dtype=np.min_scalar_type(self._observation.num_states - 1))
         for start in range(0, count, _PIECE):
             rows = flat[start : min(start + _PIECE, count)]
             found = self._find(rows)

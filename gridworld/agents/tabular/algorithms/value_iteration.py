@@ -65,7 +65,7 @@ class ValueIteration:
     def learn(
         self,
         total_timesteps: int,
-        on_step: Callable[[int], bool],
+        on_step: Callable[[int], int],
         on_safe_point: Callable[[int], None] | None = None,
         state: State | None = None,
     ) -> None:
