@@ -148,7 +148,7 @@ class Population:
     def safe_point(self) -> Self | None:
         """Let all runs be saved, as nothing is half done; returns the population of those that go on."""
         finite = np.isfinite(self.networks.weights.sum(dim=1).cpu().numpy())
-        for run in self.runs:
+        for run in self.going():
             if not finite[run.row] and not torch.isfinite(self.networks.weights[run.row]).all():
                 run.diverge("the network's weights are no finite number")
                 continue
@@ -208,7 +208,12 @@ def train(runs: Sequence[Run], states: Sequence[State | None]) -> None:
         if len(group) > 1 and agree(group):
             type(group[0].population)(group, [run.population.get_state(run) for run in group])
         for population in dict.fromkeys(run.population for run in group):
-            population.learn(group[0].total_timesteps)
+            try:
+                population.learn(group[0].total_timesteps)
+            except Exception as error:  # torch's, of settings that only it can judge
+                for run in group:
+                    run.failed_update = error
+                    run.error = run.error or error
 
 
 def make_networks(

@@ -67,7 +67,8 @@ class Run:
     next_call: int = field(init=False, default=0)  # the steps by which `on_step` wants to be called
     on_step: Callable[[int], int] = field(init=False, default_factory=lambda: _go_on)
     on_safe_point: Callable[[int], None] | None = field(init=False, default=None)
-    error: BaseException | None = field(init=False, default=None)
+    error: BaseException | None = field(init=False, default=None)  # that it ended with
+    failed_update: Exception | None = field(init=False, default=None)  # the same, where an update failed
 
     def begin(self, total_timesteps: int) -> None:
         """Prepare SB3's model as its `learn` does."""
@@ -148,10 +149,10 @@ class Run:
             "num_episodes": int(model._episode_num),
             "recent_episodes": [[each["r"], each["l"]] for each in model.ep_info_buffer],
             "seconds": (time.time_ns() - model.start_time) / 1e9,
-            "logged": {
-                name: [float(value), "tensorboard" in (excluded[name] or ())]
+            "logged": [
+                [name, float(value), "tensorboard" in (excluded[name] or ())]
                 for name, value in logged.items()
-            },
+            ],
         }
 
     def set_state(self, state: State) -> None:
@@ -174,5 +175,5 @@ class Run:
             {"r": float(each), "l": int(length), "t": 0.0} for each, length in state["recent_episodes"]
         )
         model.start_time = time.time_ns() - int(state["seconds"] * 1e9)
-        for name, (value, is_excluded) in state["logged"].items():
+        for name, value, is_excluded in state["logged"]:
             self.record(name, float(value), not is_excluded)

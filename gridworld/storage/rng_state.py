@@ -60,7 +60,13 @@ def set_global_state(state: State) -> None:
 
 
 def set_plain_state(generator: np.random.RandomState, state: State) -> None:
-    """Set one of numpy's legacy generators to the state of another."""
+    """Set one of numpy's legacy generators to the state of another.
+
+    Raises:
+        ValueError: the state is not of such a generator.
+    """
+    if state.keys() != generator.get_state(legacy=False).keys():
+        raise ValueError("numpy's generator has other parts")
     generator.set_state(_as_numpy(state))
 
 

@@ -12,8 +12,7 @@ from helpers.support import configure
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gridworld.agents import Learning, family
-from gridworld.agents.sb3.engine_agent import learn_together
+from gridworld.agents import Learning, family, learn_together
 from gridworld.agents.sb3.settings.engine import ACTIVATIONS
 from gridworld.engine import population
 from gridworld.envs.observations import make_observation

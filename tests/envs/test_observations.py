@@ -254,9 +254,9 @@ def test_a_world_without_what_an_observation_shows(kind, why):
 @pytest.mark.parametrize("numbers", [False, True])
 def test_agents_train_on_the_environments_own_observation(algorithm, numbers):
     import stable_baselines3
-
     from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
     from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
+
     from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 
     images = np.repeat(np.arange(4, dtype=np.uint8), 7 * 7 * 3).reshape(4, 7, 7, 3)

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gridworld.envs.joint_rollout import roll
 from helpers.support import LEARNING, SHORT, train_in
 
-from gridworld.envs.joint_rollout import roll
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.vector_env import Advance, GridWorldVectorEnv
 

@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from gridworld.envs.joint_rollout import roll
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
 from gridworld import GridWorldEnv
-from gridworld.envs.joint_rollout import roll
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.stratified import stratified_numbers
 from gridworld.envs.vector_env import GridWorldVectorEnv

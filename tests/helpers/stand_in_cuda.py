@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
+from gridworld.agents.sb3.tabulated.side_by_side import SideBySide
 from hydra.experimental.callback import Callback
 from numpy.typing import NDArray
 from omegaconf import DictConfig
@@ -11,7 +12,6 @@ from torch import Tensor
 
 from gridworld.agents import sb3
 from gridworld.agents.sb3 import factory
-from gridworld.agents.sb3.tabulated.side_by_side import SideBySide
 
 _backward = SideBySide.backward
 

@@ -13,8 +13,7 @@ import pytest
 from helpers.resuming import begin, differences, go_on, left_behind, stopped_after
 from helpers.support import SHORT, script, train_on_full_disk
 
-from gridworld.agents.sb3 import rehearsal
-from gridworld.agents.sb3.tabulated.off_policy import Update
+from gridworld.engine.dqn import DQN
 from gridworld.errors import InputError
 from gridworld.run import checkpoints as checkpoint
 from gridworld.run import writer as run
@@ -34,12 +33,9 @@ def calm(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("agent", ["dqn", "ppo", "a2c"])
-def test_numbers_that_are_none_stop_a_run(
-    agent: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_numbers_that_are_none_stop_a_run(agent: str, tmp_path: Path) -> None:
     words = [*SHORT[agent], *LESS, "checkpoint.every=100"]
     rate = "agent.arguments.learning_rate" if agent == "a2c" else "agent.learning_rate"
-    monkeypatch.setattr(rehearsal, "rehearse", lambda config, make_context: None)  # which would refuse it
     with pytest.raises(
         InputError, match=r"training diverged at update [\d,]+, after [\d,]+ steps: .* no finite"
     ):
@@ -50,14 +46,13 @@ def test_numbers_that_are_none_stop_a_run(
 def test_the_last_good_state_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     words = [*SHORT["dqn"], *LESS, "checkpoint.every=100"]
     begin(tmp_path / "calm", *words)
-    descend = Update.descend
+    targets = DQN._targets
 
-    def spoilt(self: Update, states: Any, actions: Any, targets: Any) -> Any:
-        late = self._models[0].num_timesteps > 1500
-        return descend(self, states, actions, targets * (float("nan") if late else 1))
+    def spoilt(self: DQN, *arguments: Any) -> Any:
+        return targets(self, *arguments) * (float("nan") if self.num_timesteps > 1500 else 1)
 
     with monkeypatch.context() as patched:
-        patched.setattr(Update, "descend", spoilt)
+        patched.setattr(DQN, "_targets", spoilt)
         with pytest.raises(
             InputError, match=r"training diverged at update 64, after 1,536 steps: the gradient"
         ):
@@ -72,17 +67,15 @@ def test_a_finished_run_that_fails_while_it_is_made_longer_stays_as_it_was(
     run = tmp_path / "run"
     begin(run, *SHORT["dqn"], *LESS, "checkpoint.every=100")
     before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    descend, errors = Update.descend, {"error.txt": RuntimeError("a bug"), "": InputError("diverged")}
+    targets, errors = DQN._targets, {"error.txt": RuntimeError("a bug"), "": InputError("diverged")}
 
-    def spoilt(self: Update, *arguments: Any) -> Any:
-        if (
-            self._models[0].num_timesteps > 4000
-        ):  # the finished run's checkpoint is kept beside the newest two
+    def spoilt(self: DQN, *arguments: Any) -> Any:
+        if self.num_timesteps > 4000:  # the finished run's checkpoint is kept beside the newest two
             assert len(list(run.glob("checkpoints/*.state"))) == 3
             raise error
-        return descend(self, *arguments)
+        return targets(self, *arguments)
 
-    monkeypatch.setattr(Update, "descend", spoilt)
+    monkeypatch.setattr(DQN, "_targets", spoilt)
     for trace, error in errors.items():
         with pytest.raises(type(error), match=str(error)):
             go_on(run, 5000)

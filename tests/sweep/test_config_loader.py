@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from gridworld.config.composition.for_all_seeds import converted, converting_once
 from helpers.support import CONF
 from hydra import __version__ as hydra_version
 from hydra import compose, initialize_config_dir
@@ -17,7 +18,6 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from gridworld.config.composition import for_all_seeds
 from gridworld.config.composition import loader as composition_loader
 from gridworld.config.composition.compose import register_schemas, to_config
-from gridworld.config.composition.for_all_seeds import converted, converting_once
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.sweep.config_loader import Configurations, SweepLoader

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 import torch
+from gridworld.agents.sb3.tabulated.side_by_side import SideBySide
 from helpers.hostile import manifest
 from helpers.pages import NO_PICTURES
 from helpers.resuming import differences, go_on, left_behind, stopped_after
@@ -23,7 +24,6 @@ from omegaconf import OmegaConf
 from stable_baselines3.common.policies import BasePolicy
 
 from gridworld.agents import family
-from gridworld.agents.sb3.tabulated.side_by_side import SideBySide
 from gridworld.commands import reproduce as command
 from gridworld.config.sweep import SweepConfig
 from gridworld.envs.observations import make_observation

@@ -1,11 +1,13 @@
 """The promise: the shipped settings end certified optimal on the default world, on every seed."""
 
+from functools import partial
 from pathlib import Path
 
 import pytest
-from helpers.support import train_in
+from helpers.support import configure
 
-from gridworld.process.parallel.together import run_together
+from gridworld.training.together import run_together
+from gridworld.training.train import training
 
 QUIET = (
     "recording.frames=false",
@@ -19,12 +21,12 @@ QUIET = (
 @pytest.mark.slow
 @pytest.mark.parametrize("agent", ["dqn", "ppo", "q_learning", "sarsa", "expected_sarsa", "value_iteration"])
 def test_the_default_job_is_certified(agent: str, tmp_path: Path) -> None:
-    """On ten seeds, which train together: each run is what it is alone, see agents/sb3/test_population.py."""
+    """On ten seeds, which train together: each run is what it is alone, see engine/test_populations.py."""
+    for seed in range(10):
+        (tmp_path / str(seed)).mkdir()
+    configs = [configure(f"agent={agent}", f"seed={seed}", *QUIET) for seed in range(10)]
     summaries = run_together(
-        [
-            lambda seed=seed: train_in(tmp_path / str(seed), f"agent={agent}", f"seed={seed}", *QUIET)
-            for seed in range(10)
-        ]
+        [partial(training, config, tmp_path / str(config.seed), []) for config in configs]
     )
     assert len(summaries) == 10
     for seed, summary in enumerate(summaries):

@@ -178,7 +178,7 @@ def test_the_model_of_an_evaluation_at_the_end_is_kept_for_a_longer_run() -> Non
 
 def test_training_may_stop_after_certificates_in_a_row() -> None:
     _, goes_on = follow([True, False, True, True, True], "evaluation.stop_after=3")
-    assert goes_on == [True, True, True, True, False]
+    assert [next_call > 0 for next_call in goes_on] == [True, True, True, True, False]
 
 
 def test_a_policy_that_walks_in_circles_is_reported_not_waited_for() -> None:

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from gridworld.envs.joint_rollout import roll
 from helpers.oracle import World, maps
 from helpers.support import configure
 from hypothesis import given
@@ -13,7 +14,6 @@ from scipy.stats import binom, chi2_contingency
 from gridworld.agents import family
 from gridworld.agents.sb3.tabulated import on_policy
 from gridworld.envs import rollout
-from gridworld.envs.joint_rollout import roll
 from gridworld.envs.observations import make_observation
 from gridworld.envs.rollout import play_episode, sample_episodes
 from gridworld.envs.statistics_env import StatisticsVectorEnv

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import time
+import traceback
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,17 +17,17 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.save_util import recursive_getattr
 
 from gridworld.agents import PolicySnapshot, TrainingContext, WriteScalars
-from gridworld.agents.sb3.factory import make_model
+from gridworld.agents.sb3.factory import UnfitError, cannot_update, make_model
 from gridworld.agents.sb3.falling_setting import falling_settings
 from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters, reason
-from gridworld.agents.sb3.policy_outputs import Reading, epsilon_greedy, read, read_states
+from gridworld.agents.sb3.policy_outputs import Reading, epsilon_greedy, read, read_states, why_no_table
 from gridworld.agents.sb3.settings.callbacks import make_callbacks
 from gridworld.agents.sb3.settings.schemas import SB3Config, reward_scale
 from gridworld.agents.sb3.snapshot.callback import CheckpointCallback, check_finite, diverged
 from gridworld.bounds import within
 from gridworld.config.agents import AgentConfig
 from gridworld.errors import InputError
-from gridworld.storage.serialization import State
+from gridworld.storage.serialization import State, StateError
 from gridworld.world.mdp import FloatArray, IntArray
 
 # A model file holds the optimiser's numbers beside every weight, and what SB3 pickles: the last
@@ -59,9 +61,22 @@ class SB3Agent:
         self._envs = context.envs
         self._loaded = False
         self._model = make_model(config, context, with_buffers and not context.only_asked)
+        if with_buffers:
+            self._check_table()
         self._callbacks = make_callbacks(context.callbacks)
         writers = [] if context.write_scalars is None else [_ScalarsOnly(context.write_scalars)]
         self._model.set_logger(Logger(folder=None, output_formats=list(writers)))
+
+    def _check_table(self) -> None:
+        """Check that the policy can be asked, and answers the same in the same state always."""
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # which come again while it learns
+                reason = why_no_table(self._model.policy, self.observation)
+        except Exception as error:  # the class may be anybody's
+            raise cannot_update(self.config, error) from error
+        if reason is not None:
+            raise UnfitError(self.config, reason)
 
     @property
     def model(self) -> BaseAlgorithm:
@@ -85,9 +100,19 @@ class SB3Agent:
             self._model.learn(total_timesteps, callback=self._callback, log_interval=self.config.log_interval)
         except FloatingPointError as error:
             raise diverged(self._model, str(error)) from None
-        except ValueError:  # torch's distributions refuse NaN, which SB3 lets through
+        except ValueError as error:  # torch's distributions refuse NaN, which SB3 lets through
             check_finite(self._model)
-            raise
+            raise self._first(error) from error
+        except Exception as error:
+            raise self._first(error) from error
+
+    def _first(self, error: Exception) -> Exception:
+        """What to raise where learning failed: a sentence if it was the first update, of anybody's class."""
+        is_update = any(frame.name == "train" for frame in traceback.extract_tb(error.__traceback__))
+        is_ours = isinstance(error, InputError | OSError | StateError)
+        if is_ours or not is_update or self._model._n_updates:
+            return error
+        return cannot_update(self.config, error)
 
     def get_state(self) -> State:
         """See `gridworld.agents.Agent.get_state`, for while it learns."""

@@ -13,6 +13,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 
 from gridworld.agents import Learning, PolicySnapshot, TrainingContext
 from gridworld.agents.sb3.agent import SB3Agent
+from gridworld.agents.sb3.factory import cannot_update
 from gridworld.agents.sb3.features import FIXED, LEARNED
 from gridworld.agents.sb3.settings.schemas import SB3Config, counts_transitions, reward_scale
 from gridworld.agents.sb3.settings.validation import FALLING
@@ -75,15 +76,15 @@ class EngineAgent(SB3Agent):
 
     def learn_together(self, learnings: Sequence[Learning]) -> list[BaseException | None]:
         """See `gridworld.agents.learn_together`."""
-        runs = []
-        for learning in learnings:
-            assert isinstance(learning.agent, EngineAgent)
-            run = learning.agent.run
-            run.begin(learning.total_timesteps)
-            run.on_step, run.on_safe_point = learning.on_step, learning.on_safe_point
-            runs.append(run)
-        train(runs, [learning.state for learning in learnings])
-        return [run.error for run in runs]
+        agents = [learning.agent for learning in learnings if isinstance(learning.agent, EngineAgent)]
+        for agent, learning in zip(agents, learnings, strict=True):
+            agent.run.begin(learning.total_timesteps)
+            agent.run.on_step, agent.run.on_safe_point = learning.on_step, learning.on_safe_point
+        train([agent.run for agent in agents], [learning.state for learning in learnings])
+        for agent in agents:
+            if agent.run.failed_update is not None and not agent.run.model._n_updates:
+                agent.run.error = cannot_update(agent.config, agent.run.failed_update)
+        return [agent.run.error for agent in agents]
 
     def get_state(self) -> State:
         """See `gridworld.agents.Agent.get_state`."""

@@ -13,7 +13,7 @@ from gridworld.agents import TrainingContext
 from gridworld.agents.sb3.memory_size import NoBuffer, check_model, weighed
 from gridworld.agents.sb3.policy_outputs import why_unreadable
 from gridworld.agents.sb3.settings.constructor_arguments import Arguments, algorithm_and_arguments
-from gridworld.agents.sb3.settings.schemas import SB3Config, reward_scale
+from gridworld.agents.sb3.settings.schemas import SB3ClassConfig, SB3Config, as_dict, reward_scale
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.envs.observations import ObservationTable
 from gridworld.errors import InputError
@@ -38,6 +38,23 @@ def said(error: Exception) -> str:
     """The message of a library's exception in one line."""
     lines = str(error).strip().splitlines()
     return lines[0] if lines else type(error).__name__
+
+
+def unfit(config: SB3Config, what: str, error: Exception) -> UnfitError:
+    """The error to raise where the class fails, with the settings that only it can judge."""
+    where = "agent.arguments" if isinstance(config, SB3ClassConfig) else "agent"
+    given = config.arguments if isinstance(config, SB3ClassConfig) else vars(config)
+    kwargs = as_dict(given.get("policy_kwargs") or {})
+    suspects = [f"{where}.policy_kwargs.{name}={value}" for name, value in kwargs.items() if value]
+    if isinstance(config, SB3ClassConfig):
+        suspects += [f"{where}.{name}={value}" for name, value in given.items() if name != "policy_kwargs"]
+    why = f"; look at {', '.join(suspects)}" if suspects else ""
+    return UnfitError(config, f"{what}: {said(error)}{why}")
+
+
+def cannot_update(config: SB3Config, error: Exception) -> UnfitError:
+    """The error to raise where the first update fails."""
+    return unfit(config, "cannot make its first update", error)
 
 
 def make_model(config: SB3Config, context: TrainingContext, with_buffers: bool = True) -> BaseAlgorithm:
@@ -73,7 +90,7 @@ def make_model(config: SB3Config, context: TrainingContext, with_buffers: bool =
             "agent.n_steps or n_envs, or another observation"
         ) from None
     except Exception as error:  # the class may be anybody's
-        raise UnfitError(config, f"cannot be built: {said(error)}") from error
+        raise unfit(config, "cannot be built", error) from error
     if not isinstance(getattr(model, "policy", None), BasePolicy):
         raise UnfitError(config, "cannot be built: it makes no policy")
     if model.observation_space._np_random is not None:

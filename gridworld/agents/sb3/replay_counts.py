@@ -19,32 +19,13 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from gridworld.engine.replay import systematic_sample
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State, fill
 from gridworld.world.mdp import IntArray
 
 _ROOM = 256  # transitions, at first
 _COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", "counts")
-
-
-def systematic_sample(counts: IntArray, size: int, chance: NDArray[np.float64]) -> IntArray:
-    """Draw minibatches from what was met: every N/B-th of all in a row, from a random one on.
-
-    G. Kitagawa, Monte Carlo Filter and Smoother for Non-Gaussian Nonlinear State Space Models, 1996.
-
-    Args:
-        counts: (R,), how often each transition was met, N times in all.
-        size: B, of a minibatch.
-        chance: (n,), numbers from [0, 1), where each of n minibatches begins.
-
-    Returns:
-        (n, R), how often each transition is in each minibatch, B in all.
-    """
-    ends = np.cumsum(counts)
-    before = np.ceil(size * (ends / ends[-1]) - chance[:, None])  # points before each end
-    before[:, -1] = size  # whatever was rounded
-    times: IntArray = np.diff(before, prepend=0).astype(np.int64)
-    return times
 
 
 class ReplayCounts(ReplayBuffer):

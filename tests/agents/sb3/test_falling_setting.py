@@ -1,4 +1,4 @@
-"""Settings that fall over training, in SB3's own loop and in the tabulated one."""
+"""Settings that fall over training, in SB3's own loop and in the engine."""
 
 from typing import Any
 
@@ -7,6 +7,7 @@ from stable_baselines3 import A2C, PPO
 
 import gridworld
 from gridworld.agents.sb3.falling_setting import FallingSetting
+from gridworld.engine.population import Population
 
 SHORT = (
     "total_timesteps=320",
@@ -62,18 +63,22 @@ def test_lambda_falls_to_nothing_in_plain_sb3(algorithm: Any) -> None:
 def test_a_run_has_it_by_its_setting(
     engine: str, name: str, value: str, expected: list[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found: list[float] = []
-    own = FallingSetting._set
+    found: dict[float, None] = {}  # in the order in which they were set
+    own, settings = FallingSetting._set, Population.settings
 
     def noting(callback: FallingSetting) -> None:
         own(callback)
         model: Any = callback.model
-        found.append(model.lr_schedule(0) if name == "learning_rate" else getattr(model, name))
+        found[model.lr_schedule(0) if name == "learning_rate" else getattr(model, name)] = None
+
+    def asked(population: Population, asked_for: str) -> list[float]:
+        numbers = settings(population, asked_for)
+        if asked_for == name:
+            found[numbers[0]] = None
+        return numbers
 
     monkeypatch.setattr(FallingSetting, "_set", noting)
-    words = ("agent=ppo", f"agent.engine={engine}", *SHORT)
-    falling = gridworld.train(*words, f"agent.{name}={value}")
-    assert found == pytest.approx(expected)
+    monkeypatch.setattr(Population, "settings", asked)
+    falling = gridworld.train("agent=ppo", f"agent.engine={engine}", *SHORT, f"agent.{name}={value}")
+    assert list(found) == pytest.approx(expected)
     assert getattr(falling.config.agent, name) == value
-    gridworld.train(*words, f"agent.{name}=0.5")
-    assert len(found) == 5

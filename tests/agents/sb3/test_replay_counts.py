@@ -2,26 +2,23 @@
 
 import copy
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from gymnasium import spaces
 from helpers.support import SHORT, train_in
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import DQN
-from stable_baselines3.common.callbacks import CallbackList
-from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
 from gridworld import GridWorldVectorEnv
-from gridworld.agents.sb3.replay_counts import ReplayCounts, systematic_sample
-from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
+from gridworld.agents.sb3.replay_counts import ReplayCounts
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
+from gridworld.engine.replay import CountedReplay, systematic_sample
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.storage.serialization import StateError
@@ -106,31 +103,39 @@ def test_in_sb3s_own_loop_every_transition_is_counted() -> None:
     assert kept(other) == model.told
 
 
-def test_the_engine_counts_the_same_and_makes_the_same_update() -> None:
-    settings: dict[str, Any] = {"replay_buffer_class": ReplayCounts, "seed": 0, "device": "cpu"}
-    settings |= {"exploration_initial_eps": 0.0, "exploration_final_eps": 0.0, "learning_starts": 0}
-    ours, theirs = (cls("MlpPolicy", batch(), **settings) for cls in (TabulatedDQN, DQN))
-    theirs.policy.load_state_dict(ours.policy.state_dict())
-    for model in (ours, theirs):
-        model._setup_learn(10_000)
-        callback = CallbackList([])
-        callback.init_callback(model)
-        for _ in range(3):
-            frequency = TrainFreq(40, TrainFrequencyUnit.STEP)
-            model.collect_rollouts(model.env, callback, frequency, model.replay_buffer)
-    states, actions, following, rewards, ends, _ = (
-        part[0].tolist() for part in ours.replay_buffer.draw(1, 10, np.random.RandomState(0))
+def steps(seed: int, count: int) -> Iterator[tuple[Any, ...]]:
+    """Steps of 16 environments: states, actions, next states, rewards and whether they ended, or were cut."""
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        states, following = rng.integers(30, size=(2, NUM_ENVS))
+        actions, rewards = rng.integers(4, size=NUM_ENVS), rng.integers(-1, 2, size=NUM_ENVS) / 4
+        dones, cut = rng.random((2, NUM_ENVS)) < 0.3
+        yield states, actions, following, rewards, dones, cut
+
+
+def test_the_engine_counts_the_same() -> None:
+    ours = CountedReplay(2, 30, 4)
+    theirs = ReplayCounts(1, spaces.Box(0, 1, (30,)), spaces.Discrete(4), n_envs=NUM_ENVS)
+    rows = np.eye(30, dtype=np.float32)
+    for states, actions, following, rewards, dones, cut in steps(0, 40):
+        infos = [{"TimeLimit.truncated": bool(each)} for each in cut]
+        theirs.add(rows[states], rows[following], actions, rewards, dones, infos)
+        ours.store(*(np.stack([each] * 2) for each in (states, actions, following, rewards, dones & ~cut)))
+    total = 40 * NUM_ENVS
+    for run in range(2):
+        drawn = ours.draw([np.random.RandomState(0)] * 2, 1, total)  # each as often as it was met
+        *columns, ends, shares = (column[0, run].tolist() for column in drawn)
+        times = [round(share * total) for share in shares]
+        keys = zip(*columns, map(bool, ends), strict=True)
+        assert Counter(dict(zip(keys, times, strict=True))) == kept(theirs)
+    alone = CountedReplay(1, 30, 4)
+    alone.set_state(0, ours.get_state(1))
+    one, other = (
+        each.draw([np.random.RandomState(5) for _ in range(runs)], 3, 50)
+        for each, runs in ((ours, 2), (alone, 1))
     )
-    keys = zip(states, actions, following, rewards, map(bool, ends), strict=True)
-    counted = Counter(dict(zip(keys, ours.replay_buffer.counts.tolist(), strict=True)))
-    assert counted == kept(theirs.replay_buffer)
-    total = 3 * 40 * NUM_ENVS
-    assert counted.total() == total
-    for model in (ours, theirs):
-        model.train(2, total)  # each transition as often as it was met
-    for mine, peer in zip(ours.policy.parameters(), theirs.policy.parameters(), strict=True):
-        assert torch.allclose(mine, peer, rtol=1e-4, atol=1e-6)
-    assert ours.replay_buffer.pos == total
+    for mine, again in zip(one, other, strict=True):
+        assert np.array_equal(mine[:, :1], again)
 
 
 @pytest.mark.parametrize(
@@ -145,12 +150,13 @@ def test_the_engine_counts_the_same_and_makes_the_same_update() -> None:
     ],
 )
 def test_a_state_of_no_transitions_of_this_world_is_refused(name: str, change: Callable[[Any], Any]) -> None:
-    model = TabulatedDQN("MlpPolicy", batch(), replay_buffer_class=ReplayCounts, learning_starts=400)
-    state = model.learn(192).replay_buffer.get_state()
+    replay = CountedReplay(1, 30, 4)
+    for states, actions, following, rewards, dones, _ in steps(1, 12):
+        replay.store(*(each[None] for each in (states, actions, following, rewards, dones)))
+    state = replay.get_state(0)
     with pytest.raises(StateError, match="must be"):
-        model.replay_buffer.set_state({**state, name: change(state[name])})
-    model.replay_buffer.set_state(state)
-    assert model.replay_buffer.pos == 192
+        replay.set_state(0, {**state, name: change(state[name])})
+    replay.set_state(0, state)
 
 
 def test_it_takes_the_memory_of_the_transitions_alone() -> None:
