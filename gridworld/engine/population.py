@@ -15,6 +15,7 @@ from gridworld.engine.networks import Array, DenseNetworks, ModuleNetworks, Netw
 from gridworld.engine.optimizer import Optimizer
 from gridworld.engine.run import Run
 from gridworld.process.console.terminal import tell
+from gridworld.process.parallel.together import mixed
 from gridworld.storage.serialization import State, StateError, fill, fitting
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
@@ -61,7 +62,8 @@ class Population:
     def kind(cls, run: Run) -> Hashable:
         """Equal for runs that can form a population; of runs in large worlds each is of its own kind."""
         model, envs, mdp = run.model, run.envs, run.envs.mdp
-        if mdp.num_states > FEW_STATES or not DenseNetworks.fit(run.nets, run.parameters):
+        fits = mdp.num_states <= FEW_STATES and DenseNetworks.fit(run.nets, run.parameters)
+        if not fits or not (model.device.type == "cpu" or mixed()):
             return id(run)
         settings = [repr(getattr(model, name)) for name in cls.same]
         optimizer = {**model.policy.optimizer.param_groups[0], "lr": None, "params": None}
@@ -246,20 +248,22 @@ _agreed: dict[Hashable, bool] = {}  # by kind, number of runs and threads
 
 
 def agree(runs: Sequence[Run]) -> bool:
-    """Whether these networks at once give the numbers of each alone, to the last bit.
+    """Whether these networks at once give the numbers of each alone, to the last bit, or need not.
 
     A batched product calls for each matrix the routine that it calls for one alone, on most processors and
     for most shapes. It is tried out once in a process for each kind and number of networks.
     """
+    if len(runs) == 1 or mixed():
+        return True
     key = runs[0].population.kind(runs[0]), len(runs), torch.get_num_threads()
-    if len(runs) > 1 and key not in _agreed:
+    if key not in _agreed:
         _agreed[key] = _try_out(runs)
         if not _agreed[key]:
             tell(
                 "population: this processor or torch adds up otherwise for several networks like these at "
                 "once; such runs train one by one"
             )
-    return len(runs) == 1 or _agreed[key]
+    return _agreed[key]
 
 
 def _try_out(runs: Sequence[Run]) -> bool:

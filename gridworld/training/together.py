@@ -97,7 +97,7 @@ class _Together:
         try:
             return learn_together([run.learning for run in runs if run.learning is not None])
         finally:
-            self._seconds = self._elapsed()
+            self._seconds += time.perf_counter() - self._started
             self._started = None
 
     def share(self) -> float:

@@ -3,6 +3,8 @@
 import csv
 import json
 import struct
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,8 @@ from gridworld.agents import sb3, tabular
 from gridworld.restore.resume import open_unfinished
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.storage.serialization import decode
-from gridworld.training.train import train
+from gridworld.training.together import run_together
+from gridworld.training.train import train, training
 
 OF_THE_CLOCK = {"train_seconds", "evaluation_seconds"}
 TIMED_TAGS = {"time/fps"}
@@ -29,6 +32,13 @@ class Crash(BaseException):
 def begin(folder: Path, *overrides: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     train(configure(*overrides), folder, list(overrides))
+
+
+def begin_all(runs: Sequence[tuple[Path, Sequence[str]]]) -> list[Any]:
+    """The same of several runs that train together; returns their summaries, or how they failed."""
+    for folder, _ in runs:
+        folder.mkdir(parents=True, exist_ok=True)
+    return run_together([partial(training, configure(*words), folder, list(words)) for folder, words in runs])
 
 
 def go_on(folder: Path, total_timesteps: int | None = None) -> None:

@@ -27,6 +27,7 @@ from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.job import run_in_sweep
 from gridworld.sweep.job_table import JobTable
 from gridworld.training.pictures import Pictures
+from gridworld.training.together import run_alone
 from gridworld.visualization.animation import animation_of_states
 from gridworld.visualization.video import save_pngs
 from gridworld.world.grid import compile_mdp
@@ -127,13 +128,13 @@ def test_who_works_for_a_sweep_stops_with_it(tmp_path: Path, monkeypatch: pytest
         assert held()
         job = sweep / "seed=0"
         job.mkdir()
-        run_in_sweep(configure(*WORDS), job, WORDS, stop_at_failure=False)
+        run_alone(run_in_sweep(configure(*WORDS), job, WORDS, stop_at_failure=False))
         kept = (sweep / LOCK).rename(tmp_path / "kept")
         assert kept.exists()
         (sweep / LOCK).touch()
         before = content(sweep)
         with pytest.raises(FolderLostError, match=TOLD):
-            run_in_sweep(configure(*WORDS), job, WORDS, stop_at_failure=False)
+            run_alone(run_in_sweep(configure(*WORDS), job, WORDS, stop_at_failure=False))
         assert content(sweep) == before
 
 
@@ -154,7 +155,7 @@ def test_a_job_that_lost_its_folder_fails_alone(
     with SweepFolder(sweep).at_work():
         job.mkdir()
         with pytest.raises(JobError, match=TOLD):
-            run_in_sweep(configure(*WORDS), job, WORDS, stop_at_failure=False)
+            run_alone(run_in_sweep(configure(*WORDS), job, WORDS, stop_at_failure=False))
     row = JobTable(sweep).read()["seed=0"]
     assert (row.status, "no longer this process's" in row.error) == ("failed", True)
     assert content(job) == content(stranger)

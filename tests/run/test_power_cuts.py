@@ -29,6 +29,7 @@ from gridworld.sweep.folder import SweepFolder, open_sweep
 from gridworld.sweep.job import run_in_sweep
 from gridworld.sweep.job_table import DONE, FAILED, JobTable
 from gridworld.sweep.plan import plan
+from gridworld.training.together import run_alone
 
 CUTS = int(os.environ.get("GRIDWORLD_POWER_CUTS", "8"))
 LESS = ["recording.frames=false", "recording.gif=false", "recording.learning=false", "logging.progress=false"]
@@ -118,7 +119,11 @@ def run_sweep(folder: Path) -> None:
         for entry in entries:
             if rows[entry.job].status != DONE:
                 (folder / entry.job).mkdir(exist_ok=True)
-                run_in_sweep(configure(*entry.overrides), folder / entry.job, list(entry.overrides), False)
+                run_alone(
+                    run_in_sweep(
+                        configure(*entry.overrides), folder / entry.job, list(entry.overrides), False
+                    )
+                )
         table.repair(sweep.entries.values())
 
 

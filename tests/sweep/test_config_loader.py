@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from gridworld.config.composition.for_all_seeds import converted, converting_once
 from helpers.support import CONF
 from hydra import __version__ as hydra_version
 from hydra import compose, initialize_config_dir
@@ -15,10 +14,8 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from gridworld.config.composition import for_all_seeds
 from gridworld.config.composition import loader as composition_loader
 from gridworld.config.composition.compose import register_schemas, to_config
-from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.sweep.config_loader import Configurations, SweepLoader
 from gridworld.sweep.plan import expand
@@ -213,34 +210,3 @@ def test_jobs_that_differ_in_the_seed_only_are_composed_once(
     assert len(composed) == compositions
     for job, config in zip(jobs, configs, strict=True):
         assert config == to_config(SweepLoader(loader).load_settings(master, job))
-
-
-def test_settings_that_differ_in_the_seed_only_are_converted_once(
-    loader: ConfigLoader, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    master = loader.load_configuration("train", [], RunMode.MULTIRUN)
-    conversions: list[DictConfig] = []
-
-    def counted(settings: DictConfig) -> TrainConfig:
-        conversions.append(settings)
-        return to_config(settings)
-
-    def settings(*words: str) -> DictConfig:
-        return SweepLoader(loader).load_settings(master, list(words))
-
-    monkeypatch.setattr(for_all_seeds, "to_config", counted)
-    slips = [
-        settings("agent=ppo", f"env.slip={slip}", f"seed={seed}") for slip in (0, 0.1) for seed in (4, 5, 6)
-    ]
-    following = [settings("n_envs=${seed}", f"seed={seed}") for seed in (4, 5)]
-    leading = [settings("seed=${n_envs}", f"n_envs={count}") for count in (4, 5)]
-    with converting_once():
-        found = [converted(each) for each in slips]
-        assert len(conversions) == 2
-        assert [converted(each).n_envs for each in following] == [4, 5]
-        assert [converted(each).seed for each in leading] == [4, 5]
-    assert found == [to_config(each) for each in slips]
-    assert found[0].callbacks is not found[1].callbacks  # what one run changes is not another's
-    conversions.clear()
-    assert [converted(each) for each in slips] == found
-    assert len(conversions) == len(slips)

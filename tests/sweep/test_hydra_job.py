@@ -20,6 +20,7 @@ from gridworld.config.composition.compose import register_schemas, to_config
 from gridworld.sweep import hydra_job
 from gridworld.sweep.config_loader import SweepLoader
 from gridworld.sweep.launchers import select
+from gridworld.training.together import run_alone
 
 
 class Callbacks(SimpleNamespace):
@@ -36,6 +37,10 @@ def loader() -> Iterator[SweepLoader]:
     utils.setup_globals()
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         yield SweepLoader(GlobalHydra.instance().hydra.config_loader)  # type: ignore[union-attr]
+
+
+def run_job(*arguments: object, **keys: object) -> object:
+    return run_alone(hydra_job.job(*arguments, **keys))  # type: ignore[arg-type]
 
 
 OVERRIDES = [
@@ -81,7 +86,7 @@ def test_files_variables_and_results_are_hydras(
 
     theirs = result(utils.run_job, again=False)
     for _ in range(2):  # afresh, and from what is kept
-        assert result(hydra_job.run_job, again=True) == theirs
+        assert result(run_job, again=True) == theirs
 
 
 def test_a_failed_job_has_its_error(loader: SweepLoader, tmp_path: Path) -> None:
@@ -91,7 +96,7 @@ def test_a_failed_job_has_its_error(loader: SweepLoader, tmp_path: Path) -> None
     master = loader.load_configuration("train", [f"hydra.sweep.dir={tmp_path}"], RunMode.MULTIRUN)
     config = loader.load_sweep_config(master, ["seed=5", "hydra.sweep.subdir=x"])
     context = HydraContext(config_loader=loader, callbacks=Callbacks())  # type: ignore[arg-type]
-    done = hydra_job.run_job(task, config, "hydra.sweep.dir", "hydra.sweep.subdir", context)
+    done = run_job(task, config, "hydra.sweep.dir", "hydra.sweep.subdir", context)
     assert done.status is JobStatus.FAILED
     with pytest.raises(ValueError, match="5"):
         _ = done.return_value
@@ -102,6 +107,6 @@ def test_our_basic_launcher_gives_what_hydras_gives() -> None:
     from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 
     source = inspect.getsource(BasicLauncher.launch)
-    given = set(inspect.signature(hydra_job.run_job).parameters) - {"configures_logging"}
+    given = set(inspect.signature(hydra_job.job).parameters) - {"configures_logging"}
     assert all(f"{name}=" in source for name in given)
     assert f"{BasicLauncher.__module__}.{BasicLauncher.__name__}" == select._HYDRAS

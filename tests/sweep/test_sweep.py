@@ -32,6 +32,7 @@ from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.job_table import JobRow, JobTable
 from gridworld.sweep.progress import sweep_line
 from gridworld.sweep.results import results_lines
+from gridworld.training.together import run_alone
 
 QUICK = ("agent=q_learning", "total_timesteps=500", *NO_PICTURES)
 FOLDER = "hydra.sweep.dir=sweep"
@@ -333,10 +334,10 @@ def test_a_job_that_a_full_disk_ended_goes_on_from_its_checkpoint(
 
     monkeypatch.setattr(AppendLog, "append", fill)
     with pytest.raises(JobError, match="No space left on device"):
-        run_in_sweep(configure(*words), folder, list(words), stop_at_failure=False)
+        run_alone(run_in_sweep(configure(*words), folder, list(words), stop_at_failure=False))
     assert statuses(tmp_path) == {"seed=0": "interrupted"}
     monkeypatch.setattr(AppendLog, "append", append)
-    assert run_in_sweep(configure(*words), folder, list(words), stop_at_failure=False) >= 0
+    assert run_alone(run_in_sweep(configure(*words), folder, list(words), stop_at_failure=False)) >= 0
     assert statuses(tmp_path) == {"seed=0": "done"}
     assert json.loads((folder / "manifest.json").read_text())["resumed"][0]["step"] > 0
 
@@ -350,7 +351,7 @@ def test_a_table_that_cannot_be_written_is_no_fault_of_the_job(
     (tmp_path / "seed=0").mkdir()
     monkeypatch.setattr(JobTable, "set", fail)
     with pytest.raises(OSError, match="No space left on device"):
-        run_in_sweep(configure(*QUICK), tmp_path / "seed=0", [], stop_at_failure=False)
+        run_alone(run_in_sweep(configure(*QUICK), tmp_path / "seed=0", [], stop_at_failure=False))
     assert not (tmp_path / "seed=0" / "manifest.json").exists()
 
 

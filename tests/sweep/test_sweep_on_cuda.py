@@ -12,16 +12,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from gridworld.agents.sb3.tabulated.side_by_side import SideBySide
 from helpers.hostile import manifest
 from helpers.pages import NO_PICTURES
 from helpers.resuming import differences, go_on, left_behind, stopped_after
 from helpers.stand_in_cuda import stand_in
 from helpers.support import ROOT, configure, script
 from omegaconf import OmegaConf
-from stable_baselines3.common.policies import BasePolicy
 
 from gridworld.agents import family
 from gridworld.commands import reproduce as command
@@ -221,37 +220,32 @@ def agents(count: int, *words: str) -> list[Any]:
     contexts = [
         make_context(config, mdp, make_observation(mdp, config.observation.kind)) for _ in range(count)
     ]
-    return [family(config.agent).build(config.agent, context).model for context in contexts]
+    return [family(config.agent).build(config.agent, context) for context in contexts]
 
 
-def test_on_cuda_networks_are_of_one_kind_only_where_that_is_asked_for(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    plain = agents(2)
+def test_on_cuda_networks_are_of_one_kind_only_where_that_is_asked_for() -> None:
+    runs = [agent.run for agent in agents(2)]
+    for run in runs:
+        run.begin(100)
+        run.model.device = torch.device("cuda")
+    assert len({run.population.kind(run) for run in runs}) == 2
     with mixing({"a": "", "b": ""}):
-        asked = agents(2)
-    monkeypatch.setattr(BasePolicy, "device", torch.device("cuda"))
-    assert len({model.inputs.kind for model in plain}) == 2
-    assert len({model.inputs.kind for model in asked}) == 1
+        assert len({run.population.kind(run) for run in runs}) == 1
 
 
 @pytest.mark.parametrize("words", [["agent=ppo"], ["agent=dqn", "observation=coordinates"], ["agent=qrdqn"]])
 def test_all_tensors_are_made_where_the_weights_are(words: list[str]) -> None:
     """A tensor that is made on torch's default device instead has no numbers here, and mixes with none."""
-    models = agents(2, *words)
-    optimizers = [model.descent for model in models]
-    for optimizer in optimizers:
-        optimizer.gradient.fill_(1)
-        optimizer.advance()  # makes the optimiser's own state
-    models[0].outputs_of_all()  # and the features
-    before = [optimizer.weights.clone() for optimizer in optimizers]
-    with torch.device("meta"), SideBySide(optimizers) as rows:
-        outputs = models[0].outputs_of_all(rows.leaves)
-        slopes = [output.detach().numpy() for output in outputs]
-        assert rows.step(outputs, slopes, [1e-3, 1e-3], [0, 1]) == [True, True]
-    for optimizer, weights in zip(optimizers, before, strict=True):
-        assert optimizer.weights.device.type == "cpu"
-        assert not torch.equal(optimizer.weights, weights)
+    runs = [agent.run for agent in agents(2, *words)]
+    population = type(runs[0].population)(runs, [run.population.get_state(run) for run in runs])
+    networks, active = population.networks, np.ones(2, dtype=np.bool_)
+    before = networks.weights.clone()
+    with torch.device("meta"):
+        for _ in range(2):
+            networks.backward(*map(np.ones_like, networks.run()))
+            assert population.optimizer.step([1e-3, 1e-3], active).all()
+    assert networks.weights.device.type == "cpu"
+    assert not torch.equal(networks.weights, before)
 
 
 @pytest.mark.parametrize(("device", "found"), [("cpu", True), ("cuda", False), ("auto", False), ("?", True)])

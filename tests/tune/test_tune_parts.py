@@ -1,5 +1,7 @@
 """The parts of tuning: the score, search spaces, what Optuna is told, and how trials end."""
 
+from __future__ import annotations
+
 import contextlib
 import dataclasses
 import itertools
@@ -8,7 +10,8 @@ import math
 import os
 import shutil
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -33,7 +36,7 @@ from gridworld.tune.search import storage, worker
 from gridworld.tune.search.objective import Objective, SeedScore, Stopped, score
 from gridworld.tune.search.search_space import SearchSpace, with_values
 from gridworld.tune.search.storage import StudyStorage, count_trials, is_lost
-from gridworld.tune.search.worker import StudyContext, _run_next
+from gridworld.tune.search.worker import StudyContext, search
 from gridworld.tune.search.worker_pool import StorageLostError
 from gridworld.tune.study_folder import SEARCH_JSON, is_claimed, write_trials
 from gridworld.tune.study_spec import ConfFolders, compose_study
@@ -177,14 +180,31 @@ def test_a_pruned_trial_spares_its_other_seeds() -> None:
     assert max(study.trials[0].intermediate_values) == 9
 
 
+@dataclass
+class Plain:
+    """An objective that trains nothing: a function of the trial."""
+
+    function: Callable[[optuna.Trial, Any], float]
+    trial: Any = None
+
+    def begin(self, trial: optuna.Trial) -> Plain:
+        return Plain(self.function, trial)
+
+    def trainings(self, is_stopped: object) -> list[Any]:
+        return [[]]
+
+    def score(self) -> float:
+        return self.function(self.trial, None)
+
+
 def study_of(
-    folder: Path, objective: object, trials: int, sampler: str = "tpe"
+    folder: Path, objective: Any, trials: int, sampler: str = "tpe"
 ) -> tuple[optuna.Study, StudyContext]:
     settings = TuneConfig(trials=trials, heartbeat=1, sampler=sampler)
     url = f"sqlite:///{folder / 'study.db'}"
     storage = StudyStorage(url, "one", settings)
     storage.begin({})
-    return storage.load(), StudyContext(folder, storage, objective, math.inf)  # type: ignore[arg-type]
+    return storage.load(), StudyContext(folder, storage, Plain(objective), math.inf)  # type: ignore[arg-type]
 
 
 def test_what_fails_is_a_trial_with_its_reason_and_the_study_goes_on(tmp_path: Path) -> None:
@@ -199,8 +219,7 @@ def test_what_fails_is_a_trial_with_its_reason_and_the_study_goes_on(tmp_path: P
         return answer
 
     study, context = study_of(tmp_path, objective, 5)
-    while _run_next(study, context, set()):
-        pass
+    search(study, context)
     now = count_trials(study)
     assert (now.complete, now.failed, now.ended) == (2, 3, 5)
     assert study.best_value == 0.25
@@ -222,8 +241,7 @@ def test_the_pruner_sees_at_once_what_its_process_has_ended(tmp_path: Path) -> N
         return value
 
     study, context = study_of(tmp_path, objective, 10)
-    while _run_next(study, context, set()):
-        pass
+    search(study, context)
     pruned = [trial.number for trial in study.trials if trial.state == optuna.trial.TrialState.PRUNED]
     assert pruned == [6, 8]  # the medians before them are 0.475 and 0.45
 
@@ -236,26 +254,23 @@ def test_a_trial_whose_worker_is_lost_before_its_first_sign_of_life_is_run_again
     lost = study.ask()  # and nothing more: Optuna takes it for alive
     monkeypatch.setattr(worker._stopped, "wait", lambda seconds: None)
     for _ in range(3):
-        assert _run_next(study, context, set())  # it may still be about to begin
+        assert worker._begin(study, context) == ([], False)  # it may still be about to begin
     assert [trial.number for trial in study.trials] == [lost.number]
     monkeypatch.setattr(storage, "_SILENT_BEATS", 0)
-    while _run_next(study, context, set()):
-        pass
+    search(study, context)
     states = optuna.trial.TrialState
     assert [trial.state for trial in study.trials] == [states.FAIL, states.COMPLETE]
     assert is_lost(study.trials[0])
 
 
-@pytest.mark.filterwarnings("ignore:Heartbeat of storage")  # of `ask`
 def test_who_runs_a_trial_is_known_after_a_sign_of_life(tmp_path: Path) -> None:
     def objective(trial: optuna.Trial, is_stopped: object) -> float:
         with contextlib.closing(sqlite3.connect(tmp_path / "study.db")) as database:
             return float(database.execute("SELECT COUNT(*) FROM trial_heartbeats").fetchone()[0])
 
-    study, _ = study_of(tmp_path, objective, 1)
-    trial = study.ask()  # without the thread that Optuna has for it
-    with contextlib.ExitStack() as turn:
-        assert worker._run(trial, objective, 0, turn, [], set()) == 1
+    study, context = study_of(tmp_path, objective, 1)
+    search(study, context)
+    assert study.best_value == 1
     assert study.trials[0].user_attrs.keys() >= {"worker"}
 
 
@@ -407,8 +422,7 @@ def test_training_that_diverges_is_such_a_failure(tmp_path: Path) -> None:
     )
     space = SearchSpace({"agent.clip_range": DimensionConfig("float", low=0.1, high=0.3)}, "own")
     study, context = study_of(tmp_path, Objective(asked.measured, space, asked.seeds, 10, 2), 1)
-    while _run_next(study, context, set()):
-        pass
+    search(study, context)
     assert "diverged" in study.trials[0].user_attrs["error"]
 
 

@@ -3,7 +3,6 @@
 import math
 import threading
 from collections import Counter
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +16,10 @@ from gridworld.tune import finalists
 from gridworld.tune.finalists import FinalRuns
 from gridworld.tune.search import objective as objective_module
 from gridworld.tune.search import worker as worker_module
-from gridworld.tune.search.objective import Objective, Stopped, learn
+from gridworld.tune.search.objective import Objective, Stopped, learn, learning
 from gridworld.tune.search.search_space import SearchSpace
 from gridworld.tune.search.storage import StudyStorage, draw_of, is_lost
-from gridworld.tune.search.worker import StudyContext, _run_trials, run_all
+from gridworld.tune.search.worker import StudyContext
 from gridworld.tune.search.worker_pool import share
 from gridworld.tune.study_spec import ConfFolders, compose_study
 
@@ -69,7 +68,7 @@ def test_seeds_that_train_together_are_those_that_train_one_by_one(
         begun[seed] += 1
         if trials.setdefault(config.agent.learning_rate, len(trials)) == 3 and seed == 1:
             raise ZeroDivisionError("in the fourth trial's second seed")
-        return learn(config, seed, *more)
+        return learning(config, seed, *more)
 
     def found() -> list[tuple[Any, ...]]:
         begun.clear()
@@ -77,7 +76,7 @@ def test_seeds_that_train_together_are_those_that_train_one_by_one(
         study.optimize(lambda trial: objective(trial, lambda: False), n_trials=5, catch=ZeroDivisionError)
         return [told(trial) for trial in study.trials]
 
-    monkeypatch.setattr(objective_module, "learn", noted)
+    monkeypatch.setattr(objective_module, "learning", noted)
     together = found()
     assert begun == {0: 5, 1: 5, 2: 5}
     monkeypatch.setattr(objective_module, "shape", lambda config: None)
@@ -88,39 +87,32 @@ def test_seeds_that_train_together_are_those_that_train_one_by_one(
 
 
 def search(folder: Path, objective: Objective, trials: int, together: int) -> list[FrozenTrial]:
-    settings = TuneConfig(trials=trials, sampler="random", heartbeat=60)
+    settings = TuneConfig(trials=trials, sampler="random", heartbeat=60, together=together)
     storage = StudyStorage(f"sqlite:///{folder / 'study.db'}", "one", settings)
     storage.begin({})
     context = StudyContext(folder, storage, objective, math.inf)
-    studies = storage.load_several(together)
-    for study in studies:
-        study.pruner = PRUNER
-    own: set[int] = set()
-    try:
-        run_all([partial(_run_trials, study, context, own) for study in studies])
-    finally:
-        assert not own
-    return studies[0].get_trials()
+    study = storage.load()
+    study.pruner = PRUNER
+    worker_module.search(study, context)
+    return study.get_trials()
 
 
 def test_trials_that_train_together_are_those_that_train_one_by_one(
     objective: Objective, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from gridworld.agents.sb3.tabulated import ppo
-
     sizes = []
+    learn_together = worker_module.run_together
 
-    def noted(update: Any, runs: Any) -> Any:
-        sizes.append(len(runs))
-        return update_together(update, runs)
+    def noted(trainings: Any) -> Any:
+        sizes.append(len(trainings))
+        return learn_together(trainings)
 
-    update_together = ppo.update_together
-    monkeypatch.setattr(ppo, "update_together", noted)
+    monkeypatch.setattr(worker_module, "run_together", noted)
     found = []
     for together in (1, 3):
         (tmp_path / str(together)).mkdir()
         found.append([told(trial) for trial in search(tmp_path / str(together), objective, 5, together)])
-        assert max(sizes) > 3 * (together - 1)
+        assert max(sizes) == 3 * together
     assert found[0] == found[1]
     assert [number for number, trial in enumerate(found[1]) if trial[0] == TrialState.PRUNED] == [1, 2, 4]
 

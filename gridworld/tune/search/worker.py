@@ -11,6 +11,7 @@ import socket
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -153,7 +154,9 @@ def _begin(study: Study, context: StudyContext) -> tuple[list[Begun], bool]:
             seed_sampler(study, settings, draw, place)
             if draw == 0 and context.first is not None and counts.waiting == 0:
                 study.enqueue_trial(context.first)
-            trial = study.ask()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # that `ask` has no heartbeat, for which there is `beating`
+                trial = study.ask()
             sign_on(trial, draw, f"{socket.gethostname()}:{os.getpid()}")
         try:
             begun.append(Begun(study, trial, context.objective.begin(trial)))

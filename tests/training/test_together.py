@@ -1,0 +1,250 @@
+"""Trainings that run together: none can tell that the others are there."""
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar, copy_context
+from functools import partial
+from typing import Any
+
+import pytest
+
+from gridworld.agents import Learning
+from gridworld.process import signals
+from gridworld.process.parallel.together import clock
+from gridworld.process.signals import Interrupted, StopRequest
+from gridworld.training.together import Training, run_alone, run_together
+
+NAME: ContextVar[str] = ContextVar("name", default="outside")
+
+
+@pytest.fixture(autouse=True)
+def handlers_are_put_back() -> Iterator[None]:
+    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGALRM)
+    yield
+    assert signals._listeners == []
+    assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGALRM)) == before
+    assert signal.getitimer(signal.ITIMER_REAL)[0] == 0
+
+
+class Walker:
+    """An agent that makes steps in turn with all others of its class, as a population does."""
+
+    together: list[int]
+
+    def __init__(self, name: str, at_step: dict[int, Callable[[], Any]] | None = None) -> None:
+        self.name, self.at_step = name, at_step or {}
+
+    def learn(self, total: int, on_step: Any, on_safe_point: Any = None, state: Any = None) -> None:
+        (error,) = self.learn_together([Learning(self, total, on_step, on_safe_point, state)])  # type: ignore[arg-type]
+        if error is not None:
+            raise error
+
+    def learn_together(self, learnings: Sequence[Learning]) -> list[BaseException | None]:
+        Walker.together.append(len(learnings))
+        errors: dict[int, BaseException | None] = {}
+        for step in range(1, 1 + max(each.total_timesteps for each in learnings)):
+            for place, each in enumerate(learnings):
+                if place in errors:
+                    continue
+                try:
+                    agent: Any = each.agent
+                    if each.on_safe_point is not None:
+                        each.on_safe_point(step)
+                    agent.at_step.get(step, int)()  # of nobody's own: what it raises ends all
+                    if not each.on_step(step) or step >= each.total_timesteps:
+                        errors[place] = None
+                except signals.Interrupted:
+                    raise
+                except BaseException as error:
+                    errors[place] = error
+        return [errors[place] for place in range(len(learnings))]
+
+
+@pytest.fixture(autouse=True)
+def nobody_yet() -> None:
+    Walker.together = []
+
+
+def walk(
+    log: list[str],
+    name: str,
+    steps: int = 3,
+    at_step: dict[int, Callable[[], Any]] | None = None,
+    then: Callable[[], Any] = int,
+) -> Training[str]:
+    assert NAME.get() == "outside"
+    NAME.set(name)
+    seen: list[int] = []
+
+    def on_step(step: int) -> int:
+        assert NAME.get() == name
+        seen.append(step)
+        return step + 1
+
+    try:
+        yield Learning(Walker(name, at_step), steps, on_step)  # type: ignore[arg-type]
+        assert NAME.get() == name
+        then()
+    except BaseException as error:
+        log.append(f"{name} ended by {type(error).__name__}")
+        raise
+    log.append(f"{name} walked {seen}")
+    return name.upper()
+
+
+def raises(error: BaseException) -> Callable[[], Any]:
+    def call() -> None:
+        raise error
+
+    return call
+
+
+def test_each_is_what_it_is_alone() -> None:
+    alone: list[str] = []
+    for name, steps in (("a", 3), ("b", 1)):
+        assert copy_context().run(run_alone, walk(alone, name, steps)) == name.upper()
+    assert Walker.together == [1, 1]
+    log: list[str] = []
+    assert run_together([partial(walk, log, "a", 3), partial(walk, log, "b", 1)]) == ["A", "B"]
+    assert log == alone == ["a walked [1, 2, 3]", "b walked [1]"]
+    assert Walker.together[2:] == [2]
+    assert NAME.get() == "outside"
+    assert run_together([]) == []
+
+
+@pytest.mark.parametrize("where", ["before", "learning", "after"])
+def test_one_that_fails_leaves_the_others(where: str) -> None:
+    log: list[str] = []
+    error = ZeroDivisionError("by zero")
+
+    def fails() -> Training[str]:
+        if where == "before":
+            raise error
+        at_step = {2: raises(error)} if where == "learning" else {}
+        return (yield from walk(log, "b", at_step=at_step, then=raises(error) if where == "after" else int))
+
+    found = run_together([partial(walk, log, "a"), fails, partial(walk, log, "c")])
+    assert found == ["A", error, "C"]
+    assert [line for line in log if not line.startswith("b")] == ["a walked [1, 2, 3]", "c walked [1, 2, 3]"]
+
+
+@pytest.mark.parametrize("where", ["before", "learning", "after"])
+def test_a_system_exit_lets_the_others_end(where: str) -> None:
+    """Those that had not begun are left for another time."""
+    log: list[str] = []
+
+    def exits() -> Training[str]:
+        if where == "before":
+            sys.exit(3)
+        at_step = {2: partial(sys.exit, 3)} if where == "learning" else {}
+        return (
+            yield from walk(log, "b", at_step=at_step, then=partial(sys.exit, 3) if where == "after" else int)
+        )
+
+    with pytest.raises(SystemExit) as end:
+        run_together([partial(walk, log, "a"), exits, partial(walk, log, "c")])
+    assert end.value.code == 3
+    walked = ["a walked [1, 2, 3]"] + ["c walked [1, 2, 3]"] * (where != "before")
+    assert [line for line in log if not line.startswith("b")] == walked
+
+
+@pytest.mark.parametrize("where", ["before", "learning", "after"])
+def test_what_is_no_exception_ends_all(where: str) -> None:
+    log: list[str] = []
+
+    def stops() -> Training[str]:
+        stop = Interrupted(signal.SIGTERM)
+        if where == "before":
+            raise stop
+        at_step = {2: raises(stop)} if where == "learning" else {}
+        return (yield from walk(log, "b", at_step=at_step, then=raises(stop) if where == "after" else int))
+
+    with pytest.raises(Interrupted):
+        run_together([partial(walk, log, "a"), stops, partial(walk, log, "c")])
+    first = "a walked [1, 2, 3]" if where == "after" else "a ended by Interrupted"
+    assert log[0] == first or where != "after"
+    ended = {line for line in log if "ended" in line}
+    expected = {"before": {"a"}, "learning": {"a", "b", "c"}, "after": {"b", "c"}}[where]
+    assert ended == {f"{name} ended by Interrupted" for name in expected}
+
+
+def test_the_clock_counts_a_runs_own_time_and_its_share() -> None:
+    found: dict[str, float] = {}
+
+    def timed(name: str, seconds: float) -> Training[None]:
+        started = clock()
+        shared = {1: partial(time.sleep, 0.2)} if name == "a" else {}  # outside of all hooks
+
+        def on_step(step: int) -> int:
+            time.sleep(seconds)
+            return 1
+
+        yield Learning(Walker(name, shared), 1, on_step)  # type: ignore[arg-type]
+        found[name] = clock() - started
+
+    run_together([partial(timed, "a", 0.1), partial(timed, "b", 0.3)])
+    assert found["a"] == pytest.approx(0.1 + 0.1, abs=0.08)
+    assert found["b"] == pytest.approx(0.3 + 0.1, abs=0.08)
+
+
+def interruptible(log: list[str], name: str, kills: dict[int, int], patient: bool = True) -> Training[None]:
+    """As a session: it is asked by signals, saves at its safe points, and exits."""
+    request = StopRequest()
+
+    def on_safe_point(step: int) -> None:
+        if request.number is not None:
+            log.append(f"{name} saved at {step}")
+        request.obey()
+
+    def kill(times: int) -> None:
+        for _ in range(times):
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0)
+
+    at_step = {step: partial(kill, times) for step, times in kills.items()}
+    hook = on_safe_point if patient else None
+    try:
+        with request.listening():
+            request.patient = patient
+            yield Learning(Walker(name, at_step), 4, lambda step: step + 1, hook)  # type: ignore[arg-type]
+            request.patient = False
+            request.obey()
+    except Interrupted as stop:
+        log.append(f"{name} stopped")
+        sys.exit(stop.exit_code)
+    log.append(f"{name} done")
+
+
+def test_a_second_signal_ends_all_at_once() -> None:
+    log: list[str] = []
+    with pytest.raises(Interrupted):
+        run_together([partial(interruptible, log, name, {2: 2} if name == "b" else {}) for name in "abc"])
+    assert sorted(log) == [f"{name} stopped" for name in "abc"]
+
+
+def test_who_comes_to_no_safe_point_is_stopped_after_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(signals, "_SECONDS_TO_SAFE_POINT", 0.01)
+    log: list[str] = []
+
+    def slow() -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(5)
+
+    def sleeps(name: str) -> Training[None]:
+        request = StopRequest()
+        try:
+            with request.listening():
+                request.patient = True
+                yield Learning(Walker(name, {1: slow}), 1, lambda step: 1)  # type: ignore[arg-type]
+        except Interrupted:
+            log.append(f"{name} stopped")
+            raise
+
+    started = time.monotonic()
+    with pytest.raises(Interrupted):
+        run_together([partial(sleeps, "a"), partial(sleeps, "b")])
+    assert time.monotonic() - started < 4
+    assert log == ["a stopped", "b stopped"]
