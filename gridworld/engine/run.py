@@ -70,6 +70,9 @@ class Run:
     error: BaseException | None = field(init=False, default=None)  # that it ended with
     failed_update: Exception | None = field(init=False, default=None)  # the same, where an update failed
 
+    def __post_init__(self) -> None:
+        self.begin(1)
+
     def begin(self, total_timesteps: int) -> None:
         """Prepare SB3's model as its `learn` does."""
         self.total_timesteps, model = total_timesteps, self.model

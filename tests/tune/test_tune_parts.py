@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import optuna
 import pytest
@@ -284,8 +285,7 @@ def test_a_study_gone_on_with_chooses_as_an_undisturbed_one(tmp_path: Path, samp
         (tmp_path / name).mkdir()
         for trials in parts:
             study, context = study_of(tmp_path / name, objective, trials, sampler)
-            while _run_next(study, context, set()):
-                pass
+            search(study, context)
         chosen.append([trial.params["x"] for trial in study.trials])
     assert len(set(chosen[0])) == 14
     assert chosen[0] == chosen[1]
@@ -307,10 +307,9 @@ def test_trials_that_are_cut_short_do_not_change_what_is_chosen(tmp_path: Path, 
         calls = itertools.count()
         (tmp_path / name).mkdir()
         study, context = study_of(tmp_path / name, objective, 14, sampler)
-        more = True
-        while more:
+        for _ in range(1 + len(stops)):
             try:
-                more = _run_next(study, context, set())
+                search(study, context)
             except Stopped:
                 study, context = study_of(tmp_path / name, objective, 14, sampler)
         assert len(study.trials) == 14 + len(stops)
@@ -357,22 +356,22 @@ def test_a_killed_search_of_one_worker_goes_on_as_if_it_had_not_been(
         if moment == "failed" and trial.params["x"] > 0.8:
             trial.set_user_attr("error", "ValueError: too far")
 
-    def search(name: str, killed: Sequence[int]) -> list[tuple[object, ...]]:
+    def searched(name: str, killed: Sequence[int]) -> list[tuple[object, ...]]:
         (tmp_path / name).mkdir()
         for ended in (*killed, 14):
             study, context = study_of(tmp_path / name, objective, 14)
             context = dataclasses.replace(context, first={"x": 0.25, "y": -0.5, "z": 0.75})
             with worker.among_workers(study, context):
-                while count_trials(study).ended < ended and _run_next(study, context, set()):
-                    pass
+                while count_trials(study).ended < ended:
+                    worker._run(worker._begin(study, context)[0], context)
                 if ended < 14:
                     die(study, context)
         found = [trial for trial in study.trials if not is_lost(trial)]
         return [(trial.state, trial.params, trial.value, trial.intermediate_values) for trial in found]
 
-    calm = search("calm", ())
+    calm = searched("calm", ())
     assert calm[0][1] == {"x": 0.25, "y": -0.5, "z": 0.75}
-    assert search("killed", killed) == calm
+    assert searched("killed", killed) == calm
 
 
 @pytest.mark.filterwarnings("ignore:Heartbeat of storage")  # of `ask`
@@ -521,7 +520,7 @@ def test_a_final_run_that_fails_is_told_and_counted_as_failed(
     def diverge(*arguments: object) -> None:
         raise InputError("training diverged")
 
-    monkeypatch.setattr(finalists, "learn", diverge)
+    monkeypatch.setattr(finalists, "learning", diverge)
     study = optuna.create_study()
     score = dataclasses.asdict(SeedScore(0, 100, 0.0))
     study.add_trial(create_trial(value=0.1, user_attrs={"seeds": [score]}))

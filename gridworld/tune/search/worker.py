@@ -210,11 +210,13 @@ def _run(begun: Sequence[Begun], context: StudyContext) -> None:
             else:
                 for part in itertools.chain.from_iterable(groups):
                     run_all(part)
-    except BaseException:
         for each in begun:
-            each.trial.set_user_attr(STOPPED, True)
-            each.study.tell(each.trial, state=optuna.trial.TrialState.FAIL)
+            each.end()
+    except BaseException:
+        states = optuna.trial.TrialState
+        for each in begun:
+            if each.study.get_trials(deepcopy=False)[each.trial.number].state == states.RUNNING:
+                each.trial.set_user_attr(STOPPED, True)
+                each.study.tell(each.trial, state=states.FAIL)
         raise
-    for each in begun:
-        each.end()
     show_ended(begun[0].study)
