@@ -30,6 +30,7 @@ from gridworld.errors import InputError
 from gridworld.report.analysis import statistics
 from gridworld.storage.sealed_json import sealed
 from gridworld.training.setup import check_settings
+from gridworld.training.together import run_alone
 from gridworld.tune import finalists
 from gridworld.tune.confirmation import HeldOutResults, held_out_runs, read_results, verdict_on
 from gridworld.tune.existing_study import check_study, legible
@@ -205,7 +206,8 @@ def study_of(
     url = f"sqlite:///{folder / 'study.db'}"
     storage = StudyStorage(url, "one", settings)
     storage.begin({})
-    return storage.load(), StudyContext(folder, storage, Plain(objective), math.inf)  # type: ignore[arg-type]
+    own: Any = objective if isinstance(objective, Objective) else Plain(objective)
+    return storage.load(), StudyContext(folder, storage, own, math.inf)
 
 
 def test_what_fails_is_a_trial_with_its_reason_and_the_study_goes_on(tmp_path: Path) -> None:
@@ -525,7 +527,7 @@ def test_a_final_run_that_fails_is_told_and_counted_as_failed(
     score = dataclasses.asdict(SeedScore(0, 100, 0.0))
     study.add_trial(create_trial(value=0.1, user_attrs={"seeds": [score]}))
     objective = SimpleNamespace(config=lambda values: None)
-    finalists._run(objective, study, 0, {}, 7)  # type: ignore[arg-type]
+    run_alone(finalists._run(objective, study, 0, {}, 7))  # type: ignore[arg-type]
     told = "trial 0 on the final seed 7 failed, and counts as not certified: training diverged\n"
     assert capsys.readouterr().err == told
     (finalist,) = finalists.ranking(study, study.trials, [7], TOTAL)

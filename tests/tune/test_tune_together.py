@@ -124,7 +124,7 @@ def test_the_trials_of_a_worker_that_is_stopped_are_drawn_again(
     looks = iter(range(10**6))
 
     def is_stopped() -> bool:
-        if next(looks) == 100:
+        if next(looks) == 20:
             asked.set()
         return asked.is_set()
 
