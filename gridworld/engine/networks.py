@@ -233,9 +233,11 @@ class ModuleNetworks:
             parameter.data, parameter.grad = data, grad
         self._forward, self._parameters = forward, parameters
         self._outputs: tuple[Tensor, ...] = ()
+        self._pulled: list[tuple[Tensor, tuple[Tensor, ...]]] = []  # of each output, slopes and gradients
 
     def run(self, states: IntArray | None = None) -> tuple[Array, ...]:
         """See `Networks.run`."""
+        self._outputs, self._pulled = (), []
         with torch.enable_grad():
             self._outputs = self._forward(states)
         return tuple(output.detach().cpu().numpy()[None] for output in self._outputs)
@@ -251,11 +253,11 @@ class ModuleNetworks:
 
     def push(self, changes: Tensor) -> tuple[Array, ...]:
         """See `Networks.push`: a pass back through the pass back, which is linear in the slopes."""
+        self._pulled = self._pulled or [self._pull(output) for output in self._outputs]
         given = cut(changes[0], [each.shape for each in self._parameters])
-        return tuple(self._push(output, given).cpu().numpy()[None] for output in self._outputs)
+        moved = [torch.autograd.grad(pulled, slopes, given, True)[0] for slopes, pulled in self._pulled]
+        return tuple(each.cpu().numpy()[None] for each in moved)
 
-    def _push(self, output: Tensor, changes: Sequence[Tensor]) -> Tensor:
+    def _pull(self, output: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
         slopes = torch.zeros_like(output, requires_grad=True)
-        pulled = torch.autograd.grad(output, self._parameters, slopes, create_graph=True)
-        (moved,) = torch.autograd.grad(pulled, slopes, list(changes))
-        return moved
+        return slopes, torch.autograd.grad(output, self._parameters, slopes, create_graph=True)

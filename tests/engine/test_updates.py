@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from sb3_contrib import QRDQN
+from sb3_contrib import QRDQN, TRPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from gridworld.agents.sb3.engine_agent import extractors_kind
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.engine import a2c, dqn, population, ppo
+from gridworld.engine import a2c, dqn, population, ppo, trpo
 from gridworld.engine.run import Run
 from gridworld.engine.sb3_format import algorithm_of, make_run, put_weights
 from gridworld.envs.observations import make_observation
@@ -135,7 +135,7 @@ ON_POLICY: list[tuple[type, str, dict[str, Any]]] = [
 def test_updates_from_rollouts(
     algorithm: Any, kind: str, arguments: dict[str, Any], few_states: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (population, ppo, a2c):
+    for module in (population, ppo, a2c, trpo):
         monkeypatch.setattr(module, "FEW_STATES", few_states)
     n_steps = STEPS
     if algorithm is PPO:
