@@ -110,9 +110,7 @@ class OnPolicy(Population):
             which, pair = self.distinct(pairs[0, number])
             yield (
                 which,
-                sum_up(
-                    pair[None], advantages[:, number], returns[:, number], (len(which), self.num_actions)
-                ),
+                sum_up(pair[None], advantages[:, number], returns[:, number], (len(which), self.num_actions)),
             )
 
     def _count(self, run: Run, rollout: Rollout) -> None:

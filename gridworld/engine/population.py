@@ -151,7 +151,8 @@ class Population:
 
     def safe_point(self) -> Self | None:
         """Let all runs be saved, as nothing is half done; returns the population of those that go on."""
-        finite = np.isfinite(sum(each.weights.sum(dim=1) for each in self.all_networks).cpu().numpy())
+        sums = [each.weights.sum(dim=1).cpu().numpy() for each in self.all_networks]
+        finite = np.isfinite(sums).all(axis=0)
         for run in self.runs:
             if not finite[run.row] and not self._is_finite(run):
                 run.diverge("the network's weights are no finite number")
@@ -277,7 +278,10 @@ def _try_out(runs: Sequence[Run]) -> bool:
             found = list(alone.run())
             alone.backward(*(slope[own] for slope in slopes))
             found += alone.push(alone.gradients) if pushes else ()
-            if not all(np.array_equal(*pair) for pair in zip(found, (each[own] for each in (*outputs, *moved)), strict=True)):
+            if not all(
+                np.array_equal(*pair)
+                for pair in zip(found, (each[own] for each in (*outputs, *moved)), strict=True)
+            ):
                 return False
             if not torch.equal(alone.gradients[0], together.gradients[row]):
                 return False
