@@ -152,7 +152,7 @@ class Population:
     def safe_point(self) -> Self | None:
         """Let all runs be saved, as nothing is half done; returns the population of those that go on."""
         sums = [each.weights.sum(dim=1).cpu().numpy() for each in self.all_networks]
-        finite = np.isfinite(sums).all(axis=0)
+        finite: BoolArray = np.isfinite(np.stack(sums)).all(axis=0)
         for run in self.runs:
             if not finite[run.row] and not self._is_finite(run):
                 run.diverge("the network's weights are no finite number")
