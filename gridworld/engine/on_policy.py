@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
 import numpy as np
 import torch
 
 from gridworld.engine.environments import Rollout
-from gridworld.engine.losses import Array, log_softmax
-from gridworld.engine.population import Population
+from gridworld.engine.losses import Array, Sums, log_softmax, normalized, sum_up
+from gridworld.engine.population import FEW_STATES, Population
 from gridworld.engine.run import Run
 from gridworld.storage.serialization import State
-from gridworld.world.mdp import FloatArray, IntArray
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 
 class OnPolicy(Population):
@@ -78,6 +78,40 @@ class OnPolicy(Population):
             returns: (P, n), float32.
         """
         raise NotImplementedError
+
+    def orders(self, count: int, active: BoolArray) -> IntArray:
+        """(P, n), the places of each run's n samples among all, in SB3's own draw of their order."""
+        order = np.zeros((len(self.runs), count), dtype=np.int64)
+        for run in self.going(active):
+            order[run.row] = run.numpy_generator.permutation(count)
+        return order + count * np.arange(len(self.runs))[:, None]
+
+    def minibatches(
+        self, order: IntArray, size: int, *samples: Array
+    ) -> Iterator[tuple[IntArray | None, Sums]]:
+        """Cut samples (P, n) in this order into minibatches of a size, and the last of what is left."""
+        runs, count = order.shape
+        full = count // size * size
+        parts = [order[:, :full].reshape(runs, -1, size), order[:, None, full:]]
+        for part in parts[:1] if full == count else parts:
+            yield from self.summed_up(*(each.take(part) for each in samples))
+
+    def summed_up(
+        self, pairs: IntArray, advantages: Array, returns: Array
+    ) -> Iterator[tuple[IntArray | None, Sums]]:
+        """The states to run the network on, None for all, and the sums there, of K minibatches (P, K, B)."""
+        if self.normalize_advantage and pairs.shape[-1] > 1:
+            advantages = normalized(advantages)
+        if self.num_states <= max(FEW_STATES, pairs.shape[-1]):
+            sums = sum_up(pairs, advantages, returns, (self.num_states, self.num_actions))
+            yield from ((None, sums.of(number)) for number in range(pairs.shape[1]))
+            return
+        for number in range(pairs.shape[1]):
+            which, pair = self.distinct(pairs[0, number])
+            yield (
+                which,
+                sum_up(pair[None], advantages[:, number], returns[:, number], (len(which), self.num_actions)),
+            )
 
     def _count(self, run: Run, rollout: Rollout) -> None:
         """Count a run's steps, and call what wants to be called after one of them."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -49,6 +50,8 @@ class Optimizer:
             settings["fused"] = True
         make: Any = type(own[0])
         self._optimizer: torch.optim.Optimizer = make([{**settings, "params": [row]} for row in self._rows])
+        # Bare of what torch wraps around it, which imports its compiler, and that takes a second.
+        self._step = inspect.unwrap(make.step)
         self._groups = self._optimizer.param_groups
         self._rates: list[float] = []
         self._active: list[bool] = []
@@ -74,8 +77,8 @@ class Optimizer:
             self._active = now
             for row, slope, steps in zip(self._rows, self._slopes, now, strict=True):
                 row.grad = slope if steps else None
-        with _flushing_denormals():
-            self._optimizer.step()
+        with torch.no_grad(), _flushing_denormals():
+            self._step(self._optimizer)
         return finite
 
     def _set_rates(self, rates: list[float]) -> None:
@@ -115,7 +118,8 @@ class Optimizer:
         other = torch.zeros_like(row)
         other.grad = torch.zeros_like(row)
         optimizer = make([{**self._groups[0], "params": [other]}])
-        optimizer.step()
+        with torch.no_grad():
+            self._step(optimizer)
         return dict(optimizer.state[other])
 
 

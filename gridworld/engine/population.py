@@ -37,6 +37,7 @@ class Population:
     """
 
     same: ClassVar[tuple[str, ...]]  # SB3's settings that runs of one population have in common
+    pushes: ClassVar[bool] = False  # whether it needs `Networks.push` of the networks that act
 
     def __init__(self, runs: Sequence[Run], states: Sequence[State | None]) -> None:
         self.runs = runs
@@ -50,7 +51,8 @@ class Population:
             mdp.num_actions,
         )
         self.active: BoolArray = np.ones(len(runs), dtype=np.bool_)
-        self.networks = self._make_networks()
+        self.all_networks = self.networks_of(runs)
+        self.networks = self.all_networks[0]
         self.optimizer = self._optimizer()
         for run, state in zip(runs, states, strict=True):
             if state is not None:
@@ -73,8 +75,10 @@ class Population:
             *(model.num_timesteps, run.total_timesteps, *settings),
         )
 
-    def _make_networks(self) -> Networks:
-        return make_networks(self.runs)
+    @classmethod
+    def networks_of(cls, runs: Sequence[Run]) -> list[Networks]:
+        """The networks that runs learn with, as far as they differ in kind; the first acts."""
+        return [make_networks(runs)]
 
     def _optimizer(self) -> Optimizer:
         own = [run.model.policy.optimizer for run in self.runs]
@@ -149,13 +153,17 @@ class Population:
 
     def safe_point(self) -> Self | None:
         """Let all runs be saved, as nothing is half done; returns the population of those that go on."""
-        finite = np.isfinite(self.networks.weights.sum(dim=1).cpu().numpy())
+        sums = [each.weights.sum(dim=1).cpu().numpy() for each in self.all_networks]
+        finite: BoolArray = np.isfinite(np.stack(sums)).all(axis=0)
         for run in self.going():
-            if not finite[run.row] and not torch.isfinite(self.networks.weights[run.row]).all():
+            if not finite[run.row] and not self._is_finite(run):
                 run.diverge("the network's weights are no finite number")
                 continue
             run.safe_point(self.num_timesteps)
         return self.remaining()
+
+    def _is_finite(self, run: Run) -> bool:
+        return all(bool(torch.isfinite(each.weights[run.row]).all()) for each in self.all_networks)
 
     def check_losses(self, losses: Array) -> None:
         """End the runs whose loss (P,) is no finite number."""
@@ -267,16 +275,23 @@ def agree(runs: Sequence[Run]) -> bool:
 
 
 def _try_out(runs: Sequence[Run]) -> bool:
-    generator = np.random.default_rng(0)
-    together = make_networks(runs)
-    outputs = [output.copy() for output in together.run()]
-    slopes = [generator.normal(size=output.shape) for output in outputs]
-    together.backward(*slopes)
-    for row, run in enumerate(runs):
-        alone = make_networks([run])
-        if not all(np.array_equal(own[0], all_[row]) for own, all_ in zip(alone.run(), outputs, strict=True)):
-            return False
-        alone.backward(*(slope[row : row + 1] for slope in slopes))
-        if not torch.equal(alone.gradients[0], together.gradients[row]):
-            return False
+    generator, algorithm = np.random.default_rng(0), type(runs[0].population)
+    for number, together in enumerate(algorithm.networks_of(runs)):
+        outputs = [output.copy() for output in together.run()]
+        slopes = [generator.normal(size=output.shape) for output in outputs]
+        together.backward(*slopes)
+        pushes = algorithm.pushes and number == 0
+        moved = together.push(together.gradients) if pushes else ()
+        for row, run in enumerate(runs):
+            alone, own = algorithm.networks_of([run])[number], slice(row, row + 1)
+            found = list(alone.run())
+            alone.backward(*(slope[own] for slope in slopes))
+            found += alone.push(alone.gradients) if pushes else ()
+            if not all(
+                np.array_equal(*pair)
+                for pair in zip(found, (each[own] for each in (*outputs, *moved)), strict=True)
+            ):
+                return False
+            if not torch.equal(alone.gradients[0], together.gradients[row]):
+                return False
     return True

@@ -14,12 +14,9 @@ from gridworld.engine.losses import (
     divergence,
     log_softmax,
     losses_of,
-    normalized,
     slopes_of,
-    sum_up,
 )
 from gridworld.engine.on_policy import OnPolicy
-from gridworld.engine.population import FEW_STATES
 from gridworld.engine.run import Run
 from gridworld.storage.serialization import State
 from gridworld.world.mdp import BoolArray, IntArray
@@ -54,10 +51,11 @@ class PPO(OnPolicy):
                 break
             log.begin_epoch(active)
             if self.batch_size >= pairs.shape[1]:  # whatever their order
-                whole = whole or list(self._summed_up(pairs[:, None], advantages[:, None], returns[:, None]))
+                whole = whole or list(self.summed_up(pairs[:, None], advantages[:, None], returns[:, None]))
                 minibatches: Iterator[tuple[IntArray | None, Sums]] = iter(whole)
             else:
-                minibatches = self._minibatches(active, pairs, advantages, returns)
+                order = self.orders(pairs.shape[1], active)
+                minibatches = self.minibatches(order, self.batch_size, pairs, advantages, returns)
             for states, sums in minibatches:
                 logits, values = self.networks.run(states)
                 new = log_softmax(logits), values[..., 0]
@@ -71,35 +69,6 @@ class PPO(OnPolicy):
                 self.check_gradients(finite | ~active)
                 active &= finite
         self._log(log)
-
-    def _minibatches(self, active: BoolArray, *samples: Array) -> Iterator[tuple[IntArray | None, Sums]]:
-        """The minibatches of an epoch, in SB3's own draw of their order."""
-        (runs, count), size = samples[0].shape, self.batch_size
-        order = np.zeros((runs, count), dtype=np.int64)
-        for run in self.going(active):
-            order[run.row] = run.numpy_generator.permutation(count)
-        order += count * np.arange(runs)[:, None]
-        full = count // size * size
-        yield from self._summed_up(*(each.take(order[:, :full].reshape(runs, -1, size)) for each in samples))
-        if full < count:
-            yield from self._summed_up(*(each.take(order[:, None, full:]) for each in samples))
-
-    def _summed_up(
-        self, pairs: IntArray, advantages: Array, returns: Array
-    ) -> Iterator[tuple[IntArray | None, Sums]]:
-        """The states to run the network on, None for all, and the sums there, of K minibatches (P, K, B)."""
-        if self.normalize_advantage and pairs.shape[-1] > 1:
-            advantages = normalized(advantages)
-        if self.num_states <= max(FEW_STATES, pairs.shape[-1]):
-            sums = sum_up(pairs, advantages, returns, (self.num_states, self.num_actions))
-            yield from ((None, sums.of(number)) for number in range(pairs.shape[1]))
-            return
-        for number in range(pairs.shape[1]):
-            which, pair = self.distinct(pairs[0, number])
-            yield (
-                which,
-                sum_up(pair[None], advantages[:, number], returns[:, number], (len(which), self.num_actions)),
-            )
 
     def _log(self, log: _Log) -> None:
         means = log.means()

@@ -4,57 +4,62 @@ All samples of one (state, action) share one ratio ρ = π_θ(a|s) / π_old(a|s)
 batch's B advantages per pair over B, and w_s the share of samples in state s,
 
     surrogate  = Σ_(s,a) G(s, a) ρ(s, a),            ∂/∂ log π(a|s) = G(s, a) ρ(s, a)
-    divergence = Σ_s w_s KL(π_θ(.|s) || π_start(.|s))
+    divergence = Σ_s w_s KL(π_θ(·|s) || π_start(·|s))
 
-and a slope g in log π is g - π Σ_a g in the logits z. The divergence's second derivative in the logits, where
-θ is the start, is per state w_s (diag(π) - π π^T); with the logits' Jacobian J the Fisher matrix is
+and a slope g in log π is g - π Σ_a g in the logits z. The policy takes a step d that improves the surrogate
+while the divergence, which is ½ dᵀFd to second order, stays below δ: along the natural gradient F⁻¹∇, which
+conjugate gradients find from products with F alone, and as far as √(2δ / dᵀFd), or less where a line search
+finds that too far. The divergence's second derivative in the logits, where θ is the start, is per state
+w_s (diag(π) - π πᵀ); so with the logits' Jacobian J a product with the Fisher matrix
 
-    F = J^T [w_s (diag(π) - π π^T)] J
+    F v = Jᵀ [ w_s (diag(π) - π πᵀ) ] J v
 
-(appendix C). So conjugate gradients multiply with it by a pass forward and a pass back through the network,
-and the line search compares tables. The value network is fitted by an optimiser, the policy by the line
-search alone.
+(appendix C) is a pass forward and a pass back through the network. The values are fitted by an optimiser, to
+the returns' mean m_s of each state: of B samples the squared error is Σ_s w_s (V(s) - m_s)², and a constant.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gridworld.engine.losses import Array, log_softmax, normalized
-from gridworld.engine.networks import Networks
+from gridworld.engine.losses import Array, Sums, log_softmax
+from gridworld.engine.networks import Networks, aligned
 from gridworld.engine.on_policy import OnPolicy
 from gridworld.engine.optimizer import Optimizer
-from gridworld.engine.population import FEW_STATES, make_networks
+from gridworld.engine.population import make_networks
 from gridworld.engine.run import Run
-from gridworld.storage.serialization import State
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 _OF_VALUES = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")  # parameters of these alone
-_RESIDUAL = 1e-10  # squared, at which conjugate gradients end
+_RESIDUAL = 1e-10  # squared, below which conjugate gradients end
 
 
 class TRPO(OnPolicy):
     """P runs of TRPO."""
 
+    pushes: ClassVar[bool] = True
     same: ClassVar[tuple[str, ...]] = (
         *OnPolicy.same,
-        *("batch_size", "n_critic_updates", "sub_sampling_factor", "cg_max_steps", "cg_damping"),
-        *("line_search_max_iter", "line_search_shrinking_factor"),
+        *("batch_size", "n_critic_updates", "sub_sampling_factor", "line_search_max_iter"),
+        *("cg_max_steps", "cg_damping"),
     )
 
-    def __init__(self, runs: Sequence[Run], states: Sequence[State | None]) -> None:
-        self.critic: Networks = make_networks(runs, value_parameters, slice(1, 2))
-        super().__init__(runs, states)
+    @classmethod
+    def networks_of(cls, runs: Sequence[Run]) -> list[Networks]:
+        """See `Population.networks_of`: those of the policies, and those of the values."""
+        policies = make_networks(runs, policy_parameters, slice(0, 1))
+        return [policies, make_networks(runs, value_parameters, slice(1, 2))]
 
-    def _make_networks(self) -> Networks:
-        """Of the policies."""
-        return make_networks(self.runs, policy_parameters, slice(0, 1))
+    @property
+    def critic(self) -> Networks:
+        """The networks of the values."""
+        return self.all_networks[1]
 
     def _optimizer(self) -> Optimizer:
         own = [run.model.policy.optimizer for run in self.runs]
@@ -78,131 +83,101 @@ class TRPO(OnPolicy):
 
     def update(self, old: tuple[Array, Array], pairs: IntArray, advantages: Array, returns: Array) -> None:
         """See `OnPolicy.update`."""
-        active = self.active.copy()
-        surrogate, kl, is_success = self._improve_policies(active, old[0], pairs, advantages)
-        value_loss = self._fit_values(active, pairs // self.num_actions, returns)
+        samples = pairs, advantages, returns
+        surrogate, divergence, is_improved = self._improve_policies(old[0], *samples)
+        value_loss = self._fit_values(*samples)
         for run in self.going():
             run.model._n_updates += 1
             run.record("train/policy_objective", float(surrogate[run.row]))
             run.record("train/value_loss", float(value_loss[run.row]))
-            run.record("train/kl_divergence_loss", float(kl[run.row]))
-            run.record("train/is_line_search_success", float(is_success[run.row]))
+            run.record("train/kl_divergence_loss", float(divergence[run.row]))
+            run.record("train/is_line_search_success", float(is_improved[run.row]))
         self.check_losses(value_loss)
 
-    def _improve_policies(
-        self, active: BoolArray, old: Array, pairs: IntArray, advantages: Array
-    ) -> tuple[Array, Array, BoolArray]:
+    def _improve_policies(self, old: Array, *samples: Array) -> tuple[Array, Array, BoolArray]:
         """Make the policies' steps; returns surrogates, divergences and whether one was made, (P,) each."""
-        (order,) = self._batches(active, pairs.shape[1], pairs.shape[1])
-        part = order[:, :: self.runs[0].model.sub_sampling_factor]
-        pairs, advantages = (np.take_along_axis(each, part, axis=1) for each in (pairs, advantages))
-        if self.normalize_advantage:
-            advantages = normalized(advantages)
-        states = None
-        if self.num_states > max(FEW_STATES, pairs.shape[1]):
-            states, distinct = self.distinct(pairs[0])
-            old, pairs = old[:, states], distinct[None]
-        count, shape = pairs.shape[1], old.shape
-        gains = _summed(pairs, advantages, shape[1] * shape[2]).reshape(shape) / count
-        shares = _summed(pairs // self.num_actions, None, shape[1]) / count
-        steps, start = self._steps(states, old, gains, shares)
-        return self._search_lines(active, states, old, gains, shares, steps, start)
-
-    def _steps(
-        self, states: IntArray | None, old: Array, gains: FloatArray, shares: FloatArray
-    ) -> tuple[Tensor, Array]:
-        """The longest steps (P, W) along the natural gradients in the trust regions; log π at their start."""
+        order = self.orders(samples[0].shape[1], self.active)
+        part = order[:, None, :: self.runs[0].model.sub_sampling_factor]
+        ((states, sums),) = self.summed_up(*(each.take(part) for each in samples))
+        if states is not None:
+            old = old[:, states]
         start = log_softmax(self.networks.run(states)[0])
-        prob, damping = np.exp(start), self.runs[0].model.cg_damping
+        steps = self._longest_steps(start, old, sums)
+        return self._search_lines(states, start, old, sums, steps)
+
+    def _longest_steps(self, start: Array, old: Array, sums: Sums) -> Tensor:
+        """(P, W), along the natural gradients to the borders of the trust regions, to second order."""
+        networks, prob, damping = self.networks, np.exp(start), self.runs[0].model.cg_damping
 
         def damped_fisher(vectors: Tensor) -> Tensor:
-            (moved,) = self.networks.push(vectors)
-            pulled = prob * (moved - (prob * moved).sum(axis=-1, keepdims=True))
-            self.networks.backward(shares[..., None] * pulled)
-            return self.networks.gradients.add(vectors, alpha=damping)
+            (moved,) = networks.push(vectors)
+            curved = prob * (moved - (prob * moved).sum(axis=-1, keepdims=True))
+            networks.backward(sums.states[..., None] * curved)
+            return networks.gradients.add_(vectors, alpha=damping)
 
-        slope = gains * np.exp(start - old)
+        slope = (sums.positive + sums.negative) * np.exp(start - old)
         slope -= prob * slope.sum(axis=-1, keepdims=True)
-        self.networks.backward(slope)
-        gradients = self.networks.gradients.clone()
-        guess = torch.zeros_like(gradients)
-        for run in self.going():  # where a gradient is small, zeros would be an unstable beginning
-            noise = torch.randn(gradients.shape[1], generator=run.torch_generator)
+        networks.backward(slope)
+        guess = torch.zeros_like(networks.weights)
+        for run in self.going():  # sb3-contrib's, so that the first product is not with 0
+            noise = torch.randn(guess.shape[1], generator=run.torch_generator)
             guess[run.row] = 1e-4 * noise.to(guess.device)
-        directions = conjugate_gradients(damped_fisher, gradients, guess, self.runs[0].model.cg_max_steps)
+        steps = self.runs[0].model.cg_max_steps
+        directions = conjugate_gradients(damped_fisher, networks.gradients, guess, steps)
         curvature = _dots(directions, damped_fisher(directions)).double().cpu().numpy()
-        radius = np.array([2 * run.model.target_kl for run in self.runs])
-        with np.errstate(divide="ignore", invalid="ignore"):  # a gradient of 0, or one that diverges
-            lengths = np.sqrt(radius / curvature)
-        scales = torch.as_tensor(lengths, dtype=directions.dtype, device=directions.device)
-        return directions * scales[:, None], start
+        with np.errstate(divide="ignore", invalid="ignore"):  # a run that diverges
+            lengths = np.sqrt(2 * np.array([run.model.target_kl for run in self.runs]) / curvature)
+        return directions.mul_(torch.as_tensor(lengths[:, None]).to(directions))
 
     def _search_lines(
-        self,
-        active: BoolArray,
-        states: IntArray | None,
-        old: Array,
-        gains: FloatArray,
-        shares: FloatArray,
-        steps: Tensor,
-        start: Array,
+        self, states: IntArray | None, start: Array, old: Array, sums: Sums, steps: Tensor
     ) -> tuple[Array, Array, BoolArray]:
         """Shorten steps until they improve surrogates in the trust regions; see `_improve_policies`."""
-        model, weights = self.runs[0].model, self.networks.weights
-        target = np.array([run.model.target_kl for run in self.runs])
+        weights, gains = self.networks.weights, sums.positive + sums.negative
         before, surrogate = weights.clone(), _surrogate(start, old, gains)
-        reached, kl, searching, scale = surrogate.copy(), np.zeros(len(target)), active.copy(), 1.0
-        for _ in range(model.line_search_max_iter):
+        target = np.array([run.model.target_kl for run in self.runs])
+        shrinking = np.array([run.model.line_search_shrinking_factor for run in self.runs])
+        scale, searching = np.ones(len(target)), self.active.copy()
+        reached, divergence = surrogate.copy(), np.zeros(len(target))
+
+        def step(scale: FloatArray) -> None:
+            """Set the weights of the runs that still search."""
             rows = torch.as_tensor(np.flatnonzero(searching), device=weights.device)
-            if not len(rows):
+            column = torch.as_tensor(scale[:, None]).to(weights)
+            weights[rows] = before[rows] + column[rows] * steps[rows]
+
+        for _ in range(self.runs[0].model.line_search_max_iter):
+            if not searching.any():
                 break
-            weights[rows] = before[rows] + scale * steps[rows]
+            step(scale)
             log_prob = log_softmax(self.networks.run(states)[0])
             for run in self.going(searching & ~np.isfinite(log_prob).all(axis=(1, 2))):
                 run.diverge("the network's weights are no finite number")
-                searching[run.row] = False
-            found, now = _divergence(log_prob, start, shares), _surrogate(log_prob, old, gains)
-            improved = searching & (found < target) & (now > surrogate)
-            reached, kl = np.where(improved, now, reached), np.where(improved, found, kl)
+            searching &= self.active
+            now, far = _surrogate(log_prob, old, gains), _divergence(log_prob, start, sums.states)
+            improved = searching & (far < target) & (now > surrogate)
+            reached, divergence = np.where(improved, now, reached), np.where(improved, far, divergence)
             searching &= ~improved
-            scale *= model.line_search_shrinking_factor
-        rows = torch.as_tensor(np.flatnonzero(searching), device=weights.device)
-        weights[rows] = before[rows]
-        active &= self.active
-        return reached, kl, active & ~searching
+            scale *= shrinking
+        step(np.zeros(len(target)))
+        return reached, divergence, ~searching
 
-    def _fit_values(self, active: BoolArray, states: IntArray, returns: Array) -> Array:
+    def _fit_values(self, *samples: Array) -> Array:
         """Fit the value networks; returns the mean losses (P,)."""
-        model, losses = self.runs[0].model, []
-        learning_rates = self.settings("learning_rate")
+        model, count, losses = self.runs[0].model, samples[0].shape[1], []
+        learning_rates, whole = self.settings("learning_rate"), None
+        if model.batch_size >= count:  # whatever their order
+            whole = list(self.summed_up(*(each[:, None] for each in samples)))
         for _ in range(model.n_critic_updates):
-            for batch in self._batches(active, states.shape[1], model.batch_size):
-                index, which = np.take_along_axis(states, batch, axis=1), None
-                if self.num_states > max(FEW_STATES, batch.shape[1]):
-                    which, index = np.unique(index[0], return_inverse=True)
-                    index = index[None]
-                own = np.take_along_axis(returns, batch, axis=1)
-                values = self.critic.run(which)[0][..., 0]
-                samples = _summed(index, None, values.shape[1])
-                mean = _summed(index, own, values.shape[1]) / np.maximum(samples, 1)
-                error, count = values - mean, index.shape[1]
-                pull = samples / count * error
-                apart = own - np.take_along_axis(mean, index, axis=1)
-                losses.append((pull * error).sum(axis=1) + (apart * apart).sum(axis=1) / count)
-                self.critic.backward((2 * pull)[..., None])
-                finite = self.optimizer.step(learning_rates, active)
-                self.check_gradients(finite | ~active)
-                active &= finite
-        mean_loss: Array = np.stack(losses, axis=1).mean(axis=1)
-        return mean_loss
-
-    def _batches(self, active: BoolArray, count: int, size: int) -> Iterator[IntArray]:
-        """All samples of each run in random order, cut into batches (P, B); the draws are SB3's own."""
-        order = np.zeros((len(self.runs), count), dtype=np.int64)
-        for run in self.going(active):
-            order[run.row] = run.numpy_generator.permutation(count)
-        for first in range(0, count, size):
-            yield order[:, first : first + size]
+            order = self.orders(count, self.active)
+            for states, sums in whole or self.minibatches(order, model.batch_size, *samples):
+                error = self.critic.run(states)[0][..., 0] - sums.mean_return
+                pull = sums.states * error
+                losses.append((pull * error).sum(axis=-1) + sums.deviation)
+                self.critic.backward(2 * pull[..., None])
+                finite = self.optimizer.step(learning_rates, self.active)
+                self.check_gradients(finite)
+        return np.asarray(np.stack(losses, axis=1).mean(axis=1))
 
 
 def policy_parameters(run: Run) -> list[nn.Parameter]:
@@ -220,56 +195,46 @@ def value_parameters(run: Run) -> list[nn.Parameter]:
 def conjugate_gradients(
     product: Callable[[Tensor], Tensor], vectors: Tensor, guess: Tensor, steps: int
 ) -> Tensor:
-    """Solve P linear systems A x = b.
+    """Solve P linear systems A x = b, those of sb3-contrib's solver side by side.
 
     M. Hestenes and E. Stiefel, Methods of conjugate gradients for solving linear systems, 1952.
 
     Args:
-        product: A x (P, W) of x (P, W).
-        vectors: b (P, W).
+        product: A x (P, W) of x (P, W), with `aligned` rows; the next product may overwrite it.
+        vectors: b (P, W), which a product may overwrite.
         guess: (P, W), where to begin.
         steps: at most.
     """
-    solution = guess.clone()
-    residual = vectors - product(solution)
-    direction, square = residual.clone(), _dots(residual, residual)
+    vectors, solution = aligned(vectors), aligned(guess)
+    residual = aligned(vectors - product(solution))
+    direction, square = aligned(residual), _dots(residual, residual)
     going = square >= _RESIDUAL
     for step in range(steps):
         if not going.any():
             break
-        product_ = product(direction)
-        alpha = torch.where(going, square / _dots(direction, product_), 0)[:, None]
+        image = product(direction)
+        alpha = torch.where(going, square / _dots(direction, image), 0)[:, None]
         solution += alpha * direction
         if step + 1 == steps:
             break
-        residual -= alpha * product_
+        residual -= alpha * image
         new = _dots(residual, residual)
         going = going & (new >= _RESIDUAL)
-        direction = torch.where(going[:, None], residual + (new / square)[:, None] * direction, direction)
+        direction.mul_(torch.where(going, new / square, 0)[:, None]).add_(residual)
         square = new
     return solution
 
 
 def _dots(these: Tensor, those: Tensor) -> Tensor:
-    """(P,), the products of rows, each as one alone is made."""
+    """(P,), the products of `aligned` rows, each as one alone is made."""
     return torch.stack([one @ other for one, other in zip(these, those, strict=True)])
 
 
-def _summed(index: IntArray, numbers: Array | None, size: int) -> FloatArray:
-    """(P, size), the sums of numbers (P, B), or their count, by their index (P, B)."""
-    runs = len(index)
-    keys = (index + size * np.arange(runs)[:, None]).ravel()
-    weights = None if numbers is None else numbers.ravel()
-    summed: FloatArray = np.bincount(keys, weights, size * runs).reshape(runs, size).astype(np.float64)
-    return summed
-
-
 def _surrogate(log_prob: Array, old: Array, gains: FloatArray) -> FloatArray:
-    """(P,) of log π_θ and log π_old (P, U, A)."""
+    """(P,), of log π_θ and log π_old (P, U, A)."""
     return np.asarray((gains * np.exp(log_prob - old)).reshape(len(gains), -1).sum(axis=1))
 
 
-def _divergence(log_prob: Array, start: Array, states: FloatArray) -> FloatArray:
-    """(P,), the divergence of log π_θ from log π_start (P, U, A); `states` (P, U) has the shares w."""
-    per_state = (np.exp(log_prob) * (log_prob - start)).sum(axis=-1)
-    return np.asarray((states * per_state).sum(axis=-1))
+def _divergence(log_prob: Array, start: Array, shares: FloatArray) -> FloatArray:
+    """(P,), of log π_θ from log π_start (P, U, A), with the shares w (P, U) of the states."""
+    return np.asarray((shares * (np.exp(log_prob) * (log_prob - start)).sum(axis=-1)).sum(axis=-1))

@@ -39,6 +39,10 @@ SMALL: dict[str, Words] = {
         "agent.n_epochs=3",
     ),
     "a2c": ("agent=a2c", "total_timesteps=100", "n_envs=4"),
+    "trpo": (
+        *("agent=trpo", "total_timesteps=128", "n_envs=4", "agent.arguments.n_steps=8"),
+        *("agent.arguments.batch_size=8", "+agent.arguments.n_critic_updates=2"),
+    ),
 }
 
 
@@ -177,6 +181,13 @@ DIFFERENT: dict[str, list[list[str]]] = {  # of each argument; the empty one is 
         ["max_grad_norm=0.01", ""],
         OPTIMIZERS,
     ],
+    "trpo": [
+        ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
+        ["gamma=0.5", "gae_lambda=0.5", "gae_lambda=lin_0.5", ""],
+        ["target_kl=0.5", "target_kl=1e-5", ""],
+        ["line_search_shrinking_factor=0.3", "line_search_shrinking_factor=0.99", ""],
+        OPTIMIZERS,
+    ],
 }
 # Settings of which the runs of a population have one value.
 OF_SHAPE = {
@@ -198,7 +209,7 @@ def word(agent: str, setting: str, inside: str = "") -> Words:
     """A word of the command line that gives the agent an argument."""
     if not setting:
         return ()
-    of_class = agent in ("qrdqn", "a2c")
+    of_class = agent in ("qrdqn", "a2c", "trpo")
     return (f"++agent.{'arguments.' if of_class else ''}{inside}{setting}",)
 
 
@@ -254,6 +265,17 @@ WRITTEN = {
     "a2c one step": ("a2c", ("agent.arguments.n_steps=1", "total_timesteps=24")),
     "a2c scaled": ("a2c", ("++agent.arguments.normalize_advantage=true",)),
     "a2c adam": ("a2c", ("++agent.arguments.use_rms_prop=false",)),
+    "trpo parts": (
+        "trpo",
+        ("+agent.arguments.sub_sampling_factor=3", "+agent.arguments.normalize_advantage=false"),
+    ),
+    "trpo short searches": (
+        "trpo",
+        (
+            *("+agent.arguments.line_search_max_iter=2", "+agent.arguments.cg_max_steps=3"),
+            *("+agent.arguments.cg_damping=1e-4", "agent.arguments.target_kl=1"),
+        ),
+    ),
     "dqn one sample": ("dqn", ("agent.batch_size=1", "agent.gradient_steps=1", "agent.train_freq=1")),
     "dqn many steps": ("dqn", ("agent.gradient_steps=-1", "n_envs=3")),
     "dqn episodes": ("dqn", ("agent.train_freq=[2,episode]", "n_envs=1")),
@@ -290,7 +312,8 @@ RATE = {agent: word(agent, "learning_rate=1e38") for agent in SMALL}
 @pytest.mark.parametrize("place", [0, 1])
 @pytest.mark.parametrize("agent", SMALL)
 def test_one_that_diverges_leaves_the_others_alone(agent: str, place: int) -> None:
-    tight = word(agent, "max_grad_norm=0.01")  # so that gradients are clipped at the step, too
+    # so that gradients are clipped at the step, too
+    tight = word(agent, "max_grad_norm=0.01" if agent != "trpo" else "")
     runs = [(*SMALL[agent], *tight, f"seed={seed}") for seed in range(3)]
     runs[place] = (*runs[place], *RATE[agent])
     found = together(runs)

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from sb3_contrib import QRDQN
+from sb3_contrib import QRDQN, TRPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.logger import KVWriter, Logger
 
 from gridworld.agents.sb3.engine_agent import extractors_kind
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.engine import a2c, dqn, population, ppo
+from gridworld.engine import a2c, dqn, on_policy, population
 from gridworld.engine.run import Run
 from gridworld.engine.sb3_format import algorithm_of, make_run, put_weights
 from gridworld.envs.observations import make_observation
@@ -109,6 +109,7 @@ TWO_SIZES = {"policy_kwargs": {"net_arch": {"pi": [8], "vf": [16, 16]}}}
 RMSPROP = {"optimizer_class": torch.optim.RMSprop, "optimizer_kwargs": {"eps": 1e-3}}
 RELU = {"policy_kwargs": {"activation_fn": torch.nn.ReLU, **RMSPROP}}
 ELU = {"policy_kwargs": {"activation_fn": torch.nn.ELU}}
+FEW_PRODUCTS = {"cg_max_steps": 2, "cg_damping": 1.0, "n_critic_updates": 1}
 ON_POLICY: list[tuple[type, str, dict[str, Any]]] = [
     *[(PPO, kind, {}) for kind in KINDS],
     (PPO, "one_hot", {"clip_range": 0.02, "ent_coef": 0.3, "vf_coef": 0.1}),
@@ -126,6 +127,14 @@ ON_POLICY: list[tuple[type, str, dict[str, Any]]] = [
     (A2C, "one_hot", {"use_rms_prop": False, "max_grad_norm": 0.01}),
     *[(A2C, "none", LINEAR), (A2C, "coordinates", TWO_SIZES), (A2C, "image", SEPARATE)],
     *[(A2C, "coordinates", FOURIER), (A2C, "image", PIXELS)],
+    *[(TRPO, kind, {}) for kind in KINDS if kind != "image"],
+    *[(TRPO, "image", FEW_PRODUCTS), (TRPO, "image", {**SEPARATE, **FEW_PRODUCTS})],
+    (TRPO, "one_hot", {"normalize_advantage": False, "cg_max_steps": 3, "cg_damping": 1.0}),
+    (TRPO, "one_hot", {"sub_sampling_factor": 3, "batch_size": 100, "n_critic_updates": 2}),
+    (TRPO, "one_hot", {"target_kl": 0.5, "line_search_shrinking_factor": 0.5, "cg_damping": 1.0}),
+    (TRPO, "one_hot", {"line_search_max_iter": 0}),
+    *[(TRPO, "none", LINEAR), (TRPO, "coordinates", TWO_SIZES), (TRPO, "coordinates", FOURIER)],
+    *[(TRPO, "one_hot", RELU), (TRPO, "one_hot", ELU), (TRPO, "image", {**PIXELS, **FEW_PRODUCTS})],
 ]
 
 
@@ -135,7 +144,7 @@ ON_POLICY: list[tuple[type, str, dict[str, Any]]] = [
 def test_updates_from_rollouts(
     algorithm: Any, kind: str, arguments: dict[str, Any], few_states: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (population, ppo, a2c):
+    for module in (population, on_policy, a2c):
         monkeypatch.setattr(module, "FEW_STATES", few_states)
     n_steps = STEPS
     if algorithm is PPO:
@@ -145,6 +154,8 @@ def test_updates_from_rollouts(
             arguments |= {"batch_size": min(16, arguments["batch_size"]), "policy_kwargs": kwargs}
     elif few_states == 0:
         n_steps = 1  # fewer samples than states
+    if algorithm is TRPO:
+        arguments = {"batch_size": n_steps * NUM_ENVS, "n_critic_updates": 2, **arguments}
     run, theirs = twins(algorithm, kind, n_steps=n_steps, **arguments)
     states, actions, advantages, returns = samples(run, n_steps * NUM_ENVS)
     log_prob, values = run.population.log_policy()
@@ -161,10 +172,16 @@ def test_updates_from_rollouts(
     buffer.full = True
     move_away(run, theirs)
     np.random.set_state(run.numpy_generator.get_state())
+    torch.set_rng_state(run.torch_generator.get_state())
     theirs.train()
     run.population.update((log_prob, values), (states * 4 + actions)[None], advantages[None], returns[None])
     assert run.error is None
     assert_same(run, theirs)
+    if algorithm is TRPO:
+        is_improved = run.model.logger.output_formats[0].values["train/is_line_search_success"]
+        assert is_improved == ("line_search_max_iter" not in arguments)
+        kept = run.model.policy.optimizer.state_dict()["state"].keys()  # those of the values alone
+        assert kept == theirs.policy.optimizer.state_dict()["state"].keys()
 
 
 OFF_POLICY: list[tuple[type, str, dict[str, Any]]] = [
@@ -234,7 +251,7 @@ def test_the_same_seed_walks_and_learns_the_same(algorithm: Any) -> None:
         assert torch.allclose(mine, peer, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("algorithm", [PPO, A2C])
+@pytest.mark.parametrize("algorithm", [PPO, A2C, TRPO])
 def test_rollouts_and_advantages_are_sb3s(algorithm: Any) -> None:
     """SB3's own recursion over the rewards, values and ends of a rollout, and its values at time-outs."""
     run, theirs = twins(algorithm, "one_hot", n_steps=STEPS, gae_lambda=0.9)

@@ -1,0 +1,115 @@
+"""TRPO's natural gradients, side by side; `test_updates` has its updates beside sb3-contrib's."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from sb3_contrib import TRPO
+from test_populations import SMALL, Learned, alone, differences, train
+from test_updates import ELU, LINEAR, RELU, TWO_SIZES, samples, twins
+
+from gridworld.agents.sb3.engine_agent import learn_together
+from gridworld.engine.networks import aligned
+from gridworld.engine.trpo import conjugate_gradients
+
+
+@pytest.mark.parametrize("states", [None, np.array([3, 7, 8])], ids=["all states", "some states"])
+@pytest.mark.parametrize(
+    ("kind", "arguments"),
+    [
+        *[("one_hot", {}), ("one_hot", RELU), ("one_hot", ELU), ("one_hot", LINEAR)],
+        *[("coordinates", {}), ("coordinates", TWO_SIZES), ("image", {})],
+    ],
+    ids=str,
+)
+def test_products_with_the_jacobian_agree_from_both_sides(
+    kind: str, arguments: dict[str, Any], states: Any
+) -> None:
+    """uᵀ(J v) = (uᵀJ) v, and J v is what small changes v of the weights do."""
+    run, _ = twins(TRPO, kind, batch_size=64, n_steps=4, **arguments)
+    for networks in run.population.all_networks:
+        (outputs,) = (each.copy() for each in networks.run(states))
+        change = torch.randn(networks.weights.shape, generator=torch.Generator().manual_seed(1))
+        slopes = np.random.default_rng(1).normal(size=outputs.shape).astype(np.float32)
+        (moved,) = networks.push(aligned(change))
+        networks.backward(slopes)
+        scale = float(np.abs(slopes * moved).sum())
+        assert float((networks.gradients * change).sum()) == pytest.approx(
+            (slopes * moved).sum(), abs=1e-5 * scale
+        )
+        weights, length = networks.weights.clone(), 1e-5  # little: ReLU has kinks
+        networks.weights.copy_(weights + length * change)
+        (ahead,) = (each.copy() for each in networks.run(states))
+        networks.weights.copy_(weights - length * change)
+        (behind,) = networks.run(states)
+        assert np.allclose((ahead - behind) / (2 * length), moved, atol=0.02 * np.abs(moved).max())
+
+
+def test_the_longest_steps_end_at_the_border_of_the_trust_region() -> None:
+    """Where a step is short and nothing damps it, the divergence is what its second derivative says."""
+    short = {"target_kl": 1e-4, "cg_damping": 1e-4, "cg_max_steps": 10, "line_search_shrinking_factor": 0.99}
+    run, _ = twins(TRPO, "one_hot", batch_size=512, n_steps=32, **short)
+    states, actions, advantages, returns = samples(run, 512)
+    pairs = states * run.population.num_actions + actions
+    ours: Any = run.population
+    ours.update(ours.log_policy(), pairs[None], advantages[None], returns[None])
+    logged = run.model.logger.name_to_value
+    assert logged["train/is_line_search_success"] == 1
+    assert 0.95e-4 < logged["train/kl_divergence_loss"] < 1e-4
+
+
+def test_conjugate_gradients_solve_each_system_as_alone() -> None:
+    """Also where one ends earlier than the others, and rows have no round length."""
+    rng, width = np.random.default_rng(0), 21
+    roots = rng.normal(size=(4, width, width)).astype(np.float32)
+    matrices = torch.from_numpy(roots @ roots.transpose(0, 2, 1)) + 5 * torch.eye(width)
+    matrices[2] = torch.eye(width)  # which takes a single step
+    wanted = torch.from_numpy(rng.normal(size=(4, width)).astype(np.float32))
+    guess = 1e-4 * torch.ones_like(wanted)
+
+    def solve(rows: slice) -> torch.Tensor:
+        def product(vectors: torch.Tensor) -> torch.Tensor:
+            found = [matrix @ row for matrix, row in zip(matrices[rows], vectors, strict=True)]
+            return aligned(torch.stack(found))
+
+        right = product(wanted[rows])
+        return conjugate_gradients(product, right, guess[rows], 60)
+
+    solved = solve(slice(None))
+    assert torch.allclose(solved, wanted, atol=1e-3)
+    for row in range(4):
+        assert torch.equal(solve(slice(row, row + 1))[0], solved[row])
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_a_population_goes_on_from_the_middle(size: int) -> None:
+    runs = [(*SMALL["trpo"], f"seed={seed}", "env.slip=0.1") for seed in range(size)]
+    expected = [alone(words) for words in runs]
+    kept: list[Any] = [None] * size
+    learnings = [Learned(words).learning() for words in runs]
+    for place, learning in enumerate(learnings):
+
+        def keep(steps: int, place: int = place) -> None:
+            if steps == 64:
+                kept[place] = learnings[place].agent.get_state()
+
+        learning.on_safe_point = keep
+    assert learn_together(learnings) == [None] * size
+    rest = [Learned(words) for words in runs]
+    learnings = [run.learning() for run in rest]
+    for learning, state in zip(learnings, kept, strict=True):
+        assert 0 < state["num_timesteps"] < learning.total_timesteps
+        learning.state = state
+    assert learn_together(learnings) == [None] * size
+    for run, whole in zip(rest, expected, strict=True):
+        assert set(differences(run.found(), whole)) <= {".logged"}  # in which the first half is missing
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_a_trust_region_that_there_is_not_ends_its_own_run() -> None:
+    runs = [(*SMALL["trpo"], f"seed={seed}") for seed in range(3)]
+    runs[1] = (*runs[1], "agent.arguments.target_kl=-1")
+    found = train([Learned(words) for words in runs])
+    assert "the network's weights are no finite number" in str(found[1])
+    assert [differences(found[place], alone(runs[place])) for place in (0, 2)] == [[], []]
