@@ -123,7 +123,7 @@ class Population:
 
     def end(self, run: Run) -> None:
         """Let a run take no further part."""
-        self.active[run.row] = False
+        self.active[run.row], run.has_ended = False, True
 
     def fitted(self, run: Run) -> Sequence[Tensor]:
         """The parameters of SB3's model that the optimiser steps on."""
@@ -218,12 +218,13 @@ def train(runs: Sequence[Run], states: Sequence[State | None]) -> None:
         if len(group) > 1 and agree(group):
             type(group[0].population)(group, [run.population.get_state(run) for run in group])
         for population in dict.fromkeys(run.population for run in group):
+            members = list(population.runs)
             try:
                 population.learn(group[0].total_timesteps)
             except Exception as error:  # torch's, of settings that only it can judge
-                for run in group:
-                    run.failed_update = error
-                    run.error = run.error or error
+                for run in members:
+                    if not run.has_ended:
+                        run.error = run.failed_update = error
 
 
 def make_networks(

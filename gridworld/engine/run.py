@@ -68,6 +68,7 @@ class Run:
     on_step: Callable[[int], int] = field(init=False, default_factory=lambda: _go_on)
     on_safe_point: Callable[[int], None] | None = field(init=False, default=None)
     error: BaseException | None = field(init=False, default=None)  # that it ended with
+    has_ended: bool = field(init=False, default=False)  # before its last step
     failed_update: Exception | None = field(init=False, default=None)  # the same, where an update failed
 
     def __post_init__(self) -> None:
@@ -75,7 +76,7 @@ class Run:
 
     def begin(self, total_timesteps: int) -> None:
         """Prepare SB3's model as its `learn` does."""
-        self.total_timesteps, model = total_timesteps, self.model
+        self.total_timesteps, self.has_ended, model = total_timesteps, False, self.model
         model._total_timesteps, model._num_timesteps_at_start = total_timesteps, 0
         model.start_time = time.time_ns()
         model.ep_info_buffer = deque(maxlen=model._stats_window_size)
