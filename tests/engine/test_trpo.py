@@ -9,6 +9,7 @@ from sb3_contrib import TRPO
 from test_populations import SMALL, Learned, alone, differences, train
 from test_updates import ELU, LINEAR, RELU, TWO_SIZES, samples, twins
 
+from gridworld.agents import learn_together
 from gridworld.engine.networks import aligned
 from gridworld.engine.trpo import conjugate_gradients
 
