@@ -107,7 +107,7 @@ class Agent(Protocol):
 
         Raises:
             ValueError: `state` does not fit.
-            InputError: training diverged; or at once, where `get_state` could not be complete.
+            InputError: training diverged.
         """
 
     def get_state(self) -> State:

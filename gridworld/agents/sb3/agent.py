@@ -17,13 +17,13 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.save_util import recursive_getattr
 
 from gridworld.agents import PolicySnapshot, TrainingContext, WriteScalars
+from gridworld.agents.sb3.callback import RunCallback, check_finite, diverged
 from gridworld.agents.sb3.factory import UnfitError, cannot_update, make_model
 from gridworld.agents.sb3.falling_setting import falling_settings
 from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters, reason
 from gridworld.agents.sb3.policy_outputs import Reading, epsilon_greedy, read, read_states, why_no_table
 from gridworld.agents.sb3.settings.callbacks import make_callbacks
 from gridworld.agents.sb3.settings.schemas import SB3Config, reward_scale
-from gridworld.agents.sb3.snapshot.callback import CheckpointCallback, check_finite, diverged
 from gridworld.bounds import within
 from gridworld.config.agents import AgentConfig
 from gridworld.errors import InputError
@@ -91,11 +91,10 @@ class SB3Agent:
         state: State | None = None,
     ) -> None:
         """See `gridworld.agents.Agent.learn`."""
-        root = SB3Agent.learn.__code__
-        self._callback = CheckpointCallback(
-            on_step, on_safe_point, self.observation, root, self._callbacks, falling_settings(self.config)
+        falling = falling_settings(self.config)
+        self._callback = RunCallback(
+            on_step, on_safe_point, state, self.config.log_interval, self._callbacks, falling
         )
-        self._callback.state = state
         try:
             self._model.learn(total_timesteps, callback=self._callback, log_interval=self.config.log_interval)
         except FloatingPointError as error:
