@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -68,15 +69,20 @@ class UniformReplay:
 
     def __init__(self, runs: int, buffer_size: int, num_envs: int, num_states: int) -> None:
         self._rows, self._num_envs = max(buffer_size // num_envs, 1), num_envs
-        shape, number = (runs, self._rows, num_envs), np.min_scalar_type(num_states - 1)
-        self._columns: dict[str, NDArray[Any]] = {
-            "states": np.zeros(shape, number),
+        self._shape, self._state = (runs, self._rows, num_envs), np.min_scalar_type(num_states - 1)
+        self._position, self._is_full = 0, False
+
+    @cached_property
+    def _columns(self) -> dict[str, NDArray[Any]]:
+        """Made when something is stored: who is only asked what it learnt needs no memory for it."""
+        shape = self._shape
+        return {
+            "states": np.zeros(shape, self._state),
             "actions": np.zeros(shape, np.uint8),
-            "following": np.zeros(shape, number),
+            "following": np.zeros(shape, self._state),
             "rewards": np.zeros(shape, np.float32),
             "ends": np.zeros(shape, np.bool_),
         }
-        self._position, self._is_full = 0, False
 
     def store(
         self, states: IntArray, actions: IntArray, following: IntArray, rewards: FloatArray, ends: BoolArray

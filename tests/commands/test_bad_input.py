@@ -215,7 +215,7 @@ TRAIN_WITH_SB3 = [
     ("agent=a2c +agent.arguments.policy_kwargs=3", "agent.arguments.policy_kwargs=3: must be settings"),
     (
         "agent=a2c +agent.arguments.policy_kwargs.features_extractor_kwargs=3",
-        "agent.arguments.policy_kwargs.features_extractor_kwargs=3: stable_baselines3.A2C cannot be built",
+        "look at agent.arguments.policy_kwargs.features_extractor_kwargs=3",
     ),
 ]
 

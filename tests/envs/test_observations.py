@@ -1,5 +1,6 @@
 """Every shipped layout under every observation, single or batched, keeps the contract."""
 
+import dataclasses
 import warnings
 from typing import Any
 
@@ -7,11 +8,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.wrappers.vector import TransformObservation
+from helpers.support import configure
 
 import gridworld
 from gridworld import GridWorldEnv, InputError
+from gridworld.agents import family
 from gridworld.envs.inspection import observation_like
 from gridworld.envs.observations import KINDS, TableObservation, VectorTableObservation, make_observation
+from gridworld.training.setup import make_context
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import classic, parse
 from gridworld.world.mdp import Mdp
@@ -253,21 +257,16 @@ def test_a_world_without_what_an_observation_shows(kind, why):
 @pytest.mark.parametrize("algorithm", ["PPO", "DQN"])
 @pytest.mark.parametrize("numbers", [False, True])
 def test_agents_train_on_the_environments_own_observation(algorithm, numbers):
-    import stable_baselines3
-    from gridworld.agents.sb3.tabulated.dqn import TabulatedDQN
-    from gridworld.agents.sb3.tabulated.ppo import TabulatedPPO
-
-    from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-
     images = np.repeat(np.arange(4, dtype=np.uint8), 7 * 7 * 3).reshape(4, 7, 7, 3)
     mdp = world(own_observation=np.arange(4) if numbers else images)
     small = (
         {"n_steps": 16, "n_epochs": 1} if algorithm == "PPO" else {"learning_starts": 20, "buffer_size": 100}
     )
-    fast = {"PPO": TabulatedPPO, "DQN": TabulatedDQN}[algorithm]
-    for each in (getattr(stable_baselines3, algorithm), fast):
-        envs = gridworld.GridWorldVectorEnv(4, mdp=mdp, autoreset_mode="SameStep", max_episode_steps=9)
-        table = make_observation(mdp, "own")
-        model = each("MlpPolicy", GridWorldVecEnv(envs, table), seed=0, device="cpu", **small).learn(128)
-        assert model.num_timesteps >= 128
-        assert model.predict(table.rows(mdp.start_states))[0].shape == (1,)
+    for engine in ("stock", "tabulated"):
+        config = configure(f"agent={algorithm.lower()}", "observation=own", f"agent.engine={engine}")
+        settings = dataclasses.replace(config.agent, **small)
+        context = make_context(config, mdp, make_observation(mdp, "own"))
+        agent = family(settings).build(settings, context)
+        agent.learn(128, lambda steps: steps + 1)
+        assert agent.model.num_timesteps >= 128
+        assert agent.snapshot().greedy.shape == (mdp.num_states,)

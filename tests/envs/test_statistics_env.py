@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gridworld.envs.joint_rollout import roll
 from helpers.support import LEARNING, SHORT, train_in
 
+from gridworld.engine.environments import Environments, Step
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.vector_env import Advance, GridWorldVectorEnv
 
@@ -55,44 +55,28 @@ def test_visits_and_returns_are_those_of_a_naive_tally(settings: dict, dtype: ty
 
 @pytest.mark.parametrize("bonus", [0.0, 0.7])
 def test_a_rollout_counted_in_blocks_is_that_counted_step_by_step(bonus: float) -> None:
-    """To the last bit: whether a checkpoint or callback looks in the middle of a block changes no run."""
+    """To the last bit: whether an evaluation comes in the middle of a rollout changes no run."""
     settings: dict = {"slip": 0.3, "step_reward": -0.1, "max_episode_steps": 9}
     rolling, stepping = (StatisticsVectorEnv(6, exploration_bonus=bonus, **settings) for _ in range(2))
     for envs in (rolling, stepping):
         envs.reset(seed=3)
-    asked = {7, 8, 39, 40}  # after so many steps somebody looks
+    environments = Environments([rolling])
+    uniform = np.full((1, rolling.mdp.num_states, 4), 0.25)
     for draws in np.random.default_rng(0).random((2, 40, 6)).astype(np.float32):
-        thresholds = np.tile([[0.25], [0.5], [0.75]], rolling.mdp.num_states)
-        (rolled,) = roll([rolling], [thresholds], draws[None])
-        paid = [stepping.advance(actions)[1] for actions in rolled.actions[: min(asked)]]
-        for step in range(min(asked), 41):
-            rolling.passed(rolled, step)
-            if step in asked:
-                assert np.array_equal(rolling.visits, stepping.visits)
-                assert rolling.take_returns() == stepping.take_returns()
-            if step < 40:
-                paid.append(stepping.advance(rolled.actions[step])[1])
-        assert np.array_equal(rolled.rewards, paid)
+        rolled = environments.roll(uniform, draws)
+        pairs, rewards = rolled.pairs[:, 0], rolled.rewards[:, 0]
+        steps, returns, _ = rolled.ended[0]
+        for first, end in ((0, 7), (7, 8), (8, 39), (39, 40)):  # after so many steps somebody looks
+            rolling.count(pairs[first:end], rewards[first:end])
+            a, b = np.searchsorted(steps, (first, end))
+            rolling.add_returns(steps[a:b], returns[a:b])
+            paid = [stepping.advance(actions % 4)[1] for actions in pairs[first:end]]
+            assert np.array_equal(rewards[first:end], paid)
+            assert np.array_equal(rolling.visits, stepping.visits)
+            assert rolling.take_returns() == stepping.take_returns()
+    environments.put_back()
     assert rolling.visits.sum() == 480
-    assert rolling.get_state().keys() == stepping.get_state().keys()
-
-
-@pytest.mark.parametrize("is_restored", [False, True])
-def test_a_rollout_that_training_left_is_no_part_of_the_next(is_restored: bool) -> None:
-    envs = StatisticsVectorEnv(6, slip=0.3)
-    envs.reset(seed=3)
-    thresholds = np.tile([[0.25], [0.5], [0.75]], envs.mdp.num_states)
-    state = envs.get_state()
-    for draws, steps in zip(
-        np.random.default_rng(0).random((2, 9, 6)).astype(np.float32), (5, 9), strict=True
-    ):
-        (rolled,) = roll([envs], [thresholds], draws[None])
-        envs.passed(rolled, steps)
-        if not is_restored:
-            envs.catch_up()
-        elif steps == 5:
-            envs.set_state(state)  # before anybody looked
-    assert envs.visits.sum() == 6 * (9 if is_restored else 5 + 9)
+    assert np.array_equal(rolling.states, stepping.states)
 
 
 def test_an_episode_given_up_is_not_one_that_ended() -> None:
@@ -175,5 +159,14 @@ def ended_episodes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
                 under_way[index] = 0.0
         return states, rewards, terminated, truncated, over
 
+    def stepped(environments: Environments, actions: np.ndarray) -> Step:
+        nonlocal taken
+        found = step(environments, actions)
+        taken += len(actions)
+        ended.extend((taken, total) for total in found.returns)
+        return found
+
+    step = Environments.step
     monkeypatch.setattr(StatisticsVectorEnv, "advance", watched)
+    monkeypatch.setattr(Environments, "step", stepped)
     return ended

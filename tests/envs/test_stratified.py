@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from gridworld.envs.joint_rollout import roll
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
 from gridworld import GridWorldEnv
+from gridworld.engine.environments import Environments
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.stratified import stratified_numbers
 from gridworld.envs.vector_env import GridWorldVectorEnv
@@ -100,11 +100,11 @@ def outcomes(stratified: bool, steps: int, num_envs: int) -> tuple[IntArray, Int
     """Where steps led to that all environments began in one state, (steps, num_envs)."""
     envs = GridWorldVectorEnv(num_envs, slip=0.2, autoreset_mode="Disabled", stratified=stratified)
     envs.reset(seed=1)
-    start, _, _ = envs.under_way
+    start, _, _ = envs.episode_state
     start = start.copy()
     led = np.empty((steps, num_envs), dtype=np.int64)
     for step in range(steps):
-        envs.go_on_from(start, np.zeros(num_envs, dtype=np.int64), np.zeros(num_envs))
+        envs.set_episode_state(start, np.zeros(num_envs, dtype=np.int64), np.zeros(num_envs))
         led[step] = envs.step(np.full(num_envs, 2))[0]
     return start, led
 
@@ -129,24 +129,21 @@ def test_the_starts_are_spread_over_the_states() -> None:
 @pytest.mark.parametrize("num_envs", [1, 3, 40])
 def test_rollouts_of_several_batches_draw_what_each_would_alone(num_envs: int) -> None:
     mdp = GridWorldEnv(slip=0.3).mdp.with_exploring_starts(0.5)
-    other = GridWorldEnv(slip=0.1, num_rows=7).mdp.with_exploring_starts(0.5)
 
     def batches() -> list[StatisticsVectorEnv]:
         made = [
-            StatisticsVectorEnv(num_envs, mdp=world, stratified=True, max_episode_steps=20)
-            for world in (mdp, other, mdp)
+            StatisticsVectorEnv(num_envs, mdp=mdp, stratified=True, max_episode_steps=20) for _ in range(3)
         ]
         for seed, each in enumerate(made):
             each.reset(seed=seed)
         return made
 
-    draws = np.random.default_rng(2).random((3, 60, num_envs), dtype=np.float32)
-    together, alone = batches(), batches()
-    thresholds = [np.tile([[0.25], [0.5], [0.75]], (1, each.mdp.num_states)) for each in together]
-    rollouts = roll(together, thresholds, draws)
-    for rolled, batch, own in zip(rollouts, alone, draws, strict=True):
+    draws = np.random.default_rng(2).random((60, 3, num_envs), dtype=np.float32)
+    uniform = np.full((3, mdp.num_states, 4), 0.25)
+    rolled = Environments(batches()).roll(uniform, draws.reshape(60, -1))
+    for run, batch in enumerate(batches()):
         for step in range(60):
-            assert np.array_equal(batch.states, rolled.states[step])
-            found = batch.advance(np.floor(own[step] * 4).astype(np.int64))
-            assert np.array_equal(found[1], rolled.rewards[step])
-        assert np.array_equal(batch.states, rolled.final_states)
+            assert np.array_equal(batch.states, rolled.pairs[step, run] // 4)
+            found = batch.advance(np.floor(draws[step, run] * 4).astype(np.int64))
+            assert np.array_equal(found[1], rolled.rewards[step, run])
+        assert np.array_equal(batch.states, rolled.final_states[run])

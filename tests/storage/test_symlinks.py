@@ -10,6 +10,7 @@ from gridworld.run.claim import check_free
 from gridworld.storage.symlinks import check_no_links, links_in, make_inside, names_inside, remove_inside
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.plan import Job
+from gridworld.training.together import run_alone
 from gridworld.tune import confirmation as confirm
 from gridworld.tune.study_folder import check_study_folder
 
@@ -75,7 +76,7 @@ def test_confirming_takes_no_folder_away_through_a_link(link: str, tmp_path: Pat
     with pytest.raises(InputError, match=REFUSED):
         confirm.prepare(tmp_path / "study", [run])
     with pytest.raises(InputError, match=REFUSED):
-        confirm._run(run)
+        run_alone(confirm._run(run))
     assert contents(victim) == before
 
 

@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from gridworld.envs.joint_rollout import roll
 from helpers.oracle import World, maps
 from helpers.support import configure
 from hypothesis import given
@@ -12,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import binom, chi2_contingency
 
 from gridworld.agents import family
-from gridworld.agents.sb3.tabulated import on_policy
+from gridworld.engine.environments import Environments
 from gridworld.envs import rollout
 from gridworld.envs.observations import make_observation
 from gridworld.envs.rollout import play_episode, sample_episodes
@@ -154,14 +153,15 @@ def test_slips_do_not_depend_on_the_actions_of_training(monkeypatch, agent: str)
         walked.append((before, np.asarray(actions), answer[0] if answer[4] is None else answer[4].states))
         return answer
 
-    def rolled(*arguments):
-        found = roll(*arguments)
-        for each in found:
-            walked.extend(zip(each.states, each.actions, each.last_states, strict=True))
-        return found
+    def stepped(self, actions):
+        before = self.states
+        answer = step(self, actions)
+        walked.append((before, actions, answer.last_states))
+        return answer
 
+    step = Environments.step
     monkeypatch.setattr(StatisticsVectorEnv, "advance", advance)
-    monkeypatch.setattr(on_policy, "roll", rolled)
+    monkeypatch.setattr(Environments, "step", stepped)
     config = configure(f"agent={agent}", "env.slip=0.3", "env=four_rooms", "total_timesteps=19200")
     if agent == "dqn":
         config.agent.learning_starts = 19_000
@@ -169,7 +169,7 @@ def test_slips_do_not_depend_on_the_actions_of_training(monkeypatch, agent: str)
         config.agent.arguments["learning_starts"] = 19_000
     mdp = config.env.compile()
     context = make_context(config, mdp, make_observation(mdp, "one_hot"))
-    family(config.agent).build(config.agent, context).learn(config.total_timesteps, lambda steps: True)
+    family(config.agent).build(config.agent, context).learn(config.total_timesteps, lambda steps: steps + 1)
     assert_independent(slip_table(mdp, walked))
 
 

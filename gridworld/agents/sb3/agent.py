@@ -99,19 +99,20 @@ class SB3Agent:
             self._model.learn(total_timesteps, callback=self._callback, log_interval=self.config.log_interval)
         except FloatingPointError as error:
             raise diverged(self._model, str(error)) from None
-        except ValueError as error:  # torch's distributions refuse NaN, which SB3 lets through
-            check_finite(self._model)
-            raise self._first(error) from error
+        except (InputError, OSError, StateError):
+            raise
         except Exception as error:
-            raise self._first(error) from error
+            if isinstance(error, ValueError):  # torch's distributions refuse NaN, which SB3 lets through
+                check_finite(self._model)
+            if self._refuses_settings(error):
+                raise cannot_update(self.config, error) from error
+            raise
 
-    def _first(self, error: Exception) -> Exception:
-        """What to raise where learning failed: a sentence if it was the first update, of anybody's class."""
+    def _refuses_settings(self, error: Exception) -> bool:
+        """Whether an error is of the first update of a library's class; one of somebody's own has a bug."""
         is_update = any(frame.name == "train" for frame in traceback.extract_tb(error.__traceback__))
-        is_ours = isinstance(error, InputError | OSError | StateError)
-        if is_ours or not is_update or self._model._n_updates:
-            return error
-        return cannot_update(self.config, error)
+        library = type(self._model).__module__.partition(".")[0]
+        return is_update and not self._model._n_updates and library in ("stable_baselines3", "sb3_contrib")
 
     def get_state(self) -> State:
         """See `gridworld.agents.Agent.get_state`, for while it learns."""

@@ -20,7 +20,7 @@ from gridworld.agents.sb3.settings.validation import FALLING
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.config.agents import falls, parse_schedule
 from gridworld.engine.population import train
-from gridworld.engine.sb3_format import Kind, algorithm_of, make_run, model_file
+from gridworld.engine.sb3_format import Kind, algorithm_of, make_run, model_file, put_weights
 from gridworld.storage.serialization import State
 
 
@@ -39,7 +39,7 @@ class EngineAgent(SB3Agent):
         super().__init__(config, context, with_buffers=False)
         algorithm = algorithm_of(type(self._model))
         assert algorithm is not None
-        self._algorithm = algorithm
+        self._algorithm, self._is_only_asked = algorithm, context.only_asked
         given = vars(config) | vars(config).get("arguments", {})
         falling = {name: parse_schedule(name, given[name]) for name in FALLING if falls(given.get(name))}
         self.run = make_run(
@@ -57,7 +57,10 @@ class EngineAgent(SB3Agent):
 
     @property
     def model(self) -> BaseAlgorithm:
-        """SB3's own object, with what was learnt so far; it can learn on."""
+        """SB3's own object, with what was learnt so far; it can learn on, unless it is only asked."""
+        if self._is_only_asked:
+            put_weights(self.run)
+            return self._model
         file = io.BytesIO(self.model_file())
         envs = GridWorldVecEnv(self._envs, self.observation, reward_scale(self.config))
         return type(self._model).load(file, env=envs, device=self._model.device)
