@@ -110,6 +110,9 @@ class Agent(Protocol):
             InputError: training diverged.
         """
 
+    def class_without_state(self) -> str | None:
+        """The path of a class of which nobody knows what it keeps, so that `get_state` cannot be complete."""
+
     def get_state(self) -> State:
         """Everything that learning depends on from here, its environments included."""
 

@@ -24,6 +24,7 @@ from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters
 from gridworld.agents.sb3.policy_outputs import Reading, epsilon_greedy, read, read_states, why_no_table
 from gridworld.agents.sb3.settings.callbacks import make_callbacks
 from gridworld.agents.sb3.settings.schemas import SB3Config, reward_scale
+from gridworld.agents.sb3.state import class_without_state
 from gridworld.bounds import within
 from gridworld.config.agents import AgentConfig
 from gridworld.errors import InputError
@@ -113,6 +114,10 @@ class SB3Agent:
         is_update = any(frame.name == "train" for frame in traceback.extract_tb(error.__traceback__))
         library = type(self._model).__module__.partition(".")[0]
         return is_update and not self._model._n_updates and library in ("stable_baselines3", "sb3_contrib")
+
+    def class_without_state(self) -> str | None:
+        """See `gridworld.agents.Agent.class_without_state`."""
+        return class_without_state(self._model, self._callbacks)
 
     def get_state(self) -> State:
         """See `gridworld.agents.Agent.get_state`, for while it learns."""

@@ -1,8 +1,8 @@
 """What calls the hooks of a run while SB3's own `learn` is at work, and the user's callbacks.
 
 SB3 calls `on_step` before it has stored the transition. A rollout's start is where nothing is half done: the
-transitions are stored, the update is made. What was saved is put back when training starts, after SB3 has reset
-everything that it resets then.
+transitions are stored, the update is made. What was saved is put back when training starts, after SB3 has
+reset everything that it resets then.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from gridworld.agents.sb3.factory import said
-from gridworld.agents.sb3.state import get_state, set_state, why_not_saved
+from gridworld.agents.sb3.state import get_state, set_state
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import tell
 from gridworld.storage.serialization import State, fitting
@@ -75,10 +75,6 @@ class RunCallback(BaseCallback):
         for index, other in enumerate(self._others):
             with _beginning(index, other):
                 other.on_training_start(self.locals, self.globals)
-        stranger = why_not_saved(self.model, self._others)
-        if stranger is not None and self._on_safe_point is not None:
-            self._on_safe_point = None
-            tell(f"checkpoints: none, since {stranger} does not define get_state and set_state")
         if self._state is not None:
             state, self._state = self._state, None
             with fitting():

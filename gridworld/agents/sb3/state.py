@@ -1,12 +1,13 @@
 """The state of Stable-Baselines3's own loop, between one rollout and the next, by name.
 
-It is exact for the classes of Stable-Baselines3 and sb3-contrib: all that these change while they learn is listed
-here. What a class of somebody else's keeps, nobody can know: it says so itself, by two methods,
+It is exact for the classes of Stable-Baselines3 and sb3-contrib: all that they change while they learn is
+listed here. What a custom class keeps, only that class can know: it defines
 
-    get_state() -> dict: of numbers, strings, None, arrays, and dicts and lists of these
+    get_state(): a dict of numbers, strings, None, arrays, and of dicts and lists of these
     set_state(state): mirrors it
 
-beside which the class that it derives from is saved as it is. One without them trains without checkpoints.
+For an algorithm, that is in addition to what its base class keeps, for a layer to its parameters; a replay
+buffer or callback says everything. With a custom class that does not define them a run has no checkpoints.
 """
 
 from __future__ import annotations
@@ -23,23 +24,15 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import Tensor
 
-from gridworld.agents.sb3.falling_setting import FallingSetting
-from gridworld.agents.sb3.replay_counts import ReplayCounts
 from gridworld.storage.rng_state import (
     generator_state,
     global_state,
-    plain_state,
     set_generator_state,
     set_global_state,
 )
 from gridworld.storage.serialization import State, StateError, fill
 
-_KNOWN = (
-    "stable_baselines3",
-    "sb3_contrib",
-    "torch",
-    "gridworld",
-)  # packages whose classes have no more state
+_LIBRARIES = ("stable_baselines3", "sb3_contrib", "torch", "gridworld")
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_n_calls")
 _NUMBERS = ("exploration_rate", "_current_progress_remaining")
 _OF_CALLBACKS: dict[type[BaseCallback], tuple[str, ...]] = {  # SB3's own, and what these count
@@ -48,7 +41,6 @@ _OF_CALLBACKS: dict[type[BaseCallback], tuple[str, ...]] = {  # SB3's own, and w
     sb3_callbacks.ConvertCallback: (),
     sb3_callbacks.EveryNTimesteps: ("last_time_trigger",),
     sb3_callbacks.StopTrainingOnMaxEpisodes: ("n_episodes", "_total_max_episodes"),
-    FallingSetting: (),
 }
 
 
@@ -63,24 +55,23 @@ class HasState(Protocol):
         """Mirrors `get_state`."""
 
 
-def why_not_saved(model: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> str | None:
-    """The class whose state nobody knows, by its path; None: all of it is known."""
+def class_without_state(model: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> str | None:
+    """The path of a class of which nobody knows what it keeps; None: all are known."""
+    for each in (*_custom_parts(model), *_flat(callbacks)):
+        if type(each) not in _OF_CALLBACKS and not isinstance(each, HasState):
+            return f"{type(each).__module__}.{type(each).__qualname__}"
+    return None
+
+
+def _custom_parts(model: BaseAlgorithm) -> list[Any]:
+    """The model and those of its parts whose classes come from no library."""
     buffers = [getattr(model, f"{kind}_buffer", None) for kind in ("replay", "rollout")]
-    parts = [*model.policy.modules(), model.policy.optimizer, *(each for each in buffers if each is not None)]
-    strangers = [each for each in parts if not _is_known(each)]
-    if not (_is_known(model) or isinstance(model, HasState)):
-        strangers.insert(0, model)
-    for callback in _flat(callbacks):
-        if type(callback) not in _OF_CALLBACKS and not isinstance(callback, HasState):
-            strangers.append(callback)
-    if not strangers:
-        return None
-    kind = type(strangers[0])
-    return f"{kind.__module__}.{kind.__qualname__}"
-
-
-def _is_known(part: object) -> bool:
-    return type(part).__module__.partition(".")[0] in _KNOWN
+    parts = [model, *model.policy.modules(), model.policy.optimizer, *buffers]
+    return [
+        part
+        for part in parts
+        if part is not None and type(part).__module__.partition(".")[0] not in _LIBRARIES
+    ]
 
 
 def _flat(callbacks: Sequence[BaseCallback]) -> Iterator[BaseCallback]:
@@ -101,7 +92,7 @@ def get_state(model: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> State:
         **{name: float(getattr(model, name)) for name in _NUMBERS if hasattr(model, name)},
         "parameters": {name: _plain(found) for name, found in model.get_parameters().items()},
         "replay": None if buffer is None else _replay_state(buffer),
-        "environments": loop.env.get_state(),
+        "environments": loop.env.envs.get_state(),
         "last_episode_starts": loop._last_episode_starts,
         "recent_episodes": [[each["r"], each["l"]] for each in loop.ep_info_buffer],
         "logged": [
@@ -112,8 +103,7 @@ def get_state(model: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> State:
         "global_generators": global_state(),
         "torch_generators": torch_state(),
         "action_generator": generator_state(model.action_space.np_random),
-        "observation_generator": generator_state(model.observation_space.np_random),
-        "own": plain_state(model.get_state()) if isinstance(model, HasState) else None,
+        "custom_parts": [part.get_state() for part in _custom_parts(model)],
         "callbacks": [_callback_state(each) for each in _flat(callbacks)],
     }
 
@@ -142,7 +132,7 @@ def set_state(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], state: St
     buffer = getattr(model, "replay_buffer", None)
     if buffer is not None:
         _set_replay_state(buffer, state["replay"])
-    loop.env.set_state(state["environments"])
+    loop.env.envs.set_state(state["environments"])
     loop._last_obs = loop.env.observation.rows(loop.env.states)
     if loop._last_episode_starts is not None:
         fill(loop._last_episode_starts, state["last_episode_starts"], "last_episode_starts")
@@ -154,18 +144,17 @@ def set_state(model: BaseAlgorithm, callbacks: Sequence[BaseCallback], state: St
         loop.logger.record(name, float(value), exclude="tensorboard" if is_excluded else None)
         loop.logger.name_to_count[name] = int(count)
     loop.start_time = time.time_ns() - int(state["seconds"] * 1e9)
-    if isinstance(model, HasState):
-        model.set_state(state["own"])
+    for part, own in zip(_custom_parts(model), state["custom_parts"], strict=True):
+        part.set_state(own)
     for callback, own in zip(_flat(callbacks), state["callbacks"], strict=True):
         _set_callback_state(callback, own)
     set_generator_state(model.action_space.np_random, state["action_generator"])
-    set_generator_state(model.observation_space.np_random, state["observation_generator"])
     set_global_state(state["global_generators"])
     set_torch_state(state["torch_generators"])
 
 
 def _replay_state(buffer: Any) -> State:
-    if isinstance(buffer, ReplayCounts):
+    if isinstance(buffer, HasState):
         return buffer.get_state()
     count = buffer.buffer_size if buffer.full else buffer.pos
     columns = {name: column[:count] for name, column in _columns(buffer)}
@@ -173,7 +162,7 @@ def _replay_state(buffer: Any) -> State:
 
 
 def _set_replay_state(buffer: Any, state: State) -> None:
-    if isinstance(buffer, ReplayCounts):
+    if isinstance(buffer, HasState):
         buffer.set_state(state)
         return
     if not 0 <= state["pos"] < buffer.buffer_size:
@@ -193,7 +182,7 @@ def _columns(buffer: ReplayBuffer) -> Iterator[tuple[str, Any]]:
 
 def _callback_state(callback: BaseCallback) -> State:
     counted = {name: getattr(callback, name) for name in _OF_CALLBACKS.get(type(callback), ())}
-    own = plain_state(callback.get_state()) if isinstance(callback, HasState) else None
+    own = callback.get_state() if isinstance(callback, HasState) else None
     return {"n_calls": callback.n_calls, "num_timesteps": callback.num_timesteps, **counted, "own": own}
 
 
