@@ -107,8 +107,11 @@ class Agent(Protocol):
 
         Raises:
             ValueError: `state` does not fit.
-            InputError: training diverged; or at once, where `get_state` could not be complete.
+            InputError: training diverged.
         """
+
+    def class_without_state(self) -> str | None:
+        """The path of a class of which nobody knows what it keeps, so that `get_state` cannot be complete."""
 
     def get_state(self) -> State:
         """Everything that learning depends on from here, its environments included."""

@@ -17,6 +17,7 @@ from gridworld.agents import Agent, Learning, TrainingContext
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console.progress import Progress
+from gridworld.process.console.terminal import tell
 from gridworld.process.parallel.together import clock
 from gridworld.process.signals import StopRequest
 from gridworld.run.checkpoints import Checkpoints, Pace
@@ -132,7 +133,7 @@ class Session:
             "identity": identity(config, evaluator.mdp.text()),
             "environment": environment(config.agent),
         }
-        self._pace = Pace(config.checkpoint.every, self._steps)
+        self._pace = Pace(self._checkpoint_every(agent), self._steps)
         self._stop = StopRequest()
         self._started = clock() - (0.0 if state is None else float(state["seconds"]))
         self._curve_log = AppendLog(run.curve_file, None if state is None else state["marks"]["curve"])
@@ -143,6 +144,14 @@ class Session:
         sinks: list[Sink] = [CurveFile(self._curve_log), *scalars, ProgressLine(self._progress), pictures]
         curve = LearningCurve(evaluator, agent, config, sinks, context.envs)
         self._parts = Parts(Learner(agent), curve, pictures)
+
+    def _checkpoint_every(self, agent: Agent) -> int | str | None:
+        every = self._config.checkpoint.every
+        unknown = None if every is None else agent.class_without_state()
+        if unknown is None:
+            return every
+        tell(f"checkpoints: none, since {unknown} does not define get_state and set_state")
+        return None
 
     def run(self) -> Training[Summary]:
         """Train, evaluate, record.

@@ -141,14 +141,6 @@ def last_state(folder: Path) -> dict[str, Any] | None:
         curve["held"]["model"] = weights(curve["held"]["model"].tobytes(), folder)
     agent = state["agent"]
     agent.pop("seconds", None)
-    if "model" in agent:
-        values = agent["model"]["values"]
-        for value in values.values():
-            if isinstance(value, dict) and "envs" in value.get("state", ()):
-                value["state"].pop("seconds")
-        values.pop("start_time")
-        for episode in values["ep_info_buffer"]["deque"]:
-            episode["pairs"] = [pair for pair in episode["pairs"] if pair[0] != "t"]
     return state
 
 

@@ -17,13 +17,14 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.save_util import recursive_getattr
 
 from gridworld.agents import PolicySnapshot, TrainingContext, WriteScalars
+from gridworld.agents.sb3.callback import RunCallback, check_finite, diverged
 from gridworld.agents.sb3.factory import UnfitError, cannot_update, make_model
 from gridworld.agents.sb3.falling_setting import falling_settings
 from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters, reason
 from gridworld.agents.sb3.policy_outputs import Reading, epsilon_greedy, read, read_states, why_no_table
 from gridworld.agents.sb3.settings.callbacks import make_callbacks
 from gridworld.agents.sb3.settings.schemas import SB3Config, reward_scale
-from gridworld.agents.sb3.snapshot.callback import CheckpointCallback, check_finite, diverged
+from gridworld.agents.sb3.state import class_without_state
 from gridworld.bounds import within
 from gridworld.config.agents import AgentConfig
 from gridworld.errors import InputError
@@ -91,11 +92,10 @@ class SB3Agent:
         state: State | None = None,
     ) -> None:
         """See `gridworld.agents.Agent.learn`."""
-        root = SB3Agent.learn.__code__
-        self._callback = CheckpointCallback(
-            on_step, on_safe_point, self.observation, root, self._callbacks, falling_settings(self.config)
+        falling = falling_settings(self.config)
+        self._callback = RunCallback(
+            on_step, on_safe_point, state, self.config.log_interval, self._callbacks, falling
         )
-        self._callback.state = state
         try:
             self._model.learn(total_timesteps, callback=self._callback, log_interval=self.config.log_interval)
         except FloatingPointError as error:
@@ -114,6 +114,10 @@ class SB3Agent:
         is_update = any(frame.name == "train" for frame in traceback.extract_tb(error.__traceback__))
         library = type(self._model).__module__.partition(".")[0]
         return is_update and not self._model._n_updates and library in ("stable_baselines3", "sb3_contrib")
+
+    def class_without_state(self) -> str | None:
+        """See `gridworld.agents.Agent.class_without_state`."""
+        return class_without_state(self._model, self._callbacks)
 
     def get_state(self) -> State:
         """See `gridworld.agents.Agent.get_state`, for while it learns."""

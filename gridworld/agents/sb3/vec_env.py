@@ -17,7 +17,6 @@ from gridworld.envs.observations import ObservationTable
 from gridworld.envs.vector_env import Advance, GridWorldVectorEnv, StateArray
 from gridworld.errors import InputError
 from gridworld.storage.rng_state import independent_generator
-from gridworld.storage.serialization import State
 from gridworld.world.mdp import BoolArray, FloatArray
 
 _MASKS = "action_masks"  # asked for by agents that respect them; here nothing is ever forbidden
@@ -143,19 +142,6 @@ class GridWorldVecEnv(VecEnv):
         elapsed = round(time.time() - self._started, 6)
         pairs = zip(returns.tolist(), lengths.tolist(), strict=True)
         return [{"r": episode_return, "l": length, "t": elapsed} for episode_return, length in pairs]
-
-    def get_state(self) -> State:
-        """Where the batch stands, as a value. Seeds and options were used up by `reset`."""
-        return {"envs": self.envs.get_state(), "seconds": time.time() - self._started}
-
-    def set_state(self, state: State) -> None:
-        """Mirrors `get_state`.
-
-        Raises:
-            ValueError: the state of another batch.
-        """
-        self.envs.set_state(state["envs"])
-        self._started = time.time() - float(state["seconds"])
 
     def close(self) -> None:
         self.envs.close()

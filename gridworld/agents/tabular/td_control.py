@@ -161,6 +161,10 @@ class TabularControl(ABC):
             if on_safe_point is not None and goes_on:
                 on_safe_point(steps)
 
+    def class_without_state(self) -> None:
+        """See `gridworld.agents.Agent.class_without_state`."""
+        return
+
     def get_state(self) -> State:
         """See `gridworld.agents.Agent.get_state`."""
         return {

@@ -1,4 +1,4 @@
-"""Callbacks of one's own: built before training, called as SB3 calls them, and in the checkpoints."""
+"""Custom callbacks: built before training, called as SB3 calls them, in checkpoints if they have a state."""
 
 import json
 import sys
@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from helpers.resuming import begin, differences, go_on, left_behind, rows, stopped_after
 from helpers.support import SHORT, configure, script
-from stable_baselines3.common.base_class import BaseAlgorithm
 
 from gridworld.agents.sb3.model_file import read_weights
 from gridworld.agents.tabular import check as check_tabular
@@ -19,6 +18,7 @@ from gridworld.config.settings_by_effect import ON_RESULT, with_effects
 from gridworld.errors import InputError
 from gridworld.restore.resume import open_unfinished
 from gridworld.restore.saved_run import SavedRun
+from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.claim import check_free
 from gridworld.run.reader import read_run
 from gridworld.storage.sealed_json import sealed
@@ -36,6 +36,14 @@ class Stirring(BaseCallback):
         self.every, self.scale = every, scale
         self.counts = {"rollouts": 0, "ends": 0}
         self.rates = []
+
+    def get_state(self):
+        return {"counts": self.counts, "rates": self.rates}
+
+    def set_state(self, state):
+        self.counts, self.rates = dict(state["counts"]), list(state["rates"])
+        if self.rates:
+            self.model.gamma = self.model.ent_coef = self.rates[-1]
 
     def _on_training_start(self):
         self.start = len(self.locals)
@@ -68,11 +76,6 @@ class Recording(BaseCallback):
         CALLS.append("rollout end")
     def _on_training_end(self):
         CALLS.append("end")
-
-class Hiding(Recording):
-    def __init__(self):
-        super().__init__()
-        self.lines = iter("abc")
 
 class Sampling(EvalCallback):
     def __init__(self, **settings):
@@ -114,8 +117,8 @@ def test_a_callback_goes_on_to_the_bit(agent: str, tmp_path: Path) -> None:
     calm, run = left_behind(tmp_path / "calm"), left_behind(tmp_path / "run")
     assert differences(run, calm) == []
     assert "mine/rate" in {tag for tag, _, _ in calm["points"]}
-    values = calm["state"]["agent"]["model"]["values"]
-    assert len(values["callbacks[0].rates"]) > 3
+    (callback,) = calm["state"]["agent"]["callbacks"]
+    assert len(callback["own"]["rates"]) > 3
     mine, others = (read_weights(tmp_path / name / "model.zip", 10**8) for name in ("run", "without"))
     weights = [name for name in mine if name.startswith("policy.") and name.endswith(".weight")]
     assert weights
@@ -124,14 +127,27 @@ def test_a_callback_goes_on_to_the_bit(agent: str, tmp_path: Path) -> None:
     assert SavedRun(tmp_path / "run").snapshot().greedy.shape == (30,)  # which calls no callback
 
 
-def test_a_callback_may_hold_environments(tmp_path: Path) -> None:
-    words = [*SHORT["a2c"], *LESS, "logging.policy_map_every=0", SAMPLING]
-    begin(tmp_path / "calm", *words)
-    stopped_after(2, tmp_path / "run", *words, "checkpoint.every=150")
-    go_on(tmp_path / "run")
-    calm, run = left_behind(tmp_path / "calm"), left_behind(tmp_path / "run")
-    assert differences(run, calm) == []
-    assert "eval/mean_reward" in {tag for tag, _, _ in calm["points"]}
+@pytest.mark.parametrize(
+    ("callbacks", "name"),
+    [
+        (SAMPLING, "own_callbacks.Sampling"),
+        ("callbacks=[{_target_: own_callbacks.Recording}]", "own_callbacks.Recording"),
+        (
+            "callbacks=[{_target_: stable_baselines3.common.callbacks.EveryNTimesteps, n_steps: 9, "
+            "callback: {_target_: own_callbacks.Recording}}]",
+            "own_callbacks.Recording",
+        ),
+    ],
+    ids=["sampling", "recording", "held"],
+)
+def test_what_says_no_state_trains_without_checkpoints(
+    callbacks: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [*SHORT["a2c"], *LESS, "logging.policy_map_every=0", callbacks, "checkpoint.every=100"]
+    begin(tmp_path / "run", *words)
+    assert f"checkpoints: none, since {name} does not define get_state and" in capsys.readouterr().err
+    assert Checkpoints(tmp_path / "run").files() == []
+    assert read_run(tmp_path / "run").is_finished
 
 
 def test_a_finished_run_that_cannot_be_made_longer_stays_as_it_was(
@@ -145,14 +161,14 @@ def test_a_finished_run_that_cannot_be_made_longer_stays_as_it_was(
     def failing(self: Any) -> None:
         raise RuntimeError("no server")
 
-    def other(self: Any) -> None:
-        self.more = {"of": [BaseAlgorithm]}
+    def other(self: Any, state: Any) -> None:
+        self.more = state["more"]
 
-    for method, told in (
-        (other, r"its checkpoint does not fit this run: the model is made otherwise, callbacks\[0\]\.more"),
-        (failing, r"callbacks\[0\]: own_callbacks\.Stirring cannot begin: no server"),
+    for name, method, told in (
+        ("set_state", other, "its checkpoint does not fit this run"),
+        ("_init_callback", failing, r"callbacks\[0\]: own_callbacks\.Stirring cannot begin: no server"),
     ):
-        monkeypatch.setattr(stirring, "_init_callback", method)
+        monkeypatch.setattr(stirring, name, method)
         with pytest.raises(InputError, match=told):
             go_on(run, 2000)
         after = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
@@ -231,15 +247,6 @@ def test_callbacks_of_a_strangers_run_write_nothing_without_trust(tmp_path: Path
         overrides(recipe)
     assert precious.read_text() == "kept"
     assert not (tmp_path / "made.json").exists()
-
-
-def test_what_cannot_be_saved_is_refused(tmp_path: Path) -> None:
-    words = [*SHORT["a2c"], *LESS, "callbacks=[{_target_: own_callbacks.Hiding}]"]
-    with pytest.raises(
-        InputError, match=r"cannot be saved, callbacks\[0\]\.lines is a builtins\.str_.*every=null"
-    ):
-        begin(tmp_path / "run", *words)
-    begin(tmp_path / "without", *words, "checkpoint.every=null")
 
 
 @pytest.mark.parametrize(

@@ -72,6 +72,9 @@ class ValueIteration:
         """See `gridworld.agents.Agent.learn`. Nothing is left to learn: 0 steps."""
         on_step(0)
 
+    def class_without_state(self) -> None:
+        """See `gridworld.agents.Agent.class_without_state`."""
+
     def get_state(self) -> State:
         """See `gridworld.agents.Agent.get_state`. There is none: it is solved for again."""
         return {}
