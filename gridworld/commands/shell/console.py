@@ -36,7 +36,6 @@ Commands:
 
 What a command takes: {console} COMMAND --help
 The version: {console} --version
-Tab completion in bash: eval "$({console} --completion)"
 
 Examples:
   {console} train agent=dqn
@@ -65,7 +64,7 @@ def main() -> None:
 
 
 def _without_command(words: Sequence[str]) -> None:
-    """Print the manual, the version or what the shell asks for.
+    """Print the manual or the version.
 
     Raises:
         InputError: The first word is none of the commands.
@@ -78,14 +77,6 @@ def _without_command(words: Sequence[str]) -> None:
             from gridworld import __version__
 
             print(f"{CONSOLE} {__version__}")
-        case "--completion":
-            from gridworld.commands.shell.completion import BASH
-
-            print(BASH, end="")
-        case "--complete":  # what the shell's function calls
-            from gridworld.commands.shell.completion import complete
-
-            print("\n".join(complete(" ".join(words[1:]))))
         case unknown:
             raise InputError(f"{CONSOLE}: there is no command {unknown}{_meant(unknown)}")
 
