@@ -74,10 +74,10 @@ def train(config: AgentConfig, mdp: Mdp, gamma: float, num_envs: int, steps: int
     first, before = agent.snapshot(), _parameters(agent)
     earlier = np.zeros_like(context.envs.visits)
 
-    def watch(step: int) -> bool:
+    def watch(step: int) -> int:
         if step <= _LAST * steps:
             earlier[...] = context.envs.visits
-        return True
+        return step + 1
 
     agent.learn(steps, watch)
     after = _parameters(agent)

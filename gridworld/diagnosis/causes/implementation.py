@@ -6,17 +6,20 @@ one, with the same settings on the same world: where that is certified, the diff
 
 from __future__ import annotations
 
+import inspect
 import time
 from dataclasses import replace
 
 from gridworld.agents import family
 from gridworld.agents.sb3.settings.schemas import SB3ClassConfig
+from gridworld.config.agents import AgentConfig
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.finding import Finding
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.training.setup import make_context
 
+_LIBRARIES = ("stable_baselines3", "sb3_contrib")
 _SEEDS = 2  # its own and the next, as one that was certified may have been lucky
 _SECONDS = 2.5  # of the processor
 
@@ -25,8 +28,6 @@ def faulty_class(run: Evidence) -> Finding | None:
     """The library's own class is certified with the same settings."""
     if run.config.agent.family != "sb3":
         return None
-    from gridworld.agents.sb3.ancestor import of_library  # imports torch
-
     sound = of_library(run.config.agent)
     if sound is None:
         return None
@@ -45,6 +46,27 @@ def faulty_class(run: Evidence) -> Finding | None:
     return Finding("implementation", run.split.wrong, why, (f"agent.algorithm={sound.algorithm}",))
 
 
+def of_library(config: AgentConfig) -> SB3ClassConfig | None:
+    """The same settings for the algorithm of Stable-Baselines3 or sb3-contrib that a class is derived from.
+
+    Returns:
+        The settings, without arguments that only the derived class takes; None: it is the library's own, or
+        derived from no algorithm that could train.
+    """
+    if not isinstance(config, SB3ClassConfig):
+        return None
+    from gridworld.agents.sb3.settings.constructor_arguments import algorithm_class  # imports torch
+
+    kinds = algorithm_class("agent.algorithm", config.algorithm).__mro__
+    first = next((kind for kind in kinds if kind.__module__.split(".")[0] in _LIBRARIES), None)
+    if first in (None, kinds[0]) or not getattr(first, "policy_aliases", None):
+        return None
+    known = inspect.signature(first).parameters
+    arguments = {name: value for name, value in config.arguments.items() if name in known}
+    path = f"{first.__module__.split('.')[0]}.{first.__name__}"
+    return replace(config, algorithm=path, arguments=arguments, engine="tabulated")
+
+
 def _certified_after(
     run: Evidence, agent: SB3ClassConfig, seed: int, until: float, to_the_end: bool
 ) -> int | None:
@@ -53,13 +75,14 @@ def _certified_after(
     observation = make_observation(run.mdp, config.observation.kind, config.observation.cell_size)
     every, due, found = config.evaluation.every, 0, None
 
-    def watch(step: int) -> bool:
+    def watch(step: int) -> int:
         nonlocal due, found
         if step >= min(due, config.total_timesteps):
             due = (step // every + 1) * every
             certified = run.evaluator.score(learner.snapshot().greedy_policy()).certified
             found = step if certified else None
-        return (to_the_end or found is None) and time.process_time() < until
+        goes_on = (to_the_end or found is None) and time.process_time() < until
+        return due if goes_on else 0
 
     try:
         learner = family(agent).build(agent, make_context(config, run.mdp, observation))
