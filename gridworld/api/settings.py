@@ -50,11 +50,7 @@ def compose(*overrides: Override, **settings: Any) -> TrainConfig:
 
 
 def words(*overrides: Override, **settings: Any) -> list[str]:
-    """The words of the command line that say the same as these arguments of `compose`.
-
-    Raises:
-        InputError: an argument that is no override.
-    """
+    """The words of the command line that say the same as these arguments of `compose`."""
     found: list[str] = []
     for override in (*overrides, settings):
         if isinstance(override, Mapping):
@@ -72,11 +68,7 @@ def words(*overrides: Override, **settings: Any) -> list[str]:
 
 
 def compose_words(words: list[str]) -> TrainConfig:
-    """Compose the settings that these words of a command line choose.
-
-    Raises:
-        InputError: as for `compose`.
-    """
+    """Compose the settings that these words of a command line choose."""
     try:
         return composition.compose(conf_folder(), words)
     except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError) as error:

@@ -90,9 +90,6 @@ def check_all(
         seed: the first of the `SEEDS` that a probe may take.
         processes: how many train at a time.
         told: called with every finding, in the order of the probes.
-
-    Raises:
-        InputError: no such probe, or settings that the implementation refuses.
     """
     started = time.monotonic()
     groups = [list(group) for _, group in itertools.groupby(_chosen(names), lambda probe: probe.training)]

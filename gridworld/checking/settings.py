@@ -89,9 +89,6 @@ def settings(config: AgentConfig, probe: Probe, given: Mapping[str, Any]) -> tup
 
     Returns:
         The settings and the kind of the algorithm; None where it does not take what the probe needs.
-
-    Raises:
-        InputError: an argument of the user's that it does not take, or that is not the user's to choose.
     """
     known = _argument_names(config)
     for name in given:
@@ -133,11 +130,7 @@ def _of_policy(config: AgentConfig) -> dict[str, Any]:
 
 
 def class_of(config: SB3ClassConfig) -> Any:
-    """The class that is checked.
-
-    Raises:
-        InputError: there is no such class of SB3's kind.
-    """
+    """The class that is checked."""
     from gridworld.agents.sb3.settings.constructor_arguments import (
         algorithm_class,  # here, since it imports torch
     )

@@ -18,9 +18,6 @@ def subject(algorithm: Any) -> AgentConfig:
     Args:
         algorithm: a class with SB3's interface, its import path, or the name of a file in `conf/agent`. A
             class trains in its own loop; a shipped agent in the one that it ships with.
-
-    Raises:
-        InputError: no such class or agent.
     """
     if inspect.isclass(algorithm):
         algorithm = f"{algorithm.__module__}.{algorithm.__qualname__}"
@@ -44,11 +41,7 @@ def _shipped(name: str) -> AgentConfig:
 
 
 def arguments(words: Sequence[str]) -> dict[str, Any]:
-    """The arguments of `--set NAME=VALUE`; values are Python's, or text.
-
-    Raises:
-        InputError: a word without a name or a value.
-    """
+    """The arguments of `--set NAME=VALUE`; values are Python's, or text."""
     found: dict[str, Any] = {}
     for word in words:
         name, equals, value = word.partition("=")

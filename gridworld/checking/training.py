@@ -44,11 +44,7 @@ class Trained:
 
 
 def build(config: AgentConfig, mdp: Mdp, num_envs: int, seed: int) -> tuple[Agent, TrainingContext]:
-    """Build an agent on a world.
-
-    Raises:
-        InputError: settings that it refuses.
-    """
+    """Build an agent on a world."""
     kind = "none" if config.family == "tabular" else "one_hot"
     envs = StatisticsVectorEnv(num_envs, mdp=mdp, max_episode_steps=mdp.max_episode_steps)
     context = TrainingContext(envs, make_observation(mdp, kind), seed, "cpu")

@@ -21,11 +21,7 @@ _TABLES |= {"whole": "end_to_end", "files": "file_system"}
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Print the tables as they are measured, and write them as JSON.
-
-    Raises:
-        InputError: An option is not valid.
-    """
+    """Print the tables as they are measured, and write them as JSON."""
     options = _parser().parse_args(arguments)
     check_inside(options.out, "--out")
     if not options.out.parent.is_dir():

@@ -26,11 +26,7 @@ _MOST_EPISODES = 1_000_000
 
 @limited()
 def main(arguments: Sequence[str]) -> None:
-    """Print the scores.
-
-    Raises:
-        InputError: An option is not valid, or the run cannot be read.
-    """
+    """Print the scores."""
     options = _parser().parse_args(arguments)
     if not 1 <= options.episodes <= _MOST_EPISODES:
         raise InputError(f"--episodes {options.episodes}: must be from 1 to {_MOST_EPISODES}")

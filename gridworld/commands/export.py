@@ -29,11 +29,7 @@ from gridworld.storage.safe_read import check_no_link
 
 @limited()
 def main(arguments: Sequence[str]) -> None:
-    """Export the runs, and print where they are.
-
-    Raises:
-        InputError: An option is not valid, or no run could be exported.
-    """
+    """Export the runs, and print where they are."""
     options = _parser().parse_args(arguments)
     out: Path = options.out or Path("runs/export") / options.to
     if options.out is not None:

@@ -20,11 +20,7 @@ from gridworld.world.metrics import regret_text
 
 @limited()
 def main(arguments: Sequence[str]) -> None:
-    """Print a row per job, in the order in which they were asked for, and their number.
-
-    Raises:
-        InputError: The folder holds no sweep that can be read.
-    """
+    """Print a row per job, in the order in which they were asked for, and their number."""
     options = _parser().parse_args(arguments)
     folder = open_sweep(options.sweep)
     table = JobTable(folder.path)

@@ -30,11 +30,7 @@ _WORLD = ("num_rows", "num_cols", "slip", "step_reward", "goal_reward", "trap_re
 
 @limited()
 def main(arguments: Sequence[str]) -> None:
-    """Open the window and play until it is closed.
-
-    Raises:
-        InputError: An option is not valid, the run cannot be read, or there is no display.
-    """
+    """Open the window and play until it is closed."""
     options = _parser().parse_args(arguments)
     _check(options)
     with telling_if_slow("solving the world"):

@@ -31,11 +31,7 @@ _MOST_DIAGNOSED = 10
 
 @limited()
 def main(arguments: Sequence[str]) -> None:
-    """Write the report and print its path.
-
-    Raises:
-        InputError: An option is not valid, or there is nothing to report.
-    """
+    """Write the report and print its path."""
     options = _parser().parse_args(arguments)
     for name in ("seed", "diagnose"):
         if getattr(options, name) < 0:

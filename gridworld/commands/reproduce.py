@@ -39,11 +39,7 @@ DIFFERENT = 1  # exit code
 
 @limited()
 def main(arguments: Sequence[str]) -> None:
-    """Train again and print the comparison; ends the program with `DIFFERENT` if anything differs.
-
-    Raises:
-        InputError: The run cannot be read, repeated, or compared in full.
-    """
+    """Train again and print the comparison; ends the program with `DIFFERENT` if anything differs."""
     options = _parser().parse_args(arguments)
     then = open_run(options.run)
     config = settings_of(then, options.trust)

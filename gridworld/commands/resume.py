@@ -24,11 +24,7 @@ KEY = "resume"
 
 @limited()
 def main(arguments: Sequence[str]) -> None:
-    """Resume, and print the result as a new run does.
-
-    Raises:
-        InputError: An argument is not valid, or the run cannot be resumed.
-    """
+    """Resume, and print the result as a new run does."""
     result_is_in_files()
     words = _parse(arguments)
     folder = Path(words[KEY])

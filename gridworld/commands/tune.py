@@ -56,11 +56,7 @@ examples:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Search, confirm the winner, and print the verdict.
-
-    Raises:
-        InputError: An argument is not valid, or the study cannot be resumed.
-    """
+    """Search, confirm the winner, and print the verdict."""
     conf = conf_folder()
     refuse_dashes(arguments)
     options = _parser(conf).parse_intermixed_args(_with_kind(arguments))

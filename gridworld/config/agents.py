@@ -101,9 +101,6 @@ def parse_schedule(key: str, value: Schedule, linear_only: bool = False) -> Deca
         key: the setting's dotted name, for the message.
         value: a number, or one of `lin_NUMBER`, `sqrt_NUMBER` and `quad_NUMBER`.
         linear_only: whether the last two are refused.
-
-    Raises:
-        InputError: `value` is none of these.
     """
     powers = {LINEAR: 1.0} if linear_only else _POWERS
     text = value if isinstance(value, str) else None
@@ -130,11 +127,7 @@ class EpsilonSchedule(Protocol):
 
 
 def check_exploration(agent: EpsilonSchedule) -> None:
-    """Check that epsilon goes from one probability to another within training.
-
-    Raises:
-        InputError: it does not.
-    """
+    """Check that epsilon goes from one probability to another within training."""
     above_zero("agent.exploration_fraction", agent.exploration_fraction)
     within("agent.exploration_fraction", agent.exploration_fraction, 0, 1)
     within("agent.exploration_initial_eps", agent.exploration_initial_eps, 0, 1)

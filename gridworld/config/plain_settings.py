@@ -39,9 +39,6 @@ def check_foreign(settings: Mapping[str, Any], where: str, allow: str) -> None:
         settings: of a run, or a part of them, as plain values.
         where: they stand, for the message.
         allow: the word that would allow it, for the message.
-
-    Raises:
-        InputError: there is such a setting.
     """
     for name, value, harm in foreign(settings):
         told = printable(f"{name[:200]}={str(value)[:80]}")
@@ -126,9 +123,6 @@ def read_config(content: Any, where: str) -> TrainConfig:
     Args:
         content: the manifest's JSON.
         where: it stands, for the message.
-
-    Raises:
-        InputError: anything that the schema does not have.
     """
     agent = content.get("agent") if isinstance(content, dict) else None
     agent = agent if isinstance(agent, dict) else {}

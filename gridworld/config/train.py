@@ -106,11 +106,7 @@ class TrainConfig:
 
 
 def check(config: TrainConfig) -> None:
-    """Check the values that no schema can. Maps, rewards and agents are checked elsewhere.
-
-    Raises:
-        InputError: a value that no run could use.
-    """
+    """Check the values that no schema can. Maps, rewards and agents are checked elsewhere."""
     at_least("seed", config.seed, 0)
     if config.seed >= 2**32:
         raise InputError(f"seed={config.seed}: must be below 2**32")

@@ -43,19 +43,11 @@ class EnvConfig:
         return True
 
     def compile(self) -> Mdp:
-        """Compile the world.
-
-        Raises:
-            InputError: settings that make no world.
-        """
+        """Compile the world."""
         raise NotImplementedError
 
     def step_limit(self, mdp: Mdp) -> int:
-        """The step limit of an episode in the compiled world.
-
-        Raises:
-            InputError: the world's own is one that an exact evaluation would not come to the end of.
-        """
+        """The step limit of an episode in the compiled world."""
         limit = self.max_episode_steps or mdp.max_episode_steps or STEP_LIMIT
         if limit > MOST_STEPS:
             raise InputError(
@@ -65,11 +57,7 @@ class EnvConfig:
         return limit
 
     def check(self) -> None:
-        """Check the step limit: one that can be, and that an exact evaluation comes to the end of.
-
-        Raises:
-            InputError: it is another one; or a source that is not this schema's.
-        """
+        """Check the step limit: one that can be, and that an exact evaluation comes to the end of."""
         source = getattr(self, "source", None)
         if source is not None and SOURCES.get(source) is not type(self):
             raise InputError(f"env.source={source}: is no setting of its own; choose a source by env=...")
@@ -103,11 +91,7 @@ class MapConfig(EnvConfig):
         return self.compile_on(load(self.layout, self.num_rows, self.num_cols))
 
     def compile_on(self, layout: Layout) -> GridMdp:
-        """Compile the world with another map in place of the configured one.
-
-        Raises:
-            InputError: a reward that cannot be.
-        """
+        """Compile the world with another map in place of the configured one."""
         return _compiled(layout, self.slip, self.step_reward, self.goal_reward, self.trap_reward)
 
 

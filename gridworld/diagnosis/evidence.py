@@ -50,11 +50,7 @@ class Evidence:
 
     @classmethod
     def of(cls, saved: SavedRun) -> Evidence:
-        """Read a run's files.
-
-        Raises:
-            InputError: a file was changed since, or is missing.
-        """
+        """Read a run's files."""
         agent, shape = saved.agent(), saved.mdp.next_state.shape[:2]
         return cls(
             saved.config,

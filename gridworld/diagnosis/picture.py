@@ -26,9 +26,6 @@ def draw_diagnosis(found: Diagnosis, cell_size: int | None = None) -> Frame:
 
     Returns:
         (height, width, 3), RGB.
-
-    Raises:
-        InputError: where the picture would be too large to draw.
     """
     mdp, cost = found.mdp, np.maximum(found.split.cost, 0.0)
     cost = np.where(np.isfinite(cost) & (found.cause_of >= 0), cost, 0.0)

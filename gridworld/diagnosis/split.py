@@ -52,9 +52,6 @@ def split_regret(evaluator: Evaluator, policy: FloatArray) -> RegretSplit:
     Args:
         evaluator: of the world, under the discount that counts.
         policy: (S, A), action probabilities.
-
-    Raises:
-        InputError: it is no policy of this world.
     """
     mdp, best = evaluator.mdp, evaluator.solution
     chain = Chain(mdp, policy)

@@ -62,11 +62,7 @@ def beside(folder: Path) -> Path:
 
 
 def check_trusted(saved: SavedRun, found: Diagnosis, trust: bool) -> None:
-    """Check that to compose and train the offers runs no code of a stranger's choice.
-
-    Raises:
-        InputError: it might.
-    """
+    """Check that to compose and train the offers runs no code of a stranger's choice."""
     if found.offers and not trust:
         _check(saved.config, saved)
 

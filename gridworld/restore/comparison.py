@@ -48,11 +48,7 @@ class Finding:
 
 
 def check_whole(then: RunReader, config: TrainConfig) -> None:
-    """Check the files of a run that are to be compared.
-
-    Raises:
-        InputError: One is not the file that the run wrote, or is damaged.
-    """
+    """Check the files of a run that are to be compared."""
     best = [then.best_model_file] if _has_best(then) else []
     for path in (then.curve_file, then.model_file, *best, then.visits_file, then.summary_file):
         then.verify(path)
@@ -72,9 +68,6 @@ def compare(then: RunReader, now: RunReader, config: TrainConfig, mdp: Mdp) -> I
 
     Yields:
         A finding for each part of the result.
-
-    Raises:
-        InputError: A file was changed or cannot be read.
     """
     yield _curves(then, now)
     yield _weights(then, now, config, MODEL)

@@ -42,9 +42,6 @@ def lengths(then: RunReader, config: TrainConfig) -> list[int]:
 
     Returns:
         Environment steps; the last are those of the settings.
-
-    Raises:
-        InputError: The run was made longer in a way that cannot be repeated.
     """
     found = [_old_length(then, again) for again in then.resumptions if again.get("total_timesteps")]
     found.append(config.total_timesteps)
@@ -73,9 +70,6 @@ def population(then: RunReader) -> list[RunReader]:
 
     Returns:
         The runs; none where the run's numbers are those that it has alone.
-
-    Raises:
-        InputError: They cannot be trained together again as they were.
     """
     depends_on = then.manifest.get(NUMBERS_DEPEND_ON, {})
     if then.resumptions and any(NUMBERS_DEPEND_ON in each for each in (then.manifest, *then.resumptions)):

@@ -84,9 +84,6 @@ def open_unfinished(folder: Path, trust: bool = False) -> Unfinished:
     Args:
         folder: The run's folder.
         trust: Import the classes that its settings name, wherever they are from.
-
-    Raises:
-        InputError: There is no run, or its manifest or settings cannot be used.
     """
     run = run_to_resume(folder)
     config = settings_of(run, trust, allow="trust=true")
@@ -94,11 +91,7 @@ def open_unfinished(folder: Path, trust: bool = False) -> Unfinished:
 
 
 def unfinished_of(folder: Path, config: TrainConfig) -> Unfinished:
-    """Read the unfinished run of these settings, to resume it with them.
-
-    Raises:
-        InputError: As for `open_unfinished`; or the run is finished, or has other settings.
-    """
+    """Read the unfinished run of these settings, to resume it with them."""
     unfinished = open_unfinished(folder, trust=True)  # its classes are those of `config`, or it is refused
     if unfinished.run.is_finished:
         raise InputError(f"{folder}: holds a run already; give every run a folder of its own")
@@ -116,11 +109,7 @@ class Unfinished:
     is_trusted: bool
 
     def check_same(self, config: TrainConfig, world: str) -> None:
-        """Check that settings and a world's text are the run's own.
-
-        Raises:
-            InputError: They are not.
-        """
+        """Check that settings and a world's text are the run's own."""
         own, other = (
             dict(flat(settings(each) | {"total_timesteps": each.total_timesteps}))
             for each in (self.config, config)

@@ -46,9 +46,6 @@ class SavedRun:
         folder: The run's folder.
         trust: Import the classes that the settings name, wherever they are from.
         best: Take the agent with the lowest regret on the way, not the one at the end.
-
-    Raises:
-        InputError: The folder holds no finished run, or its settings or map are not valid.
     """
 
     @limited()
@@ -86,9 +83,6 @@ class SavedRun:
 
         Args:
             layout: The name or file of another map, of the same size, to take instead.
-
-        Raises:
-            InputError: That map cannot be read or has another size.
         """
         mdp = self.mdp
         if layout is not None:
@@ -109,20 +103,12 @@ class SavedRun:
 
     @limited()
     def snapshot(self) -> PolicySnapshot:
-        """The trained agent's values and policy in every state.
-
-        Raises:
-            InputError: As for `agent`.
-        """
+        """The trained agent's values and policy in every state."""
         return self.agent().snapshot()
 
     @limited()
     def agent(self) -> Agent:
-        """The trained agent, a new object at every call.
-
-        Raises:
-            InputError: The model's file was changed or does not fit the settings.
-        """
+        """The trained agent, a new object at every call."""
         observation = make_observation(
             self.mdp, self.config.observation.kind, self.config.observation.cell_size
         )
@@ -135,11 +121,7 @@ class SavedRun:
         return agent
 
     def steps(self) -> int:
-        """The environment steps that the agent has learnt for.
-
-        Raises:
-            InputError: The summary was changed, or does not say so.
-        """
+        """The environment steps that the agent has learnt for."""
         steps = self.run.read_summary().get(self._steps)
         if not isinstance(steps, int) or isinstance(steps, bool) or steps < 0:
             raise InputError(
@@ -158,9 +140,6 @@ def settings_of(
         trust: As for `SavedRun`.
         trains: Whether it is to be trained, which calls its callbacks.
         allow: The word by which the command's user says that the run is trusted.
-
-    Raises:
-        InputError: A setting is not valid, or names a class that is not trusted.
     """
     config = read_config(run.manifest["config"], str(run.manifest_file))
     for key, name in (("agent.name", config.agent.name), ("env", config.env.name)):
@@ -189,9 +168,6 @@ def read_visits(run: RunReader, shape: tuple[int, ...]) -> NDArray[np.int64]:
 
     Returns:
         Counts, int64 (S, A).
-
-    Raises:
-        InputError: The file was changed, or holds something else.
     """
     path = run.visits_file
     content = run.read(path, _LARGEST_HEADER + 8 * math.prod(shape))

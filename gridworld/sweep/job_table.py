@@ -145,11 +145,7 @@ _COLUMNS = [field.name for field in dataclasses.fields(JobRow)]
 
 
 def outcome(run: RunReader) -> dict[str, str]:
-    """The seconds, objective and error of a run that ended, as far as it has them, for its row.
-
-    Raises:
-        InputError: the run is finished, and its summary was changed.
-    """
+    """The seconds, objective and error of a run that ended, as far as it has them, for its row."""
     found = {"error": one_line(run.manifest.get("error", ""))}
     try:
         started, ended = (datetime.fromisoformat(run.manifest[key]) for key in ("started", "ended"))

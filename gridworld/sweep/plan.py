@@ -63,10 +63,6 @@ def expand(
 
     Returns:
         (overrides, the swept ones among them) of every job, the last key changing fastest.
-
-    Raises:
-        InputError: an empty range, one that makes no list, more than `most` jobs, or keys that cannot be
-            paired.
     """
     columns: dict[str, tuple[bool, list[str]]] = {}
     for override in OverridesParser.create(config_loader=loader).parse_overrides(list(words)):

@@ -167,9 +167,6 @@ def populations(
 
     Returns:
         The populations, in the order of their first jobs; of one job each where they cannot train together.
-
-    Raises:
-        InputError: `hydra.sweeper.population` is no number of runs, or `hydra.sweeper.together` is given.
     """
     if settings.together or settings.in_fork:
         raise InputError(

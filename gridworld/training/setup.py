@@ -82,9 +82,6 @@ def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = comp
 
     Returns:
         The run's world.
-
-    Raises:
-        InputError: for a mistake in the settings.
     """
     check(config)
     family(config.agent).check(config)
@@ -143,11 +140,7 @@ def objective_note(config: TrainConfig, mdp: Mdp) -> str | None:
 
 
 def check_recording(config: TrainConfig, mdp: Mdp) -> None:
-    """Check that the episode can be drawn as the settings ask for.
-
-    Raises:
-        InputError: where the cells are too large, or the video library is missing.
-    """
+    """Check that the episode can be drawn as the settings ask for."""
     wanted = config.recording
     if wanted.mp4:
         require_video()

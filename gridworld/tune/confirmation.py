@@ -77,11 +77,7 @@ def held_out_runs(folder: Path, name: str, config: TrainConfig, seeds: Sequence[
 
 
 def prepare(folder: Path, runs: Sequence[HeldOutRun]) -> None:
-    """Make the runs' folder, in the study's `folder`, and remove damaged runs and those of an earlier winner.
-
-    Raises:
-        InputError: a symbolic link is in the way.
-    """
+    """Make the runs' folder, in the study's `folder`, and remove damaged runs and those of an earlier winner."""
     make_inside(folder, CONFIRM)
     names = {run.folder.name for run in runs}
     for name in names:
@@ -163,11 +159,7 @@ class HeldOutResults:
 
 
 def read_results(runs: Sequence[HeldOutRun]) -> HeldOutResults:
-    """Read what runs of one configuration came to; one that failed was not certified.
-
-    Raises:
-        InputError: none has a result.
-    """
+    """Read what runs of one configuration came to; one that failed was not certified."""
     steps, failed, left_out = [], [], []
     for run in runs:
         try:
@@ -246,11 +238,7 @@ def _plain(results: HeldOutResults) -> dict[str, Any]:
 
 
 def _steps(folder: Path) -> float | None:
-    """The steps until the certificate that held, infinite without one; None for a run that failed.
-
-    Raises:
-        InputError: the run has no result: it did not come to its end, or was damaged since.
-    """
+    """The steps until the certificate that held, infinite without one; None for a run that failed."""
     if told := _damage(folder):
         raise InputError("; ".join(told))
     run = find_run(folder)

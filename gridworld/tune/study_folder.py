@@ -99,9 +99,6 @@ def is_claimed(folder: Path, name: str, about: Mapping[str, Any]) -> bool:
         folder: the study's folder.
         name: the study's name.
         about: what makes its trials comparable, as JSON.
-
-    Raises:
-        InputError: it is another study's, or that of another search.
     """
     file = next((each for each in (folder / SEARCH_JSON, folder / STUDY_JSON) if os.path.lexists(each)), None)
     if file is None:

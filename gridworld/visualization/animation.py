@@ -71,9 +71,6 @@ def animation_of_states(mdp: Mdp, states: IntArray, cell_size: int | None = None
 
     Returns:
         A picture for each state.
-
-    Raises:
-        InputError: for a cell size below 1, or where the frame would be too large to draw.
     """
     size = automatic_cell_size(mdp) if cell_size is None else positive_int("cell_size", cell_size)
     empty = _empty_board(mdp, size)
@@ -127,9 +124,6 @@ def animation_of_cards(mdp: Mdp, episodes: Sequence[Episode], cell_size: int | N
 
     Returns:
         A picture for each state of each episode.
-
-    Raises:
-        InputError: see `animation_of_states`.
     """
     size = automatic_cell_size(mdp) if cell_size is None else positive_int("cell_size", cell_size)
     frame_size = drawing.frame_size(mdp, size)
@@ -162,9 +156,6 @@ def animation_of_frames(frames: Iterable[Frame | Packed], likely: Iterable[Seque
 
     Returns:
         A picture for each frame.
-
-    Raises:
-        InputError: where they have more colours together than a palette holds.
     """
     numbered = _number(frames, likely)
     if numbered is None:

@@ -80,11 +80,7 @@ class Drawer(Protocol):
     TENSORBOARD_SIDE: int | None
 
     def draw(self, subject: Subject) -> Draw:
-        """Prepare the picture: what does not depend on its size is computed here, once.
-
-        Raises:
-            InputError: for what cannot be drawn, here or when the picture is drawn.
-        """
+        """Prepare the picture: what does not depend on its size is computed here, once."""
 
 
 def drawer(name: str) -> Drawer:
@@ -102,9 +98,6 @@ def save(drawn: Frame | Animation, path: Path, fps: int) -> bytes | None:
 
     Returns:
         The content of a GIF.
-
-    Raises:
-        InputError: for an animation that is too large for its format.
     """
     gif = None
     if not isinstance(drawn, Animation):

@@ -101,11 +101,7 @@ def _gif_frames(film: Animation, delay: int) -> Iterator[tuple[int, int]]:
 
 
 def encode_apng(film: Animation, fps: int) -> bytes:
-    """Encode an endless animated PNG of `fps` pictures per second.
-
-    Raises:
-        InputError: it has more pixels than memory should hold, see `check_size`.
-    """
+    """Encode an endless animated PNG of `fps` pictures per second."""
     check_size(film, ["apng"])
     duration = 1000 / fps
     durations = [duration] * (len(film) - 1) + [duration * (1 + _LAST_FRAME_HOLD)]
@@ -116,11 +112,7 @@ def encode_apng(film: Animation, fps: int) -> bytes:
 
 
 def save_mp4(film: Animation, path: Path, fps: int) -> None:
-    """Write an H.264 video. An odd width or height is padded by repeating the last row or column.
-
-    Raises:
-        InputError: PyAV is not installed, or the pictures are too large, see `check_size`.
-    """
+    """Write an H.264 video. An odd width or height is padded by repeating the last row or column."""
     require_video()
     check_size(film, ["mp4"])
     import av
@@ -138,11 +130,7 @@ def save_mp4(film: Animation, path: Path, fps: int) -> None:
 
 
 def check_size(film: Animation, formats: Collection[str]) -> None:
-    """Refuse an animation that is too large for one of the formats. PNG and GIF take any.
-
-    Raises:
-        InputError: more than `MOST_APNG_PIXELS` in all, or more than `MOST_MP4_PIXELS` in a picture.
-    """
+    """Refuse an animation that is too large for one of the formats. PNG and GIF take any."""
     width, height = film.size
     if "apng" in formats and len(film) * width * height > MOST_APNG_PIXELS:
         raise InputError(
@@ -156,21 +144,13 @@ def check_size(film: Animation, formats: Collection[str]) -> None:
 
 
 def require_video() -> None:
-    """Check that PyAV is installed.
-
-    Raises:
-        InputError: it is not.
-    """
+    """Check that PyAV is installed."""
     if find_spec("av") is None:
         raise InputError(f"mp4: needs PyAV, which is not installed; {install_command('video')} (or av)")
 
 
 def save_animation(film: Animation, path: Path, fps: int) -> None:
-    """Write GIF, APNG or MP4, chosen by the path's suffix.
-
-    Raises:
-        InputError: see `encode_apng` and `save_mp4`.
-    """
+    """Write GIF, APNG or MP4, chosen by the path's suffix."""
     if path.suffix == ".mp4":
         save_mp4(film, path, fps)
         return

@@ -44,9 +44,6 @@ class SB3Agent:
     Args:
         config: its settings.
         context: what it learns on.
-
-    Raises:
-        InputError: settings that only SB3 itself can judge, or a clock with which it writes no models.
     """
 
     def __init__(self, config: AgentConfig, context: TrainingContext, with_buffers: bool = True) -> None:

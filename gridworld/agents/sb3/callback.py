@@ -134,11 +134,7 @@ def _beginning(index: int, other: BaseCallback) -> Iterator[None]:
 
 
 def check_finite(model: BaseAlgorithm) -> None:
-    """Check that the last update left finite weights and losses.
-
-    Raises:
-        InputError: it did not.
-    """
+    """Check that the last update left finite weights and losses."""
     # A sum takes one pass, and is finite only where all are; of very large weights it need not be.
     weights = model.policy.parameters()
     if not all(math.isfinite(each.sum().item()) or bool(torch.isfinite(each).all()) for each in weights):

@@ -30,9 +30,6 @@ class EngineAgent(SB3Agent):
     Args:
         config: its settings.
         context: what it learns on.
-
-    Raises:
-        InputError: settings that only SB3 itself can judge.
     """
 
     def __init__(self, config: SB3Config, context: TrainingContext) -> None:

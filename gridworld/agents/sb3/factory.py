@@ -64,9 +64,6 @@ def make_model(config: SB3Config, context: TrainingContext, with_buffers: bool =
         config: its settings.
         context: what it learns on.
         with_buffers: whether it is to keep what it meets.
-
-    Raises:
-        InputError: what only SB3 or torch can judge, or more memory than there is.
     """
     keep_compiler_out()
     algorithm, arguments = algorithm_and_arguments(config, context.features)

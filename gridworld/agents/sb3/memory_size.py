@@ -66,9 +66,6 @@ def weighed(name: str, observation: ObservationTable) -> Iterator[None]:
     Args:
         name: the agent's, for the message.
         observation: what it sees.
-
-    Raises:
-        InputError: it does not.
     """
     if not is_limited():
         yield
@@ -84,9 +81,6 @@ def check_model(model: BaseAlgorithm, name: str, observation: ObservationTable) 
         model: the model.
         name: the agent's, for the message.
         observation: what it sees.
-
-    Raises:
-        InputError: they need more.
     """
     if not is_limited():
         return

@@ -136,9 +136,6 @@ def read_weights(path: Path, most: int) -> Weights:
     Args:
         path: the model file.
         most: bytes; a larger file is refused.
-
-    Raises:
-        InputError: the file cannot be read.
     """
     try:
         return flat(read_parameters(path, most)[0])

@@ -34,9 +34,6 @@ class ReplayCounts(ReplayBuffer):
     Args:
         buffer_size: has no effect.
         observation_space: SB3's, as all the others.
-
-    Raises:
-        InputError: `optimize_memory_usage` is set, which stores no transitions but sequences of them.
     """
 
     def __init__(

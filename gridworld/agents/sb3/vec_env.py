@@ -53,9 +53,6 @@ class GridWorldVecEnv(VecEnv):
         envs: the batch. It must reset in the same step, which is how SB3 sees episodes.
         observation: the table.
         reward_scale: rewards are multiplied by it; the reported episodes' returns are not.
-
-    Raises:
-        InputError: the batch resets otherwise.
     """
 
     def __init__(
@@ -106,9 +103,6 @@ class GridWorldVecEnv(VecEnv):
 
         Args:
             actions: (num_envs,), integers from 0 to 3.
-
-        Raises:
-            InputError: other actions.
         """
         step = self.envs.advance(actions)
         return self.told(step, [] if step[4] is None else self.episodes(step[4].returns, step[4].lengths))

@@ -32,9 +32,6 @@ def read_model(path: Path, algorithm: str, like: Mapping[str, NDArray[Any]]) -> 
         path: the file.
         algorithm: whose model it must be.
         like: arrays by the names, types and shapes that it must have.
-
-    Raises:
-        InputError: anything else is in it.
     """
     most = _SPARE_BYTES + sum(array.nbytes for array in like.values())
     found = read_arrays(path, most, algorithm)
@@ -65,9 +62,6 @@ def read_arrays(path: Path, most: int, algorithm: str = "a table") -> dict[str, 
         path: the file.
         most: bytes; a larger file is refused.
         algorithm: for the message.
-
-    Raises:
-        InputError: the file cannot be read.
     """
     content = read_bytes(path, most, copies=3)  # beside it a member and the array in it
     return npz_arrays(path, content, f"a model of {algorithm}")

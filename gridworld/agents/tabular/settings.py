@@ -17,9 +17,5 @@ class TabularConfig(AgentConfig):
     gamma: float = 0.99  # the discount it learns with
 
     def check(self) -> None:
-        """Check the values of these settings.
-
-        Raises:
-            InputError: a value under which the agent would not learn, or not what it says.
-        """
+        """Check the values of these settings."""
         within("agent.gamma", self.gamma, 0, 1)

@@ -64,11 +64,7 @@ def main() -> None:
 
 
 def _without_command(words: Sequence[str]) -> None:
-    """Print the manual or the version.
-
-    Raises:
-        InputError: The first word is none of the commands.
-    """
+    """Print the manual or the version."""
     match words[0] if words else "--help":
         case "--help" | "-h" | "help":
             commands = "\n".join(f"  {name:<11}{about}" for name, about in COMMANDS.items())

@@ -26,9 +26,6 @@ def run_folder(config: DictConfig) -> AbstractContextManager[None]:
 
     Returns:
         The block in which this process holds the folder, see `claimed`.
-
-    Raises:
-        InputError: The folder cannot be written to, or leads elsewhere, or holds something else.
     """
     folder = Path(config.hydra.run.dir)
     check_inside(folder, "hydra.run.dir")
@@ -40,11 +37,7 @@ def run_folder(config: DictConfig) -> AbstractContextManager[None]:
 
 
 def check_settings_of(config: DictConfig) -> None:
-    """Check that an unfinished run in the folder has the settings of `config`.
-
-    Raises:
-        InputError: It has others, or it cannot be read.
-    """
+    """Check that an unfinished run in the folder has the settings of `config`."""
     folder = Path(config.hydra.run.dir).absolute()
     if not (folder / MANIFEST).exists():
         return

@@ -38,9 +38,6 @@ def compose(conf: Path, overrides: list[str]) -> TrainConfig:
     Args:
         conf: the folder of the yaml files.
         overrides: the command line's words.
-
-    Raises:
-        InputError: a key that the schema does not have.
     """
     with _leaving_hydra_as_it_was():
         _store_schemas()
@@ -73,11 +70,7 @@ def without_hydra(whole: DictConfig) -> TrainConfig:
 
 
 def to_config(settings: DictConfig) -> TrainConfig:
-    """Convert Hydra's settings to the dataclasses that everything below takes.
-
-    Raises:
-        InputError: a key that the schema does not have.
-    """
+    """Convert Hydra's settings to the dataclasses that everything below takes."""
     refuse_added_keys(settings)
     return cast(TrainConfig, OmegaConf.to_object(settings))
 

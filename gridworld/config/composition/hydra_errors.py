@@ -86,11 +86,7 @@ def unreadable_file(error: Exception, folders: Iterable[Path]) -> str | None:
 
 
 def refuse_added_keys(settings: DictConfig) -> None:
-    """Refuse keys that `+key=value` added, which gets past the schema while Hydra composes.
-
-    Raises:
-        InputError: there is such a key.
-    """
+    """Refuse keys that `+key=value` added, which gets past the schema while Hydra composes."""
     _refuse(settings, "")
 
 

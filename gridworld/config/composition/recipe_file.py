@@ -51,9 +51,6 @@ def with_recipe(words: Sequence[str]) -> list[str]:
 
     Args:
         words: the command line.
-
-    Raises:
-        InputError: a recipe that cannot be read, or says what no recipe may.
     """
     given = [word for word in words if word.startswith(f"{KEY}=")]
     if not given:
@@ -97,9 +94,6 @@ def overrides(path: Path, trust: bool = False) -> list[str]:
 
     Returns:
         Overrides: choices first, then values.
-
-    Raises:
-        InputError: anything but choices of shipped groups and settings of the schema.
     """
     content = _read(path)
     if not isinstance(content, dict):
@@ -220,9 +214,6 @@ def literal(value: Any, where: str) -> str:
     Args:
         value: text, a number, a boolean, None, or a list or dictionary of such.
         where: it stands, for the message.
-
-    Raises:
-        InputError: it is anything else.
     """
     if isinstance(value, dict):
         for key in value:

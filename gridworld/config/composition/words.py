@@ -24,11 +24,7 @@ _LARGEST_EXACT = 2.0**53
 
 
 def refuse_dashes(words: Sequence[str]) -> None:
-    """Refuse settings that are written as the options of other programs are: `--seed 3`.
-
-    Raises:
-        InputError: there is one.
-    """
+    """Refuse settings that are written as the options of other programs are: `--seed 3`."""
     for word, following in pairwise([*words, ""]):
         option, equals, value = word.partition("=")
         name = option[2:].replace("-", "_")

@@ -32,9 +32,6 @@ def make_launcher(context: HydraContext, task: TaskFunction, config: DictConfig)
         context: for the launcher.
         task: the function that runs a job.
         config: the configuration of the sweep itself.
-
-    Raises:
-        InputError: a package or a command is missing, or a setting is out of its range.
     """
     settings = config.hydra.launcher
     choice = f"hydra/launcher={config.hydra.runtime.choices['hydra/launcher']}"

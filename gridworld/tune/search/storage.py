@@ -123,9 +123,6 @@ class StudyStorage:
 
         Args:
             about: what makes its trials comparable, as JSON.
-
-        Raises:
-            InputError: the database cannot be reached, or its study of that name searches something else.
         """
         storage, name = self.connect(), self.name
         try:

@@ -108,9 +108,6 @@ def draw_policy_map(
 
     Returns:
         The finished picture.
-
-    Raises:
-        InputError: where the picture would be too large to draw.
     """
     canvas = Canvas(mdp, cell_size, legend_rows=2)
     playable = shown(mdp)

@@ -32,11 +32,7 @@ _SMALLEST_SEPARATED_CELL = 24  # pixels
 
 
 def draw(subject: Subject) -> Draw:
-    """The map of |Q - Q*|, or |V - V*| without Q.
-
-    Raises:
-        InputError: where the world has no optimum under the agent's discount.
-    """
+    """The map of |Q - Q*|, or |V - V*| without Q."""
     evaluator, snapshot = subject.evaluator, subject.snapshot
     best = evaluator.solution
     gamma = agents_gamma(subject)
@@ -77,9 +73,6 @@ def draw_error_map(mdp: Mdp, error: FloatArray, caption: str = "", cell_size: in
 
     Returns:
         (height, width, 3), RGB.
-
-    Raises:
-        InputError: where the picture would be too large to draw.
     """
     canvas = Canvas(mdp, cell_size)
     sides = moving_actions(mdp) if error.shape[1] == len(MOVES) and canvas.has_grid else None

@@ -40,9 +40,6 @@ def draw_visit_map(
 
     Returns:
         (height, width, 3), RGB.
-
-    Raises:
-        InputError: where the picture would be too large to draw.
     """
     canvas = Canvas(mdp, cell_size)
     counts = visits.sum(axis=1)

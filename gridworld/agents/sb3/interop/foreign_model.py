@@ -48,9 +48,6 @@ class ForeignPolicy:
     Args:
         model: an SB3 model, or its policy.
         task: the task, whose observations are asked for anew at every reading, since statistics may change.
-
-    Raises:
-        InputError: it has no table: it keeps a memory, sees or does something else, or is no SB3 model.
     """
 
     def __init__(self, model: Any, task: Task) -> None:
@@ -70,11 +67,7 @@ class ForeignPolicy:
         self._check_is_a_table(self._observation())
 
     def tables(self) -> Tables:
-        """Ask it about every state. It is left as it was.
-
-        Raises:
-            InputError: its outputs are no finite numbers.
-        """
+        """Ask it about every state. It is left as it was."""
         observation = self._observation()
         was_training = self._policy.training
         _, probabilities, q = read_states(

@@ -21,9 +21,6 @@ def make_callbacks(entries: Sequence[Any]) -> list[BaseCallback]:
     Args:
         entries: a mapping each, of `_target_` and the class's arguments; such mappings among these, and in
             lists, are built first, as the callback of SB3's `EveryNTimesteps`.
-
-    Raises:
-        InputError: a class that there is not, or that cannot be built with its arguments.
     """
     return [_make(f"callbacks[{index}]", entry, BaseCallback) for index, entry in enumerate(entries)]
 

@@ -57,9 +57,6 @@ def algorithm_and_arguments(
 
     Returns:
         The class; its arguments but for the environments, the seed and the device.
-
-    Raises:
-        InputError: a class or an argument that there is not, or of another type.
     """
     if isinstance(config, SB3ClassConfig):
         algorithm = algorithm_class("agent.algorithm", config.algorithm)
@@ -169,9 +166,6 @@ def import_class(where: str, path: Any, kind: type) -> Any:
         where: the setting that has the path, for messages.
         path: its import path.
         kind: what it must be derived from.
-
-    Raises:
-        InputError: there is no such class, or its module cannot be imported.
     """
     found = imported(where, path)
     if not (inspect.isclass(found) and issubclass(found, kind)):

@@ -34,11 +34,7 @@ _CLASSES: tuple[tuple[str, tuple[type, ...], str], ...] = (
 
 
 def learns_in_engine(config: SB3Config, context: TrainingContext) -> bool:
-    """Whether the engine learns what SB3's own loop would; a line says why not where it is asked for.
-
-    Raises:
-        InputError: as `algorithm_and_arguments`.
-    """
+    """Whether the engine learns what SB3's own loop would; a line says why not where it is asked for."""
     algorithm, arguments = algorithm_and_arguments(config, context.features)
     if config.engine != "tabulated" or algorithm_of(algorithm) is None:
         return False

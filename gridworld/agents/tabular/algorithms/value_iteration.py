@@ -39,9 +39,6 @@ class ValueIteration:
     Attributes:
         q: (S, A), Q*.
         optimal: (S, A), True for every action as good as the best.
-
-    Raises:
-        InputError: Q* is not finite in every cell.
     """
 
     def __init__(self, config: ValueIterationConfig, context: TrainingContext) -> None:
