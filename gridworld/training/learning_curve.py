@@ -21,8 +21,6 @@ from gridworld.envs.statistics_env import NO_EPISODES, Returns, StatisticsVector
 from gridworld.errors import InputError
 from gridworld.process.parallel.together import clock
 from gridworld.storage.serialization import State
-from gridworld.training.best_model import BestModel
-from gridworld.training.certificate import Certificate
 from gridworld.world.exact.evaluation import Evaluator, Score
 
 
@@ -55,6 +53,81 @@ class _Held:
     def get_state(self) -> State:
         model = np.frombuffer(self.model, np.uint8)
         return {"step": self.step, "beliefs": vars(self.snapshot).copy(), "model": model}
+
+
+@dataclass
+class Certificate:
+    """Since when the greedy policy is certified optimal."""
+
+    streak: int = 0  # certified policies in a row, each counted once
+    first_certified_step: int | None = None
+    certified_since_step: int | None = None  # of the streak that still holds
+
+    def update(self, step: int, certified: bool, is_new_policy: bool) -> None:
+        """Take in an evaluation.
+
+        Args:
+            step: environment steps so far.
+            certified: whether the greedy policy is certified optimal.
+            is_new_policy: False if this policy was evaluated last time too. Between two updates the same one
+                may be met again; it earns one certificate, not several.
+        """
+        if not certified:
+            self.certified_since_step, self.streak = None, 0
+            return
+        self.streak += is_new_policy
+        if self.certified_since_step is None:
+            self.certified_since_step = step
+        if self.first_certified_step is None:
+            self.first_certified_step = step
+
+    def get_state(self) -> State:
+        """The three fields."""
+        return vars(self).copy()
+
+    def set_state(self, state: State) -> None:
+        """Continue from the three fields, which may stand among others."""
+        self.streak = int(state["streak"])
+        self.first_certified_step = state["first_certified_step"]
+        self.certified_since_step = state["certified_since_step"]
+
+
+class BestModel:
+    """The model of the lowest exact regret, the earliest of equals; all certified policies are equals.
+
+    Attributes:
+        step: environment steps at its evaluation; -1: there was none yet.
+        regret: of its greedy policy.
+        content: of its model file.
+    """
+
+    def __init__(self) -> None:
+        self.step, self.regret, self.content = -1, float("inf"), b""
+
+    def is_beaten_by(self, score: Score) -> bool:
+        """Whether a policy with this score is better."""
+        return self.step < 0 or score.shortfall < self.regret
+
+    def offer(self, step: int, score: Score, model_file: Callable[[], bytes]) -> None:
+        """Take a model if it is better.
+
+        Args:
+            step: environment steps so far.
+            score: of its greedy policy.
+            model_file: gives the content of its file, which is only then asked for.
+        """
+        if self.is_beaten_by(score):
+            self.step, self.regret, self.content = step, score.shortfall, model_file()
+
+    def get_state(self) -> State:
+        """The attributes."""
+        content = np.frombuffer(self.content, np.uint8)
+        return {"step": self.step, "regret": self.regret, "content": content}
+
+    def set_state(self, state: State) -> None:
+        """Mirrors `get_state`."""
+        self.step, self.regret = int(state["step"]), float(state["regret"])
+        self.content = state["content"].tobytes()
 
 
 class LearningCurve:

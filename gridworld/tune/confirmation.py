@@ -77,7 +77,7 @@ def held_out_runs(folder: Path, name: str, config: TrainConfig, seeds: Sequence[
 
 
 def prepare(folder: Path, runs: Sequence[HeldOutRun]) -> None:
-    """Make the runs' folder, in the study's `folder`, and remove damaged runs and those of an earlier winner."""
+    """Make the runs' folder in the study's, and remove damaged runs and those of an earlier winner."""
     make_inside(folder, CONFIRM)
     names = {run.folder.name for run in runs}
     for name in names:

@@ -17,12 +17,11 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.save_util import recursive_getattr
 
 from gridworld.agents import PolicySnapshot, TrainingContext, WriteScalars
-from gridworld.agents.sb3.callback import RunCallback, check_finite, diverged
+from gridworld.agents.sb3.callbacks import RunCallback, check_finite, diverged, make_callbacks
 from gridworld.agents.sb3.factory import UnfitError, cannot_update, make_model
 from gridworld.agents.sb3.falling_setting import falling_settings
 from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters, reason
 from gridworld.agents.sb3.policy_outputs import Reading, epsilon_greedy, read, read_states, why_no_table
-from gridworld.agents.sb3.settings.callbacks import make_callbacks
 from gridworld.agents.sb3.settings.schemas import SB3Config, reward_scale
 from gridworld.agents.sb3.state import class_without_state
 from gridworld.bounds import within

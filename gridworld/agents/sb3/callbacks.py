@@ -8,6 +8,7 @@ reset everything that it resets then.
 from __future__ import annotations
 
 import contextlib
+import inspect
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -19,10 +20,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from gridworld.agents.sb3.factory import said
+from gridworld.agents.sb3.settings.constructor_arguments import import_class
 from gridworld.agents.sb3.state import get_state, set_state
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import tell
 from gridworld.storage.serialization import State, fitting
+
+_TARGET = "_target_"
 
 
 class RunCallback(BaseCallback):
@@ -150,3 +154,36 @@ def diverged(model: BaseAlgorithm, what: str) -> InputError:
         f"training diverged at update {model._n_updates:,}, after {model.num_timesteps:,} steps: {what}; "
         "try a smaller learning rate"
     )
+
+
+def make_callbacks(entries: Sequence[Any]) -> list[BaseCallback]:
+    """Import the classes and build an object of each.
+
+    Args:
+        entries: a mapping each, of `_target_` and the class's arguments; such mappings among these, and in
+            lists, are built first, as the callback of SB3's `EveryNTimesteps`.
+    """
+    return [_make(f"callbacks[{index}]", entry, BaseCallback) for index, entry in enumerate(entries)]
+
+
+def _make(where: str, entry: dict[str, Any], kind: type) -> Any:
+    path = entry[_TARGET]
+    found = import_class(f"{where}.{_TARGET}", path, kind)
+    arguments = {name: _value(f"{where}.{name}", value) for name, value in entry.items() if name != _TARGET}
+    try:
+        inspect.signature(found).bind(**arguments)
+    except TypeError as error:
+        known = ", ".join(inspect.signature(found).parameters)
+        raise InputError(f"{where}: {path} {error}; its arguments are {known}") from None
+    except ValueError:  # it has no signature that could be read
+        pass
+    try:
+        return found(**arguments)
+    except Exception as error:  # the class may be anybody's
+        raise InputError(f"{where}: {path} cannot be built: {said(error)}") from error
+
+
+def _value(where: str, value: Any) -> Any:
+    if isinstance(value, list):
+        return [_value(f"{where}[{index}]", item) for index, item in enumerate(value)]
+    return _make(where, value, object) if isinstance(value, dict) and _TARGET in value else value
