@@ -2,7 +2,7 @@
 
 Overrides compose the configuration to begin from, as for train.py. What is searched stands in a file:
 {spaces}
-The same line again goes on with the study. On several machines, with tune.storage=URL of a database that all
+Run the command again to continue the study. On several machines, with tune.storage=URL of a database that all
 reach, they work on it together.
 """
 

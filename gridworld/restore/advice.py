@@ -35,7 +35,7 @@ def advice(folder: Path) -> list[str]:
     place = shlex.quote(shown(folder))
     try:
         rows = list(_commands(SavedRun(folder), place))
-    except InputError:  # it has a class of one's own, which is imported with trust only
+    except InputError:  # it has a custom class, which is imported with trust only
         rows = [[_WHY, f"{command('diagnose')} {place} --trust"]]
     except (OSError, ValueError):  # the run was just made, but anybody may have touched it since
         return []

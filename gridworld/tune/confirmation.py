@@ -171,7 +171,7 @@ def read_results(runs: Sequence[HeldOutRun]) -> HeldOutResults:
         steps.append(math.inf if found is None else found)
         failed += [run.folder.name] if found is None else []
     if not steps:
-        raise InputError(f"{runs[0].folder.parent}: no held-out run has a result; try the same line again")
+        raise InputError(f"{runs[0].folder.parent}: no held-out run has a result; run the command again")
     certified = int(np.isfinite(steps).sum())
     share_of = statistics.share(certified, len(steps))
     total = runs[0].config.total_timesteps

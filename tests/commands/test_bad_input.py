@@ -155,11 +155,11 @@ TRAIN = [
     ("--config-dir nowhere", "nowhere' not found"),
     (
         "--config-dir {conf} agent=broken",
-        "agent/broken.yaml: line 2, column 2: is no yaml, expected ',' or ']'",
+        "agent/broken.yaml: line 2, column 2: is not valid YAML: expected ',' or ']'",
     ),
     (
         "--config-dir={conf} env=tagged",
-        "env/tagged.yaml: line 1, column 9: is no yaml, could not determine a con",
+        "env/tagged.yaml: line 1, column 9: is not valid YAML: could not determine a con",
     ),
     (
         "--config-dir {conf} agent=empty",

@@ -105,9 +105,11 @@ class GridWorldVecEnv(VecEnv):
             actions: (num_envs,), integers from 0 to 3.
         """
         step = self.envs.advance(actions)
-        return self.told(step, [] if step[4] is None else self.episodes(step[4].returns, step[4].lengths))
+        return self.to_sb3_step(
+            step, [] if step[4] is None else self.episodes(step[4].returns, step[4].lengths)
+        )
 
-    def told(self, step: Advance, episodes: list[dict[str, Any]]) -> StateStep:
+    def to_sb3_step(self, step: Advance, episodes: list[dict[str, Any]]) -> StateStep:
         """A step of the batch as SB3 is told of it; `episodes` are those that it ended."""
         states, rewards, terminated, truncated, ended = step
         if self._reward_scale != 1:

@@ -37,7 +37,9 @@ def sentence(error: BaseException) -> str:
         return failure(error)
     if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
         mark = error.problem_mark
-        return f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}: is no yaml, {error.problem}"
+        return (
+            f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}: is not valid YAML: {error.problem}"
+        )
     if missing := re.search(r"[Mm]issing mandatory value: (\S+)", message):
         key = missing.group(1)
         key = key if "." in key else getattr(error, "full_key", None) or key

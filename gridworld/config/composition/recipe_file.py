@@ -115,9 +115,9 @@ def _read(path: Path) -> Any:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark is not None else ""
-        raise InputError(f"{path}: {where}is no yaml, {error.problem}") from None
+        raise InputError(f"{path}: {where}is not valid YAML: {error.problem}") from None
     except (yaml.YAMLError, ValueError) as error:
-        raise InputError(f"{path}: is no yaml ({' '.join(str(error).split())[:200]})") from None
+        raise InputError(f"{path}: is not valid YAML ({' '.join(str(error).split())[:200]})") from None
 
 
 def _check_syntax(text: str, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The cause in a class of one's own, told by the class that it is derived from.
+"""The cause in a custom class, found by the class that it is derived from.
 
 A setting that is wrong is wrong for both. So Stable-Baselines3's own class trains in the place of the derived
 one, with the same settings on the same world: where that is certified, the difference is in the class.

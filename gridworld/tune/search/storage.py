@@ -159,7 +159,7 @@ class StudyStorage:
             raise StorageLostError(
                 f"tune.storage={self.shown_url}: the study cannot be reached any more "
                 f"({_first_line(cause)}); bring the database back, with what has ended in it, and run the "
-                "same line again"
+                "command again"
             ) from None
 
 
@@ -321,12 +321,12 @@ def check_same_search(name: str, before: Any, about: Mapping[str, Any]) -> None:
         key = changed[0]
         more = f" (and {len(changed) - 1} more)" if len(changed) > 1 else ""
         raise InputError(
-            f"tune.study={name}: was begun with another {part}: {key} was {_told(was.get(key))}, now it is "
-            f"{_told(is_now.get(key))}{more}; choose another tune.study, or set it back"
+            f"tune.study={name}: was begun with another {part}: {key} was {_shown(was.get(key))}, now it is "
+            f"{_shown(is_now.get(key))}{more}; choose another tune.study, or set it back"
         )
 
 
-def _told(value: Any) -> str:
+def _shown(value: Any) -> str:
     return "not there" if value is None else json.dumps(value)
 
 
