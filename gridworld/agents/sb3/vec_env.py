@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,33 +13,11 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from gridworld.envs.observations import ObservationTable
-from gridworld.envs.vector_env import Advance, GridWorldVectorEnv, StateArray
+from gridworld.envs.vector_env import GridWorldVectorEnv, StateArray
 from gridworld.errors import InputError
 from gridworld.storage.rng_state import independent_generator
-from gridworld.world.mdp import BoolArray, FloatArray
 
 _MASKS = "action_masks"  # asked for by agents that respect them; here nothing is ever forbidden
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class StateStep:
-    """A step of the batch; all arrays are (num_envs,).
-
-    Attributes:
-        states: int64, the new ones, after the reset of episodes that ended.
-        last_states: int64, where the step led to, before that reset.
-        rewards: float64.
-        dones: bool, whether the episode ended.
-        truncated: bool, whether it ended by the step limit alone.
-        ended: SB3's info of each environment whose episode ended.
-    """
-
-    states: StateArray
-    last_states: StateArray
-    rewards: FloatArray
-    dones: BoolArray
-    truncated: BoolArray
-    ended: dict[int, dict[str, Any]]
 
 
 class GridWorldVecEnv(VecEnv):
@@ -91,53 +68,23 @@ class GridWorldVecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        step = self.step_states(self._actions)
-        rewards = step.rewards.astype(np.float32)
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for index, info in step.ended.items():
-            infos[index] = info
-        return self.observation.rows(step.states), rewards, step.dones, infos
-
-    def step_states(self, actions: NDArray[Any]) -> StateStep:
-        """Step all environments, in states instead of observations.
-
-        Args:
-            actions: (num_envs,), integers from 0 to 3.
-        """
-        step = self.envs.advance(actions)
-        return self.to_sb3_step(
-            step, [] if step[4] is None else self.episodes(step[4].returns, step[4].lengths)
-        )
-
-    def to_sb3_step(self, step: Advance, episodes: list[dict[str, Any]]) -> StateStep:
-        """A step of the batch as SB3 is told of it; `episodes` are those that it ended."""
-        states, rewards, terminated, truncated, ended = step
+        states, rewards, terminated, truncated, ended = self.envs.advance(self._actions)
         if self._reward_scale != 1:
             rewards = rewards * self._reward_scale
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if ended is None:
-            return StateStep(states, states, rewards, terminated, truncated, {})
+            return self.observation.rows(states), rewards.astype(np.float32), terminated, infos
         truncated &= ~terminated
-        infos = {
-            index: {
-                "terminal_observation": observation,
-                "TimeLimit.truncated": cut,
-                "episode": episode,
-            }
-            for index, observation, cut, episode in zip(
-                ended.which.tolist(),
-                self.observation.rows(ended.states[ended.which]),
-                truncated[ended.which].tolist(),
-                episodes,
-                strict=True,
-            )
-        }
-        return StateStep(states, ended.states, rewards, ended.mask, truncated, infos)
-
-    def episodes(self, returns: FloatArray, lengths: NDArray[np.int64]) -> list[dict[str, Any]]:
-        """Episodes that ended now, by their returns and lengths (m,), as SB3's Monitor reports them."""
         elapsed = round(time.time() - self._started, 6)
-        pairs = zip(returns.tolist(), lengths.tolist(), strict=True)
-        return [{"r": episode_return, "l": length, "t": elapsed} for episode_return, length in pairs]
+        last = self.observation.rows(ended.states[ended.which])
+        of_each = zip(ended.which.tolist(), last, ended.returns.tolist(), ended.lengths.tolist(), strict=True)
+        for index, observation, episode_return, length in of_each:
+            infos[index] = {
+                "terminal_observation": observation,
+                "TimeLimit.truncated": bool(truncated[index]),
+                "episode": {"r": episode_return, "l": length, "t": elapsed},
+            }
+        return self.observation.rows(states), rewards.astype(np.float32), ended.mask, infos
 
     def close(self) -> None:
         self.envs.close()
