@@ -17,10 +17,8 @@ from gridworld.report import tables
 from gridworld.report.analysis.analyse import Result, TaskAnalysis
 from gridworld.report.analysis.statistics import RESAMPLES, Share
 from gridworld.report.build import Report
-from gridworld.report.charts.chart import Chart
-from gridworld.report.charts.overall_charts import overall_charts
-from gridworld.report.charts.style import AGENT_PAINTS, DARK, LIGHT, Styles, styles
-from gridworld.report.charts.task_charts import task_charts
+from gridworld.report.charts.agent_charts import overall_charts, task_charts
+from gridworld.report.charts.chart import AGENT_PAINTS, DARK, LIGHT, Chart, Styles, styles
 from gridworld.report.charts.tuning_charts import tuning_charts
 from gridworld.report.embedded_images import pictures
 from gridworld.report.evidence.grouping import shortfall

@@ -34,13 +34,10 @@ from gridworld.report.analysis.analyse import Comparison, Overall, TaskAnalysis
 from gridworld.report.analysis.curves import on_grid
 from gridworld.report.analysis.metrics import online_return
 from gridworld.report.analysis.statistics import Interval
-from gridworld.report.analysis.sweeps import sweeps
 from gridworld.report.build import Report, gather
-from gridworld.report.charts.chart import Chart
-from gridworld.report.charts.overall_charts import overall_charts
-from gridworld.report.charts.style import house_style, line_count, styles, text_width, wrapped_apart
-from gridworld.report.charts.sweep_charts import sweep_charts
-from gridworld.report.charts.task_charts import task_charts
+from gridworld.report.charts.agent_charts import overall_charts, task_charts
+from gridworld.report.charts.chart import Chart, line_count, styles, wrapped_apart
+from gridworld.report.charts.sweep_charts import sweep_charts, sweeps
 from gridworld.report.evidence.grouping import labels
 from gridworld.report.evidence.reasons import Reason, reasons
 from gridworld.report.evidence.run_reader import Evidence, read
@@ -456,43 +453,15 @@ def test_a_search_for_runs_ends(maker: Maker, tmp_path: Path, monkeypatch: pytes
     )
 
 
-@pytest.fixture(scope="module")
-def many_keys(tmp_path_factory: pytest.TempPathFactory) -> TaskAnalysis:
-    """Of three swept keys every combination, one with a seed that has no certificate."""
-    folder, maker = tmp_path_factory.mktemp("many"), Maker("agent=ppo")
-    for rate, depth, gamma in itertools.product((0.01, 0.002, 0.1), (3, 10), (0.95, 0.9)):
-        at = math.inf if rate == 0.1 else 1000 * depth
+def test_three_swept_settings_have_tables_and_no_figure(maker: Maker, tmp_path: Path) -> None:
+    for rate, depth, gamma in itertools.product((0.01, 0.002), (3, 10), (0.95, 0.9)):
         settings = {"agent__learning_rate": rate, "agent__n_epochs": depth, "agent__gamma": gamma}
-        maker.write(folder / f"{rate} {depth} {gamma}", 0, at, **settings)
-    (task,) = gather([folder]).tasks
-    return task
-
-
-def test_three_swept_settings_are_a_heatmap_for_each_value_of_the_third(many_keys: TaskAnalysis) -> None:
-    (swept,) = sweeps(many_keys.results)
-    assert swept.keys == ("agent.learning_rate", "agent.gamma", "agent.n_epochs")
-    drawn = {each.name: each for each in sweep_charts(swept, "classic")}
-    heat = drawn["classic ppo certified by learning_rate, gamma and n_epochs"]
-    words = [text.text for text in ElementTree.fromstring(heat.svg).iter(f"{SVG}text")]
-    assert [word for word in words if " = " in str(word)] == ["n_epochs = 3", "n_epochs = 10"]
-    assert (words.count("1/1"), words.count("0/1"), words.count("0.002")) == (8, 4, 2)
-    heights = {bar.get_y() for bar in heat.figure.axes[0].patches}
-    assert len(heights) == 6  # three rates, twice, none over another
-
-
-def test_settings_that_were_swept_without_a_grid_are_ranked(many_keys: TaskAnalysis) -> None:
-    (swept,) = sweeps(many_keys.results)
-    some = dict(itertools.islice(sorted(swept.results.items()), 0, None, 3))
-    (few,) = sweeps(list(some.values()))
-    assert len(few.results) == 4
-    spread = replace(few, values=tuple((*each, "other", "more") for each in few.values))
-    chart = next(sweep_charts(spread, "classic"))
-    assert "the best first" in chart.description
-    words = [str(text.text) for text in ElementTree.fromstring(chart.svg).iter(f"{SVG}text")]
-    shares = [word for word in words if word in ("1/1", "0/1")]
-    assert shares == sorted(shares, reverse=True)
-    assert {"learning_rate", "gamma", "n_epochs", "seeds certified"} <= set(words)
-    assert not sweeps(list(some.values())[:3])  # no more than settings that differ: a comparison
+        maker.write(tmp_path / f"{rate} {depth} {gamma}", 0, 1000 * depth, **settings)
+    (task,) = gather([tmp_path]).tasks
+    (swept,) = sweeps(task.results)
+    assert swept.keys == ("agent.gamma", "agent.learning_rate", "agent.n_epochs")
+    assert not list(sweep_charts(swept, "classic"))
+    assert not sweeps(task.results[:2])  # no more than settings that differ: a comparison
 
 
 def test_a_folder_that_may_not_be_read(maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -547,7 +516,8 @@ def test_swept_settings_are_a_line_or_a_heatmap_and_the_opening_is_short(tmp_pat
     assert words.count("0/2") == 3
     assert words.count("1/2") == 2  # 20 epochs: one seed at step 20,000, the other not
     grey = to_rgba("#c6c6c6")
-    cells = [bar.get_facecolor() for bar in drawn[f"classic ppo steps by {keys}"].figure.axes[0].patches]
+    mesh = drawn[f"classic ppo steps by {keys}"].figure.axes[0].collections[0]
+    cells = [tuple(colour) for colour in mesh.to_rgba(mesh.get_array()).reshape(-1, 4).tolist()]
     assert cells.count(grey) == 5  # half of their seeds or more are never certified
     assert len(set(cells)) == 3  # 3 epochs, 10, never: the worst finite number has another colour
     assert drawn[f"classic ppo steps by {keys}"].caption.endswith("grey cells have no finite value.")
@@ -607,7 +577,7 @@ def test_no_figure_has_only_zeros_and_equal_curves_are_dashed(maker: Maker, tmp_
         pixels = picture.convert("RGB").getcolors(100_000) or []
     seen = {"#" + bytes(colour).hex(): count for count, colour in pixels if isinstance(colour, tuple)}
     counts = [seen[each.line["color"]] for each in styles("abcde").values()]
-    assert min(counts) > 0.7 * max(counts)  # of equal curves, each is seen as much as any other
+    assert min(counts) > 0.5 * max(counts)  # of equal curves, each is seen about as much as any other
     assert drawn["classic regret"].caption.endswith("(IQM) with 95 % bootstrap bands, 2 seeds; 0 is optimal.")
 
 
@@ -868,15 +838,13 @@ def test_long_labels_are_whole_on_more_lines_and_told_apart() -> None:
     settings = [(rate, steps) for rate in (0.01, 0.02) for steps in (32, 64)]
     texts = [f"ppo (gamma=0.9, agent.learning_rate={rate}, n_steps={steps})" for rate, steps in settings]
     endless = ["_" * 600 + middle + "_" * 600 for middle in "ab"]
-    with house_style():
-        assert wrapped_apart(["dqn", "ppo", "ppo"], 170, 12) == ["dqn", "ppo", "ppo"]
-        told = wrapped_apart(texts, 170, 12)
-        assert told[0] == "ppo (gamma=0.9,\nagent.learning_rate=0.01,\nn_steps=32)"
-        assert [label.replace("\n", " ") for label in told] == texts  # nothing is cut
-        first, second = wrapped_apart(endless, 170, 12)
-        assert (first[-3:], second[-3:]) == (" #1", " #2")
-        assert line_count(first) == 6
-        assert all(text_width(label, 12) <= 170 for label in (*told, first, second))
+    assert wrapped_apart(["dqn", "ppo", "ppo"], 25) == ["dqn", "ppo", "ppo"]
+    told = wrapped_apart(texts, 25)
+    assert told[0] == "ppo (gamma=0.9,\nagent.learning_rate=0.01,\nn_steps=32)"
+    assert [label.replace("\n", " ") for label in told] == texts  # nothing is cut
+    first, second = wrapped_apart(endless, 25)
+    assert (first[-3:], second[-3:]) == (" #1", " #2")
+    assert line_count(first) == 6
 
 
 def test_what_follows_from_the_observation_names_no_group() -> None:
