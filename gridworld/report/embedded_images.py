@@ -12,13 +12,11 @@ from pathlib import Path
 from PIL import Image
 
 from gridworld.config.pictures import PICTURES
-from gridworld.report.analysis.analyse import Result
-from gridworld.report.evidence.run_reader import Evidence
+from gridworld.report.analysis.analyse import Result, TaskAnalysis
 from gridworld.report.table import number
 from gridworld.storage.safe_read import read_bytes, sha256
 
-_LARGEST_PNG = 4 * 2**20  # bytes
-_LARGEST_GIF = 256 * 2**10  # bytes; it stands in the page as it is
+_LARGEST = {".png": 4 * 2**20, ".gif": 256 * 2**10}  # bytes; an animation stands in the page as it is
 _MOST_PIXELS = 4_000_000
 _WIDTH = 960  # pixels, where it is shown large
 
@@ -33,58 +31,44 @@ class Picture:
     caption: str
 
 
-def pictures(result: Result) -> Iterator[Picture]:
-    """The pictures of the run with the median regret, if they are there, unchanged and not too large."""
-    run = _shown(result)
-    verdict = "certified optimal" if run.certified else f"regret {number(run.regret)}"
-    for drawn in PICTURES:
-        name = drawn.file
-        if drawn.caption is None:
-            continue
-        embedded = embed(run.folder / name, run.pictures[name]) if name in run.pictures else None
-        if embedded is not None:
-            yield Picture(*embedded, f"{result.group.agent}, seed {run.seed}, {verdict}: {drawn.caption}")
+def galleries(task: TaskAnalysis) -> list[list[Picture]]:
+    """The pictures of each agent that has any, the best one first."""
+    return [found for result in task.ranked if (found := list(_pictures(result)))]
 
 
-def _shown(result: Result) -> Evidence:
-    """The run with the median regret."""
+def _pictures(result: Result) -> Iterator[Picture]:
+    """Those of the run with the median regret that are there, unchanged and not too large."""
     ranked = sorted(result.group.runs, key=lambda run: (run.regret, run.seed))
-    return ranked[(len(ranked) - 1) // 2]
+    run = ranked[(len(ranked) - 1) // 2]
+    verdict = "certified optimal" if run.certified else f"regret {number(run.regret)}"
+    for picture in PICTURES:
+        if picture.caption is None or picture.file not in run.pictures:
+            continue
+        if (found := _embedded(run.folder / picture.file, run.pictures[picture.file])) is not None:
+            yield Picture(*found, f"{result.group.agent}, seed {run.seed}, {verdict}: {picture.caption}")
 
 
-def _most(name: str) -> int:
-    return _LARGEST_GIF if name.endswith(".gif") else _LARGEST_PNG
+def _embedded(path: Path, digest: str | None) -> tuple[str, int, int] | None:
+    """Data URI, width and height of a PNG or GIF.
 
-
-def embed(path: Path, digest: str | None = None) -> tuple[str, int, int] | None:
-    """Read a PNG or GIF to stand in a page.
-
-    Args:
-        path: of the file; its suffix says which it is.
-        digest: the file's SHA-256; None accepts any.
-
-    Returns:
-        Data URI, width and height in pixels; None where the file is missing, another, damaged or too large.
+    None where it is missing, damaged, too large, or has another SHA-256 than `digest`, of which None is any.
     """
-    animated = path.suffix == ".gif"
+    kind = path.suffix[1:]
     try:
-        content = read_bytes(path, _most(path.name))
+        content = read_bytes(path, _LARGEST[path.suffix])
         if digest not in (None, sha256(content)):
             return None
-        with Image.open(io.BytesIO(content), formats=["GIF" if animated else "PNG"]) as image:
+        with Image.open(io.BytesIO(content), formats=[kind.upper()]) as image:
             if image.width * image.height > _MOST_PIXELS:
                 return None
-            if animated:
-                return _uri("gif", content), image.width, image.height
-            small = image.convert("RGB")
+            width, height = image.size
+            if kind == "png":
+                small = image.convert("RGB")
+                small.thumbnail((_WIDTH, 2 * _WIDTH), Image.Resampling.LANCZOS)
+                buffer = io.BytesIO()
+                small.save(buffer, format="PNG")  # the highest compression takes four times as long for 6 %
+                content, (width, height) = buffer.getvalue(), small.size
     # What Pillow raises for a damaged one; ValueError is ours, too.
     except (OSError, ValueError, SyntaxError, EOFError, struct.error, Image.DecompressionBombError):
         return None
-    small.thumbnail((_WIDTH, 2 * _WIDTH), Image.Resampling.LANCZOS)
-    buffer = io.BytesIO()
-    small.save(buffer, format="PNG")  # the highest compression takes four times as long for 6 %
-    return _uri("png", buffer.getvalue()), small.width, small.height
-
-
-def _uri(kind: str, content: bytes) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}", width, height

@@ -43,8 +43,7 @@ from gridworld.report.evidence.reasons import Reason, reasons
 from gridworld.report.evidence.run_reader import Evidence, read
 from gridworld.report.evidence.tuning_study import find_tunings
 from gridworld.report.page import charts, render
-from gridworld.report.tensorboard_export import BANDS
-from gridworld.report.writer import MARKERS
+from gridworld.report.writer import BANDS, MARKERS
 from gridworld.storage.sealed_json import sealed
 from gridworld.world.exact.evaluation import Evaluator
 
