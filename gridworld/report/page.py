@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import base64
 import functools
+import io
 import math
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+import struct
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import jinja2
 from markupsafe import Markup, escape
+from PIL import Image
 
+from gridworld.config.pictures import PICTURES
 from gridworld.process.console.terminal import plain
 from gridworld.report import tables
 from gridworld.report.analysis.analyse import Result, TaskAnalysis
@@ -19,13 +25,16 @@ from gridworld.report.build import Report
 from gridworld.report.charts.agent_charts import overall_charts, task_charts
 from gridworld.report.charts.chart import AGENT_PAINTS, DARK, LIGHT, Chart, Styles, styles
 from gridworld.report.charts.tuning_charts import tuning_charts
-from gridworld.report.embedded_images import galleries
 from gridworld.report.evidence.grouping import shortfall
 from gridworld.report.table import Cell, interval_text, is_text, main_text, number
+from gridworld.storage.safe_read import read_bytes, sha256
 
 _ALL_TASKS = ""  # no task's name
 _FEW = 6  # agents; of more, what is long is folded away
 _MOST_TOLD = 4  # agents, each by name in the opening
+_LARGEST = {".png": 4 * 2**20, ".gif": 256 * 2**10}  # bytes; an animation stands in the page as it is
+_MOST_PIXELS = 4_000_000
+_WIDTH = 960  # pixels, where it is shown large
 
 
 def charts(report: Report) -> dict[str, list[Chart]]:
@@ -111,7 +120,7 @@ def render(report: Report, drawn: dict[str, list[Chart]]) -> str:
         styles=_look(report),
         tables=tables,
         facts=_facts,
-        galleries=galleries,
+        galleries=_galleries,
         plain=plain,
         markup=Markup,
         main_text=main_text,
@@ -183,3 +192,56 @@ def _verdict(result: Result) -> str:
 
 def _share_of(cell: Cell) -> float | None:
     return round(100 * cell.count / cell.total, 1) if isinstance(cell, Share) else None
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """An image as a data URI."""
+
+    uri: str
+    width: int
+    height: int
+    caption: str
+
+
+def _galleries(task: TaskAnalysis) -> list[list[_Picture]]:
+    """The pictures of each agent that has any, the best one first."""
+    return [found for result in task.ranked if (found := list(_pictures(result)))]
+
+
+def _pictures(result: Result) -> Iterator[_Picture]:
+    """Those of the run with the median regret that are there, unchanged and not too large."""
+    ranked = sorted(result.group.runs, key=lambda run: (run.regret, run.seed))
+    run = ranked[(len(ranked) - 1) // 2]
+    verdict = "certified optimal" if run.certified else f"regret {number(run.regret)}"
+    for picture in PICTURES:
+        if picture.caption is None or picture.file not in run.pictures:
+            continue
+        if (found := _embedded(run.folder / picture.file, run.pictures[picture.file])) is not None:
+            yield _Picture(*found, f"{result.group.agent}, seed {run.seed}, {verdict}: {picture.caption}")
+
+
+def _embedded(path: Path, digest: str | None) -> tuple[str, int, int] | None:
+    """Data URI, width and height of a PNG or GIF.
+
+    None where it is missing, damaged, too large, or has another SHA-256 than `digest`, of which None is any.
+    """
+    kind = path.suffix[1:]
+    try:
+        content = read_bytes(path, _LARGEST[path.suffix])
+        if digest not in (None, sha256(content)):
+            return None
+        with Image.open(io.BytesIO(content), formats=[kind.upper()]) as image:
+            if image.width * image.height > _MOST_PIXELS:
+                return None
+            width, height = image.size
+            if kind == "png":
+                small = image.convert("RGB")
+                small.thumbnail((_WIDTH, 2 * _WIDTH), Image.Resampling.LANCZOS)
+                buffer = io.BytesIO()
+                small.save(buffer, format="PNG")  # the highest compression takes four times as long for 6 %
+                content, (width, height) = buffer.getvalue(), small.size
+    # What Pillow raises for a damaged one; ValueError is ours, too.
+    except (OSError, ValueError, SyntaxError, EOFError, struct.error, Image.DecompressionBombError):
+        return None
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}", width, height

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
 from gridworld.report.analysis.analyse import Comparison, Overall, Result, TaskAnalysis
 from gridworld.report.analysis.metrics import BY_KEY, METRICS
-from gridworld.report.build import Report
+from gridworld.report.build import Reasons, Report
 from gridworld.report.evidence.grouping import Group, Study, differing, learning_key, shortfall
-from gridworld.report.evidence.reasons import Reasons, most_common
 from gridworld.report.evidence.run_reader import Unusable
 from gridworld.report.evidence.tuning_study import TuningStudy
 from gridworld.report.table import NOTHING, Cell, Estimate, Table, number, steps_up_to
@@ -55,7 +55,7 @@ def results_table(tasks: Sequence[TaskAnalysis], reasons: Reasons) -> Table:
             result.certified,
             result.ever,
             *(estimate(result, *which) for which in shown),
-            *([most_common(result.group, reasons)] if reasons else []),
+            *([_most_common(result.group, reasons)] if reasons else []),
         ]
         for task in tasks
         for result in task.results
@@ -64,6 +64,12 @@ def results_table(tasks: Sequence[TaskAnalysis], reasons: Reasons) -> Table:
     columns += ["why not"] if reasons else []
     caption = "Certified seeds, exact regret and steps, with 95 % intervals"
     return _counting([group for task in tasks for group in task.groups], "results", caption, columns, rows)
+
+
+def _most_common(group: Group, reasons: Reasons) -> str:
+    """The most common cause of a group's runs that are not certified, with its count; "" without any."""
+    causes = Counter(reasons[run.folder].cause for run in group.runs if run.folder in reasons)
+    return "".join(f"{cause} ({count} of {causes.total()})" for cause, count in causes.most_common(1))
 
 
 def _counting(

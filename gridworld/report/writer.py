@@ -89,7 +89,8 @@ def write_report(report: Report, folder: Path, formats: Sequence[str] = FORMATS)
         drawn = [chart for of_one in of_all.values() for chart in of_one]
         for name, chart in zip(_file_names(chart.name for chart in drawn), drawn, strict=True):
             for kind in formats:
-                (new / FIGURES / f"{name}.{kind}").write_bytes(chart.saved_as(kind))
+                content = chart.svg.encode() if kind == "svg" else chart.saved_as(kind)
+                (new / FIGURES / f"{name}.{kind}").write_bytes(content)
         (new / TABLES).mkdir()
         all_tables = list(tables.all_tables(report))
         for name, table in zip(_file_names(table.name for table in all_tables), all_tables, strict=True):

@@ -88,6 +88,7 @@ _RC = {
     "svg.fonttype": "none",  # text stays text
 }
 
+_CHANGING = {"svg": "Date", "pdf": "CreationDate", "png": "Software"}  # entries that are left out
 _SVG_FONT = "font-family: 'DejaVu Sans', sans-serif; "  # the page has its own
 _OF_A_FILE = re.compile(r"<metadata>.*?</metadata>|<style.*?</style>", re.DOTALL)
 _TAG = re.compile(r"<[^>]*>")
@@ -99,8 +100,7 @@ _PAINTS = {colour: f"var(--{paint})" for paint, colour in LIGHT.items()}
 def house_style(salt: str = "") -> Iterator[None]:
     """Draw and save in the report's style, whatever the user's matplotlib is set to.
 
-    Args:
-        salt: tells the ids in this figure's SVG from those in another's, without chance.
+    `salt` tells the ids in this figure's SVG from those in another's, without chance.
     """
     with warnings.catch_warnings(), style.context(["default", _RC | {"svg.hashsalt": salt}]):
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
@@ -134,19 +134,12 @@ def styles(agents: Sequence[str]) -> dict[str, Style]:
 
 @dataclass(frozen=True)
 class Chart:
-    """A figure, laid out.
+    """A figure, laid out."""
 
-    Attributes:
-        name: of its files.
-        title: what it is called where it cannot be seen.
-        description: what is drawn, with which statistic of how many seeds; the caption in the page.
-        figure: of matplotlib, drawn in the colours of `LIGHT`.
-    """
-
-    name: str
-    title: str
-    description: str
-    figure: Figure
+    name: str  # of its files
+    title: str  # what it is called where it cannot be seen
+    description: str  # what is drawn, with which statistic of how many seeds; the caption in the page
+    figure: Figure  # in the colours of `LIGHT`
 
     def __post_init__(self) -> None:
         if (engine := self.figure.get_layout_engine()) is not None:
@@ -166,25 +159,21 @@ class Chart:
     @cached_property
     def svg(self) -> str:
         """A file whose text is text."""
-        return self._saved("svg", Date=None).decode("utf-8")
-
-    def pdf(self) -> bytes:
-        """A file for a paper. Text is outlines: a figure's fonts, as publishers want them, take 0.4 s."""
-        texts = self.figure.findobj(Text)
-        for text in texts:
-            text.set_path_effects([Normal()])
-        content = self._saved("pdf", CreationDate=None)
-        for text in texts:
-            text.set_path_effects([])
-        return content
-
-    def png(self) -> bytes:
-        """A picture on white."""
-        return self._saved("png", dpi=2 * _POINTS, Software=None)
+        return self.saved_as("svg").decode("utf-8")
 
     def saved_as(self, kind: str) -> bytes:
-        """The content of a file: "png", "pdf" or "svg"."""
-        return {"png": self.png, "pdf": self.pdf, "svg": self.svg.encode}[kind]()
+        """A file, "png", "pdf" or "svg". A PDF's text is outlines: proper fonts take 0.4 s."""
+        texts = self.figure.findobj(Text) if kind == "pdf" else []
+        for text in texts:
+            text.set_path_effects([Normal()])
+        metadata = {"Title": plain(f"{self.title}: {self.description}"), _CHANGING[kind]: None}
+        buffer = io.BytesIO()
+        with house_style(plain(self.name)):
+            scale = 2 if kind == "png" else 1
+            self.figure.savefig(buffer, format=kind, dpi=scale * _POINTS, facecolor=PAPER, metadata=metadata)
+        for text in texts:
+            text.set_path_effects([])
+        return buffer.getvalue()
 
     def svg_element(self) -> str:
         """An SVG element in the page's font, as wide as the page lets it, its colours CSS variables."""
@@ -193,13 +182,6 @@ class Chart:
         body = _TAG.sub(lambda tag: _for_page(tag[0]), _OF_A_FILE.sub("", body))
         told = escape(plain(self.title))
         return f'<svg viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{told}">{body}'
-
-    def _saved(self, kind: str, dpi: int = _POINTS, **metadata: None) -> bytes:
-        told = {"Title": plain(f"{self.title}: {self.description}"), **metadata}
-        buffer = io.BytesIO()
-        with house_style(plain(self.name)):
-            self.figure.savefig(buffer, format=kind, dpi=dpi, facecolor=PAPER, metadata=told)
-        return buffer.getvalue()
 
 
 def _for_page(tag: str) -> str:
@@ -216,17 +198,9 @@ def new_figure(
     legend: Sequence[tuple[Artist, str]] = (),
     width: float = WIDTH,
 ) -> tuple[Figure, Axes]:
-    """A figure with a heading and a legend above its axes.
+    """A figure with a heading and a legend above its axes, which are about `height` points high.
 
-    Args:
-        heading: shortened to the figure's width.
-        height: about that of the axes, points.
-        grid: the axis with lines across at its numbers.
-        legend: handles with their names, of a line or more.
-        width: of the figure, points.
-
-    Returns:
-        The figure, and its axes without a frame.
+    `grid` is the axis with lines across at its numbers, `legend` has handles with names of a line or more.
     """
     names = [name for _, name in legend]
     columns, lines = 1, sum(map(line_count, names))

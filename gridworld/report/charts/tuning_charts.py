@@ -18,6 +18,8 @@ from gridworld.report.charts.chart import INK, LIGHT, MUTED, SMALL, WIDE, Chart,
 from gridworld.report.evidence.tuning_study import TrialRow, TuningStudy
 from gridworld.world.mdp import FloatArray
 
+_Marks = list[tuple[str, float]]  # at an axis: what stands there, and where, from 0 to 1
+
 _BEST = 0.1  # of the trials stand out in parallel coordinates
 _DONE, _PRUNED, _WINNER = LIGHT["c0"], MUTED, LIGHT["c1"]
 
@@ -60,7 +62,7 @@ def _history(tuning: TuningStudy) -> Chart:
     figure, axes = chart.new_figure("Score by trial", 190, "y", legend if done.any() else legend[:2])
     end = max(1.0, numbers.max())
     axes.set(yscale="log", ylim=(low, high), ylabel="score, logarithmic", xlim=(0, end), xlabel="trial")
-    axes.set_yticks(marks, [f"{mark:.3g}" for mark in marks])
+    axes.set_yticks(marks, list(map(_power, marks)))
     axes.yaxis.set_minor_locator(NullLocator())
     axes.plot(numbers[done], scores[done], color=_DONE, alpha=0.75, **dots)
     axes.plot(numbers[~done], scores[~done], color=_PRUNED, alpha=0.45, **dots)
@@ -98,20 +100,20 @@ def _parallel(tuning: TuningStudy, done: Sequence[TrialRow]) -> Chart:
     bold = max(1, round(_BEST * len(ranked)))
     keys = list(tuning.space)
     scores, low, high, marks = _scale(ranked)
-    columns = [_on_axis(scores, low, high, is_log=True)]
-    columns += [_heights(tuning.space[key], [trial.values[key] for trial in ranked]) for key in keys]
-    at_marks = _on_axis(np.array(marks), low, high, is_log=True)
-    marked = [[(f"{mark:.3g}", height) for mark, height in zip(marks, at_marks, strict=True)]]
-    marked += [_marks(tuning.space[key]) for key in keys]
+    of_scores = _on_axis(np.array(marks), low, high, is_log=True)
+    axes_of = [
+        (_on_axis(scores, low, high, is_log=True), list(zip(map(_power, marks), of_scores, strict=True)))
+    ]
+    axes_of += [_axis(tuning.space[key], [trial.values[key] for trial in ranked]) for key in keys]
     title = "What the best tenth of the finished trials chose, and the winner"
     figure, axes = chart.new_figure(title, 250, width=WIDE)
     axes.set(xlim=(0, max(1, len(keys))), ylim=(0, 1), xticks=[], yticks=[])
-    lines = [list(enumerate(heights)) for heights in zip(*columns, strict=True)]
+    lines = [list(enumerate(heights)) for heights in zip(*(heights for heights, _ in axes_of), strict=True)]
     winner = [line for trial, line in zip(ranked, lines, strict=True) if trial.number == tuning.winner]
     looks = ((lines[bold:], MUTED, 0.5), (lines[:bold], _DONE, 1.6), (winner, _WINNER, 2.6))
     for chosen, colour, width in looks:
         axes.add_collection(LineCollection(chosen, colors=colour, linewidths=width, clip_on=False))
-    for index, (name, texts) in enumerate(zip(["score", *map(_short, keys)], marked, strict=True)):
+    for index, (name, (_, texts)) in enumerate(zip(["score", *map(_short, keys)], axes_of, strict=True)):
         axes.axvline(index, color=INK, linewidth=1, clip_on=False)
         side = "left" if index == 0 else "right" if index == len(keys) else "center"
         below = -18 if index % 2 == 0 else -34  # in two rows, for long names
@@ -134,24 +136,20 @@ def _on_axis(numbers: FloatArray, low: float, high: float, is_log: bool) -> Floa
     return np.interp(bend(numbers), bend(np.array([low, high])), (0.0, 1.0))
 
 
-def _heights(dimension: Mapping[str, Any], texts: Sequence[str]) -> FloatArray:
-    """Where values lie on their axis, from 0 to 1."""
+def _axis(dimension: Mapping[str, Any], texts: Sequence[str]) -> tuple[FloatArray, _Marks]:
+    """Where values lie on their axis, from 0 to 1, and what stands at it: its choices or its ends."""
     if dimension["type"] == "categorical":
-        places = dict(_places(dimension["choices"]))
-        return np.array([places.get(text, 0.0) for text in texts])
+        choices = dimension["choices"]
+        places = {choice: index / max(1, len(choices) - 1) for index, choice in enumerate(choices)}
+        marks = [(clipped(choice, 12), height) for choice, height in places.items()]
+        return np.array([places.get(text, 0.0) for text in texts]), marks
     low, high = dimension["low"], dimension["high"]
-    return _on_axis(np.array([float(text or low) for text in texts]), low, high, dimension["log"])
+    numbers = np.array([float(text or low) for text in texts])
+    return _on_axis(numbers, low, high, dimension["log"]), [(f"{low:g}", 0.0), (f"{high:g}", 1.0)]
 
 
-def _marks(dimension: Mapping[str, Any]) -> list[tuple[str, float]]:
-    """What stands at an axis: its choices or its ends."""
-    if dimension["type"] == "categorical":
-        return [(clipped(choice, 12), height) for choice, height in _places(dimension["choices"])]
-    return [(f"{dimension['low']:g}", 0.0), (f"{dimension['high']:g}", 1.0)]
-
-
-def _places(choices: Sequence[str]) -> list[tuple[str, float]]:
-    return [(choice, index / max(1, len(choices) - 1)) for index, choice in enumerate(choices)]
+def _power(number: float) -> str:
+    return f"{number:.3g}"
 
 
 def _short(key: str) -> str:
