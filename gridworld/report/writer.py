@@ -65,18 +65,9 @@ def check_out(folder: Path) -> None:
 
 
 def write_report(report: Report, folder: Path, formats: Sequence[str] = FORMATS) -> Path:
-    """Write the page, figures, tables and event files, in the place of an older report.
+    """Write the page, figures, tables and event files, in the place of an older report, whole or not at all.
 
-    Args:
-        report: what is written.
-        folder: replaced as a whole, or not at all.
-        formats: that the figures are written in, besides in the page.
-
-    Returns:
-        The page's path.
-
-    Raises:
-        InputError: something other than a report is in the way.
+    Returns the page's path. Raises `InputError` where something other than a report is in the way.
     """
     check_out(folder)
     # matplotlib is imported only now, since it may refuse the user's settings.
@@ -105,13 +96,9 @@ def write_over_seeds(runs: Path, folder: Path) -> Path | None:
 
     What is damaged, or keeps them from being written, is told on standard error.
 
-    Args:
-        runs: the folder that has the runs' folders.
-        folder: of the sweep or the study. What was written there before is replaced.
-
     Returns:
-        What was made; None where no agent has two seeds, there are too many runs to read them all, or
-        none has curves for TensorBoard or can be used.
+        What was made in `folder`; None where no agent has two seeds, there are too many runs to read them
+        all, or none has curves for TensorBoard or can be used.
     """
     count = sum(1 for _ in runs.glob(f"*/{MANIFEST}"))
     if count > _MOST_READ_UNASKED or not any(runs.glob(f"*/{EVENT_FILE}")):

@@ -51,12 +51,6 @@ class Comparison:
     tasks: int  # over how many
     probability: Interval
 
-    def mirrored(self) -> Comparison:
-        """Seen from the other's side."""
-        seen = self.probability
-        mirrored = Interval(1 - seen.point, 1 - seen.high, 1 - seen.low)
-        return Comparison(self.other, self.agent, self.metric, self.tasks, mirrored)
-
 
 @dataclass(frozen=True, eq=False)
 class TaskAnalysis:
@@ -115,19 +109,15 @@ def analyse(
 def _task(task: str, groups: list[Group], seed: int, log_steps: bool) -> TaskAnalysis:
     runs = [run for group in groups for run in group.runs]
     world = reference(next((run for run in runs if not run.damage), runs[0]))
-    log_steps = log_steps or _is_one_slow(groups)
+    ends = [max(run.steps for run in group.runs) for group in groups]
+    learnt = [float(np.median([run.first_certified_step for run in group.runs])) for group in groups]
+    for steps in (ends, learnt):  # whether one agent ran, or learnt, ten times as long as another
+        known = [step for step in steps if 0 < step < math.inf]
+        log_steps |= bool(known) and max(known) >= _SLOWER * min(known)
     grid = curves.grid_for(runs, log_steps)
     results = tuple(_result(group, world, grid, seed) for group in groups)
     comparisons = compare([{r.group.agent: r.samples for r in results}], seed)
     return TaskAnalysis(task, world, results, comparisons, log_steps)
-
-
-def _is_one_slow(groups: Sequence[Group]) -> bool:
-    """Whether one agent ran, or learnt, ten times as long as another."""
-    ends = [max(run.steps for run in group.runs) for group in groups]
-    learnt = [float(np.median([run.first_certified_step for run in group.runs])) for group in groups]
-    times = [[step for step in steps if 0 < step < math.inf] for steps in (ends, learnt)]
-    return any(steps and max(steps) >= _SLOWER * min(steps) for steps in times)
 
 
 def _result(group: Group, world: Reference, grid: FloatArray, seed: int) -> Result:
@@ -169,10 +159,10 @@ def compare(
             ]
             pairs = [pair for pair in pairs if len(pair[0]) and len(pair[1])]
             if len(pairs) >= least:
-                comparison = Comparison(
-                    one, other, metric.key, len(pairs), statistics.improvement(pairs, seed)
-                )
-                out += [comparison, comparison.mirrored()]
+                seen = statistics.improvement(pairs, seed)
+                mirrored = Interval(1 - seen.point, 1 - seen.high, 1 - seen.low)
+                out.append(Comparison(one, other, metric.key, len(pairs), seen))
+                out.append(Comparison(other, one, metric.key, len(pairs), mirrored))
     return tuple(out)
 
 

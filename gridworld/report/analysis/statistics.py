@@ -169,25 +169,22 @@ def improvement(pairs: Sequence[tuple[FloatArray, FloatArray]], seed: int) -> In
     It is the Mann-Whitney statistic over n·m of both agents' samples on a task, (n,) and (m,), and the mean
     of these over tasks, with its 95 % bootstrap interval.
     """
-    wins = [_wins(first, second) for first, second in pairs]
+    # (n, m) for each task: 1 where the first is greater, 1/2 for a tie.
+    wins = [
+        0.5 * np.greater.outer(first, second) + 0.5 * np.greater_equal.outer(first, second)
+        for first, second in pairs
+    ]
 
     def mean_probability(*drawn: FloatArray, axis: int = -1) -> FloatArray:
-        by_task = zip(wins, drawn[::2], drawn[1::2], strict=True)
-        return np.asarray(np.mean([_share_won(*of_task) for of_task in by_task], axis=0))
+        """The mean share of pairs won among runs drawn by their places, (..., n) and (..., m) in turn."""
+        shares = []
+        for won, first, second in zip(wins, drawn[::2], drawn[1::2], strict=True):
+            of_first = (_times_drawn(first) @ won) * _times_drawn(second)
+            shares.append(of_first.sum(axis=-1) / won.size)
+        return np.asarray(np.mean(shares, axis=0))
 
     places = [np.arange(len(sample), dtype=np.float64) for pair in pairs for sample in pair]
     return interval(mean_probability, places, seed)
-
-
-def _wins(first: FloatArray, second: FloatArray) -> FloatArray:
-    """(n, m): 1 where the first is greater, 1/2 for a tie."""
-    return 0.5 * np.greater.outer(first, second) + 0.5 * np.greater_equal.outer(first, second)
-
-
-def _share_won(wins: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
-    """The share of pairs won among runs drawn by their places, (..., n) and (..., m)."""
-    won = ((_times_drawn(first) @ wins) * _times_drawn(second)).sum(axis=-1)
-    return np.asarray(won / wins.size)
 
 
 def _times_drawn(places: FloatArray) -> FloatArray:
