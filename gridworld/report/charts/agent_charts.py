@@ -216,8 +216,10 @@ def _draw_band(axes: Axes, band: Band, below: IntArray, line: dict[str, Any], bo
     whole = int((band.steps <= band.whole_until).sum())
     corners, levels = np.repeat(band.steps[:whole], 2)[1:], np.repeat(values[:whole], 2)[:-1]
     for start, end in pairwise([0, *(np.flatnonzero(np.diff(below[:whole])) + 1).tolist(), whole]):
-        piece = slice(max(0, 2 * start - int(below[start] == 0)), 2 * end + 1)
-        dashes = {"linestyle": (0, (_DASH, _DASH * int(below[start])))} if below[start] else {}
+        bold = not below[start]  # a change between a bold and a dashed piece is bold
+        leads = start > 0 and (bold or bool(below[start - 1]))
+        piece = slice(2 * start - int(leads), 2 * end + int(bold))
+        dashes = {} if bold else {"linestyle": (0, (_DASH, _DASH * int(below[start])))}
         axes.plot(corners[piece], levels[piece], linewidth=2.2, **look | dashes)
     if whole == 1:
         axes.plot(band.steps[:1], values[:1], marker="o", markersize=7, **look)

@@ -23,6 +23,7 @@ from matplotlib import style
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patheffects import Normal
 from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
@@ -210,8 +211,8 @@ def new_figure(
         columns = max(1, len(names) if fits else _LEGEND // (longest + _HANDLE))
         lines = -(-len(names) // columns)
     points = height + 64 + LINE * lines
-    figure = Figure(figsize=(width / _POINTS, points / _POINTS), dpi=_POINTS, layout="constrained")
-    figure.get_layout_engine().set(w_pad=8 / _POINTS, h_pad=4 / _POINTS)  # type: ignore[union-attr, call-arg]
+    layout = ConstrainedLayoutEngine(w_pad=8 / _POINTS, h_pad=4 / _POINTS)
+    figure = Figure(figsize=(width / _POINTS, points / _POINTS), dpi=_POINTS, layout=layout)
     axes = figure.add_subplot(facecolor="none")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
