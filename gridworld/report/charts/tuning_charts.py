@@ -20,6 +20,7 @@ from gridworld.world.mdp import FloatArray
 
 _Marks = list[tuple[str, float]]  # at an axis: what stands there, and where, from 0 to 1
 
+_HIGHEST = 1e200  # score that is drawn as it is; its inverse is the lowest
 _BEST = 0.1  # of the trials stand out in parallel coordinates
 _DONE, _PRUNED, _WINNER = LIGHT["c0"], MUTED, LIGHT["c1"]
 
@@ -37,9 +38,9 @@ def tuning_charts(tuning: TuningStudy) -> Iterator[Chart]:
 
 def _scale(trials: Sequence[TrialRow]) -> tuple[FloatArray, float, float, list[float]]:
     """Scores for a logarithmic axis, its ends, and its marks: what is not positive lies at the lower end."""
-    scores = np.array([trial.score for trial in trials])
+    scores = np.array([min(trial.score, _HIGHEST) for trial in trials])
     positive = scores[scores > 0] if (scores > 0).any() else np.ones(1)
-    low = float(positive.min()) / 1.1
+    low = max(float(positive.min()), 1 / _HIGHEST) / 1.1
     high = max(float(positive.max()) * 1.1, 2 * low)
     factors = (1, 2, 5) if high < 1000 * low else (1,)
     marks = [mark for mark in LogLocator(10, factors).tick_values(low, high) if low <= mark <= high]
