@@ -20,8 +20,7 @@ from gridworld.process.console.command_line import program
 from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
-from gridworld.report.build import MOST_TOLD, Report, gather
-from gridworld.report.evidence.reasons import Reason, reasons
+from gridworld.report.build import MOST_TOLD, Reason, Report, gather, reasons
 from gridworld.report.writer import FORMATS, MARKERS, check_markers, check_out, write_readme, write_report
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.claim import check_inside

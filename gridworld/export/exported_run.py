@@ -78,11 +78,7 @@ class ExportedRun:
 
 
 def read(folder: Path, copies: Path) -> ExportedRun:
-    """Read a finished run.
-
-    Args:
-        folder: The run's folder.
-        copies: An empty folder, for copies of its files.
+    """Read a finished run; `copies` is an empty folder, for copies of its files.
 
     Raises:
         InputError: It is no finished run, or a file is missing, too large, or not the one that the run wrote.
@@ -91,27 +87,34 @@ def read(folder: Path, copies: Path) -> ExportedRun:
     if isinstance(evidence, Unusable):
         raise InputError("; ".join(evidence.reasons))
     run = open_run(folder)
-    config = read_config(run.manifest["config"], str(run.manifest_file))
+    config, sums = read_config(run.manifest["config"], str(run.manifest_file)), run.manifest["sha256"]
+    numbers = {key: value for key, value in flat(run.read_summary()) if isinstance(value, int | float)}
+    models = [run.model_file]
+    models += [run.best_model_file] if run.best_model_file.name in sums else []  # earlier versions kept none
+    world = None
+    if not isinstance(config.env, MapConfig):
+        world = copies / WORLD
+        world.write_bytes(world_bytes(stored_world(run, config.env)))
     return ExportedRun(
-        identity=sha256(repr(sorted(run.manifest["sha256"].items())).encode())[:16],
+        identity=sha256(repr(sorted(sums.items())).encode())[:16],
         evidence=evidence,
         config=config,
-        summary=dict(_numbers(run)),
+        summary={key: value for key, value in numbers.items() if re.fullmatch(r"[\w.]+", key, re.ASCII)},
         curve=list(_curve(run)),
-        models=tuple(_models(run, copies)),
-        pictures=tuple(_pictures(run, copies)),
-        world=_world(run, config, copies),
+        models=tuple(_copied(run, path, copies, LARGEST_RESULT) for path in models),
+        pictures=tuple(_copied(run, path, copies, _LARGEST_PICTURE) for path in _pictures(run)),
+        world=world,
     )
+
+
+def _copied(run: RunReader, path: Path, copies: Path, most: int) -> Path:
+    copy = copies / path.name
+    copy.write_bytes(run.read(path, most))
+    return copy
 
 
 def _safe(name: str) -> str:
     return re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII)
-
-
-def _numbers(run: RunReader) -> Iterator[tuple[str, float]]:
-    for key, value in flat(run.read_summary()):
-        if isinstance(value, int | float) and re.fullmatch(r"[\w.]+", key, re.ASCII):
-            yield key, value
 
 
 def _curve(run: RunReader) -> Iterator[Row]:
@@ -121,31 +124,13 @@ def _curve(run: RunReader) -> Iterator[Row]:
         yield int(step), {name: number for name, number in named if math.isfinite(number)}
 
 
-def _models(run: RunReader, copies: Path) -> Iterator[Path]:
-    for path in (run.model_file, run.best_model_file):
-        if path == run.model_file or path.name in run.manifest["sha256"]:  # earlier versions kept no best one
-            copy = copies / path.name
-            copy.write_bytes(run.read(path, LARGEST_RESULT))
-            yield copy
-
-
-def _world(run: RunReader, config: TrainConfig, copies: Path) -> Path | None:
-    if isinstance(config.env, MapConfig):
-        return None
-    copy = copies / WORLD
-    copy.write_bytes(world_bytes(stored_world(run, config.env)))
-    return copy
-
-
-def _pictures(run: RunReader, copies: Path) -> Iterator[Path]:
+def _pictures(run: RunReader) -> Iterator[Path]:
     """Those that the folder still has; earlier versions noted no checksum of an episode's films."""
     for picture in PICTURES:
         path = run.folder / picture.file
         if not path.suffix or not os.path.lexists(path):
             continue
-        if picture.file not in run.manifest["sha256"]:
+        if picture.file in run.manifest["sha256"]:
+            yield path
+        else:
             tell(printable(f"{path}: is left out, the run's manifest has no checksum of it"))
-            continue
-        copy = copies / path.name
-        copy.write_bytes(run.read(path, _LARGEST_PICTURE))
-        yield copy

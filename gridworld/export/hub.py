@@ -67,17 +67,19 @@ hf upload USER/{group} .
 
 
 def to_hub(run: ExportedRun, out: Path, project: str) -> str:
-    """Write the folder of a run in `out`, named for it; nothing is uploaded. It says nothing of the project.
+    """Write the folder of a run in `out`, named for it, and return it; nothing is uploaded.
 
-    Returns:
-        The folder.
-
-    Raises:
-        InputError: The agent's class has a name that cannot be imported.
+    It says nothing of the project. Raises `InputError` where the agent's class has a name that cannot be
+    imported.
     """
     folder = out / run.name
-    if folder.exists() and _identity(folder) != run.identity:
-        folder = out / f"{run.name}-{run.identity}"
+    if folder.exists():
+        try:
+            identity = read_object(folder / _RESULTS).get("run")
+        except InputError:  # it is something else
+            identity = None
+        if identity != run.identity:
+            folder = out / f"{run.name}-{run.identity}"
     if folder.exists():
         return str(folder)
     card = _card(run)
@@ -94,13 +96,6 @@ def to_hub(run: ExportedRun, out: Path, project: str) -> str:
         exact = {"is_deterministic": True, "is_exact": True, "run": run.identity}
         write_json(new / _RESULTS, {**run.summary, **_sb3_scores(run), **exact})
     return str(folder)
-
-
-def _identity(folder: Path) -> Any:
-    try:
-        return read_object(folder / _RESULTS).get("run")
-    except InputError:  # it is something else
-        return None
 
 
 def _shown_as(path: Path) -> str:
@@ -120,12 +115,21 @@ def _card(run: ExportedRun) -> str:
         )
     module, _, name = algorithm.rpartition(".")
     file = f'(folder / "{run.group}.zip")'
+    scores = [
+        metric.row(
+            run.summary.get(metric.name),
+            run.summary.get(f"sampled.{metric.name}"),
+            run.summary.get(f"optimal_{metric.name}", metric.known_optimum),
+        )
+        for metric in METRICS
+        if metric.in_tables
+    ]
     text = _CARD.format(
         group=run.group,
         verdict="Certified optimal" if run.evidence.certified else "Not optimal",
         steps=run.steps,
         seed=run.evidence.seed,
-        scores=to_markdown(Table("scores", "", ("", "greedy", "sampled", "optimum"), _scores(run))),
+        scores=to_markdown(Table("scores", "", ("", "greedy", "sampled", "optimum"), scores)),
         images="".join(
             f"![{each.stem}]({_shown_as(each)})\n" for each in run.pictures if each.suffix != ".mp4"
         ),
@@ -162,13 +166,3 @@ def _metadata(run: ExportedRun, is_sb3: bool) -> dict[str, Any]:
     tags = [world, "deep-reinforcement-learning" if is_sb3 else "tabular", "reinforcement-learning"]
     index = {"name": run.config.agent.algorithm, "results": [result]}
     return {**library, "tags": [*tags, *library.values()], "model-index": [index]}
-
-
-def _scores(run: ExportedRun) -> list[tuple[str, ...]]:
-    rows = []
-    for metric in METRICS:
-        best = run.summary.get(f"optimal_{metric.name}", metric.known_optimum)
-        found = (run.summary.get(metric.name), run.summary.get(f"sampled.{metric.name}"), best)
-        if metric.in_tables:
-            rows.append(metric.row(*found))
-    return rows

@@ -1,9 +1,10 @@
-"""Gathering everything that a report shows from the given paths."""
+"""Gathering everything that a report shows from the given paths, and why runs are not certified."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+import itertools
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -14,8 +15,7 @@ from gridworld.config.worlds import SOURCES
 from gridworld.errors import InputError
 from gridworld.report.analysis.analyse import Overall, TaskAnalysis, analyse
 from gridworld.report.evidence.discovery import find_runs
-from gridworld.report.evidence.grouping import Study, arrange
-from gridworld.report.evidence.reasons import Reasons
+from gridworld.report.evidence.grouping import Group, Study, arrange
 from gridworld.report.evidence.run_reader import DAMAGED, Evidence, Unusable, read
 from gridworld.report.evidence.tuning_study import TuningStudy, find_tunings
 
@@ -24,6 +24,17 @@ MOST_TOLD = 20  # sentences on standard error; the page has them all
 
 class NothingFinishedError(InputError):
     """No run can be used, and none is damaged: they are not finished."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why one run is not certified, in about four words, and the word for the command line to try, if any."""
+
+    cause: str
+    change: str = ""
+
+
+Reasons = Mapping[Path, Reason]  # by the run's folder
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,13 +72,8 @@ class Report:
 def gather(paths: Sequence[Path], seed: int = 0, log_steps: bool = False) -> Report:
     """Read and analyse all runs and tuning studies below the paths.
 
-    Args:
-        paths: folders of runs, of sweeps, or any above them.
-        seed: of the bootstrap.
-        log_steps: whether all curves are against the logarithm of the steps.
-
-    Raises:
-        InputError: no run can be used.
+    `seed` is of the bootstrap; `log_steps` is whether all curves are against the logarithm of the steps.
+    Raises `InputError` where no run can be used.
     """
     found = find_runs(paths)
     problems = found.problems
@@ -94,23 +100,50 @@ _OPEN = ("agent.", "env.kwargs.")  # sections with settings that no schema names
 
 def _foreign(runs: Sequence[Evidence]) -> tuple[str, ...]:
     """What was written by another version, and what it says that this one does not know."""
-    notes = []
-    for version, count in sorted(Counter(run.version for run in runs).items()):
-        if version != gridworld.__version__:
-            first = next(run for run in runs if run.version == version)
-            notes.append(
-                f"{count} {'runs were' if count > 1 else 'run was'} written by gridworld {version}, this is "
-                f"{gridworld.__version__}: {first.folder}{' and others' if count > 1 else ''}."
-            )
+    versions: dict[str, list[Path]] = defaultdict(list)
+    unknown: dict[str, list[Path]] = defaultdict(list)
     worlds = [asdict(TrainConfig(env=source())) for source in SOURCES.values()]
     known = {name for settings in worlds for name, _ in flat(settings)}
-    unknown = Counter(
-        name for run in runs for name in run.settings if name not in known and not name.startswith(_OPEN)
-    )
-    for name, count in sorted(unknown.items()):
-        first = next(run for run in runs if name in run.settings)
-        notes.append(
-            f"{count} {'runs have' if count > 1 else 'run has'} the setting {name}, which this version does "
-            f"not know: {first.folder}{' and others' if count > 1 else ''}."
-        )
+    for run in runs:
+        if run.version != gridworld.__version__:
+            versions[run.version].append(run.folder)
+        for name in run.settings:
+            if name not in known and not name.startswith(_OPEN):
+                unknown[name].append(run.folder)
+    notes = [
+        f"{len(folders)} {'runs were' if len(folders) > 1 else 'run was'} written by gridworld {version}, "
+        f"this is {gridworld.__version__}: {folders[0]}{' and others' if len(folders) > 1 else ''}."
+        for version, folders in sorted(versions.items())
+    ]
+    notes += [
+        f"{len(folders)} {'runs have' if len(folders) > 1 else 'run has'} the setting {name}, which this "
+        f"version does not know: {folders[0]}{' and others' if len(folders) > 1 else ''}."
+        for name, folders in sorted(unknown.items())
+    ]
     return tuple(notes)
+
+
+def reasons(
+    groups: Iterable[Group], ask: Callable[[Path], Reason | None], most: int
+) -> tuple[Reasons, list[str]]:
+    """Ask why runs are not certified.
+
+    Args:
+        groups: their runs, of which the first seed of each comes before the second of any.
+        ask: tells the reason of the run in a folder; None: it cannot. Raises `InputError` where a file of
+            the run keeps it from that.
+        most: how many to ask about.
+
+    Returns:
+        The reasons, and a sentence for each run that cannot be asked about.
+    """
+    found, untold = {}, []
+    columns = ([run for run in group.runs if not run.certified] for group in groups)
+    in_turn = (run for row in itertools.zip_longest(*columns) for run in row if run is not None)
+    for run in itertools.islice(in_turn, most):
+        try:
+            if (reason := ask(run.folder)) is not None:
+                found[run.folder] = reason
+        except InputError as error:
+            untold.append(f"{run.folder}: is not diagnosed; {error}")
+    return found, untold

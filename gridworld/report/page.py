@@ -2,35 +2,39 @@
 
 from __future__ import annotations
 
+import base64
 import functools
+import io
 import math
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from typing import Any
+import struct
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import jinja2
 from markupsafe import Markup, escape
+from PIL import Image
 
+from gridworld.config.pictures import PICTURES
 from gridworld.process.console.terminal import plain
 from gridworld.report import tables
 from gridworld.report.analysis.analyse import Result, TaskAnalysis
 from gridworld.report.analysis.statistics import RESAMPLES, Share
 from gridworld.report.build import Report
-from gridworld.report.charts.chart import Chart
-from gridworld.report.charts.overall_charts import overall_charts
-from gridworld.report.charts.style import AGENT_PAINTS, DARK, LIGHT, Styles, styles
-from gridworld.report.charts.task_charts import task_charts
+from gridworld.report.charts.agent_charts import overall_charts, task_charts
+from gridworld.report.charts.chart import AGENT_PAINTS, DARK, LIGHT, Chart, Styles, styles
 from gridworld.report.charts.tuning_charts import tuning_charts
-from gridworld.report.embedded_images import pictures
 from gridworld.report.evidence.grouping import shortfall
-from gridworld.report.evidence.tuning_study import TuningStudy
 from gridworld.report.table import Cell, interval_text, is_text, main_text, number
-from gridworld.report.tuning_tables import finalists_table, trials_table, winner_table
+from gridworld.storage.safe_read import read_bytes, sha256
 
 _ALL_TASKS = ""  # no task's name
 _FEW = 6  # agents; of more, what is long is folded away
 _MOST_TOLD = 4  # agents, each by name in the opening
+_LARGEST = {".png": 4 * 2**20, ".gif": 256 * 2**10}  # bytes; an animation stands in the page as it is
+_MOST_PIXELS = 4_000_000
+_WIDTH = 960  # pixels, where it is shown large
 
 
 def charts(report: Report) -> dict[str, list[Chart]]:
@@ -75,43 +79,50 @@ def render(report: Report, drawn: dict[str, list[Chart]]) -> str:
         report: what it shows.
         drawn: the figures, from `charts`.
     """
-    look = _look(report)
-    headline = _headline(report)
+    study = report.study
+    runs = [run for group in study.groups for run in group.runs]
+    folders = [run.folder.absolute() for run in runs]
+    agents = {run.agent for run in runs}  # their own names, whatever settings they were run with
+    headline = next(  # of a page about one tuning study
+        (
+            tuning.title
+            for tuning in report.tunings
+            if all(folder.is_relative_to(tuning.folder.absolute()) for folder in folders)
+        ),
+        "",
+    )
+    names = " on ".join(
+        ", ".join(names) if len(names) <= _MOST_TOLD else f"{len(names)} {what}"
+        for names, what in ((study.agents, "agents"), (study.tasks, "tasks"))
+    )
+    days = sorted({run.started for run in runs if run.started})
+    counts = {"run": len(runs), "agent": len(agents), "configuration": len(study.agents)}
+    if len(study.agents) == len(agents):
+        del counts["configuration"]
+    counts["task"] = len(study.tasks)
     return template().render(
-        title=f"{headline or _names(report)}, gridworld",
-        headline=headline or "Which agent solves which task",
-        lead=_lead(report),
-        answers=[
-            *(
-                tuning.sentence if headline else f"{tuning.title}. {tuning.sentence}"
-                for tuning in report.tunings
-            ),
-            *map(_answer, report.tasks),
-        ],
-        answer=tables.answer_table(report.study, report.tasks),
-        few=_FEW,
-        kinds="agents" if len(_agents(report)) == len(report.study.agents) else "configurations",
-        problems=list(map(plain, [*report.problems, *report.damage])),
-        warnings=list(map(plain, report.study.warnings)),
-        notes=list(map(plain, [*report.study.notes, *report.notes])),
-        tunings=[_tuning(tuning, drawn[tuning.title], headline) for tuning in report.tunings],
-        tasks=[_task(task, drawn[task.task], look) for task in report.tasks],
-        overall=tables.overall_table(report.overall, report.study.groups) if report.overall else None,
-        overall_figures=_figures(drawn[_ALL_TASKS]),
-        overall_improvements=tables.improvement_tables(
-            report.overall.comparisons, "all tasks", report.study.groups
-        )
-        if report.overall
-        else [],
-        unusable=tables.unusable_table(report.unusable),
-        reasons=tables.reasons_table(report.study, report.reasons),
-        runs=tables.runs_table(report.study),
-        settings=tables.settings_table(report.study),
+        report=report,
+        study=study,
+        headline=headline,
+        names=plain(names)[:120],
+        counts=counts,
+        days=list(dict.fromkeys([*days[:1], *days[-1:]])),
+        problems=[*report.problems, *report.damage],
+        answers=list(map(_answer, report.tasks)),
+        kinds="agents" if len(agents) == len(study.agents) else "configurations",
+        versions=sorted({run.version for run in runs}),
+        drawn=drawn,
+        overall_figures=drawn[_ALL_TASKS],
         resamples=f"{RESAMPLES:,}",
-        provenance=_provenance(report),
+        few=_FEW,
         light=LIGHT,
         dark=DARK,
-        styles=look,
+        styles=_look(report),
+        tables=tables,
+        facts=_facts,
+        galleries=_galleries,
+        plain=plain,
+        markup=Markup,
         main_text=main_text,
         interval_text=interval_text,
         share_of=_share_of,
@@ -123,64 +134,6 @@ def render(report: Report, drawn: dict[str, list[Chart]]) -> str:
 def _breakable(heading: str) -> Markup:
     """A column's heading that may go on in the next line after "_" and "=", as labels are long."""
     return Markup(re.sub(r"(?<=[_=])", "<wbr>", str(escape(heading))))
-
-
-def _task(task: TaskAnalysis, drawn: Sequence[Chart], look: Styles) -> dict[str, Any]:
-    run = task.results[0].group.runs[0]
-    return {
-        "title": task.task,
-        "facts": _facts(task),
-        "figures": _figures(drawn),
-        "tables": [tables.task_table(task), tables.scores_table(task)],
-        "improvements": tables.improvement_tables(task.comparisons, task.task, task.groups),
-        "pictures": [found for result in task.ranked if (found := list(pictures(result)))],
-        "layout": run.layout,
-    }
-
-
-def _tuning(tuning: TuningStudy, drawn: Sequence[Chart], headline: str) -> dict[str, Any]:
-    return {
-        "title": "The search" if tuning.title == headline else tuning.title,
-        "facts": [
-            f"Study {tuning.name}, {tuning.counts}.",
-            *([_MEDIANS] if "median" in tuning.sentence else []),
-        ],
-        "figures": _figures(chart for chart in drawn if not chart.is_wide),
-        "wide": _figures(chart for chart in drawn if chart.is_wide),
-        "tables": [winner_table(tuning), finalists_table(tuning)],
-        "trials": trials_table(tuning),
-    }
-
-
-_MEDIANS = (
-    "The sentence above has two medians, of the winner's held-out runs and of those with the settings that "
-    "the search began from: from that step on, half of the runs were certified for good, to the end. The "
-    "tasks below tell the step of the first certificate, which a run may lose again, so it can be earlier."
-)
-
-
-def _figures(drawn: Iterable[Chart]) -> list[tuple[Markup, str]]:
-    """Each as its element and its caption."""
-    return [(Markup(chart.svg_element()), chart.caption) for chart in drawn]
-
-
-def _headline(report: Report) -> str:
-    """Of a page about one tuning study; "" for any other."""
-    folders = [run.folder.absolute() for group in report.study.groups for run in group.runs]
-    for tuning in report.tunings:
-        if all(folder.is_relative_to(tuning.folder.absolute()) for folder in folders):
-            return tuning.title
-    return ""
-
-
-def _names(report: Report) -> str:
-    """The agents and the tasks, where that is short."""
-    agents, tasks = report.study.agents, report.study.tasks
-    told = [
-        ", ".join(names) if len(names) <= _MOST_TOLD else f"{len(names)} {what}"
-        for names, what in ((agents, "agents"), (tasks, "tasks"))
-    ]
-    return plain(" on ".join(told))[:120]
 
 
 def _facts(task: TaskAnalysis) -> list[str]:
@@ -203,41 +156,21 @@ def _facts(task: TaskAnalysis) -> list[str]:
     return [f"{sentence}." for sentence in told]
 
 
-def _lead(report: Report) -> str:
-    runs = sum(len(group.runs) for group in report.study.groups)
-    counts = (
-        (runs, "run"),
-        (len(agents := _agents(report)), "agent"),
-        *([(count, "configuration")] if (count := len(report.study.agents)) > len(agents) else []),
-        (len(report.study.tasks), "task"),
-    )
-    return ", ".join(f"{count} {name}{'s' if count > 1 else ''}" for count, name in counts) + _days(report)
-
-
-def _agents(report: Report) -> set[str]:
-    """The agents' own names, whatever settings they were run with."""
-    return {run.agent for group in report.study.groups for run in group.runs}
-
-
-def _days(report: Report) -> str:
-    days = sorted({run.started for group in report.study.groups for run in group.runs if run.started})
-    return "" if not days else f", {days[0]}" if len(days) == 1 else f", {days[0]} to {days[-1]}"
-
-
 def _answer(task: TaskAnalysis) -> str:
+    """How each agent did on a task; of many, the best one, and how many others are certified."""
     ranked = task.ranked
-    told = [_verdict(result) for result in ranked] if len(ranked) <= _MOST_TOLD else _verdicts(ranked)
+    told = list(map(_verdict, ranked[:_MOST_TOLD]))
+    if len(ranked) > _MOST_TOLD:
+        whole = sum(result.certified.count == result.certified.total for result in ranked)
+        none = sum(result.certified.count == 0 for result in ranked)
+        names = {result.group.runs[0].agent for result in ranked}
+        what = f"configurations of {names.pop()}" if len(names) == 1 else "agents"
+        told = [
+            f"{whole} of {len(ranked)} {what} are certified optimal on all of their seeds",
+            *([f"{none} on none"] if none else []),
+            f"best of all: {told[0]}",
+        ]
     return f"On {task.task}, {'; '.join(told)}{task.shortfall}."
-
-
-def _verdicts(ranked: Sequence[Result]) -> list[str]:
-    """The best of many agents, and how many others are certified."""
-    whole = sum(result.certified.count == result.certified.total for result in ranked)
-    none = sum(result.certified.count == 0 for result in ranked)
-    names = {result.group.runs[0].agent for result in ranked}
-    what = f"configurations of {names.pop()}" if len(names) == 1 else "agents"
-    counts = [f"{whole} of {len(ranked)} {what} are certified optimal on all of their seeds"]
-    return [*counts, *([f"{none} on none"] if none else []), f"best of all: {_verdict(ranked[0])}"]
 
 
 def _verdict(result: Result) -> str:
@@ -245,27 +178,70 @@ def _verdict(result: Result) -> str:
     if share.count == 0:
         regret = number(result.estimates["regret", "iqm"].point)
         return f"{agent} is certified on none of {share.total} seeds (IQM of the regret {regret})"
-    seeds = (
-        f"all {share.total} seeds" if share.count == share.total else f"{share.count} of {share.total} seeds"
-    )
+    seeds = f"{'all' if share.count == share.total else f'{share.count} of'} {share.total} seeds"
     if share.total == 1:
         seeds = "its one seed"
     if result.ever.count > share.count:  # a certificate can be lost again
         return f"{agent} ends certified optimal on {seeds}, and was so at some time on {result.ever.count}"
-    return f"{agent} is certified optimal on {seeds}{_after(result)}"
-
-
-def _after(result: Result) -> str:
+    told = f"{agent} is certified optimal on {seeds}"
     cell = tables.estimate(result, "steps", "median")
-    if cell is None or math.isinf(cell.interval.point):
-        return ""
-    return f", by step {main_text(cell)}" + (" in the median" if len(result.group.runs) > 1 else "")
-
-
-def _provenance(report: Report) -> str:
-    versions = sorted({run.version for group in report.study.groups for run in group.runs})
-    return f"The runs were written by gridworld {', '.join(versions)}. Bootstrap seed {report.seed}."
+    if cell is not None and math.isfinite(cell.interval.point):
+        told += f", by step {main_text(cell)}" + (" in the median" if share.total > 1 else "")
+    return told
 
 
 def _share_of(cell: Cell) -> float | None:
     return round(100 * cell.count / cell.total, 1) if isinstance(cell, Share) else None
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """An image as a data URI."""
+
+    uri: str
+    width: int
+    height: int
+    caption: str
+
+
+def _galleries(task: TaskAnalysis) -> list[list[_Picture]]:
+    """The pictures of each agent that has any, the best one first."""
+    return [found for result in task.ranked if (found := list(_pictures(result)))]
+
+
+def _pictures(result: Result) -> Iterator[_Picture]:
+    """Those of the run with the median regret that are there, unchanged and not too large."""
+    ranked = sorted(result.group.runs, key=lambda run: (run.regret, run.seed))
+    run = ranked[(len(ranked) - 1) // 2]
+    verdict = "certified optimal" if run.certified else f"regret {number(run.regret)}"
+    for picture in PICTURES:
+        if picture.caption is None or picture.file not in run.pictures:
+            continue
+        if (found := _embedded(run.folder / picture.file, run.pictures[picture.file])) is not None:
+            yield _Picture(*found, f"{result.group.agent}, seed {run.seed}, {verdict}: {picture.caption}")
+
+
+def _embedded(path: Path, digest: str | None) -> tuple[str, int, int] | None:
+    """Data URI, width and height of a PNG or GIF.
+
+    None where it is missing, damaged, too large, or has another SHA-256 than `digest`, of which None is any.
+    """
+    kind = path.suffix[1:]
+    try:
+        content = read_bytes(path, _LARGEST[path.suffix])
+        if digest not in (None, sha256(content)):
+            return None
+        with Image.open(io.BytesIO(content), formats=[kind.upper()]) as image:
+            if image.width * image.height > _MOST_PIXELS:
+                return None
+            width, height = image.size
+            if kind == "png":
+                small = image.convert("RGB")
+                small.thumbnail((_WIDTH, 2 * _WIDTH), Image.Resampling.LANCZOS)
+                buffer = io.BytesIO()
+                small.save(buffer, format="PNG")  # the highest compression takes four times as long for 6 %
+                content, (width, height) = buffer.getvalue(), small.size
+    # What Pillow raises for a damaged one; ValueError is ours, too.
+    except (OSError, ValueError, SyntaxError, EOFError, struct.error, Image.DecompressionBombError):
+        return None
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}", width, height

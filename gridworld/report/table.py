@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from gridworld.process.console.terminal import plain
@@ -31,18 +31,12 @@ Cell = str | float | int | None | Share | Estimate
 
 @dataclass(frozen=True)
 class Table:
-    """A table whose texts are plain: control characters in names of strangers' runs are escaped.
+    """A table whose texts are plain: control characters in names of strangers' runs are escaped."""
 
-    Attributes:
-        name: of its files.
-        columns: the headings.
-        rows: a cell for each column.
-    """
-
-    name: str
+    name: str  # of its files
     caption: str
-    columns: Sequence[str]
-    rows: Sequence[Sequence[Cell]]
+    columns: Sequence[str]  # the headings
+    rows: Sequence[Sequence[Cell]]  # a cell for each column
 
     def __post_init__(self) -> None:
         rows = [[plain(cell) if isinstance(cell, str) else cell for cell in row] for row in self.rows]
@@ -124,42 +118,32 @@ def to_markdown(table: Table) -> str:
 
 def to_csv(table: Table) -> str:
     """A CSV of plain numbers; an interval takes three columns, a share four."""
-    kinds = [_kind([row[index] for row in table.rows]) for index in range(len(table.columns))]
-    headings = (
-        heading + suffix
-        for heading, kind in zip(table.columns, kinds, strict=True)
-        for suffix in _SUFFIXES.get(kind, ("",))
-    )
-    rows = (
-        (value for cell, kind in zip(row, kinds, strict=True) for value in _values(cell, kind))
-        for row in table.rows
-    )
-    return csv_text([headings, *rows])
+    suffixes = []  # of each column's headings
+    for index in range(len(table.columns)):
+        kinds = {type(row[index]) for row in table.rows}
+        is_share, is_estimate = Share in kinds, Estimate in kinds
+        suffixes.append(
+            ("", " of", " low", " high") if is_share else ("", " low", " high") if is_estimate else ("",)
+        )
+    rows: list[list[object]] = [
+        [head + suffix for head, own in zip(table.columns, suffixes, strict=True) for suffix in own]
+    ]
+    for row in table.rows:
+        rows.append([])
+        for cell, own in zip(row, suffixes, strict=True):
+            match cell:
+                case Estimate(interval, _):
+                    rows[-1] += map(_digits, (interval.point, interval.low, interval.high))
+                case Share(count, total, low, high):
+                    rows[-1] += (count, total, _digits(low), _digits(high))
+                case None:
+                    rows[-1] += [""] * len(own)
+                case _:
+                    rows[-1].append(_digits(cell) if isinstance(cell, float) else cell)
+    return csv_text(rows)
 
 
-_SUFFIXES: dict[type | None, tuple[str, ...]] = {
-    Estimate: ("", " low", " high"),
-    Share: ("", " of", " low", " high"),
-}
-
-
-def _kind(cells: Sequence[Cell]) -> type | None:
-    return next((type(cell) for cell in cells if isinstance(cell, Estimate | Share)), None)
-
-
-def _values(cell: Cell, kind: type | None) -> Iterator[object]:
-    match cell:
-        case Estimate(interval, _):
-            yield from (_plain(value) for value in (interval.point, interval.low, interval.high))
-        case Share(count, total, low, high):
-            yield from (count, total, _plain(low), _plain(high))
-        case None:
-            yield from ("" for _ in _SUFFIXES.get(kind, ("",)))
-        case _:
-            yield _plain(cell) if isinstance(cell, float) else cell
-
-
-def _plain(value: float) -> str:
+def _digits(value: float) -> str:
     return "" if math.isnan(value) else f"{value:.10g}"
 
 

@@ -3,17 +3,46 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 
 from gridworld.report.analysis.analyse import Comparison, Overall, Result, TaskAnalysis
 from gridworld.report.analysis.metrics import BY_KEY, METRICS
-from gridworld.report.analysis.statistics import Share
+from gridworld.report.build import Reasons, Report
 from gridworld.report.evidence.grouping import Group, Study, differing, learning_key, shortfall
-from gridworld.report.evidence.reasons import Reasons, most_common
 from gridworld.report.evidence.run_reader import Unusable
+from gridworld.report.evidence.tuning_study import TuningStudy
 from gridworld.report.table import NOTHING, Cell, Estimate, Table, number, steps_up_to
 
 _SCORES = tuple(metric.key for metric in METRICS if metric.key not in ("regret", "steps"))
+_HEADINGS = {
+    ("regret", "iqm"): "regret, IQM",
+    ("regret", "median"): "regret, median",
+    ("steps", "iqm"): "steps to certificate, IQM",
+    ("steps", "median"): "steps to certificate, median",
+}
+
+
+def all_tables(report: Report) -> Iterator[Table]:
+    """Those that are written as files."""
+    study = report.study
+    yield results_table(report.tasks, report.reasons)
+    yield answer_table(study, report.tasks)
+    yield runs_table(study)
+    yield unusable_table(report.unusable)
+    if report.reasons:
+        yield reasons_table(study, report.reasons)
+    yield settings_table(study)
+    for task in report.tasks:
+        yield task_table(task)
+        yield scores_table(task)
+        yield from improvement_tables(task.comparisons, task.task, task.groups)
+    if report.overall is not None:
+        yield overall_table(report.overall, study.groups)
+    for tuning in report.tunings:
+        yield winner_table(tuning)
+        yield finalists_table(tuning)
+        yield trials_table(tuning)
 
 
 def results_table(tasks: Sequence[TaskAnalysis], reasons: Reasons) -> Table:
@@ -26,15 +55,21 @@ def results_table(tasks: Sequence[TaskAnalysis], reasons: Reasons) -> Table:
             result.certified,
             result.ever,
             *(estimate(result, *which) for which in shown),
-            *([most_common(result.group, reasons)] if reasons else []),
+            *([_most_common(result.group, reasons)] if reasons else []),
         ]
         for task in tasks
         for result in task.results
     ]
-    columns = ["task", "agent", "seeds certified", "ever certified", *(_heading(*which) for which in shown)]
+    columns = ["task", "agent", "seeds certified", "ever certified", *(_HEADINGS[which] for which in shown)]
     columns += ["why not"] if reasons else []
     caption = "Certified seeds, exact regret and steps, with 95 % intervals"
     return _counting([group for task in tasks for group in task.groups], "results", caption, columns, rows)
+
+
+def _most_common(group: Group, reasons: Reasons) -> str:
+    """The most common cause of a group's runs that are not certified, with its count; "" without any."""
+    causes = Counter(reasons[run.folder].cause for run in group.runs if run.folder in reasons)
+    return "".join(f"{cause} ({count} of {causes.total()})" for cause, count in causes.most_common(1))
 
 
 def _counting(
@@ -52,12 +87,11 @@ def _counting(
 
 def task_table(task: TaskAnalysis) -> Table:
     """Certified seeds, regret and steps to the certificate on a task."""
-    shown = [(key, statistic) for key in ("regret", "steps") for statistic in ("iqm", "median")]
-    columns = ["agent", "certified at the end", "ever certified", *(_heading(*which) for which in shown)]
     rows: list[list[Cell]] = [
-        [result.group.agent, result.certified, result.ever, *(estimate(result, *which) for which in shown)]
+        [result.group.agent, result.certified, result.ever, *(estimate(result, *each) for each in _HEADINGS)]
         for result in task.results
     ]
+    columns = ["agent", "certified at the end", "ever certified", *_HEADINGS.values()]
     return _counting(task.groups, task.task, f"Results on {task.task}", columns, rows)
 
 
@@ -67,21 +101,9 @@ def scores_table(task: TaskAnalysis) -> Table:
     rows: list[list[Cell]] = [
         [result.group.agent, *(estimate(result, key, "mean") for key in keys)] for result in task.results
     ]
-    return _counting(
-        task.groups,
-        f"{task.task} scores",
-        f"Means over seeds on {task.task}, of the greedy policy where nothing else is said",
-        ["agent", *(BY_KEY[key].title for key in keys)],
-        rows,
-    )
-
-
-def _heading(key: str, statistic: str) -> str:
-    return f"{_HEADINGS[key]}, {_SHORT[statistic]}"
-
-
-_HEADINGS = {"regret": "regret", "steps": "steps to certificate"}
-_SHORT = {"iqm": "IQM", "median": "median"}
+    caption = f"Means over seeds on {task.task}, of the greedy policy where nothing else is said"
+    columns = ["agent", *(BY_KEY[key].title for key in keys)]
+    return _counting(task.groups, f"{task.task} scores", caption, columns, rows)
 
 
 def estimate(result: Result, key: str, statistic: str) -> Estimate | None:
@@ -92,34 +114,25 @@ def estimate(result: Result, key: str, statistic: str) -> Estimate | None:
     return Estimate(found, steps_up_to(result.shortest_uncertified) if key == "steps" else number)
 
 
-def improvement_table(
-    comparisons: Sequence[Comparison], metric: str, name: str, groups: Iterable[Group]
-) -> Table | None:
-    """Probabilities that the row's agent is better than the column's; None where none are compared."""
-    cells = {
-        (c.agent, c.other): Estimate(c.probability, _two_digits) for c in comparisons if c.metric == metric
-    }
-    if not cells:
-        return None
-    agents = sorted({agent for agent, _ in cells})
-    rows = [[agent, *(cells.get((agent, other)) for other in agents)] for agent in agents]
-    title = BY_KEY[metric].title
-    return Table(
-        f"{name} improvement in {title}",
-        f"Probability that a run of the row's agent beats one of the column's in {title}{shortfall(groups)}",
-        ["agent", *agents],
-        rows,
-    )
-
-
 def improvement_tables(comparisons: Sequence[Comparison], name: str, groups: Sequence[Group]) -> list[Table]:
-    """The probabilities of improvement on the task `name`, a table for each metric that is compared."""
-    found = (improvement_table(comparisons, metric.key, name, groups) for metric in METRICS)
-    return [table for table in found if table is not None]
+    """The probabilities that the row's agent is better than the column's on the task `name`.
 
-
-def _two_digits(value: float) -> str:
-    return f"{value:.2f}"
+    There is a table for each metric that is compared.
+    """
+    tables = []
+    for metric in METRICS:
+        cells = {
+            (each.agent, each.other): Estimate(each.probability, lambda value: f"{value:.2f}")
+            for each in comparisons
+            if each.metric == metric.key
+        }
+        agents = sorted({agent for agent, _ in cells})
+        caption = f"Probability that a run of the row's agent beats one of the column's in {metric.title}"
+        rows = [[agent, *(cells.get((agent, other)) for other in agents)] for agent in agents]
+        if cells:
+            title = f"{name} improvement in {metric.title}"
+            tables.append(Table(title, caption + shortfall(groups), ["agent", *agents], rows))
+    return tables
 
 
 def overall_table(overall: Overall, groups: Iterable[Group]) -> Table:
@@ -134,9 +147,7 @@ def overall_table(overall: Overall, groups: Iterable[Group]) -> Table:
 
 def answer_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
     """Seeds certified at the end, agents down and tasks across."""
-    found: dict[tuple[str, str], Share] = {
-        (result.group.agent, task.task): result.certified for task in tasks for result in task.results
-    }
+    found = {(result.group.agent, task.task): result.certified for task in tasks for result in task.results}
     rows = [[agent, *(found.get((agent, task)) for task in study.tasks)] for agent in study.agents]
     caption = f"Seeds certified optimal at the end{shortfall(study.groups)}"
     return Table("certified", caption, ["agent", *study.tasks], rows)
@@ -144,35 +155,23 @@ def answer_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
 
 def runs_table(study: Study) -> Table:
     """A row for each run that is counted."""
-    rows: list[list[Cell]] = []
-    for group in study.groups:
-        for run in group.runs:
-            first = run.first_certified_step
-            rows.append(
-                [
-                    group.task,
-                    group.agent,
-                    run.seed,
-                    "yes" if run.certified else "no",
-                    run.regret,
-                    int(first) if math.isfinite(first) else None,
-                    run.steps,
-                    run.seconds,
-                    str(run.folder),
-                ]
-            )
-    columns = [
-        "task",
-        "agent",
-        "seed",
-        "certified",
-        "regret",
-        "first certificate",
-        "steps",
-        "seconds",
-        "folder",
+    rows: list[list[Cell]] = [
+        [
+            group.task,
+            group.agent,
+            run.seed,
+            "yes" if run.certified else "no",
+            run.regret,
+            int(run.first_certified_step) if math.isfinite(run.first_certified_step) else None,
+            run.steps,
+            run.seconds,
+            str(run.folder),
+        ]
+        for group in study.groups
+        for run in group.runs
     ]
-    return Table("runs", "Every run that is counted", columns, rows)
+    columns = ["task", "agent", "seed", "certified", "regret", "first certificate", "steps", "seconds"]
+    return Table("runs", "Every run that is counted", [*columns, "folder"], rows)
 
 
 def reasons_table(study: Study, reasons: Reasons) -> Table:
@@ -190,21 +189,47 @@ def reasons_table(study: Study, reasons: Reasons) -> Table:
 
 
 def unusable_table(unusable: Sequence[Unusable]) -> Table:
-    """A row for each run that is not."""
-    rows: list[list[Cell]] = [
-        [run.agent or NOTHING, run.env or NOTHING, "; ".join(run.reasons)] for run in unusable
-    ]
+    """A row for each run that is not counted."""
+    rows = [[run.agent or NOTHING, run.env or NOTHING, "; ".join(run.reasons)] for run in unusable]
     return Table("not counted", "Runs that are not counted", ["agent", "task", "reason"], rows)
 
 
 def settings_table(study: Study) -> Table:
     """Settings in which the groups differ."""
     settings = [dict(learning_key(group.runs[0])) for group in study.groups]
-    names = differing(settings)
-    rows: list[list[Cell]] = [[name, *(each.get(name, "") for each in settings)] for name in names]
-    return Table(
-        "settings",
-        "Settings in which agents differ",
-        ["setting", *(f"{group.agent} on {group.task}" for group in study.groups)],
-        rows,
-    )
+    rows = [[name, *(each.get(name, "") for each in settings)] for name in differing(settings)]
+    columns = ["setting", *(f"{group.agent} on {group.task}" for group in study.groups)]
+    return Table("settings", "Settings in which agents differ", columns, rows)
+
+
+def winner_table(tuning: TuningStudy) -> Table:
+    """What a search changed, and how much each key mattered."""
+    rows: list[list[Cell]] = [
+        [key, str(value), str(tuning.began_from.get(key, "")), tuning.importances.get(key)]
+        for key, value in tuning.values.items()
+    ]
+    caption = f"The winner, trial {tuning.winner}, beside what the search began from"
+    return Table(f"{tuning.name} winner", caption, ["key", "winner", "began from", "importance"], rows)
+
+
+def finalists_table(tuning: TuningStudy) -> Table:
+    """The trials that went on to more seeds."""
+    caption = "The finalists, by all of their seeds"
+    return Table(f"{tuning.name} finalists", caption, ["trial", "score", "certified"], tuning.finalists)
+
+
+def trials_table(tuning: TuningStudy) -> Table:
+    """Every trial."""
+    columns = ("certified", "steps", "regret", "seconds", "error")
+    rows: list[list[Cell]] = [
+        [
+            str(trial.number),
+            trial.status,
+            trial.score if math.isfinite(trial.score) else None,
+            *(trial.told.get(column, "") for column in columns),
+            *(trial.values.get(key, "") for key in tuning.space),
+        ]
+        for trial in tuning.trials
+    ]
+    heads = ["trial", "status", "score", *columns, *tuning.space]
+    return Table(f"{tuning.name} trials", "All trials", heads, rows)

@@ -1,23 +1,31 @@
-"""A report's folder: the page, its figures and tables as files, event files. Written whole or not at all."""
+"""A report's folder: the page, its figures and tables as files, event files. Written whole or not at all.
+
+The event files have the curves over seeds, since TensorBoard cannot average runs.
+"""
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from gridworld.errors import InputError, reason
 from gridworld.process.console.terminal import tell
 from gridworld.report import tables
+from gridworld.report.analysis.analyse import Result, TaskAnalysis
+from gridworld.report.analysis.curves import Band
 from gridworld.report.build import MOST_TOLD, NothingFinishedError, Report, gather
-from gridworld.report.table import Table, to_captioned_markdown, to_csv, to_markdown
-from gridworld.report.tensorboard_export import write_events
-from gridworld.report.tuning_tables import finalists_table, trials_table, winner_table
+from gridworld.report.table import to_captioned_markdown, to_csv, to_markdown
 from gridworld.run.claim import check_writable
 from gridworld.run.folder import EVENTS as EVENT_FILE
 from gridworld.run.folder import MANIFEST
 from gridworld.storage.atomic_write import replacing_folder, write_text
+from gridworld.training.tensorboard import EventWriter
+from gridworld.world.mdp import FloatArray
 
 PAGE = "report.html"
 FIGURES, TABLES, EVENTS = "figures", "tables", "tensorboard"
@@ -27,6 +35,14 @@ _OURS = {PAGE, FIGURES, TABLES, EVENTS}
 _LONGEST_NAME = 120
 
 FORMATS = ("png", "pdf", "svg")  # of the figures
+
+BANDS = {  # tags of a value, its lower and its upper end
+    name: (f"{name}/{point}", f"{name}/low", f"{name}/high")
+    for name, point in (
+        *(("regret", "iqm"), ("value", "iqm"), ("on-line return", "iqm")),
+        ("seeds certified", "mean"),
+    )
+}
 
 MARKERS = "<!-- results -->", "<!-- /results -->"
 
@@ -49,18 +65,9 @@ def check_out(folder: Path) -> None:
 
 
 def write_report(report: Report, folder: Path, formats: Sequence[str] = FORMATS) -> Path:
-    """Write the page, figures, tables and event files, in the place of an older report.
+    """Write the page, figures, tables and event files, in the place of an older report, whole or not at all.
 
-    Args:
-        report: what is written.
-        folder: replaced as a whole, or not at all.
-        formats: that the figures are written in, besides in the page.
-
-    Returns:
-        The page's path.
-
-    Raises:
-        InputError: something other than a report is in the way.
+    Returns the page's path. Raises `InputError` where something other than a report is in the way.
     """
     check_out(folder)
     # matplotlib is imported only now, since it may refuse the user's settings.
@@ -73,9 +80,10 @@ def write_report(report: Report, folder: Path, formats: Sequence[str] = FORMATS)
         drawn = [chart for of_one in of_all.values() for chart in of_one]
         for name, chart in zip(_file_names(chart.name for chart in drawn), drawn, strict=True):
             for kind in formats:
-                (new / FIGURES / f"{name}.{kind}").write_bytes(chart.saved_as(kind))
+                content = chart.svg.encode() if kind == "svg" else chart.saved_as(kind)
+                (new / FIGURES / f"{name}.{kind}").write_bytes(content)
         (new / TABLES).mkdir()
-        all_tables = list(_tables(report))
+        all_tables = list(tables.all_tables(report))
         for name, table in zip(_file_names(table.name for table in all_tables), all_tables, strict=True):
             write_text(new / TABLES / f"{name}.csv", to_csv(table))
             write_text(new / TABLES / f"{name}.md", to_captioned_markdown(table))
@@ -88,13 +96,9 @@ def write_over_seeds(runs: Path, folder: Path) -> Path | None:
 
     What is damaged, or keeps them from being written, is told on standard error.
 
-    Args:
-        runs: the folder that has the runs' folders.
-        folder: of the sweep or the study. What was written there before is replaced.
-
     Returns:
-        What was made; None where no agent has two seeds, there are too many runs to read them all, or
-        none has curves for TensorBoard or can be used.
+        What was made in `folder`; None where no agent has two seeds, there are too many runs to read them
+        all, or none has curves for TensorBoard or can be used.
     """
     count = sum(1 for _ in runs.glob(f"*/{MANIFEST}"))
     if count > _MOST_READ_UNASKED or not any(runs.glob(f"*/{EVENT_FILE}")):
@@ -123,7 +127,33 @@ def _write_events(report: Report, folder: Path) -> None:
     labels = [(f"{result.group.agent} on {task.task}", result.group.seeds) for task, result in results]
     names = _file_names((", ".join(filter(None, label)) for label in labels), blank=" ")
     for name, (task, result) in zip(names, results, strict=True):
-        write_events(result, task, folder / name)
+        (folder / name).mkdir(parents=True)
+        events = EventWriter(folder / name)
+        curves = dict(_curves(result, task))
+        events.bands("over seeds, with 95 % intervals", {name: BANDS[name] for name in curves})
+        for of, (steps, parts) in curves.items():
+            for index, step in enumerate(steps.astype(np.int64).tolist()):
+                values = {f"{of}/{part}": float(numbers[index]) for part, numbers in parts.items()}
+                events.scalars({tag: value for tag, value in values.items() if math.isfinite(value)}, step)
+        events.close()
+
+
+def _curves(
+    result: Result, task: TaskAnalysis
+) -> Iterator[tuple[str, tuple[FloatArray, dict[str, FloatArray]]]]:
+    """Steps and the parts of each curve, by its name."""
+
+    def parts(band: Band) -> dict[str, FloatArray]:
+        return {"iqm": band.point, "low": band.low, "high": band.high, "mean": band.mean}
+
+    regret = parts(result.regret)
+    yield "regret", (result.regret.steps, regret)
+    # The value is the optimum's minus the regret: its upper end belongs to the regret's lower one.
+    value = {part: task.world.optimal_value - numbers for part, numbers in regret.items()}
+    yield "value", (result.regret.steps, value | {"low": value["high"], "high": value["low"]})
+    yield "seeds certified", (result.certificates.steps, parts(result.certificates))
+    if result.online is not None:
+        yield "on-line return", (result.online.steps, parts(result.online))
 
 
 def check_markers(path: Path) -> None:
@@ -155,31 +185,8 @@ def _around_markers(path: Path) -> tuple[str, str]:
     return text.split(begin)[0], text.split(end)[1]
 
 
-def _tables(report: Report) -> Iterator[Table]:
-    yield tables.results_table(report.tasks, report.reasons)
-    yield tables.answer_table(report.study, report.tasks)
-    yield tables.runs_table(report.study)
-    yield tables.unusable_table(report.unusable)
-    if report.reasons:
-        yield tables.reasons_table(report.study, report.reasons)
-    yield tables.settings_table(report.study)
-    for task in report.tasks:
-        yield tables.task_table(task)
-        yield tables.scores_table(task)
-        yield from tables.improvement_tables(task.comparisons, task.task, task.groups)
-    if report.overall is not None:
-        yield tables.overall_table(report.overall, report.study.groups)
-    for tuning in report.tunings:
-        yield winner_table(tuning)
-        yield finalists_table(tuning)
-        yield trials_table(tuning)
-
-
 def _file_names(names: Iterable[str], blank: str = "_") -> list[str]:
-    """Names that are safe for files and different from each other, even where capitals do not count.
-
-    What stands for a blank in them is `blank`.
-    """
+    """Names that are safe for files and different from each other, even where capitals do not count."""
     out: list[str] = []
     for name in names:
         plain = re.sub(r"[^\w.,=()+ -]+", "-", name).strip(" .-")[:_LONGEST_NAME] or "unnamed"

@@ -28,7 +28,7 @@ from gridworld.report.charts.tuning_charts import tuning_charts
 from gridworld.report.evidence.run_reader import read
 from gridworld.report.evidence.tuning_study import TRIALS_SUM, find_tunings
 from gridworld.report.table import to_captioned_markdown, to_csv
-from gridworld.report.tuning_tables import finalists_table, trials_table, winner_table
+from gridworld.report.tables import finalists_table, trials_table, winner_table
 from gridworld.restore.saved_run import SavedRun
 from gridworld.storage.sealed_json import sealed
 from gridworld.training.setup import check_settings, make_context

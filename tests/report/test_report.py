@@ -34,20 +34,15 @@ from gridworld.report.analysis.analyse import Comparison, Overall, TaskAnalysis
 from gridworld.report.analysis.curves import on_grid
 from gridworld.report.analysis.metrics import online_return
 from gridworld.report.analysis.statistics import Interval
-from gridworld.report.analysis.sweeps import sweeps
-from gridworld.report.build import Report, gather
-from gridworld.report.charts.chart import Chart
-from gridworld.report.charts.overall_charts import overall_charts
-from gridworld.report.charts.style import house_style, line_count, styles, text_width, wrapped_apart
-from gridworld.report.charts.sweep_charts import sweep_charts
-from gridworld.report.charts.task_charts import task_charts
+from gridworld.report.build import Reason, Report, gather, reasons
+from gridworld.report.charts.agent_charts import overall_charts, task_charts
+from gridworld.report.charts.chart import Chart, line_count, styles, wrapped_apart
+from gridworld.report.charts.sweep_charts import sweep_charts, sweeps
 from gridworld.report.evidence.grouping import labels
-from gridworld.report.evidence.reasons import Reason, reasons
 from gridworld.report.evidence.run_reader import Evidence, read
 from gridworld.report.evidence.tuning_study import find_tunings
 from gridworld.report.page import charts, render
-from gridworld.report.tensorboard_export import BANDS
-from gridworld.report.writer import MARKERS
+from gridworld.report.writer import BANDS, MARKERS
 from gridworld.storage.sealed_json import sealed
 from gridworld.world.exact.evaluation import Evaluator
 
@@ -456,43 +451,15 @@ def test_a_search_for_runs_ends(maker: Maker, tmp_path: Path, monkeypatch: pytes
     )
 
 
-@pytest.fixture(scope="module")
-def many_keys(tmp_path_factory: pytest.TempPathFactory) -> TaskAnalysis:
-    """Of three swept keys every combination, one with a seed that has no certificate."""
-    folder, maker = tmp_path_factory.mktemp("many"), Maker("agent=ppo")
-    for rate, depth, gamma in itertools.product((0.01, 0.002, 0.1), (3, 10), (0.95, 0.9)):
-        at = math.inf if rate == 0.1 else 1000 * depth
+def test_three_swept_settings_have_tables_and_no_figure(maker: Maker, tmp_path: Path) -> None:
+    for rate, depth, gamma in itertools.product((0.01, 0.002), (3, 10), (0.95, 0.9)):
         settings = {"agent__learning_rate": rate, "agent__n_epochs": depth, "agent__gamma": gamma}
-        maker.write(folder / f"{rate} {depth} {gamma}", 0, at, **settings)
-    (task,) = gather([folder]).tasks
-    return task
-
-
-def test_three_swept_settings_are_a_heatmap_for_each_value_of_the_third(many_keys: TaskAnalysis) -> None:
-    (swept,) = sweeps(many_keys.results)
-    assert swept.keys == ("agent.learning_rate", "agent.gamma", "agent.n_epochs")
-    drawn = {each.name: each for each in sweep_charts(swept, "classic")}
-    heat = drawn["classic ppo certified by learning_rate, gamma and n_epochs"]
-    words = [text.text for text in ElementTree.fromstring(heat.svg).iter(f"{SVG}text")]
-    assert [word for word in words if " = " in str(word)] == ["n_epochs = 3", "n_epochs = 10"]
-    assert (words.count("1/1"), words.count("0/1"), words.count("0.002")) == (8, 4, 2)
-    heights = {bar.get_y() for bar in heat.figure.axes[0].patches}
-    assert len(heights) == 6  # three rates, twice, none over another
-
-
-def test_settings_that_were_swept_without_a_grid_are_ranked(many_keys: TaskAnalysis) -> None:
-    (swept,) = sweeps(many_keys.results)
-    some = dict(itertools.islice(sorted(swept.results.items()), 0, None, 3))
-    (few,) = sweeps(list(some.values()))
-    assert len(few.results) == 4
-    spread = replace(few, values=tuple((*each, "other", "more") for each in few.values))
-    chart = next(sweep_charts(spread, "classic"))
-    assert "the best first" in chart.description
-    words = [str(text.text) for text in ElementTree.fromstring(chart.svg).iter(f"{SVG}text")]
-    shares = [word for word in words if word in ("1/1", "0/1")]
-    assert shares == sorted(shares, reverse=True)
-    assert {"learning_rate", "gamma", "n_epochs", "seeds certified"} <= set(words)
-    assert not sweeps(list(some.values())[:3])  # no more than settings that differ: a comparison
+        maker.write(tmp_path / f"{rate} {depth} {gamma}", 0, 1000 * depth, **settings)
+    (task,) = gather([tmp_path]).tasks
+    (swept,) = sweeps(task.results)
+    assert swept.keys == ("agent.gamma", "agent.learning_rate", "agent.n_epochs")
+    assert not list(sweep_charts(swept, "classic"))
+    assert not sweeps(task.results[:2])  # no more than settings that differ: a comparison
 
 
 def test_a_folder_that_may_not_be_read(maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -501,7 +468,7 @@ def test_a_folder_that_may_not_be_read(maker: Maker, tmp_path: Path, monkeypatch
     scandir = os.scandir
 
     def refuse(folder: Path) -> object:
-        if folder.name == "locked":
+        if Path(folder).name == "locked":
             raise PermissionError(13, "Permission denied", str(folder))
         return scandir(folder)
 
@@ -547,7 +514,8 @@ def test_swept_settings_are_a_line_or_a_heatmap_and_the_opening_is_short(tmp_pat
     assert words.count("0/2") == 3
     assert words.count("1/2") == 2  # 20 epochs: one seed at step 20,000, the other not
     grey = to_rgba("#c6c6c6")
-    cells = [bar.get_facecolor() for bar in drawn[f"classic ppo steps by {keys}"].figure.axes[0].patches]
+    mesh = drawn[f"classic ppo steps by {keys}"].figure.axes[0].collections[0]
+    cells = [tuple(colour) for colour in mesh.to_rgba(mesh.get_array()).reshape(-1, 4).tolist()]
     assert cells.count(grey) == 5  # half of their seeds or more are never certified
     assert len(set(cells)) == 3  # 3 epochs, 10, never: the worst finite number has another colour
     assert drawn[f"classic ppo steps by {keys}"].caption.endswith("grey cells have no finite value.")
@@ -603,11 +571,11 @@ def test_no_figure_has_only_zeros_and_equal_curves_are_dashed(maker: Maker, tmp_
     for chart in (drawn["classic regret"], profiles_of("ab")):
         bold = [line for line in chart.figure.axes[0].lines if line.get_linewidth() == 2.2]
         assert {line.get_color() for line in bold if line.is_dashed()} == {second} != {first}
-    with Image.open(io.BytesIO(profiles_of("abcde").png())) as picture:
+    with Image.open(io.BytesIO(profiles_of("abcde").saved_as("png"))) as picture:
         pixels = picture.convert("RGB").getcolors(100_000) or []
     seen = {"#" + bytes(colour).hex(): count for count, colour in pixels if isinstance(colour, tuple)}
     counts = [seen[each.line["color"]] for each in styles("abcde").values()]
-    assert min(counts) > 0.7 * max(counts)  # of equal curves, each is seen as much as any other
+    assert min(counts) > 0.5 * max(counts)  # of equal curves, each is seen about as much as any other
     assert drawn["classic regret"].caption.endswith("(IQM) with 95 % bootstrap bands, 2 seeds; 0 is optimal.")
 
 
@@ -868,15 +836,13 @@ def test_long_labels_are_whole_on_more_lines_and_told_apart() -> None:
     settings = [(rate, steps) for rate in (0.01, 0.02) for steps in (32, 64)]
     texts = [f"ppo (gamma=0.9, agent.learning_rate={rate}, n_steps={steps})" for rate, steps in settings]
     endless = ["_" * 600 + middle + "_" * 600 for middle in "ab"]
-    with house_style():
-        assert wrapped_apart(["dqn", "ppo", "ppo"], 170, 12) == ["dqn", "ppo", "ppo"]
-        told = wrapped_apart(texts, 170, 12)
-        assert told[0] == "ppo (gamma=0.9,\nagent.learning_rate=0.01,\nn_steps=32)"
-        assert [label.replace("\n", " ") for label in told] == texts  # nothing is cut
-        first, second = wrapped_apart(endless, 170, 12)
-        assert (first[-3:], second[-3:]) == (" #1", " #2")
-        assert line_count(first) == 6
-        assert all(text_width(label, 12) <= 170 for label in (*told, first, second))
+    assert wrapped_apart(["dqn", "ppo", "ppo"], 25) == ["dqn", "ppo", "ppo"]
+    told = wrapped_apart(texts, 25)
+    assert told[0] == "ppo (gamma=0.9,\nagent.learning_rate=0.01,\nn_steps=32)"
+    assert [label.replace("\n", " ") for label in told] == texts  # nothing is cut
+    first, second = wrapped_apart(endless, 25)
+    assert (first[-3:], second[-3:]) == (" #1", " #2")
+    assert line_count(first) == 6
 
 
 def test_what_follows_from_the_observation_names_no_group() -> None:
@@ -932,8 +898,8 @@ def test_a_name_in_a_figure_is_text(name: str, maker: Maker, tmp_path: Path) -> 
     charts = list(task_charts(replace(task, results=(named,), task=name), styles([name])))
     assert len(charts) == 3  # no seed has a regret left
     for chart in charts:
-        assert chart.png().startswith(b"\x89PNG")
-        assert chart.pdf().startswith(b"%PDF-")
+        assert chart.saved_as("png").startswith(b"\x89PNG")
+        assert chart.saved_as("pdf").startswith(b"%PDF-")
         words = [text.text or "" for text in ElementTree.fromstring(chart.svg).iter(f"{SVG}text")]
         assert any(plain(name)[:4] in word for word in words)
         page = Links()
@@ -964,7 +930,11 @@ def test_a_users_matplotlib_settings_do_not_matter(maker: Maker, tmp_path: Path)
 
     def drawn() -> list[bytes]:
         charts = task_charts(task, styles(["ppo"]))
-        return [content for chart in charts for content in (chart.svg.encode(), chart.pdf(), chart.png())]
+        return [
+            content
+            for chart in charts
+            for content in (chart.svg.encode(), chart.saved_as("pdf"), chart.saved_as("png"))
+        ]
 
     usual = drawn()
     with matplotlib.rc_context({"text.usetex": True, "font.size": 30, "axes.facecolor": "red"}):

@@ -11,10 +11,9 @@ import numpy as np
 
 from gridworld.report.analysis import curves, statistics
 from gridworld.report.analysis.curves import Band
-from gridworld.report.analysis.metrics import METRICS
+from gridworld.report.analysis.metrics import METRICS, Reference, reference
 from gridworld.report.analysis.statistics import Interval, Share
 from gridworld.report.evidence.grouping import Group, Study, shortfall
-from gridworld.report.evidence.reference import Reference, reference
 from gridworld.world.mdp import FloatArray
 
 _SLOWER = 10  # times, from which on the steps of a task's agents need a logarithmic axis
@@ -52,17 +51,6 @@ class Comparison:
     tasks: int  # over how many
     probability: Interval
 
-    def mirrored(self) -> Comparison:
-        """Seen from the other's side."""
-        seen = self.probability
-        return Comparison(
-            self.other,
-            self.agent,
-            self.metric,
-            self.tasks,
-            Interval(1 - seen.point, 1 - seen.high, 1 - seen.low),
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class TaskAnalysis:
@@ -77,7 +65,12 @@ class TaskAnalysis:
     @property
     def ranked(self) -> list[Result]:
         """The results, best first: by the share certified, then by steps to it, then by regret."""
-        return sorted(self.results, key=_rank)
+
+        def rank(result: Result) -> tuple[float, ...]:
+            steps, regret = result.estimates["steps", "median"], result.estimates["regret", "iqm"]
+            return -result.certified.count / result.certified.total, steps.point, regret.point
+
+        return sorted(self.results, key=rank)
 
     @property
     def groups(self) -> list[Group]:
@@ -88,11 +81,6 @@ class TaskAnalysis:
     def shortfall(self) -> str:
         """See `grouping.shortfall`."""
         return shortfall(self.groups)
-
-
-def _rank(result: Result) -> tuple[float, float, float]:
-    share = result.certified.count / result.certified.total
-    return -share, result.estimates["steps", "median"].point, result.estimates["regret", "iqm"].point
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,16 +97,10 @@ class Overall:
 def analyse(
     study: Study, seed: int = 0, log_steps: bool = False
 ) -> tuple[tuple[TaskAnalysis, ...], Overall | None]:
-    """Compute all that the report shows.
+    """Compute all that the report shows: of each task, and over tasks where an agent was run on two.
 
-    Args:
-        study: the runs in groups.
-        seed: of the bootstrap.
-        log_steps: whether all curves are against the logarithm of the steps. Those of a task on which one
-            agent is ten times slower than another always are.
-
-    Returns:
-        An analysis of each task, and of agents over tasks; None where no agent was run on two tasks.
+    `seed` is of the bootstrap. With `log_steps`, all curves are against the logarithm of the steps; those
+    of a task on which one agent is ten times slower than another always are.
     """
     tasks = tuple(_task(task, study.on(task), seed, log_steps) for task in study.tasks)
     return tasks, _overall(tasks, seed)
@@ -127,19 +109,15 @@ def analyse(
 def _task(task: str, groups: list[Group], seed: int, log_steps: bool) -> TaskAnalysis:
     runs = [run for group in groups for run in group.runs]
     world = reference(next((run for run in runs if not run.damage), runs[0]))
-    log_steps = log_steps or _is_one_slow(groups)
+    ends = [max(run.steps for run in group.runs) for group in groups]
+    learnt = [float(np.median([run.first_certified_step for run in group.runs])) for group in groups]
+    for steps in (ends, learnt):  # whether one agent ran, or learnt, ten times as long as another
+        known = [step for step in steps if 0 < step < math.inf]
+        log_steps |= bool(known) and max(known) >= _SLOWER * min(known)
     grid = curves.grid_for(runs, log_steps)
     results = tuple(_result(group, world, grid, seed) for group in groups)
     comparisons = compare([{r.group.agent: r.samples for r in results}], seed)
     return TaskAnalysis(task, world, results, comparisons, log_steps)
-
-
-def _is_one_slow(groups: Sequence[Group]) -> bool:
-    """Whether one agent ran, or learnt, ten times as long as another."""
-    ends = [max(run.steps for run in group.runs) for group in groups]
-    learnt = [float(np.median([run.first_certified_step for run in group.runs])) for group in groups]
-    times = [[step for step in steps if 0 < step < math.inf] for steps in (ends, learnt)]
-    return any(steps and max(steps) >= _SLOWER * min(steps) for steps in times)
 
 
 def _result(group: Group, world: Reference, grid: FloatArray, seed: int) -> Result:
@@ -165,15 +143,10 @@ def _result(group: Group, world: Reference, grid: FloatArray, seed: int) -> Resu
 def compare(
     tasks: Sequence[Mapping[str, Mapping[str, FloatArray]]], seed: int, least: int = 1
 ) -> tuple[Comparison, ...]:
-    """Compare every agent with every other on the tasks that both were run on.
+    """Compare every agent with every other on the tasks that both were run on, `least` or more.
 
-    Args:
-        tasks: for each task, samples (runs,) by agent and metric.
-        seed: of the bootstrap.
-        least: how many tasks two agents must share to be compared.
-
-    Returns:
-        Each pair twice, seen from either side, for each metric that is compared.
+    `tasks` has samples (runs,) by agent and metric for each task. Each pair is there twice, seen from either
+    side, for each metric that is compared.
     """
     agents = sorted({agent for task in tasks for agent in task})
     out = []
@@ -186,10 +159,10 @@ def compare(
             ]
             pairs = [pair for pair in pairs if len(pair[0]) and len(pair[1])]
             if len(pairs) >= least:
-                comparison = Comparison(
-                    one, other, metric.key, len(pairs), statistics.improvement(pairs, seed)
-                )
-                out += [comparison, comparison.mirrored()]
+                seen = statistics.improvement(pairs, seed)
+                mirrored = Interval(1 - seen.point, 1 - seen.high, 1 - seen.low)
+                out.append(Comparison(one, other, metric.key, len(pairs), seen))
+                out.append(Comparison(other, one, metric.key, len(pairs), mirrored))
     return tuple(out)
 
 

@@ -29,14 +29,9 @@ class Band:
 
 
 def grid_for(runs: Sequence[Evidence], logarithmic: bool = False) -> FloatArray:
-    """The steps at which a task's curves are evaluated.
+    """The steps at which all of a task's curves are evaluated, (points,).
 
-    Args:
-        runs: all of the task.
-        logarithmic: whether the curves are drawn against the logarithm of the steps.
-
-    Returns:
-        (points,), from 0 to the end of the longest run; evenly spread, and on a logarithmic axis too.
+    They go from 0 to the end of the longest run, evenly spread, where asked for on a logarithmic axis too.
     """
     end = max(run.steps for run in runs)
     points = np.linspace(0, end, GRID_POINTS)
@@ -47,11 +42,7 @@ def grid_for(runs: Sequence[Evidence], logarithmic: bool = False) -> FloatArray:
 
 
 def on_grid(run: Evidence, column: str, grid: FloatArray) -> FloatArray:
-    """A column of a run's curve at the grid's steps, the last observation carried forward.
-
-    Returns:
-        (points,): the newest value at each step; NaN before the first. An ended run keeps its last.
-    """
+    """A column's newest value at each of the grid's steps, (points,): NaN before the first one."""
     steps, values = run.curve["step"], run.curve[column]
     told = ~np.isnan(values)
     steps, values = steps[told], values[told]
@@ -62,14 +53,7 @@ def on_grid(run: Evidence, column: str, grid: FloatArray) -> FloatArray:
 def band(runs: Sequence[Evidence], column: str, grid: FloatArray, seed: int) -> Band:
     """IQM and mean of a column over runs, with the IQM's 95 % bootstrap band.
 
-    Args:
-        runs: of one agent on one task.
-        column: of their curves.
-        grid: environment steps, (points,).
-        seed: of the bootstrap.
-
-    Returns:
-        The band from the first step at which every run has a value to the end of the last run.
+    It goes from the first step at which every run has a value to the end of the last run.
     """
     grid, whole_until = _until_the_end(runs, grid)
     values = np.stack([on_grid(run, column, grid) for run in runs], axis=-1)

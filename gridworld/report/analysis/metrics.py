@@ -1,38 +1,80 @@
-"""The metrics of a run, and which statistics over seeds the report has of each."""
+"""The metrics of a run, their statistics over seeds, and the exact ends of a task's scale."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from gridworld.config.worlds import schema_of
 from gridworld.report.evidence.curve_reader import ONLINE, SAMPLED_RETURN, reported
-from gridworld.report.evidence.reference import Reference
 from gridworld.report.evidence.run_reader import Evidence
+from gridworld.run.identity.stored_world import stored_world
+from gridworld.run.reader import read_run
+from gridworld.world.exact.evaluation import Evaluator
+
+_MOST_CELLS = 100_000  # beyond, solving the world again would take longer than the report
+_TOLERANCE = 1e-6  # relative
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Exact numbers of a task; NaN where its world cannot be built again."""
+
+    optimal_value: float
+    optimal_return: float  # of the policy with the optimal value, undiscounted, within the step limit
+    random_value: float
+    random_return: float
+    problem: str | None = None  # why they are missing, or in doubt
+
+
+def reference(run: Evidence) -> Reference:
+    """Solve the run's world again, from its manifest. Nothing is raised: `problem` says what is wrong."""
+    try:
+        schema = schema_of(run.world)
+        known = {field.name for field in dataclasses.fields(schema)}
+        if unknown := sorted(run.world.keys() - known):
+            raise ValueError(f"env.{unknown[0]} is not known to this version")
+        lines = run.layout.split("\n")
+        if len(lines) * max(map(len, lines)) > _MOST_CELLS:
+            raise ValueError(f"it has more than {_MOST_CELLS:,} cells")
+        env = schema(**run.world)
+        env.check()
+        mdp = stored_world(read_run(run.folder), env)
+        evaluator = Evaluator(mdp, run.gamma, env.step_limit(mdp))
+        random = evaluator.score(np.full(evaluator.mdp.probability.shape[:2], 1 / evaluator.mdp.num_actions))
+    except (ValueError, TypeError, ArithmeticError, np.linalg.LinAlgError) as error:
+        # Whatever is wrong with another version's world, the runs' own scores are as good as before.
+        nan = math.nan
+        return Reference(run.optimal_value, nan, nan, nan, f"its world cannot be built again here ({error})")
+    optimum, problem = evaluator.optimal_value, None
+    if not math.isclose(optimum, run.optimal_value, rel_tol=_TOLERANCE, abs_tol=_TOLERANCE):
+        problem = (
+            f"its optimal value is {optimum:.6g} here, and {run.optimal_value:.6g} according "
+            f"to {run.folder}; was it written by another version?"
+        )
+    returns = evaluator.optimum.expected_return, random.outcome.expected_return
+    return Reference(run.optimal_value, returns[0], random.value, returns[1], problem)
 
 
 @dataclass(frozen=True)
 class RunMetric:
-    """One number of a run.
-
-    Attributes:
-        of: computes it from the run and its task's scale; NaN where the run does not have it.
-        statistics: over seeds; the first one is drawn.
-        better: 1 where more is better, -1 where less is.
-        compared: between agents, as a probability of improvement.
-    """
+    """One number of a run."""
 
     key: str
     title: str
-    of: Callable[[Evidence, Reference], float]
-    statistics: tuple[str, ...] = ("mean",)
-    better: int = 1
-    compared: bool = False
+    of: Callable[
+        [Evidence, Reference], float
+    ]  # from its task's scale, too; NaN where the run does not have it
+    statistics: tuple[str, ...] = ("mean",)  # over seeds; the first one is drawn
+    better: int = 1  # -1 where less is better
+    compared: bool = False  # between agents, as a probability of improvement
 
 
-def optimality(run: Evidence, world: Reference) -> float:
+def _optimality(run: Evidence, world: Reference) -> float:
     """The final regret rescaled: 1 for the optimum, 0 for the uniformly random policy, below 0 for worse."""
     span = world.optimal_value - world.random_value
     if not (math.isfinite(span) and span > 0):
@@ -41,14 +83,9 @@ def optimality(run: Evidence, world: Reference) -> float:
 
 
 def online_return(run: Evidence, last: float = 1.0) -> float:
-    """Mean return of the training episodes.
+    """Mean return of the training episodes in the `last` part of training; NaN where there is none.
 
-    Args:
-        run: with on-line returns in its curve.
-        last: the part of training that counts, up to its end; 1 is all of it.
-
-    Returns:
-        The mean over the curve's rows, weighted by their steps in that part; NaN where there is none.
+    It is the mean over the curve's rows, weighted by their steps in that part.
     """
     if ONLINE not in run.curve:
         return math.nan
@@ -75,7 +112,7 @@ METRICS = (
         -1,
         compared=True,
     ),
-    RunMetric("optimality", "optimality", optimality, ("iqm", "mean")),
+    RunMetric("optimality", "optimality", _optimality, ("iqm", "mean")),
     *(RunMetric(metric.name, metric.label, _last(metric.name)) for metric in reported()),
     RunMetric("sampled_return", "sampled policy's return", _last(SAMPLED_RETURN)),
     RunMetric("online_return", "on-line return, all of training", lambda run, _: online_return(run)),

@@ -1,19 +1,12 @@
 """Statistics over seeds, with intervals.
 
-Interquartile mean (IQM): the mean of what is left when the lowest and the highest quarter are cut off,
-`scipy.stats.trim_mean(x, 0.25)`; ⌊n/4⌋ values at either end, so the plain mean of up to three.
+Interquartile mean (IQM): the mean without the lowest and the highest ⌊n/4⌋ values, as
+`scipy.stats.trim_mean(x, 0.25)`. Intervals: the 95 % percentile bootstrap, runs drawn anew within each task
+(the strata), as `scipy.stats.bootstrap` does; the same draws serve every point of a curve. Both come to
+SciPy's bits, but by hand: a sweep ends with them, and `scipy.stats` takes as long to import as two runs to
+train.
 
-Intervals: the 95 % percentile bootstrap, runs drawn anew within each task (the strata), as
-`scipy.stats.bootstrap` does. The same draws serve every point of a curve: what is drawn is runs, not points.
-
-Both come to SciPy's bits, but by hand: a sweep ends with them, and to import `scipy.stats` takes as long as
-to train two runs of a population.
-
-Probability of improvement: P(X > Y) + P(X = Y) / 2 for a random run of either agent, the Mann-Whitney
-statistic over n·m; over several tasks, the mean of the tasks' probabilities.
-
-Infinity is a value like any other: a run that was never certified took infinitely many steps. A median is
-finite as long as fewer than half are infinite, an IQM as long as no more than the upper quarter is.
+Infinity is a value like any other: a run that was never certified took infinitely many steps.
 
 References: R. Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS
 2021; H. B. Mann and D. R. Whitney, Annals of Mathematical Statistics 18, 1947;
@@ -29,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridworld.envs.intervals import wilson_interval
-from gridworld.world.mdp import FloatArray, IntArray
+from gridworld.world.mdp import FloatArray
 
 LEVEL = 0.95
 RESAMPLES = 2000
@@ -101,13 +94,7 @@ def difference(first: Share, second: Share) -> Interval:
 def bands(
     statistic: Statistic, samples: Sequence[FloatArray], seed: int, resamples: int = RESAMPLES
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A statistic with its 95 % bootstrap interval, point by point.
-
-    Args:
-        statistic: `mean`, `median`, `iqm` or another function of all samples along their last axis.
-        samples: one for each stratum, (..., n); infinite numbers are allowed.
-        seed: of the bootstrap.
-        resamples: how often runs are drawn anew.
+    """A statistic of samples (..., n), one for each stratum, with its 95 % bootstrap interval at each point.
 
     Returns:
         Point, low and high, (...) each; low and high are NaN where a stratum has one run.
@@ -131,7 +118,10 @@ def _bootstrapped(
     same statistics, which are taken once.
     """
     batch = max(1, _LARGEST_BATCH // sum(sample.size for sample in samples))
-    samples, place = _distinct(samples)
+    joined = np.concatenate(samples, axis=-1)
+    rows_of_all = joined.reshape(-1, joined.shape[-1])
+    _, first, place = np.unique(rows_of_all, axis=0, return_index=True, return_inverse=True)
+    samples = [sample.reshape(-1, sample.shape[-1])[first] for sample in samples]
     parts = []
     for begun in range(0, resamples, batch):
         rows = min(batch, resamples - begun)
@@ -142,16 +132,7 @@ def _bootstrapped(
         ]
         parts.append(statistic(*drawn, axis=-1))
     ordered = np.sort(np.concatenate(parts, axis=-1), axis=-1)
-    return np.asarray(ordered[place])
-
-
-def _distinct(samples: Sequence[FloatArray]) -> tuple[list[FloatArray], IntArray]:
-    """The points of samples (..., n) without repetition, (points, n) each, and where each point is there."""
-    joined = np.concatenate(samples, axis=-1)
-    rows = joined.reshape(-1, joined.shape[-1])
-    _, first, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    kept = [sample.reshape(-1, sample.shape[-1])[first] for sample in samples]
-    return kept, place.reshape(joined.shape[:-1])
+    return np.asarray(ordered[place.reshape(joined.shape[:-1])])
 
 
 def _quantile(ordered: FloatArray, share: float) -> FloatArray:
@@ -167,14 +148,8 @@ def _quantile(ordered: FloatArray, share: float) -> FloatArray:
 def profile(samples: Sequence[FloatArray], levels: FloatArray, seed: int) -> tuple[FloatArray, ...]:
     """A performance profile: the share of runs whose score is above each level, as the mean over tasks.
 
-    Args:
-        samples: an agent's scores on each task, (n,).
-        levels: (points,).
-        seed: of the bootstrap.
-
-    Returns:
-        The share with its pointwise 95 % interval from the stratified bootstrap, low and high, (points,) each
-        (the score distribution of Agarwal et al. 2021, section 4.3).
+    `samples` are an agent's scores on each task, (n,). The share has a pointwise 95 % interval, low and high,
+    (points,) each (the score distribution of Agarwal et al. 2021, section 4.3).
     """
 
     def mean_share(*above: FloatArray, axis: int = -1) -> FloatArray:
@@ -191,32 +166,25 @@ def interval(statistic: Statistic, samples: Sequence[FloatArray], seed: int) -> 
 def improvement(pairs: Sequence[tuple[FloatArray, FloatArray]], seed: int) -> Interval:
     """The probability that a run of the first agent has the greater number; ties count as half.
 
-    Args:
-        pairs: both agents' samples, (n,) and (m,), for each task.
-        seed: of the bootstrap.
-
-    Returns:
-        The mean over tasks with its 95 % bootstrap interval (Agarwal et al. 2021; Mann and Whitney 1947).
+    It is the Mann-Whitney statistic over n·m of both agents' samples on a task, (n,) and (m,), and the mean
+    of these over tasks, with its 95 % bootstrap interval.
     """
-    wins = [_wins(first, second) for first, second in pairs]
+    # (n, m) for each task: 1 where the first is greater, 1/2 for a tie.
+    wins = [
+        0.5 * np.greater.outer(first, second) + 0.5 * np.greater_equal.outer(first, second)
+        for first, second in pairs
+    ]
 
     def mean_probability(*drawn: FloatArray, axis: int = -1) -> FloatArray:
-        by_task = zip(wins, drawn[::2], drawn[1::2], strict=True)
-        return np.asarray(np.mean([_share_won(*of_task) for of_task in by_task], axis=0))
+        """The mean share of pairs won among runs drawn by their places, (..., n) and (..., m) in turn."""
+        shares = []
+        for won, first, second in zip(wins, drawn[::2], drawn[1::2], strict=True):
+            of_first = (_times_drawn(first) @ won) * _times_drawn(second)
+            shares.append(of_first.sum(axis=-1) / won.size)
+        return np.asarray(np.mean(shares, axis=0))
 
     places = [np.arange(len(sample), dtype=np.float64) for pair in pairs for sample in pair]
     return interval(mean_probability, places, seed)
-
-
-def _wins(first: FloatArray, second: FloatArray) -> FloatArray:
-    """(n, m): 1 where the first is greater, 1/2 for a tie."""
-    return 0.5 * np.greater.outer(first, second) + 0.5 * np.greater_equal.outer(first, second)
-
-
-def _share_won(wins: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
-    """The share of pairs won among runs drawn by their places, (..., n) and (..., m)."""
-    won = ((_times_drawn(first) @ wins) * _times_drawn(second)).sum(axis=-1)
-    return np.asarray(won / wins.size)
 
 
 def _times_drawn(places: FloatArray) -> FloatArray:

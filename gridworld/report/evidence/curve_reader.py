@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -30,14 +29,7 @@ def reported() -> list[Metric]:
 
 
 def read_curve(run: RunReader) -> dict[str, FloatArray]:
-    """Read the columns of the learning curve that the statistics need.
-
-    Returns:
-        (evaluations,) each, by name: those in `REQUIRED`, and the optional ones that the file has.
-
-    Raises:
-        InputError: as for `read_columns`.
-    """
+    """Read the columns that the statistics need: those in `REQUIRED`, and optional ones that the file has."""
     used = dict.fromkeys((*REQUIRED, *(metric.name for metric in reported()), SAMPLED_RETURN, ONLINE))
     curve = read_columns(run, tuple(used))
     curve["regret"] = np.maximum(0.0, curve["regret"])  # below zero is rounding
@@ -62,19 +54,30 @@ def read_columns(run: RunReader, wanted: Sequence[str] | None = None) -> dict[st
     if lines and lines[0].count(",") >= _MOST_COLUMNS:
         raise InputError(f"{path}: has more than {_MOST_COLUMNS} columns; is it of another version?")
     try:
-        rows = list(csv.reader(lines))
+        header, *rows = list(csv.reader(lines)) or [[]]
     except csv.Error as error:
         raise InputError(f"{path}: is no CSV ({error})") from None
-    if len(rows) < 2:
+    if not rows:
         raise InputError(f"{path}: has no row")
-    header = rows[0]
     if missing := [name for name in REQUIRED if name not in header]:
         raise InputError(f"{path}: has no column {', '.join(missing)}; is it of another version?")
-    for number, row in enumerate(rows[1:], start=2):
+    curve = {name: np.empty(len(rows)) for name in (header if wanted is None else wanted) if name in header}
+    places = [(name, header.index(name)) for name in curve]
+    for index, row in enumerate(rows):
+        line = index + 2
         if len(row) != len(header):
-            raise InputError(f"{path}: line {number} has {len(row)} of {len(header)} columns, it was cut off")
-    names = header if wanted is None else [name for name in wanted if name in header]
-    curve = {name: _column(path, name, header, rows[1:]) for name in names}
+            raise InputError(f"{path}: line {line} has {len(row)} of {len(header)} columns, it was cut off")
+        for name, place in places:
+            text = row[place]
+            try:
+                value = float(text) if text or name != ONLINE else math.nan
+            except ValueError:
+                raise InputError(f"{path}: line {line}: {name}={text[:40]!r} is no number") from None
+            if math.isnan(value) and name != ONLINE:
+                raise InputError(
+                    f"{path}: line {line}: {name} is NaN; the run diverged or the file was changed"
+                )
+            curve[name][index] = value
     if not np.isfinite(curve["step"]).all() or (np.diff(curve["step"]) <= 0).any():
         raise InputError(f"{path}: the steps do not rise from row to row")
     if curve["step"][0] != 0:
@@ -82,20 +85,3 @@ def read_columns(run: RunReader, wanted: Sequence[str] | None = None) -> dict[st
     if not np.isin(curve["certified"], (0, 1)).all():
         raise InputError(f"{path}: certified must be 0 or 1 in every row")
     return curve
-
-
-def _column(path: Path, name: str, header: list[str], rows: list[list[str]]) -> FloatArray:
-    index = header.index(name)
-    values = np.empty(len(rows))
-    for number, row in enumerate(rows):
-        text = row[index]
-        try:
-            value = float(text) if text or name != ONLINE else math.nan
-        except ValueError:
-            raise InputError(f"{path}: line {number + 2}: {name}={text[:40]!r} is no number") from None
-        if math.isnan(value) and name != ONLINE:
-            raise InputError(
-                f"{path}: line {number + 2}: {name} is NaN; the run diverged or the file was changed"
-            )
-        values[number] = value
-    return values

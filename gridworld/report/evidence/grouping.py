@@ -76,12 +76,8 @@ class Study:
 def arrange(runs: Iterable[Evidence], unusable: Sequence[Unusable] = ()) -> Study:
     """Sort runs into groups, name the groups, and keep one run per seed.
 
-    Args:
-        runs: all that are usable.
-        unusable: the others. Each is put to the group that it would be in, as far as that can be told.
-
-    Returns:
-        The groups, by task and agent. Its notes and warnings name runs with the same settings and seed.
+    Each unusable run is put to the group that it would be in, as far as that can be told. The notes and
+    warnings name runs with the same settings and seed.
     """
     notes: list[str] = []
     warnings: list[str] = []
@@ -96,7 +92,15 @@ def arrange(runs: Iterable[Evidence], unusable: Sequence[Unusable] = ()) -> Stud
         for run in members:
             configurations[run.agent, learning_key(run)].append(run)
         agent_labels = labels([(agent, dict(key)) for agent, key in configurations])
-        notes += _splits(task, configurations)
+        of_agent: dict[str, list[Settings]] = defaultdict(list)
+        for agent, key in configurations:
+            of_agent[agent].append(dict(key))
+        notes += [
+            f"{agent} on {task} was run with {len(found)} different configurations, which are reported "
+            f"apart; they differ in {', '.join(differing(found))}."
+            for agent, found in of_agent.items()
+            if len(found) > 1
+        ]
         for agent, group in zip(agent_labels, configurations.values(), strict=True):
             groups.append(Group(agent, task, _one_per_seed(group, notes, warnings)))
     groups.sort(key=lambda group: (group.task, group.agent))
@@ -122,12 +126,11 @@ def listed(lost: Sequence[Unusable]) -> str:
     states: dict[str, list[str]] = defaultdict(list)
     for run in lost:
         states[run.state].append(run.folder.name)
-    return "; ".join(f"{len(names)} {state}: {_named(names)}" for state, names in states.items())
-
-
-def _named(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-    return ", ".join(names[:_MOST_NAMED]) + more
+    told = []
+    for state, names in states.items():
+        more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+        told.append(f"{len(names)} {state}: {', '.join(names[:_MOST_NAMED])}{more}")
+    return "; ".join(told)
 
 
 def _with_lost(groups: list[Group], unusable: Sequence[Unusable], warnings: list[str]) -> Iterator[Group]:
@@ -196,9 +199,7 @@ def learning_key(run: Evidence) -> Key:
 def labels(named: Sequence[tuple[str, Settings]], with_unset: bool = True) -> list[str]:
     """A label for each (name, settings): the name, with the settings that tell it from its namesakes.
 
-    Args:
-        named: names, which may be the same, and settings.
-        with_unset: whether to tell of a setting that only others have that it is not set.
+    `with_unset` is whether to tell of a setting that only others have that it is not set.
     """
     out = []
     for name, settings in named:
@@ -235,27 +236,13 @@ def _difference(settings: Settings, namesakes: Sequence[Settings], with_unset: b
 
 
 def _told(settings: Settings, names: Sequence[str], with_unset: bool) -> str:
-    return ", ".join(
-        f"{name.removeprefix('agent.')}={_short(settings.get(name, _UNSET))}"
-        for name in names
-        if with_unset or name in settings
-    )
-
-
-def _short(value: str) -> str:
-    return value if len(value) <= _LONGEST_VALUE else f"{value[: _LONGEST_VALUE - 3]}..."
-
-
-def _splits(task: str, configurations: Iterable[tuple[str, Key]]) -> list[str]:
-    settings: dict[str, list[Settings]] = defaultdict(list)
-    for agent, key in configurations:
-        settings[agent].append(dict(key))
-    return [
-        f"{agent} on {task} was run with {len(found)} different configurations, which are reported apart; "
-        f"they differ in {', '.join(differing(found))}."
-        for agent, found in settings.items()
-        if len(found) > 1
-    ]
+    told = []
+    for name in names:
+        if with_unset or name in settings:
+            value = settings.get(name, _UNSET)
+            short = value if len(value) <= _LONGEST_VALUE else f"{value[: _LONGEST_VALUE - 3]}..."
+            told.append(f"{name.removeprefix('agent.')}={short}")
+    return ", ".join(told)
 
 
 def _one_per_seed(runs: list[Evidence], notes: list[str], warnings: list[str]) -> tuple[Evidence, ...]:
@@ -267,18 +254,14 @@ def _one_per_seed(runs: list[Evidence], notes: list[str], warnings: list[str]) -
             continue
         warnings += run.damage
         told = f"{run.folder} has the settings and the seed of {first.folder}"
-        if _same_curve(first, run):
+        same = first.curve.keys() == run.curve.keys() and all(
+            np.array_equal(first.curve[name], run.curve[name], equal_nan=True) for name in run.curve
+        )
+        if same:
             notes.append(f"{told}, and the same curve; it is counted once.")
         else:
             warnings.append(
                 f"{told}, but ANOTHER curve (final regret {run.curve['regret'][-1]:.6g} against "
-                f"{first.curve['regret'][-1]:.6g}): one command, two results. Only "
-                "the latter is counted."
+                f"{first.curve['regret'][-1]:.6g}): one command, two results. Only the latter is counted."
             )
     return tuple(kept[seed] for seed in sorted(kept))
-
-
-def _same_curve(one: Evidence, other: Evidence) -> bool:
-    return one.curve.keys() == other.curve.keys() and all(
-        np.array_equal(one.curve[name], other.curve[name], equal_nan=True) for name in one.curve
-    )

@@ -34,45 +34,25 @@ Settings = Mapping[str, str]  # flat: {"agent.gamma": "0.9"}
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """A finished run, as far as the statistics need it.
-
-    Attributes:
-        folder: The run's folder.
-        agent: The agent's name in the settings.
-        env: The map's name.
-        seed: The seed.
-        settings: All settings.
-        world: env.* as the manifest has it.
-        layout: The map's text.
-        gamma: The evaluation's discount.
-        optimal_value: The optimal policy's value at the start.
-        seconds: The duration of training.
-        started: The date of the start.
-        version: The version of this package; "?" where the manifest does not say.
-        curve: Columns (evaluations,): those of `curve_reader.REQUIRED`, and optional ones that the file has.
-        pictures: As `RunReader.pictures`.
-        step_limit: Of an episode, as the summary has it.
-        privileges: As `config.privileges` finds them in its settings.
-        damage: A sentence for each of its other files that is not the one that it wrote.
-    """
+    """A finished run, as far as the statistics need it."""
 
     folder: Path
-    agent: str
-    env: str
+    agent: str  # its name in the settings
+    env: str  # the map's name
     seed: int
-    settings: Settings
-    world: Mapping[str, Any]
-    layout: str
-    gamma: float
-    optimal_value: float
-    seconds: float
-    started: str
-    version: str
-    curve: Mapping[str, FloatArray]
-    pictures: Mapping[str, str | None]
-    step_limit: Any = None
-    privileges: Sequence[str] = ()
-    damage: tuple[str, ...] = ()
+    settings: Settings  # all of them
+    world: Mapping[str, Any]  # env.* as the manifest has it
+    layout: str  # the map's text
+    gamma: float  # the evaluation's discount
+    optimal_value: float  # of the optimal policy at the start
+    seconds: float  # of training
+    started: str  # the date
+    version: str  # of this package; "?" where the manifest does not say
+    curve: Mapping[str, FloatArray]  # (evaluations,): `curve_reader.REQUIRED`, and what else the file has
+    pictures: Mapping[str, str | None]  # as `RunReader.pictures`
+    step_limit: Any = None  # of an episode, as the summary has it
+    privileges: Sequence[str] = ()  # as `config.privileges` finds them in its settings
+    damage: tuple[str, ...] = ()  # a sentence for each of its other files that is not the one that it wrote
 
     @property
     def steps(self) -> int:
@@ -98,23 +78,12 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Unusable:
-    """A run that is in no statistic, and why.
-
-    Attributes:
-        folder: The run's folder.
-        reasons: A sentence each, which begins with the folder.
-        state: `DAMAGED`, or how the run stands that is not finished.
-        agent: As in `Evidence`; these and those below are None where no file says so.
-        env: The map's name.
-        seed: The seed.
-        settings: As in `Evidence`.
-        layout: As in `Evidence`.
-    """
+    """A run that is in no statistic, and why."""
 
     folder: Path
-    reasons: tuple[str, ...]
-    state: str = DAMAGED
-    agent: str | None = None
+    reasons: tuple[str, ...]  # a sentence each, which begins with the folder
+    state: str = DAMAGED  # or how the run stands that is not finished
+    agent: str | None = None  # as in `Evidence`; None, as those below, where no file says so
     env: str | None = None
     seed: int | None = None
     settings: Settings | None = None
@@ -129,16 +98,20 @@ def read(folder: Path) -> Evidence | Unusable:
     """
     try:
         run = read_run(folder)
-    except InputError as error:
-        return _without_manifest(folder, str(error))
+    except InputError as error:  # what it is of, its summary may still say, though unverified
+        try:
+            told = read_object(folder / SUMMARY)
+        except InputError:
+            told = {}
+        agent, env = _name_in(told, "agent"), _name_in(told, "env")
+        return Unusable(folder, (str(error),), agent=agent, env=env, seed=_whole_in(told, "seed"))
     config = run.manifest["config"]
+    names = (_name_in(config.get("env"), key) for key in ("layout", "id", "source"))
     unusable = Unusable(
         folder,
         (),
         agent=_name_in(config.get("agent"), "name"),
-        env=next(
-            filter(None, (_name_in(config.get("env"), key) for key in ("layout", "id", "source"))), None
-        ),
+        env=next(filter(None, names), None),
         seed=_whole_in(config, "seed"),
         settings=dict(_settings(config)),
         layout="\n".join(run.manifest["layout"]),
@@ -155,26 +128,15 @@ def read(folder: Path) -> Evidence | Unusable:
     return dataclasses.replace(unusable, reasons=tuple(damaged.values()))
 
 
-def _without_manifest(folder: Path, reason: str) -> Unusable:
-    """A run whose manifest cannot be read; what it is of, its summary may still say, though unverified."""
-    try:
-        told = read_object(folder / SUMMARY)
-    except InputError:
-        told = {}
-    agent, env = _name_in(told, "agent"), _name_in(told, "env")
-    return Unusable(folder, (reason,), agent=agent, env=env, seed=_whole_in(told, "seed"))
-
-
 def _evidence(run: RunReader) -> Evidence:
     folder, manifest, where = run.folder, run.manifest, run.manifest_file
     config = manifest["config"]
     if not isinstance(config.get("env"), dict):
         raise InputError(f"{where}: has no settings of the world under config; is it of another version?")
-    summary = run.read_summary()
-    curve = read_curve(run)
-    seed = config.get("seed")
-    if not isinstance(seed, int) or isinstance(seed, bool):
+    summary, curve, seed = run.read_summary(), read_curve(run), config.get("seed")
+    if _whole_in(config, "seed") is None:
         raise InputError(f"{where}: config.seed={seed!r} must be a whole number")
+    versions = manifest.get("versions")
     evidence = Evidence(
         folder=folder,
         agent=_text(config.get("agent"), "name", f"{where}: config.agent"),
@@ -187,84 +149,75 @@ def _evidence(run: RunReader) -> Evidence:
         optimal_value=_number(summary, "optimal_value", str(folder / SUMMARY)),
         seconds=_number(summary, "train_seconds", str(folder / SUMMARY)),
         started=str(manifest.get("started", ""))[:10],
-        version=_version(manifest),
+        version=_printable(str(versions.get("gridworld", "?"))) if isinstance(versions, dict) else "?",
         curve=curve,
         pictures=run.pictures(),
         step_limit=summary.get("max_episode_steps"),
         privileges=privileges(TrainConfig, config),
     )
-    _check_agreement(evidence, summary)
+    last, told = evidence.curve["regret"][-1], summary.get("regret")
+    same = told is None and not math.isfinite(last)
+    if isinstance(told, int | float):
+        same = math.isclose(told, last, rel_tol=1e-9, abs_tol=1e-12)
+    ends = evidence.certified, evidence.steps
+    if not same or (summary.get("certified"), summary.get("timesteps")) != ends:
+        raise InputError(
+            f"{folder}: {CURVE} ends at step {evidence.steps:,} with regret {last:.6g}, {SUMMARY} "
+            "says otherwise; one of them was changed or cut off"
+        )
     return evidence
 
 
 def _unfinished(run: RunReader) -> str:
+    """How a run stands, and how far its curve goes, which has no checksum."""
     status, told = run.manifest["status"], run.manifest.get("error")
     why = f": {' '.join(told.split())[:300]}" if told else ""
     if status == "running":
         why = ": it is still going on, or was killed"
-    return f"{run.folder}: this run is {status[:_LONGEST_NAME]!r}, not finished{why}{_reached(run)}"
-
-
-def _reached(run: RunReader) -> str:
-    """How far the curve of an unfinished run goes, which has no checksum."""
+    sentence = f"{run.folder}: this run is {status[:_LONGEST_NAME]!r}, not finished{why}"
     try:
         steps = int(read_curve(run)["step"][-1])
-        return f" (last evaluated after {steps:,} steps, says {CURVE}, which is not verified before the end)"
     except InputError:
-        return ""
-
-
-def _check_agreement(run: Evidence, summary: Mapping[str, Any]) -> None:
-    """Check that the curve's last row and the summary are of the same policy."""
-    last = run.curve["regret"][-1]
-    told = summary.get("regret")
-    same = told is None and not math.isfinite(last)
-    if isinstance(told, int | float):
-        same = math.isclose(told, last, rel_tol=1e-9, abs_tol=1e-12)
-    if not same or summary.get("certified") != run.certified or summary.get("timesteps") != run.steps:
-        raise InputError(
-            f"{run.folder}: {CURVE} ends at step {run.steps:,} with regret {last:.6g}, {SUMMARY} "
-            "says otherwise; one of them was changed or cut off"
-        )
+        return sentence
+    sentence += f" (last evaluated after {steps:,} steps, says {CURVE}"
+    return f"{sentence}, which is not verified before the end)"
 
 
 def _settings(config: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """Dotted names, and values as JSON."""
     for key, value in flat(config):
-        if is_newer(key) and not value:
-            continue
-        text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
-        yield printable(key), printable(text)
-
-
-def _text(content: Any, key: str, where: str) -> str:
-    value = content.get(key) if isinstance(content, dict) else None
-    if not isinstance(value, str) or not value.strip():
-        raise InputError(f"{where}: {key}={value!r} must be a name; is it of another version?")
-    return _printable(value)
+        if value or not is_newer(key):
+            text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+            yield printable(key), printable(text)
 
 
 def _printable(text: str) -> str:
     return "".join(sign if sign.isprintable() else "?" for sign in text)[:_LONGEST_NAME]
 
 
-def _version(manifest: dict[str, Any]) -> str:
-    versions = manifest.get("versions")
-    return _printable(str(versions.get("gridworld", "?"))) if isinstance(versions, dict) else "?"
+def _in(content: Any, key: str) -> Any:
+    return content.get(key) if isinstance(content, dict) else None
+
+
+def _text(content: Any, key: str, where: str) -> str:
+    value = _in(content, key)
+    if not isinstance(value, str) or not value.strip():
+        raise InputError(f"{where}: {key}={value!r} must be a name; is it of another version?")
+    return _printable(value)
 
 
 def _number(content: Any, key: str, where: str) -> float:
-    value = content.get(key) if isinstance(content, dict) else None
+    value = _in(content, key)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{where}: {key}={value!r} must be a number; is it of another version?")
     return float(value)
 
 
 def _name_in(content: Any, key: str) -> str | None:
-    value = content.get(key) if isinstance(content, dict) else None
+    value = _in(content, key)
     return _printable(value) if isinstance(value, str) else None
 
 
-def _whole_in(content: dict[str, Any], key: str) -> int | None:
-    value = content.get(key)
+def _whole_in(content: Any, key: str) -> int | None:
+    value = _in(content, key)
     return value if type(value) is int else None

@@ -72,11 +72,7 @@ class TuningStudy:
 
 
 def find_tunings(paths: Sequence[Path]) -> tuple[list[TuningStudy], list[str]]:
-    """Read the studies in these folders and right below them.
-
-    Returns:
-        The studies, each once, and a sentence for each one that cannot be read.
-    """
+    """Read the studies in these folders and right below them; a sentence for each that cannot be read."""
     found: dict[Path, TuningStudy] = {}
     problems = []
     for path in paths:
@@ -92,9 +88,15 @@ def find_tunings(paths: Sequence[Path]) -> tuple[list[TuningStudy], list[str]]:
 
 def _read(folder: Path) -> TuningStudy:
     file = folder / STUDY_JSON
-    content = read_sealed(file)
-    table = _trials(folder / TRIALS_CSV, content)
-    check_memory(folder / TRIALS_CSV, _OF_A_TRIAL * table.count("\n"))
+    trials = folder / TRIALS_CSV
+    content, of_trials = read_sealed(file), read_bytes(trials, LARGEST_CSV)
+    if content.get(TRIALS_SUM, digest := sha256(of_trials)) != digest:  # the first format has no sum
+        raise InputError(
+            f"{trials}: is not the table that {STUDY_JSON} was written with; it was changed or damaged, or "
+            "the search has gone on and not come to its end"
+        )
+    table = as_table(of_trials, trials)
+    check_memory(trials, _OF_A_TRIAL * table.count("\n"))
     try:
         head, *rows = csv_rows(table)
         winner = content["winner"]
@@ -118,17 +120,6 @@ def _read(folder: Path) -> TuningStudy:
         )
     except (KeyError, TypeError, ValueError, AttributeError, csv.Error) as error:
         raise InputError(f"{file}: has no search that came to an end, or was changed ({error!r})") from None
-
-
-def _trials(file: Path, study: Mapping[str, Any]) -> str:
-    """The table that study.json was written beside; one of the first format does not say which."""
-    content = read_bytes(file, LARGEST_CSV)
-    if TRIALS_SUM in study and study[TRIALS_SUM] != sha256(content):
-        raise InputError(
-            f"{file}: is not the table that {STUDY_JSON} was written with; it was changed or damaged, or the "
-            "search has gone on and not come to its end"
-        )
-    return as_table(content, file)
 
 
 def _certified(finalist: Mapping[str, Any]) -> str:
