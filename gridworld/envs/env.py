@@ -227,20 +227,11 @@ class GridWorldEnv(gym.Env[int, int]):
             self._window = None
 
     def get_coords(self, row: int, col: int, loc: str = "center") -> Point | list[Point]:
-        """Pixels for drawing into a cell.
+        """Pixels for drawing into a cell: one (x, y) for `center`, else a list of them.
 
-        Args:
-            row: of the cell, from 0.
-            col: of the cell, from 0.
-            loc: `center`; `interior_corners` are the corners of a square that lies MARGIN inside the cell,
-                clockwise from the top left; `interior_triangle` is bottom middle, top right, top left, a
-                third of a cell from the centre.
-
-        Returns:
-            One (x, y) for `center`, else a list of them.
-
-        Raises:
-            InputError: another `loc`.
+        `interior_corners` are the corners of a square that lies MARGIN inside the cell, clockwise from the
+        top left; `interior_triangle` is bottom middle, top right, top left, a third of a cell from the
+        centre.
         """
         x, y = drawing.cell_centre(row, col, self.cell_size)
         if loc == "center":
@@ -254,15 +245,7 @@ class GridWorldEnv(gym.Env[int, int]):
         raise InputError(f"loc={loc!r}: must be center, interior_corners or interior_triangle")
 
     def draw_object(self, screen: Any, coords_list: Sequence[Point]) -> None:
-        """Draw one point as a disc of 0.45 cell, three as a triangle, more as a polygon.
-
-        Args:
-            screen: pygame's surface to draw on.
-            coords_list: the points (x, y), in pixels.
-
-        Raises:
-            InputError: no points, or two.
-        """
+        """Draw one point (x, y) in pixels as a disc of 0.45 cell, three as a triangle, more as a polygon."""
         draw = drawing.import_pygame().draw
         if len(coords_list) == 1:
             draw.circle(screen, drawing.TRAP, coords_list[0], int(0.45 * self.cell_size))
@@ -274,14 +257,7 @@ class GridWorldEnv(gym.Env[int, int]):
 
 
 def check_action(action: Any) -> int:
-    """Check an action.
-
-    Returns:
-        It as an int from 0 to 3.
-
-    Raises:
-        InputError: it is anything else, floats and bools included.
-    """
+    """An action as an int from 0 to 3; refuses anything else, floats and bools included."""
     try:
         move = -1 if isinstance(action, bool | np.bool_) else operator.index(action)
     except TypeError:

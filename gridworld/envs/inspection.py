@@ -133,11 +133,7 @@ def task_of(env: Any, max_episode_steps: int | None = None) -> Task:
 
 
 def world_of(env: Any) -> Mdp:
-    """The world of an environment or a batch, with its step limit.
-
-    Raises:
-        InputError: as `task_of`.
-    """
+    """The world of an environment or a batch, with its step limit."""
     task = _task(env)
     usual = STEP_LIMIT if isinstance(task.mdp, GridMdp) else task.mdp.max_episode_steps  # what a map's means
     return (
@@ -343,11 +339,7 @@ def tabulated(space: gym.Space[Any], rows: Any, num_states: int) -> ObservationT
 
 
 def observation_like(mdp: Mdp, space: gym.Space[Any]) -> ObservationTable:
-    """The observation of a world that has this space.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The observation of a world that has this space."""
     for kind in KINDS:
         table = make_observation(mdp, kind, _cell_size(mdp, space)) if _may_be(mdp, kind, space) else None
         if table is not None and table.space == space:

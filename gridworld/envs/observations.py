@@ -57,15 +57,7 @@ class ObservationTable:
     stored: NDArray[Any] | None
 
     def rows(self, states: IntArray, out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Look observations up.
-
-        Args:
-            states: (...), state numbers.
-            out: (..., *shape), is written to.
-
-        Returns:
-            (..., *shape), `out` or a fresh array.
-        """
+        """Look up the observations (..., *shape) of states (...), in `out` or a fresh array."""
         if self.stored is not None:
             # States are within the table; "clip" merely spares numpy a buffered copy.
             return np.take(self.stored, states, axis=0, out=out, mode="clip" if out is not None else "raise")
@@ -94,11 +86,7 @@ def _one_hot(mdp: Mdp, cell_size: int) -> Rows:
 
 
 def _coordinates(mdp: Mdp, cell_size: int) -> Rows:
-    """Each from 0 (first) to 1 (last), 0 where there is only one; -1 of a state that has no place.
-
-    Raises:
-        InputError: no state has a place.
-    """
+    """Each from 0 (first) to 1 (last), 0 where there is only one; -1 of a state that has no place."""
     if mdp.places is None:
         raise InputError(
             f"observation coordinates: the states of {mdp.name} have no places; take another observation"
@@ -110,7 +98,6 @@ def _coordinates(mdp: Mdp, cell_size: int) -> Rows:
 
 
 def _image(mdp: Mdp, cell_size: int) -> Rows:
-    """Raises `InputError` where states have no places, or all frames would not fit into 1 GiB."""
     if mdp.places is None:
         raise InputError(
             f"observation image: the states of {mdp.name} have no places; take another observation"
@@ -135,11 +122,7 @@ def _none(mdp: Mdp, cell_size: int) -> Rows:
 
 
 def _own(mdp: Mdp, cell_size: int) -> Rows:
-    """As it is, within the bounds of the table; pixels are flat, for SB3 would take others for CnnPolicy's.
-
-    Raises:
-        InputError: the world has none.
-    """
+    """As it is, within the table's bounds; pixels are flat, for SB3 would take others for CnnPolicy's."""
     table = mdp.own_observation
     if table is None:
         raise InputError(

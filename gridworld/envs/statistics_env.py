@@ -1,8 +1,5 @@
 """The batch that agents learn on: it counts visits, and the returns of the episodes that ended.
 
-Both can be counted only while training happens. It costs some microseconds a step of the whole batch, however
-many cells the world has. The return and length of every single episode stand in `vector_env.Ended`.
-
 From the counts N(s, a) it can pay for exploring: a step that takes action a in state s pays its reward and
 β / sqrt(N(s, a)), with the visits of this step counted. Returns are those of the world's own rewards.
 
@@ -47,13 +44,7 @@ NO_EPISODES = Returns(0, 0.0)
 class StatisticsVectorEnv(GridWorldVectorEnv):
     """A `GridWorldVectorEnv` that resets in the same step, so that every step is one that an agent chose.
 
-    Args:
-        num_envs: see `GridWorldVectorEnv`.
-        exploration_bonus: β, at least 0.
-        settings: the other arguments of `GridWorldVectorEnv`.
-
-    Attributes:
-        visits: (S, A), int64, how often each action was taken in each state; the same array always.
+    `exploration_bonus` is β, at least 0; `visits` (S, A), int64, is the same array always.
     """
 
     def __init__(self, num_envs: int, *, exploration_bonus: float = 0.0, **settings: Any) -> None:
@@ -65,7 +56,7 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
 
     @property
     def visits(self) -> NDArray[np.int64]:
-        """See the class."""
+        """(S, A), int64, how often each action was taken in each state."""
         return self._visits
 
     def advance(self, actions: NDArray[Any]) -> Advance:
@@ -92,7 +83,7 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
             np.add.at(self._flat_visits, pairs.ravel(), 1)
 
     def add_returns(self, steps: NDArray[Any], returns: FloatArray) -> None:
-        """Add the returns (m,) of episodes that ended, of which `steps` (m,), ascending, tells the step."""
+        """Add the returns (m,) of episodes that ended in `steps` (m,), ascending."""
         bounds = np.flatnonzero(np.diff(steps)) + 1
         self._add_returns(part for part in np.split(returns, bounds) if len(part))
 

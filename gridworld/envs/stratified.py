@@ -21,14 +21,9 @@ _RADIX_SORTED = 2**16  # numpy sorts numbers below it in linear time, if they ar
 
 
 def stratified_numbers(groups: IntArray, rng: np.random.Generator) -> FloatArray:
-    """Draw a number for each member of some groups.
+    """A number for each member of some groups, each uniform in [0, 1); those of a group of m are 1/m apart.
 
-    Args:
-        groups: (n,), integers from 0 up to about n, the group of each.
-        rng: draws one number for each group that has members, in ascending order.
-
-    Returns:
-        (n,), each uniform in [0, 1). Those of a group of m are 1/m apart, where 1 is 0 again.
+    `groups` (n,) are integers from 0 up to about n. One number is drawn for each group that has members.
     """
     sizes = np.bincount(groups)
     shifts = np.zeros(len(sizes))

@@ -213,17 +213,11 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         return states, rewards, terminated, truncated, infos
 
     def advance(self, actions: NDArray[Any]) -> Advance:
-        """`step` in arrays alone, for training: a step that ends episodes makes no object for each of them.
-
-        Args:
-            actions: (num_envs,), integers from 0 to 3.
+        """`step` in arrays alone, for training: a step that ends episodes makes no object for each.
 
         Returns:
-            (num_envs,) states (int64), rewards (float64), terminated and truncated (bool), as `step` does.
-            Of a batch that resets in the same step, the episodes that ended, where any did; else None.
-
-        Raises:
-            InputError: other actions.
+            (num_envs,) states (int64), rewards (float64), terminated and truncated (bool), as `step` does; and
+            of a batch that resets in the same step, the episodes that ended, or None.
         """
         index = self._state * self._num_actions
         index += self._check_actions(actions)
@@ -274,11 +268,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         }
 
     def set_state(self, state: State) -> None:
-        """Mirrors `get_state`, of a batch of the same size on the same world.
-
-        Raises:
-            ValueError: the state of another kind of batch.
-        """
+        """Mirrors `get_state`, of a batch of the same size on the same world."""
         states = state["states"]
         if (
             isinstance(states, np.ndarray)
@@ -312,11 +302,8 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
     def draw_numbers(self, situations: StateArray) -> FloatArray:
         """A number from [0, 1) for each of some environments, to draw what happens to it.
 
-        Args:
-            situations: (n,), the same number where the same may happen with the same probabilities.
-
-        Returns:
-            (n,), evenly spread over each situation where the batch is stratified, else independent.
+        In a stratified batch, those of one of the `situations` (n,), in which the same may happen with the
+        same probabilities, are evenly spread.
         """
         if self.stratified:
             return stratified_numbers(situations, self.np_random)

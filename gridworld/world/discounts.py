@@ -17,15 +17,7 @@ _QUICKLY_SOLVED = 20_000  # outcomes of all states and actions: a few tenths of 
 
 
 def score_of_optimum(judge: Evaluator, gamma: float) -> Score:
-    """Score the optimum under a discount; of actions that are equally good under it, the judge's best.
-
-    Args:
-        judge: evaluates under the discount that counts.
-        gamma: the agent's.
-
-    Raises:
-        InputError: there is no finite optimum under it.
-    """
+    """The score of the optimum under another discount; of its ties, the actions that `judge` finds best."""
     mdp, best = judge.mdp, judge.solution
     own = solved(mdp, gamma)
     rank = np.where(own.optimal, np.maximum(best.q, np.finfo(np.float64).min), -np.inf)
@@ -33,10 +25,7 @@ def score_of_optimum(judge: Evaluator, gamma: float) -> Score:
 
 
 def fitting_discounts(judge: Evaluator) -> list[float]:
-    """Of the usual discounts and the judge's own, ascending, those whose optimum is certified.
-
-    In a large world, which takes long to solve, it is the judge's own only.
-    """
+    """The usual discounts, and the judge's own, whose optimum is certified; in a large world its own only."""
     usual = _USUAL if judge.mdp.probability.size <= _QUICKLY_SOLVED else ()
     gammas = sorted({*usual, judge.solution.gamma})
     return [gamma for gamma in gammas if score_of_optimum(judge, gamma).certified]

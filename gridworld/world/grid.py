@@ -75,10 +75,10 @@ def compile_mdp(
 
     Args:
         layout: the map.
-        slip: a probability.
-        step_reward: see `GridMdp`, as for the others.
-        goal_reward: see there.
-        trap_reward: see there.
+        slip: the probability that a move goes to one side instead.
+        step_reward: of every step.
+        goal_reward: of entering a goal.
+        trap_reward: of entering a trap or a cliff.
 
     Raises:
         InputError: a setting that makes no world.
@@ -147,23 +147,9 @@ def mdp_or_compiled(
     goal_reward: float,
     trap_reward: float,
 ) -> Mdp:
-    """The world of an environment, from the arguments of its constructor.
+    """The world of an environment's arguments: `mdp`, or else the one that the others describe.
 
-    Args:
-        mdp: a compiled world, or None: the world that the others describe is compiled.
-        layout: see `load`.
-        num_rows: the size of the layout `classic`; the default also means that none is given.
-        num_cols: the same.
-        slip: see `compile_mdp`, as for the rewards.
-        step_reward: see there.
-        goal_reward: see there.
-        trap_reward: see there.
-
-    Returns:
-        `mdp`, or the compiled world.
-
-    Raises:
-        InputError: no world; or a compiled one and arguments that describe another.
+    `num_rows` and `num_cols` of the layout `classic` also mean by their defaults that none are given.
     """
     described = (layout, num_rows, num_cols, slip, step_reward, goal_reward, trap_reward)
     if mdp is None:

@@ -155,12 +155,9 @@ class Mdp:
         return frozen(self.reachable & ~self.absorbing)
 
     def with_exploring_starts(self, share: float) -> Self:
-        """The same world, in which a share of the episodes begins in any state that can be come to.
+        """The same world, in which a share of the episodes begins in a state drawn uniformly from `acting`.
 
         Reference: R. Sutton and A. Barto, Reinforcement Learning, 2nd ed., 2018, section 5.3.
-
-        Args:
-            share: a probability. Their start is drawn uniformly from the states of `acting`.
         """
         start = (1 - share) * self.start + share * self.acting / self.acting.sum()
         return dataclasses.replace(self, start=frozen(start))
@@ -198,14 +195,7 @@ class Mdp:
         return f"{', '.join(others)} or {last}" if others else last
 
     def predecessors(self, states: IntArray) -> IntArray:
-        """States with an outcome, whatever its probability, that leads into one of these; some repeatedly.
-
-        Args:
-            states: (n,), state numbers.
-
-        Returns:
-            (m,), state numbers in no particular order.
-        """
+        """States, some repeatedly, with an outcome of whatever probability into one of `states` (n,)."""
         sources, first = self._incoming
         counts = first[states + 1] - first[states]
         skipped = first[states] - (np.cumsum(counts) - counts)
@@ -228,32 +218,20 @@ def grid_places(num_rows: int, num_cols: int) -> NDArray[np.int64]:
 
 
 def frozen(table: Table) -> Table:
-    """Make an array read-only.
-
-    Returns:
-        The same array.
-    """
+    """The same array, made read-only."""
     table.setflags(write=False)
     return table
 
 
 def checked_reward(what: str, value: Any) -> float:
-    """Check a reward.
-
-    Raises:
-        InputError: it is no finite number, or too large or too small to be added up.
-    """
+    """A finite number that is neither too large nor too small to be added up."""
     number = finite(what, value)
     within_size(what, number, LEAST_REWARD, MOST_REWARD)
     return number
 
 
 def finite(what: str, value: Any) -> float:
-    """Check a number.
-
-    Raises:
-        InputError: it is anything but a finite number.
-    """
+    """A finite number as a float; refuses anything else."""
     try:
         plain = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
         number = float(value) if plain else math.nan

@@ -134,10 +134,10 @@ class _Ends:
     """The terminal states that outcomes need.
 
     Attributes:
-        states: (E,), integers, the terminal states.
-        success: (E,), bool, which of them are goals.
-        number: (S,), integers, the number of every state: of the N numbered ones, then of further ends.
-        leads_to: (N, A, K), integers, the state that each outcome leads to.
+        states: (E,), the terminal states.
+        success: (E,), which of them are goals.
+        number: (S,), the number of every state: of the N numbered ones, then of further ends.
+        leads_to: (N, A, K), the state that each outcome leads to.
     """
 
     def __init__(self, outcomes: Outcomes) -> None:
@@ -190,11 +190,7 @@ def thresholds_of(probability: FloatArray) -> FloatArray:
 
 
 def check_size(name: str, states: int, actions: int, outcomes: int) -> None:
-    """Refuse tables that are too large. Call it before allocating them.
-
-    Raises:
-        InputError: too many states, actions or outcomes; or tables that are above the memory budget.
-    """
+    """Refuse tables that are too large; call it before they are allocated."""
     if states > MOST_STATES or actions > MOST_ACTIONS:
         raise InputError(
             f"{name}: {states:,} states and {actions:,} actions are too many; at most {MOST_STATES:,} "
@@ -220,17 +216,9 @@ _KINDS = {  # of arrays, as numpy's `dtype.kind` names them
 
 
 def checked(name: str, outcomes: Outcomes) -> Outcomes:
-    """Check the tables of outcomes, and convert them to the types that are computed with.
+    """Outcomes of any kind of numbers, checked and converted to float64 and int64.
 
-    Args:
-        name: of the world, for messages.
-        outcomes: of any kind of numbers. What is impossible may lead anywhere and pay anything.
-
-    Returns:
-        The same in float64 and int64. Probabilities of less precision than that are made to sum to 1.
-
-    Raises:
-        InputError: see `mdp_from_outcomes`.
+    What is impossible may lead anywhere and pay anything. Less precise probabilities are made to sum to 1.
     """
     _check_kinds(name, outcomes)
     least = outcomes.probability.dtype, outcomes.start.dtype

@@ -50,11 +50,7 @@ _log = logging.getLogger("gridworld")
 
 
 def frame_size(mdp: Mdp, cell_size: int = CELL_SIZE) -> tuple[int, int]:
-    """Width and height of a frame in pixels: the grid and one empty cell of border all round.
-
-    Raises:
-        InputError: the frame is too large to draw.
-    """
+    """Width and height of a frame in pixels: the grid and one empty cell of border all round."""
     board = board_of(mdp)
     width, height = (board.cols + 2) * cell_size, (board.rows + 2) * cell_size
     if width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
@@ -72,19 +68,7 @@ def fitting_cell_size(mdp: Mdp, longest_side: int, largest: int = CELL_SIZE) -> 
 
 
 def draw_frame(mdp: Mdp, state: int | None, cell_size: int = CELL_SIZE) -> Frame:
-    """Draw a frame.
-
-    Args:
-        mdp: the world.
-        state: where the agent is; None: without an agent.
-        cell_size: pixels.
-
-    Returns:
-        (height, width, 3), uint8, RGB, a fresh array.
-
-    Raises:
-        InputError: the frame is too large to draw.
-    """
+    """A frame (height, width, 3), uint8, RGB, a fresh array; `state` None: without an agent."""
     pygame = import_pygame()
     surface = pygame.Surface(frame_size(mdp, cell_size))
     draw_world(surface, mdp, state, cell_size)
@@ -209,12 +193,7 @@ def has_display() -> bool:
 
 
 class Window:
-    """The window of human mode. `surface` and `clock` are pygame's.
-
-    Args:
-        size: width and height in pixels.
-        title: of the window.
-    """
+    """The window of human mode, of a size in pixels. `surface` and `clock` are pygame's."""
 
     def __init__(self, size: tuple[int, int], title: str) -> None:
         pygame = import_pygame()
@@ -235,18 +214,7 @@ class Window:
         display.set_caption(self._title)
 
     def show(self, mdp: Mdp, state: int, cell_size: int, fps: int, delay: float) -> None:
-        """Draw and show one frame.
-
-        Args:
-            mdp: the world.
-            state: where the agent is.
-            cell_size: pixels.
-            fps: frames per second to keep to.
-            delay: seconds to wait after that.
-
-        Raises:
-            SystemExit: the user closed the window, which shuts pygame down.
-        """
+        """Draw and show one frame; keep `fps`, then wait. SystemExit if the user closed the window."""
         pygame = import_pygame()
         if not pygame.display.get_init():  # pygame has one display a process, and another window closed it
             self._open()

@@ -60,11 +60,7 @@ def text_size(text: str, size: int, room: float) -> int | None:
 
 
 def write(surface: Any, text: str, left: int, middle: int, size: int) -> int:
-    """Write a text on paper, in few greys, so that animations stay within their palette.
-
-    Returns:
-        Where it ends, in pixels.
-    """
+    """Write a text on paper, in few greys for the palettes of animations; where it ends, in pixels."""
     image = _in_greys(text, size)
     surface.blit(image, (left, middle - image.get_height() // 2))
     return left + int(image.get_width())

@@ -40,13 +40,7 @@ class Elimination:
     """Elimination without subtractions. Right-hand sides must not be negative."""
 
     def __init__(self, weights: FloatArray, leak: FloatArray, band: int) -> None:
-        """Factor the system; both arrays are overwritten.
-
-        Args:
-            weights: (n, n), float64, the w_ij; the diagonal does not count.
-            leak: (n,), float64, the l_i.
-            band: w_ij = 0 where |i - j| is larger, and these entries are not read.
-        """
+        """Overwrites weights (n, n), of which only |i - j| <= band is read, and leak (n,)."""
         size = len(weights)
         self._table = weights  # above the diagonal each pivot row's shares, below it what was eliminated
         self._pivots = np.empty(size)
@@ -64,7 +58,6 @@ class Elimination:
             self._below.append(below)
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """See `Absorption.solve`."""
         x = right.copy()
         for k, below in enumerate(self._below):
             x[k] /= self._pivots[k]
@@ -78,15 +71,7 @@ class BandedElimination:
     """The same for a sparse system: its states are renumbered so that a narrow band holds all weights."""
 
     def __init__(self, weights: Any, leak: FloatArray) -> None:
-        """Factor the system.
-
-        Args:
-            weights: a scipy CSR array (n, n) of the w_ij without a diagonal.
-            leak: (n,), float64, the l_i.
-
-        Raises:
-            BudgetError: the band does not fit into memory.
-        """
+        """Factor weights (n, n), a scipy CSR array without a diagonal, and leak (n,)."""
         from scipy.sparse.csgraph import reverse_cuthill_mckee
 
         self._order = reverse_cuthill_mckee(weights)
@@ -100,22 +85,13 @@ class BandedElimination:
         self._elimination = Elimination(table, leak[self._order], band)
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """See `Absorption.solve`."""
         x = np.empty_like(right)
         x[self._order] = self._elimination.solve(right[self._order])
         return x
 
 
 def factor(weights: Any, leak: FloatArray) -> Absorption:
-    """Factor a system.
-
-    Args:
-        weights: (n, n), the w_ij, a numpy array or a scipy CSR array; it is overwritten.
-        leak: (n,), float64, the l_i.
-
-    Raises:
-        BudgetError: the factors do not fit into memory.
-    """
+    """Factor weights (n, n), a numpy array or a scipy CSR array, which is overwritten, and leak (n,)."""
     if isinstance(weights, np.ndarray):
         return Elimination(weights, leak, band=len(leak))
     weights.setdiag(0.0)

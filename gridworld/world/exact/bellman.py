@@ -14,18 +14,7 @@ def backup(
     states: IntArray | slice = slice(None),
     magnitude: bool = False,
 ) -> FloatArray:
-    """Q(s, a) = Σ_k p_k [ r_k + γ V(next_k) ] of some states.
-
-    Args:
-        mdp: the world.
-        v: (S,), the values of the successors.
-        gamma: the discount γ.
-        states: (n,), state numbers; all by default.
-        magnitude: whether to take |r_k| in place of r_k.
-
-    Returns:
-        (n, A), float64.
-    """
+    """Q(s, a) = Σ_k p_k [ r_k + γ v(next_k) ] (n, A) of `states` (n,); `magnitude` takes |r_k| for r_k."""
     reward = np.abs(mdp.reward[states]) if magnitude else mdp.reward[states]
     target = reward + gamma * v[mdp.next_state[states]]
     if target.shape[2] == 1:

@@ -1,12 +1,8 @@
 """How good a policy is, exactly: by solving for its value.
 
-Two horizons stand side by side. Value and regret are without a step limit, as in the theory that the
-certificate rests on. What becomes of an episode (goal, trap and time-out probability, return, length) is
-within the step limit, as training and sampling see it. The discounted return within the limit links the two:
-it is what sampled episodes (`envs.rollout`) estimate, and comes near to the value where few of them are cut.
-
-The exact scores carry no sampling noise and cannot hang: a policy that walks in circles has a time-out
-probability of 1, whatever its number of steps.
+Value and regret are without a step limit, as in the theory that the certificate rests on. What becomes of an
+episode (goal, trap and time-out probability, return, length) is within the step limit, as training and
+sampling see it. The discounted return within the limit links the two: sampled episodes estimate it.
 """
 
 from __future__ import annotations
@@ -70,10 +66,7 @@ class Evaluator:
         return one_hot_policy(np.argmax(self.solution.optimal, axis=1), self.mdp.num_actions)
 
     def score(self, policy: FloatArray) -> Score:
-        """Score a policy exactly.
-
-        Args:
-            policy: (S, A), action probabilities.
+        """Score a policy (S, A) of action probabilities exactly.
 
         Raises:
             InputError: it is no policy of this world.
@@ -85,25 +78,11 @@ class Evaluator:
         return Score(value, regret, certified, chain.outcome(self.max_episode_steps))
 
     def discounted_return(self, policy: FloatArray) -> float:
-        """The exact expected discounted return of an episode within the step limit.
-
-        Args:
-            policy: (S, A), action probabilities.
-
-        Raises:
-            InputError: it is no policy of this world.
-        """
+        """The exact expected discounted return of an episode within the step limit, of a policy (S, A)."""
         return Chain(self.mdp, policy).discounted_return(self.max_episode_steps, self.solution.gamma)
 
     def endless_states(self, policy: FloatArray) -> list[int]:
-        """The states in which a policy may loop for ever, ascending; empty for a policy that always ends.
-
-        Args:
-            policy: (S, A), action probabilities.
-
-        Raises:
-            InputError: it is no policy of this world.
-        """
+        """The states in which a policy (S, A) may loop for ever, ascending; empty if it always ends."""
         states = Chain(self.mdp, policy).endless_states()
         return [int(state) for state in states if not self.mdp.absorbing[state]]
 

@@ -64,17 +64,10 @@ class Evaluation:
 class Chain:
     """States under one policy.
 
-    Args:
-        mdp: the world.
-        policy: (S, A), action probabilities.
-
     Attributes:
         policy: (S, A), float64, rows sum to 1.
         reward: (S,), r_π, the expected reward of a step.
         transition: (S, S), P_π, a numpy array, or in large worlds a scipy CSR array.
-
-    Raises:
-        InputError: a table that is no policy of this world.
     """
 
     def __init__(self, mdp: Mdp, policy: ArrayLike) -> None:
@@ -97,17 +90,9 @@ class Chain:
 
     @in_one_thread
     def value(self, gamma: float) -> FloatArray:
-        """The expected discounted sum of rewards, without a step limit.
+        """V_π (S,), the expected discounted sum of rewards, without a step limit.
 
-        Args:
-            gamma: the discount γ, from 0 to 1.
-
-        Returns:
-            (S,), V_π. With γ = 1 it is ±inf where a policy may go on earning or paying for ever, NaN where
-            it goes on doing both.
-
-        Raises:
-            InputError: another discount.
+        With γ = 1 it is ±inf where a policy may earn or pay for ever, NaN where it goes on doing both.
         """
         gamma = check_gamma(gamma)
         if gamma > ORDINARY_GAMMA:
@@ -126,10 +111,6 @@ class Chain:
 
         Gains and losses are solved for apart, as sums of non-negative numbers, whose error is small beside
         each state's own scale, not only beside the largest one.
-
-        Args:
-            gamma: the discount γ, from 0 to 1.
-            with_slope: whether to compute the slopes too.
         """
         signs = (np.maximum(self.mdp.reward, 0), np.maximum(-self.mdp.reward, 0))
         paid = np.stack([(self._weight * part).sum(axis=(1, 2)) for part in signs], axis=1)
@@ -142,11 +123,7 @@ class Chain:
 
     @in_one_thread
     def outcome(self, max_steps: int) -> Outcome:
-        """The outcome of an episode of at most `max_steps` steps, exact.
-
-        Raises:
-            InputError: `max_steps` is no whole number of at least 1.
-        """
+        """The exact outcome of an episode of at most `max_steps` steps."""
         positive_int("max_steps", max_steps)
         live = ~self.mdp.terminal
         counted = np.stack([live, self.reward], axis=1)  # summed over an episode: its length and return
@@ -162,11 +139,7 @@ class Chain:
 
     @in_one_thread
     def discounted_return(self, max_steps: int, gamma: float) -> float:
-        """The expected discounted sum of rewards of an episode of at most `max_steps` steps, exact.
-
-        Raises:
-            InputError: `max_steps` is no whole number of at least 1.
-        """
+        """The exact discounted sum of rewards of an episode of at most `max_steps` steps."""
         positive_int("max_steps", max_steps)
         total, mass = 0.0, self.mdp.start
         for first in range(0, max_steps, _STEPS_AT_ONCE):
@@ -190,13 +163,7 @@ class Chain:
         return visits
 
     def endless_states(self) -> IntArray:
-        """The states that an episode may come to walk in for ever.
-
-        For a deterministic policy in a world without slip these are the cells of its cycle.
-
-        Returns:
-            (n,), ascending; empty for a policy that always ends.
-        """
+        """(n,), ascending, where an episode may walk for ever: of a deterministic policy its cycle."""
         mdp, taken = self.mdp, self._weight > 0
         reached = np.zeros(mdp.num_states, dtype=np.bool_)
         frontier: IntArray = mdp.start_states
@@ -261,14 +228,7 @@ class Chain:
 
 
 def check_gamma(gamma: float) -> float:
-    """Check a discount.
-
-    Returns:
-        It as a float from 0 to 1.
-
-    Raises:
-        InputError: it is anything else, or so near to 1 that the cost of a step gets lost in rounding.
-    """
+    """A discount as a float, from 0 to 1 and not so near to 1 that the cost of a step is lost in rounding."""
     if isinstance(gamma, bool) or not isinstance(gamma, int | float | np.number) or not 0 <= gamma <= 1:
         raise InputError(f"gamma={gamma!r}: a discount must be a number from 0 to 1")
     discount("gamma", float(gamma))
@@ -283,18 +243,7 @@ def one_hot_policy(actions: IntArray, num_actions: int) -> FloatArray:
 
 
 def check_policy(mdp: Mdp, policy: ArrayLike) -> FloatArray:
-    """Check a policy.
-
-    Args:
-        mdp: the world that it is for.
-        policy: (S, A), action probabilities.
-
-    Returns:
-        (S, A), float64; rows sum to 1.
-
-    Raises:
-        InputError: it is no policy of this world.
-    """
+    """A policy (S, A) of this world as float64 whose rows sum to 1; refuses anything else."""
     try:
         table: FloatArray = np.asarray(policy, dtype=np.float64)
     except (TypeError, ValueError):
@@ -314,30 +263,12 @@ def check_policy(mdp: Mdp, policy: ArrayLike) -> FloatArray:
 
 
 def can_reach(mdp: Mdp, taken: BoolArray, targets: BoolArray) -> BoolArray:
-    """The states from which others can be reached.
-
-    Args:
-        mdp: the world.
-        taken: (S, A, K), the outcomes that may be taken.
-        targets: (S,), the states to reach, which reach themselves.
-
-    Returns:
-        (S,), True where a target can be reached.
-    """
+    """(S,), from where `targets` (S,) can be reached by the outcomes `taken` (S, A, K)."""
     return steps_to(mdp, taken, targets) >= 0
 
 
 def steps_to(mdp: Mdp, taken: BoolArray, targets: BoolArray) -> IntArray:
-    """The fewest steps to some states.
-
-    Args:
-        mdp: the world.
-        taken: (S, A, K), the outcomes that may be taken.
-        targets: (S,), the states to reach.
-
-    Returns:
-        (S,), integers; -1 where no target can be reached.
-    """
+    """(S,), the fewest steps to `targets` (S,) by the outcomes `taken` (S, A, K); -1: there is no way."""
     steps = np.where(targets, 0, -1)
     frontier: IntArray = np.flatnonzero(targets)
     distance = 0

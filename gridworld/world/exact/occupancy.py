@@ -17,7 +17,7 @@ from gridworld.world.mdp import BoolArray, FloatArray
 
 
 def stopping_states(chain: Chain, gamma: float) -> BoolArray:
-    """(S,), where nothing is counted any more; without a discount, where an episode cannot end any more."""
+    """(S,), where nothing is counted any more; with γ = 1, where an episode cannot end any more."""
     mdp = chain.mdp
     if gamma < 1:
         return mdp.absorbing
@@ -27,15 +27,9 @@ def stopping_states(chain: Chain, gamma: float) -> BoolArray:
 
 @in_one_thread
 def discounted_visits(chain: Chain, gamma: float, stops: BoolArray) -> FloatArray:
-    """Count the discounted visits from the start distribution on.
+    """Discounted visits (S,) from the start distribution on: d(s) = Σ_t γ^t P(s_t = s).
 
-    Args:
-        chain: the world under a policy.
-        gamma: the discount.
-        stops: (S,), of `stopping_states`: no one leaves these.
-
-    Returns:
-        (S,); of a state of `stops`, the discounted probability to come there.
+    No one leaves a state of `stops` (S,); there it is the discounted probability to come there.
     """
     start, going = chain.mdp.start, np.flatnonzero(~stops)
     ahead = gamma * chain.transition[going]

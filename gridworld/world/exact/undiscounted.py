@@ -31,15 +31,11 @@ _KEPT = 1e-10  # relative; a policy that loses more was no improvement
 
 
 def solve_by_value_and_slope(mdp: Mdp, gamma: float, greedy: IntArray) -> tuple[Evaluation, BoolArray]:
-    """Policy iteration: the larger value first, of equal values the smaller slope.
+    """Policy iteration from `greedy` (S,): the larger value first, of equal values the smaller slope.
 
-    Slopes are looked at once no value can be improved. Values that look equal may differ by less than is
-    visible: actions that turn out to be worse are taken back, and are out of the choice from then on.
-
-    Args:
-        mdp: the world.
-        gamma: 1, or a discount just below it.
-        greedy: (S,), the policy to begin with; with γ = 1, one of finite value wherever there is one.
+    With γ = 1, `greedy` has a finite value wherever a policy has. Slopes are looked at once no value can be
+    improved. Values that look equal may differ by less than is visible: actions that turn out to be worse are
+    taken back, and are out of the choice from then on.
 
     Returns:
         The evaluation of an optimal policy; (S, A), True for every optimal action.
@@ -135,19 +131,7 @@ def _advantage(
 
 
 def better_or_resting(mdp: Mdp, one: IntArray) -> IntArray:
-    """A policy to begin with at γ = 1.
-
-    Args:
-        mdp: the world.
-        one: (S,), any policy.
-
-    Returns:
-        (S,), its actions where it is worth more without discount than a policy that surely comes to an end or
-        to rest, else the actions of that one.
-
-    Raises:
-        InputError: a policy can go on for ever and earn on its way.
-    """
+    """A policy (S,) to begin with at γ = 1: `one` where it is worth more than one that ends or rests."""
     other = _resting_policy(mdp)
     first, second = (
         Chain(mdp, one_hot_policy(each, mdp.num_actions)).evaluation(1.0) for each in (one, other)

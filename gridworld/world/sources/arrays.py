@@ -71,16 +71,7 @@ def load_world(path: str | PathLike[str]) -> Mdp:
 
 
 def mdp_from_arrays(name: str, arrays: Mapping[str, Any], where: str) -> Mdp:
-    """Compile the arrays of a world of one's own; the module says which.
-
-    Args:
-        name: of the world, where `arrays` has none.
-        arrays: arrays, or what numpy makes arrays of, by name.
-        where: where they come from, for messages.
-
-    Raises:
-        InputError: arrays that make no world.
-    """
+    """Compile the arrays of a custom world, or what numpy makes arrays of, by name; see the module."""
     _check_names(where, arrays)
     given = {key: _array(where, key, value) for key, value in arrays.items()}
     shape = given["next_state"].shape
@@ -182,14 +173,7 @@ def _read(path: str | PathLike[str]) -> bytes:
 
 
 def world_bytes(mdp: Mdp) -> bytes:
-    """A world as the content of a file, all its tables bit for bit.
-
-    Args:
-        mdp: any world. Of a map, what only `GridMdp` has is left out.
-
-    Returns:
-        The same bytes for the same world.
-    """
+    """A world as the content of a file, its tables bit for bit, but for what only `GridMdp` has."""
     arrays = {"format": _FORMAT}
     for field in dataclasses.fields(Mdp):
         value = getattr(mdp, field.name)
@@ -202,15 +186,7 @@ def world_bytes(mdp: Mdp) -> bytes:
 
 
 def world_from_bytes(content: bytes, where: str) -> Mdp:
-    """Mirrors `world_bytes`.
-
-    Args:
-        content: of the file.
-        where: the file, for messages.
-
-    Raises:
-        InputError: it is no such file, or the tables in it are no world.
-    """
+    """Mirrors `world_bytes`."""
     return _from_fields(npz_arrays(where, content, "a world"), where)
 
 

@@ -64,18 +64,10 @@ def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> M
 
 
 def compile_table(real: gym.Env[Any, Any], limit: int | None = None, walked: bool = True) -> Mdp:
-    """Compile the transition table of an environment without wrappers, which is left as it is.
+    """Compile the table of an environment without wrappers, which is left as it is.
 
-    Args:
-        real: an environment with `P` and `initial_state_distrib`.
-        limit: the step limit of its wrappers.
-        walked: whether to step a copy beside the table.
-
-    Returns:
-        The world, with the environment's id as its name, or its class where it has none.
-
-    Raises:
-        InputError: no table, or an environment that does not do what the table says.
+    `limit` is the step limit of its wrappers; `walked` says whether to step a copy beside the table. The
+    world is named after the environment's id, or its class where it has none.
     """
     mdp, table = _compiled(real, real.spec.id if real.spec is not None else type(real).__name__, limit)
     if own := {"step", "reset"} & vars(real).keys():

@@ -20,13 +20,8 @@ def make_env(
 ) -> gym.Env[Any, Any]:
     """Make an environment of Gymnasium.
 
-    Args:
-        env_id: its registered id; "module:id" imports the module first.
-        kwargs: the arguments of `gymnasium.make`.
-        render_mode: how it renders.
-
-    Raises:
-        InputError: an unknown id, a package that is not installed, or arguments that it refuses.
+    `env_id` is a registered id, in which "module:id" imports the module first; `kwargs` are the arguments of
+    `gymnasium.make`.
     """
     arguments = dict(kwargs or {})
     if arguments.get("render_mode") is not None:

@@ -37,17 +37,9 @@ SO_UNKNOWN = (
 
 
 def asked(where: str, owner: Any, method: str, arguments: list[Any], chain: Iterable[Any] = ()) -> list[Any]:
-    """What a method makes of each argument.
+    """What a method of `owner` makes of (copies of) each argument; refuses what is no function of it alone.
 
-    Args:
-        where: what messages call the environment.
-        owner: whose method it is.
-        method: its name.
-        arguments: copies of these are given.
-        chain: the environments that it may refer to.
-
-    Raises:
-        InputError: it is no function of its argument alone, or raises something.
+    `chain` are the environments that it may refer to; `where` is what messages call the environment.
     """
     name, ask = f"{method}() of {type(owner).__name__}", getattr(owner, method)
     try:
@@ -106,17 +98,7 @@ def random_states() -> list[Any]:
 
 
 def remembered(where: str, name: str, owner: Any, chain: Iterable[Any] = ()) -> list[Any]:
-    """Whatever a method of `owner` could change or draw from, as values to compare.
-
-    Args:
-        where: as for `asked`, as are the others.
-        name: what messages call the method.
-        owner: see there.
-        chain: see there.
-
-    Raises:
-        InputError: it refers to an environment outside of the chain.
-    """
+    """Whatever a method of `owner` could change or draw from, to compare; refuses other environments."""
     reader = _Reader([*chain, owner])
     try:
         reader.read({key: value for key, value in vars(owner).items() if key != "env"})

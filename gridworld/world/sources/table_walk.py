@@ -48,19 +48,7 @@ _WATCHED = 5  # episodes after which it is seen which attributes change
 
 
 def walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> str:
-    """Compare steps of the real environment with its table.
-
-    Args:
-        mdp: the world that was made of the table.
-        table: what the environment says of itself.
-        real: the environment, which is stepped.
-
-    Returns:
-        What was compared, and how exactly, for `Mdp.truth`.
-
-    Raises:
-        InputError: starts or steps that are not those of the table.
-    """
+    """Compare steps of the real environment with its table; says what was compared, and how exactly."""
     walker = _Walker(mdp, table, real)
     walker.along_policies(_WALK)
     while walker.episodes < _RESETS:
@@ -108,11 +96,7 @@ class _Walker:
             )
 
     def _step(self, action: int) -> bool:
-        """Take an action.
-
-        Returns:
-            Whether the episode is over.
-        """
+        """Take an action; whether the episode is over."""
         observation, reward, terminated, truncated, _ = self.real.step(action)
         row = self._state * self.mdp.num_actions + action
         self._state = _number(self.mdp, observation)
@@ -222,11 +206,7 @@ class _Walker:
         self.check()
 
     def check(self) -> None:
-        """Count what was met since the last time, and judge all counts.
-
-        Raises:
-            InputError: they are not those of the table.
-        """
+        """Count what was met since the last time, and refuse counts that are not those of the table."""
         if self._met:
             self._count()
         seen = np.flatnonzero(self._counts.any(axis=1))

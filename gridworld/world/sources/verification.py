@@ -20,11 +20,7 @@ _SAME = 1e-9  # how far a threshold may be from the sum of its probabilities
 
 
 def checked_text(where: str, key: str, value: Any) -> str:
-    """Check a short text on one line.
-
-    Raises:
-        InputError: it is none.
-    """
+    """A short text on one line; refuses anything else."""
     text = value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
     if not isinstance(text, str) or not 0 < len(text) <= _LONGEST_TEXT or not text.isprintable():
         raise InputError(f"{where}: {key} is {str(text)[:50]!r}, must be 1 to {_LONGEST_TEXT} letters")
@@ -32,18 +28,7 @@ def checked_text(where: str, key: str, value: Any) -> str:
 
 
 def verified(mdp: Mdp, where: str) -> Mdp:
-    """Check all tables of a world.
-
-    Args:
-        mdp: the world.
-        where: where it comes from, for messages.
-
-    Returns:
-        The same world.
-
-    Raises:
-        InputError: a table is not what `Mdp` says.
-    """
+    """The same world, if all of its tables are what `Mdp` says; `where` is what messages call it."""
     for key in ("name", "truth"):
         checked_text(where, key, getattr(mdp, key))
     if not isinstance(mdp.action_names, tuple) or not mdp.action_names:

@@ -87,15 +87,9 @@ def wrappers_of(env: Any) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
 
 
 def known_class(thing: Any, table: dict[str, str], methods: Sequence[str]) -> str | None:
-    """What a table says of the class whose methods an object runs.
+    """What a table by "module:class" says of the class whose `methods` an object runs.
 
-    Args:
-        thing: a wrapper, an environment or a batch.
-        table: by "module:class".
-        methods: those that decide what it does.
-
-    Returns:
-        The entry of its first known ancestor; None: there is none, or a method is its own.
+    It is the entry of its first known ancestor; None if there is none, or a method is its own.
     """
     kind = type(thing)
     for base in kind.__mro__:
@@ -108,15 +102,7 @@ def known_class(thing: Any, table: dict[str, str], methods: Sequence[str]) -> st
 
 
 def role_of(where: str, wrapper: gym.Wrapper[Any, Any, Any, Any]) -> str:
-    """What a wrapper does: an entry of the table at the top of this module.
-
-    Args:
-        where: what messages call the environment.
-        wrapper: the wrapper.
-
-    Raises:
-        InputError: it may do anything.
-    """
+    """What a wrapper does, as in `_ROLES`; refuses one that may do anything."""
     name, role = type(wrapper).__name__, known_class(wrapper, _ROLES, ("step", "reset"))
     if role is None:
         raise InputError(
@@ -139,11 +125,7 @@ def role_of(where: str, wrapper: gym.Wrapper[Any, Any, Any, Any]) -> str:
 
 
 def refuse_transformed(where: str, env: gym.Env[Any, Any]) -> None:
-    """Refuse an environment whose wrappers change its task or what is seen of it.
-
-    Raises:
-        InputError: one of them does.
-    """
+    """Refuse an environment whose wrappers change its task or what is seen of it."""
     for wrapper in wrappers_of(env):
         if (role := role_of(where, wrapper)) not in (NEUTRAL, LIMIT):
             changed = "observation" if role == MEMORY else role
@@ -164,15 +146,9 @@ def step_limit(env: gym.Env[Any, Any]) -> int | None:
 
 
 class Wrapped:
-    """An environment's world, as it is through its wrappers.
+    """The world of an environment as it is through its wrappers; the environment is left as it is.
 
-    Args:
-        where: what messages call the environment.
-        env: the environment, which is left as it is.
-        mdp: the world of the environment below all wrappers, which shows its state's number.
-
-    Raises:
-        InputError: a wrapper that changes the task otherwise than by a function.
+    `mdp` is the world below all wrappers, which shows its state's number.
     """
 
     def __init__(self, where: str, env: gym.Env[Any, Any], mdp: Mdp) -> None:
@@ -196,11 +172,7 @@ class Wrapped:
 
     @cached_property
     def observations(self) -> list[Any]:
-        """What an agent sees of each state: S of them, arrays or of any other kind.
-
-        Raises:
-            InputError: it sees more than the state, or something that is no function of it.
-        """
+        """What an agent sees of each state: S of them, arrays or of any other kind."""
         if self.memory:
             raise InputError(
                 f"{self._where}: {self.memory[0]} makes observations of more than the state's number, so no "
@@ -217,11 +189,7 @@ class Wrapped:
 
     @cached_property
     def action_masks(self) -> NDArray[np.bool_] | None:
-        """What `action_masks()` of the environment allows, (S, A); None: there is none.
-
-        Raises:
-            InputError: it is no function of the state, or states cannot be set.
-        """
+        """What `action_masks()` of the environment allows, (S, A); None: there is none."""
         if not self._env.has_wrapper_attr("action_masks"):
             return None
         env, chain = self._copied, [self._copied.unwrapped, *wrappers_of(self._copied)]
@@ -332,12 +300,8 @@ class Wrapped:
     def _check_steps(self, rows: list[Any] | None, also: Callable[[int], None] = lambda state: None) -> None:
         """Step the copy beside the tables: from every state that can be set, then in whole episodes.
 
-        Args:
-            rows: what is seen of each state; None: it does not count.
-            also: what else to compare in a state.
-
-        Raises:
-            InputError: a step is not what the tables say.
+        `rows` is what is seen of each state, None if it does not count; `also` compares something else in a
+        state.
         """
         env, probe = self._copied, _Probe.below(self._copied)
         rng = np.random.default_rng(_SEED)

@@ -35,18 +35,7 @@ _FIXED = "; take an environment with a fixed layout and start, or name in env.ig
 class Subject:
     """The environment that is enumerated: one object, into which copies of its states are put.
 
-    Args:
-        name: what messages call it.
-        env: an environment, wrapped or not.
-        ignore: the names of attributes that are no part of a state.
-
-    Attributes:
-        num_actions: A.
-        snapshots: of it.
-
-    Raises:
-        InputError: other actions than numbers from 0 on; no such attributes; or its resets lead to different
-            states.
+    `ignore` names attributes that are no part of a state.
     """
 
     def __init__(self, name: str, env: gym.Env[Any, Any], ignore: Sequence[str] = ()) -> None:
@@ -104,14 +93,7 @@ class Subject:
             raise self.refusal(f"its state cannot be copied: {error}") from error
 
     def steps(self, snapshot: bytes) -> list[tuple[bytes, Any, float, bool, bool]]:
-        """Take each action in a copy of a state.
-
-        Returns:
-            Of each, a copy of the state that follows, the observation, reward, terminated and truncated.
-
-        Raises:
-            InputError: a step fails, or draws a random number.
-        """
+        """Of each action in a copy of a state: a copy of what follows, observation, reward, both ends."""
         found = []
         before = random_states(self.env)
         for action in range(self.num_actions):
@@ -157,16 +139,11 @@ class Graph:
     """N states, the start first.
 
     Attributes:
-        next_state: (N, A), integers; of states that are not tried, themselves.
-        reward: (N, A), float64.
-        terminated: (N, A), bool.
-        truncated: (N, A), bool.
-        tried: (N,), bool, whether steps from it were tried: it goes on from there.
-        depth: (N,), integers, the least steps from the start.
-        keys: N keys.
-        seen: N digests of observations.
-        observations: N observations, as arrays; empty where they are none.
-        names: N names, all empty where nothing is known of the environment's attributes.
+        next_state, reward, terminated, truncated: (N, A); a state that was not tried leads to itself.
+        tried: (N,), whether steps from it were tried: it goes on from there.
+        depth: (N,), the least steps from the start.
+        keys, seen, names: N keys, digests of observations, and names, all empty where none are known.
+        observations: N arrays; empty where observations are none.
     """
 
     next_state: IntArray
@@ -186,14 +163,6 @@ def explore(subject: Subject, most_states: int, limit: int | None) -> Graph:
 
     Episodes are over at the step limit. What lies beyond it is left out where states hold the time; elsewhere
     it is found too if it is little.
-
-    Args:
-        subject: the environment.
-        most_states: more are refused.
-        limit: the step limit, if one is known.
-
-    Raises:
-        InputError: too many states; or what `Subject` refuses.
     """
     search = _Search(subject, most_states)
     search.go_on(limit or _DEEPEST)

@@ -27,11 +27,6 @@ _SEED = 20_260_101
 class Replays:
     """Walks through an environment that must be those of its table.
 
-    Args:
-        subject: the environment as it was enumerated.
-        mdp: its table.
-        graph: its states.
-
     Attributes:
         limit: the steps after which it truncates: the table's, or what the walks found.
     """
@@ -42,14 +37,7 @@ class Replays:
         self.limit = mdp.max_episode_steps
 
     def check(self, env: gym.Env[Any, Any]) -> None:
-        """Walk at random, and straight to states drawn at random, with all of the wrappers of its id.
-
-        Args:
-            env: a new one; it is closed.
-
-        Raises:
-            InputError: it does something else than the table.
-        """
+        """Walk a new environment, with the wrappers of its id, to states drawn at random; it is closed."""
         snapshots = Snapshots(env.unwrapped)
         steps = episodes = 0
         try:
@@ -61,11 +49,7 @@ class Replays:
             env.close()
 
     def _episode(self, env: gym.Env[Any, Any], snapshots: Snapshots, most: int, at_random: int) -> int:
-        """Walk to one state after the other, with random steps between, until the episode ends.
-
-        Returns:
-            The steps.
-        """
+        """Walk to one state after the other, with random steps between, until it ends; the steps."""
         mdp, state, steps = self._mdp, int(self._mdp.start_states[0]), 0
         observation, _ = env.reset(seed=int(self._random.integers(2**31)))
         self._compare("state", steps, self._seen(snapshots, observation), self._expected(state))

@@ -39,22 +39,14 @@ _SHORT = 16  # numbers; a position is the same whether it is a tuple or an array
 
 
 class Snapshots:
-    """Takes copies of an environment's state, and puts them back.
-
-    Args:
-        env: the environment, unwrapped; the same object all the time.
-    """
+    """Takes copies of the state of an unwrapped environment, always the same one; puts them back."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         self._env = env
         self._kept: dict[int, Any] = {}  # by id
 
     def take(self) -> bytes:
-        """A copy of the state. Equal copies are of equal states; equal states may have several.
-
-        Raises:
-            TypeError, pickle.PicklingError, AttributeError: something in it cannot be copied.
-        """
+        """A copy of the state. Equal copies are of equal states; equal states may have several."""
         buffer = io.BytesIO()
         _Pickler(buffer, self._env, self._kept).dump(vars(self._env))
         return buffer.getvalue()
@@ -67,14 +59,7 @@ class Snapshots:
         attributes.update(unpickler.load())
 
     def key(self, without: Collection[str] = ()) -> bytes:
-        """A digest of the state, 16 bytes.
-
-        Args:
-            without: the names of attributes that do not count.
-
-        Raises:
-            TypeError: it holds what cannot be compared, such as an iterator.
-        """
+        """A digest of the state, 16 bytes, but for some attributes; TypeError where it cannot be compared."""
         attributes = {name: value for name, value in self._attributes() if name not in without}
         return _digest(_Reader(self._env).read(attributes))
 
@@ -92,10 +77,7 @@ def key_of(value: Any) -> bytes:
 
 
 def random_states(env: gym.Env[Any, Any]) -> list[Any]:
-    """The states of all generators that an environment's steps may draw from, for comparison.
-
-    These are its own, those among its attributes, those of its spaces, and the global ones.
-    """
+    """The states of all generators that a step may draw from, the global ones included."""
     sources = [env, *(each for each in vars(env).values() if isinstance(each, (gym.Space, *_GENERATORS)))]
     found = [getattr(each, "_np_random", each) for each in sources]
     own = [_generator_state(each) for each in found if isinstance(each, _GENERATORS)]
