@@ -216,8 +216,8 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         """`step` in arrays alone, for training: a step that ends episodes makes no object for each.
 
         Returns:
-            (num_envs,) states (int64), rewards (float64), terminated and truncated (bool), as `step` does; and
-            of a batch that resets in the same step, the episodes that ended, or None.
+            (num_envs,) states (int64), rewards (float64), terminated and truncated (bool), as `step` does,
+            and of a batch that resets in the same step, the episodes that ended, or None.
         """
         index = self._state * self._num_actions
         index += self._check_actions(actions)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from helpers.support import configure
 
-from gridworld.world.exact.markov_chain import Chain
-from gridworld.world.exact.one_thread import _openblas
+from gridworld.world.exact.markov_chain import Chain, _openblas
 
 
 @pytest.mark.parametrize("env", ["four_rooms", "maze"])

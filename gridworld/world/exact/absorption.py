@@ -18,7 +18,8 @@ used for them too, in a band around the diagonal.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
@@ -27,13 +28,6 @@ from gridworld.process.memory_budget import check_memory
 from gridworld.world.mdp import FloatArray
 
 _ACCURACY = 1e-11
-
-
-class Absorption(Protocol):
-    """A factored system."""
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Solve for x (n, columns), given right-hand sides (n, columns), both float64."""
 
 
 class Elimination:
@@ -90,29 +84,30 @@ class BandedElimination:
         return x
 
 
-def factor(weights: Any, leak: FloatArray) -> Absorption:
-    """Factor weights (n, n), a numpy array or a scipy CSR array, which is overwritten, and leak (n,)."""
+def factor(weights: Any, leak: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """A solver of the system, for right-hand sides (n, columns); it overwrites what it is given.
+
+    `weights` (n, n) is a numpy array or a scipy CSR array, `leak` is (n,).
+    """
     if isinstance(weights, np.ndarray):
-        return Elimination(weights, leak, band=len(leak))
-    weights.setdiag(0.0)
-    weights.eliminate_zeros()
-    try:
-        sparse = _sparse_factors(weights, leak)
-        is_accurate = np.abs(sparse.solve(leak) - 1).max() <= _ACCURACY
-    except RuntimeError:  # rounding has made it singular
-        is_accurate = False
-    return sparse if is_accurate else BandedElimination(weights, leak)
-
-
-def _sparse_factors(weights: Any, leak: FloatArray) -> Absorption:
+        return Elimination(weights, leak, band=len(leak)).solve
     from scipy.sparse import diags_array
     from scipy.sparse.linalg import splu
 
+    weights.setdiag(0.0)
+    weights.eliminate_zeros()
     matrix = diags_array(leak + weights.sum(axis=1), format="csr") - weights
-    factors: Absorption = splu(
-        matrix.tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
+    try:
+        factors = splu(
+            matrix.tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+        is_accurate = np.abs(factors.solve(leak) - 1).max() <= _ACCURACY
+    except RuntimeError:  # rounding has made it singular
+        is_accurate = False
+    solve: Callable[[FloatArray], FloatArray] = (
+        factors.solve if is_accurate else BandedElimination(weights, leak).solve
     )
-    return factors
+    return solve

@@ -13,7 +13,11 @@ Reference: M. L. Puterman, Markov Decision Processes, 1994, chapters 6 and 7 and
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import itertools
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -23,14 +27,44 @@ from numpy.typing import ArrayLike
 
 from gridworld.bounds import discount
 from gridworld.errors import InputError
-from gridworld.world.exact.absorption import Absorption, factor
-from gridworld.world.exact.one_thread import in_one_thread
+from gridworld.world.exact.absorption import factor
 from gridworld.world.layout import positive_int
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 ORDINARY_GAMMA = 0.9999  # up to here a plain solution of the linear system is accurate
 DENSE_STATES = 512  # up to here a dense matrix is both faster and small
 _STEPS_AT_ONCE = 32  # of an episode, before looking whether it can still go on
+
+
+@contextmanager
+def in_one_thread() -> Iterator[None]:
+    """OpenBLAS in one thread, however many the machine has; another library is left as it is.
+
+    It divides products and systems of a hundred states or more among threads. That changes their last bits,
+    so that a run's numbers would depend on the number of cores. And its threads wait for one another at work:
+    where other processes need the cores, for ten times the processor time.
+    """
+    count, limit = _openblas()
+    before = count()
+    if before != 1:
+        limit(1)
+    try:
+        yield
+    finally:
+        if before != 1:
+            limit(before)
+
+
+@functools.cache
+def _openblas() -> tuple[Callable[[], int], Callable[[int], Any]]:
+    """OpenBLAS's functions that tell and set the number of its threads."""
+    library: Any = ctypes.CDLL(np.linalg._umath_linalg.__file__)
+    for prefix in ("scipy_openblas", "openblas"):
+        for suffix in ("64_", "_64", ""):
+            tell, limit = (f"{prefix}_{verb}_num_threads{suffix}" for verb in ("get", "set"))
+            if hasattr(library, tell) and hasattr(library, limit):
+                return getattr(library, tell), getattr(library, limit)
+    return (lambda: 1), (lambda threads: None)
 
 
 @dataclass(frozen=True)
@@ -88,7 +122,7 @@ class Chain:
         used = weight > 0
         return csr_array((weight[used], (rows[used], self.mdp.next_state[used])), shape=(size, size))
 
-    @in_one_thread
+    @in_one_thread()
     def value(self, gamma: float) -> FloatArray:
         """V_π (S,), the expected discounted sum of rewards, without a step limit.
 
@@ -97,7 +131,7 @@ class Chain:
         gamma = check_gamma(gamma)
         if gamma > ORDINARY_GAMMA:
             return self.evaluation(gamma).value
-        states = np.flatnonzero(self._in_play)
+        states = np.flatnonzero(~self.mdp.absorbing)
         if not isinstance(self.transition, np.ndarray):
             return self._sums(self.reward[:, None], gamma)[:, 0]
         value = np.zeros(self.mdp.num_states)
@@ -105,7 +139,7 @@ class Chain:
         value[states] = np.linalg.solve(matrix, self.reward[states])
         return value
 
-    @in_one_thread
+    @in_one_thread()
     def evaluation(self, gamma: float, with_slope: bool = False) -> Evaluation:
         """The value and what else policy iteration needs, in which tiny values are accurate too.
 
@@ -121,7 +155,7 @@ class Chain:
         slopes = self._sums(self.transition @ np.where(finite, sums, 0.0), gamma)
         return Evaluation(*_value_and_scale(sums), *_value_and_scale(np.where(finite, slopes, np.inf)))
 
-    @in_one_thread
+    @in_one_thread()
     def outcome(self, max_steps: int) -> Outcome:
         """The exact outcome of an episode of at most `max_steps` steps."""
         positive_int("max_steps", max_steps)
@@ -137,7 +171,7 @@ class Chain:
         goal, trap = float(mass[self.mdp.goal].sum()), float(mass[self.mdp.trap].sum())
         return Outcome(goal, trap, float(mass[live].sum()), float(total[1]), float(total[0]))
 
-    @in_one_thread
+    @in_one_thread()
     def discounted_return(self, max_steps: int, gamma: float) -> float:
         """The exact discounted sum of rewards of an episode of at most `max_steps` steps."""
         positive_int("max_steps", max_steps)
@@ -178,29 +212,22 @@ class Chain:
                 return states
             states = following
 
-    @cached_property
-    def _in_play(self) -> BoolArray:
-        return ~self.mdp.absorbing
-
     def _sums(self, right: FloatArray, gamma: float) -> FloatArray:
         """x = right + γ P_π x for each column, x = 0 where nothing moves any more.
 
         With γ = 1 the columns must not be negative; x is infinite where it does not stop growing.
         """
         sums = np.zeros_like(right)
-        playing = self._in_play
+        playing = ~self.mdp.absorbing
         if gamma == 1:
             sums[self._growing(right)] = np.inf
             playing = playing & ~(self._recurrent > 0) & np.isfinite(sums).all(axis=1)
         states = np.flatnonzero(playing)
         if states.size:
-            sums[states] = self._system(gamma, states).solve(right[states])
+            leaving = self.transition[states][:, np.flatnonzero(~playing)].sum(axis=1)
+            leak = (1 - gamma) + gamma * leaving
+            sums[states] = factor(gamma * self.transition[states][:, states], leak)(right[states])
         return sums
-
-    def _system(self, gamma: float, states: IntArray) -> Absorption:
-        outside = np.flatnonzero(~np.isin(np.arange(self.mdp.num_states), states))
-        leak = (1 - gamma) + gamma * self.transition[states][:, outside].sum(axis=1)
-        return factor(gamma * self.transition[states][:, states], leak)
 
     def _growing(self, right: FloatArray) -> BoolArray:
         """(S, columns), states from which a column is collected for ever with some probability."""
@@ -215,7 +242,9 @@ class Chain:
     def _recurrent(self) -> IntArray:
         """(S,), a number from 1 on for each class of states that it never leaves, 0 for all other states."""
         recurrent = np.zeros(self.mdp.num_states, dtype=np.int64)
-        endless = np.flatnonzero(self._in_play & ~can_reach(self.mdp, self._weight > 0, self.mdp.terminal))
+        endless = np.flatnonzero(
+            ~self.mdp.absorbing & ~can_reach(self.mdp, self._weight > 0, self.mdp.terminal)
+        )
         if endless.size:
             from scipy.sparse import coo_array
             from scipy.sparse.csgraph import connected_components
@@ -225,6 +254,37 @@ class Chain:
             leaving = label[among.row][label[among.row] != label[among.col]]
             recurrent[endless] = np.where(np.isin(label, leaving), 0, label + 1)
         return recurrent
+
+
+def stopping_states(chain: Chain, gamma: float) -> BoolArray:
+    """(S,), where nothing is counted any more; with γ = 1, where an episode cannot end any more."""
+    mdp = chain.mdp
+    if gamma < 1:
+        return mdp.absorbing
+    taken = (chain.policy[:, :, None] > 0) & (mdp.probability > 0)
+    return mdp.absorbing | ~can_reach(mdp, taken, mdp.terminal)
+
+
+@in_one_thread()
+def discounted_visits(chain: Chain, gamma: float, stops: BoolArray) -> FloatArray:
+    """Discounted visits (S,) from the start distribution on: d(s) = Σ_t γ^t P(s_t = s).
+
+    No one leaves a state of `stops` (S,); there it is the discounted probability to come there.
+    """
+    start, going = chain.mdp.start, np.flatnonzero(~stops)
+    ahead = gamma * chain.transition[going]
+    visits = start.copy()
+    if isinstance(ahead, np.ndarray):
+        visits[going] = np.linalg.solve(np.eye(len(going)) - ahead[:, going].T, start[going])
+    else:
+        from scipy.sparse import eye_array
+        from scipy.sparse.linalg import spsolve
+
+        matrix = (eye_array(len(going)) - ahead[:, going].T).tocsc()
+        visits[going] = spsolve(matrix, start[going])
+    visits[stops] += (ahead.T @ visits[going])[stops]
+    visits[visits < 0] = 0.0  # rounding
+    return visits
 
 
 def check_gamma(gamma: float) -> float:

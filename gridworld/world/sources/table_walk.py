@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
 from gridworld.errors import InputError
-from gridworld.world.exact.bellman import backup
+from gridworld.world.exact.solver import backup
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 from gridworld.world.outcomes import Outcomes
 from gridworld.world.sources.enumeration.snapshots import Snapshots

@@ -29,7 +29,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError, in_short
-from gridworld.world.exact.bellman import backup
+from gridworld.world.exact.solver import backup
 from gridworld.world.mdp import Mdp, checked_reward, frozen
 from gridworld.world.outcomes import thresholds_of
 from gridworld.world.sources.pure_functions import SO_UNKNOWN, asked, remembered, same
