@@ -22,6 +22,7 @@ import gymnasium as gym
 import numpy as np
 
 from gridworld.errors import InputError, in_short
+from gridworld.world.sources.snapshots import GENERATORS, random_states
 
 _CALLS = 1000  # at least
 _MOST_READ = 20_000  # objects
@@ -29,7 +30,6 @@ _LIBRARIES = {
     *sys.stdlib_module_names,
     *("gymnasium", "gridworld", "minigrid", "numpy", "sb3_contrib", "scipy", "stable_baselines3", "torch"),
 } - {"__main__"}
-_GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
 SO_UNKNOWN = (
     ", so what it makes of the task is not exactly known; "
     "leave it out, or make it a function of its argument alone"
@@ -88,13 +88,6 @@ def alike(one: Any, other: Any, without: Iterable[str] = ()) -> bool:
             return False
         parts.append(reader.found)
     return parts[0] == parts[1]
-
-
-def random_states() -> list[Any]:
-    """The states of the generators that all share: of Python, numpy and torch."""
-    torch = sys.modules.get("torch")
-    drawn = [] if torch is None else [torch.get_rng_state().numpy().tobytes()]
-    return [random.getstate(), pickle.dumps(np.random.get_state()), *drawn]
 
 
 def remembered(where: str, name: str, owner: Any, chain: Iterable[Any] = ()) -> list[Any]:
@@ -203,7 +196,7 @@ def _globals_of(code: CodeType) -> set[str]:
 def _of_module(module: ModuleType) -> Iterator[Any]:
     """Its data: what it imports and defines may be anything."""
     for value in list(vars(module).values()):
-        if isinstance(value, int | float | str | list | dict | set | np.ndarray | _GENERATORS):
+        if isinstance(value, int | float | str | list | dict | set | np.ndarray | GENERATORS):
             yield value if not isinstance(value, dict) or "__name__" not in value else None
 
 

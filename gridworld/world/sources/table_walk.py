@@ -20,8 +20,8 @@ from gridworld.errors import InputError
 from gridworld.world.exact.solver import backup
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 from gridworld.world.outcomes import Outcomes
-from gridworld.world.sources.enumeration.snapshots import Snapshots
 from gridworld.world.sources.known_envs import known_env
+from gridworld.world.sources.snapshots import Snapshots
 
 if TYPE_CHECKING:
     import gymnasium as gym

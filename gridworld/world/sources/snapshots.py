@@ -14,6 +14,7 @@ import io
 import marshal
 import pickle
 import random
+import sys
 from collections import deque
 from collections.abc import Collection
 from enum import Enum
@@ -23,14 +24,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-_GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
+GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
 _KEPT = (
     gym.Space,
     gym.envs.registration.EnvSpec,
     FunctionType,
     BuiltinFunctionType,
     ModuleType,
-    *_GENERATORS,
+    *GENERATORS,
 )
 _PLAIN = frozenset({int, float, str, bool, bytes, type(None)})
 _CONTAINERS = (list, tuple, dict, set, frozenset, deque, bytearray)
@@ -76,12 +77,16 @@ def key_of(value: Any) -> bytes:
     return _digest(_Reader(None).read(value))
 
 
-def random_states(env: gym.Env[Any, Any]) -> list[Any]:
-    """The states of all generators that a step may draw from, the global ones included."""
-    sources = [env, *(each for each in vars(env).values() if isinstance(each, (gym.Space, *_GENERATORS)))]
+def random_states(env: gym.Env[Any, Any] | None = None) -> list[Any]:
+    """The states of all generators that a step may draw from: the environment's, and those that all share."""
+    torch = sys.modules.get("torch")
+    shared = [] if torch is None else [torch.get_rng_state().numpy().tobytes()]
+    shared += [random.getstate(), _generator_state(np.random.mtrand._rand)]
+    if env is None:
+        return shared
+    sources = [env, *(each for each in vars(env).values() if isinstance(each, (gym.Space, *GENERATORS)))]
     found = [getattr(each, "_np_random", each) for each in sources]
-    own = [_generator_state(each) for each in found if isinstance(each, _GENERATORS)]
-    return [*own, random.getstate(), _generator_state(np.random.mtrand._rand)]
+    return shared + [_generator_state(each) for each in found if isinstance(each, GENERATORS)]
 
 
 def _generator_state(generator: Any) -> Any:

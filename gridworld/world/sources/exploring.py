@@ -20,7 +20,7 @@ from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import check_memory
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 from gridworld.world.outcomes import MOST_ACTIONS
-from gridworld.world.sources.enumeration.snapshots import Snapshots, key_of, random_states
+from gridworld.world.sources.snapshots import Snapshots, key_of, random_states
 
 _BEYOND = 1_000  # states further than a step limit that are found too, so that a small world is whole
 _DEEPEST = 10_000  # steps from the start
@@ -54,9 +54,6 @@ class Subject:
                 f"env.ignore={list(ignore)}: {name} has no attribute {unknown[0]}; it has "
                 f"{', '.join(vars(self.env))}"
             )
-        self._check_resets()
-
-    def _check_resets(self) -> None:
         key, before = self.key(), self._keys()
         for seed in range(_SEEDS):
             self.env.reset(seed=seed)
@@ -250,9 +247,11 @@ class _Search:
         if state == len(self.depth):
             self._add(copy, seen, observation, depth)
         elif self._seen[state] != seen:
+            left_out = ", ".join(subject.ignore)
+            without = f" without {left_out}, which env.ignore leaves out" if left_out else ""
             raise subject.refusal(
                 "the same state is shown by different observations, so that what an agent sees is no "
-                f"function of the state{_without(subject.ignore)}"
+                f"function of the state{without}"
             )
         return state
 
@@ -305,10 +304,6 @@ class _Search:
             observations=self._observations[:size],
             names=self._names[:size],
         )
-
-
-def _without(ignore: Sequence[str]) -> str:
-    return f" without {', '.join(ignore)}, which env.ignore leaves out" if ignore else ""
 
 
 def _array_reader(subject: Subject) -> Callable[[Any], NDArray[Any] | None]:
