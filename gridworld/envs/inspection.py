@@ -25,9 +25,9 @@ from gridworld.errors import InputError
 from gridworld.world.grid import GridMdp, compile_mdp
 from gridworld.world.layout import Layout, load, positive_int
 from gridworld.world.mdp import Mdp
+from gridworld.world.outcomes import verified
 from gridworld.world.sources.gymnasium_table import compile_table, has_table
 from gridworld.world.sources.pure_functions import alike, same
-from gridworld.world.sources.verification import verified
 from gridworld.world.sources.wrappers import NEUTRAL, Wrapped, known_class, step_limit, wrappers_of
 
 # What a batch is, by the class whose methods it runs.
@@ -58,27 +58,10 @@ _SB3_BATCHES = {
 }
 # Attributes that say where an episode is, not what is done in it.
 _OF_AN_EPISODE = {
-    *(
-        "env",
-        "_np_random",
-        "_np_random_seed",
-        "state",
-        "_state",
-        "s",
-        "lastaction",
-        "_elapsed_steps",
-        "_has_reset",
-    ),
-    *(
-        "needs_reset",
-        "rewards",
-        "t_start",
-        "total_steps",
-        "current_reset_info",
-        "results_writer",
-        "_cached_spec",
-    ),
-    *("episode_returns", "episode_lengths", "episode_times", "episode_start_time", "checked_step"),
+    *("env", "_np_random", "_np_random_seed", "state", "_state", "s", "lastaction", "_elapsed_steps"),
+    *("_has_reset", "needs_reset", "rewards", "t_start", "total_steps", "current_reset_info"),
+    *("results_writer", "_cached_spec", "checked_step"),
+    *("episode_returns", "episode_lengths", "episode_times", "episode_start_time"),
 }
 _BY_METHOD: dict[str, Callable[[Any, Any], Any]] = {  # what SB3's wrappers make of observations (S, ...)
     "extract": lambda wrapper, rows: rows[wrapper.key],
@@ -340,27 +323,20 @@ def tabulated(space: gym.Space[Any], rows: Any, num_states: int) -> ObservationT
 
 def observation_like(mdp: Mdp, space: gym.Space[Any]) -> ObservationTable:
     """The observation of a world that has this space."""
+    needs = {"coordinates": mdp.places, "own": mdp.own_observation}
     for kind in KINDS:
-        table = make_observation(mdp, kind, _cell_size(mdp, space)) if _may_be(mdp, kind, space) else None
-        if table is not None and table.space == space:
+        cell_size = 1
+        if kind == "image":
+            if not isinstance(mdp, GridMdp) or space.dtype != np.uint8 or len(space.shape or ()) != 3:
+                continue
+            border, width = frame_size(mdp, 1)[0], (space.shape or (1,))[-1]
+            cell_size = max(1, (width - border) // (frame_size(mdp, 2)[0] - border) + 1)
+        elif kind in needs and needs[kind] is None:
+            continue
+        table = make_observation(mdp, kind, cell_size)
+        if table.space == space:
             return table
     raise InputError(
         f"the model sees {space}, and no observation of this world ({mdp.num_states} states) is like that; "
         f"give the environment that it was trained on, or train on one of {', '.join(KINDS)}"
     )
-
-
-def _may_be(mdp: Mdp, kind: str, space: gym.Space[Any]) -> bool:
-    if kind == "image":
-        return isinstance(mdp, GridMdp) and space.dtype == np.uint8 and len(space.shape or ()) == 3
-    needs = {"coordinates": mdp.places, "own": mdp.own_observation}
-    return kind not in needs or needs[kind] is not None
-
-
-def _cell_size(mdp: Mdp, space: gym.Space[Any]) -> int:
-    """Of the images that have this space, as their width has it; 1 where there is none."""
-    if not isinstance(mdp, GridMdp):
-        return 1
-    width = (space.shape or (1,))[-1]
-    per_cell, border = frame_size(mdp, 2)[0] - frame_size(mdp, 1)[0], frame_size(mdp, 1)[0]
-    return max(1, (width - border) // per_cell + 1)

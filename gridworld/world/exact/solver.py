@@ -110,7 +110,7 @@ def value_iteration(mdp: Mdp, gamma: float) -> Solution:
     """
     gamma = check_gamma(gamma)
     ordinary = min(gamma, ORDINARY_GAMMA)
-    greedy: IntArray = np.argmax(backup(mdp, _sweep(mdp, ordinary), ordinary), axis=1)
+    greedy: IntArray = np.argmax(backup(mdp, swept_values(mdp, ordinary), ordinary), axis=1)
     if gamma <= ORDINARY_GAMMA:
         return _solve_discounted(mdp, gamma, greedy)
     if gamma == 1:
@@ -154,7 +154,7 @@ def _solve_discounted(mdp: Mdp, gamma: float, greedy: IntArray) -> Solution:
             return Solution(gamma, v, q, q >= pick(q, best)[:, None] - tolerance, scale)
 
 
-def _sweep(mdp: Mdp, gamma: float) -> FloatArray:
+def swept_values(mdp: Mdp, gamma: float) -> FloatArray:
     """Value iteration from V = 0, each sweep only where a successor's value has just changed.
 
     Changes are measured relative to the value, so the wave of a far goal is followed to the last cell,

@@ -40,8 +40,7 @@ from gridworld.process.memory_budget import check_memory
 from gridworld.process.npz import npz_arrays, npz_bytes
 from gridworld.process.users_file import open_users_file
 from gridworld.world.mdp import Mdp, frozen
-from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
-from gridworld.world.sources.verification import checked_text, verified
+from gridworld.world.outcomes import Outcomes, checked_text, mdp_from_outcomes, verified
 
 _TABLES = ("next_state", "probability", "reward", "terminated", "success")
 _NEEDED = ("next_state", "reward", "terminated", "start")
@@ -85,12 +84,15 @@ def mdp_from_arrays(name: str, arrays: Mapping[str, Any], where: str) -> Mdp:
         given.setdefault("probability", np.ones(given["next_state"].shape))
     elif "probability" not in given:
         raise InputError(f"{where}: has no probability; without it, next_state must be (states, actions)")
+    places = given.get("places")
+    if places is not None and places.ndim == 2 and places.shape[1] == 2 and places.dtype.kind in "iu":
+        places = np.concatenate([np.where(places[:, :1] < 0, -1, 0), places], axis=1)  # of one panel
     tables = Outcomes(**{key: given[key] for key in (*_TABLES, "start") if key in given})
     mdp = mdp_from_outcomes(
         where,
         tables,
         action_names=_names(where, "action_names", given.get("action_names")),
-        places=_places(where, given.get("places")),
+        places=places,
         max_episode_steps=_whole(where, "max_episode_steps", given.get("max_episode_steps")),
     )
     called = checked_text(where, "name", given["name"]) if "name" in given else name
@@ -104,13 +106,9 @@ def _check_names(where: str, arrays: Mapping[str, Any]) -> None:
     for key in arrays:
         if key not in _NEEDED + _OPTIONAL:
             near = difflib.get_close_matches(str(key), _OPTIONAL, n=1)
-            told = f"did you mean {near[0]}?" if near else f"beside what is needed it may hold {_listed()}"
+            listed = f"{', '.join(_OPTIONAL[:-1])} and {_OPTIONAL[-1]}"
+            told = f"did you mean {near[0]}?" if near else f"beside what is needed it may hold {listed}"
             raise InputError(f"{where}: {str(key)[:50]} is no array of a world; {told}")
-
-
-def _listed() -> str:
-    *others, last = _OPTIONAL
-    return f"{', '.join(others)} and {last}"
 
 
 def _array(where: str, key: str, value: Any) -> NDArray[Any]:
@@ -129,12 +127,6 @@ def _names(where: str, key: str, given: NDArray[Any] | None) -> list[str] | None
     if given.ndim != 1 or given.dtype.kind != "U":
         raise InputError(f"{where}: {key} is {given.dtype} {given.shape}, must be one string each")
     return [checked_text(where, key, name) for name in given]
-
-
-def _places(where: str, given: NDArray[Any] | None) -> NDArray[Any] | None:
-    if given is not None and given.ndim == 2 and given.shape[1] == 2 and given.dtype.kind in "iu":
-        return np.concatenate([np.where(given[:, :1] < 0, -1, 0), given], axis=1)
-    return given
 
 
 def _whole(where: str, key: str, given: NDArray[Any] | None) -> int | None:

@@ -9,9 +9,8 @@ from typing import Any
 from gridworld.errors import InputError, in_short
 from gridworld.process.import_path import imported
 from gridworld.world.mdp import Mdp
-from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
+from gridworld.world.outcomes import Outcomes, mdp_from_outcomes, verified
 from gridworld.world.sources.arrays import mdp_from_arrays
-from gridworld.world.sources.verification import verified
 
 
 def build(builder: str | Callable[..., Any], kwargs: Mapping[str, Any] | None = None) -> Mdp:

@@ -12,6 +12,7 @@ be an outcome of its row, and as frequent as the row says, as far as that can be
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -112,9 +113,13 @@ def _table(name: str, real: Any) -> Outcomes:
             f"{name}: has no transition table P, so its truth cannot be read off; env=enumerated may fit, "
             "which tries out what a deterministic environment does"
         )
-    states, actions = (
-        _size(name, what, getattr(real, f"{what}_space", None)) for what in ("observation", "action")
-    )
+    sizes = []
+    for what in ("observation", "action"):
+        space = getattr(real, f"{what}_space", None)
+        if not isinstance(space, gym.spaces.Discrete) or space.start != 0:
+            raise InputError(f"{name}: its {what} space is {space}, must be Discrete(n) that starts at 0")
+        sizes.append(int(space.n))
+    states, actions = sizes
     check_size(name, states, actions, 1)
     rows, counts = _rows(name, real.P, states, actions)
     longest = int(counts.max())
@@ -135,14 +140,6 @@ def _table(name: str, real: Any) -> Outcomes:
         terminated=padded[..., 3] == 1,
         start=_start(name, real, states),
     )
-
-
-def _size(name: str, what: str, space: Any) -> int:
-    from gymnasium.spaces import Discrete
-
-    if not isinstance(space, Discrete) or space.start != 0:
-        raise InputError(f"{name}: its {what} space is {space}, must be Discrete(n) that starts at 0")
-    return int(space.n)
 
 
 def _start(name: str, real: Any, states: int) -> NDArray[np.float64]:
@@ -170,44 +167,41 @@ def _rows(name: str, table: Any, states: int, actions: int) -> tuple[NDArray[np.
                 found.extend(row)
         rows = np.array(found, dtype=np.float64)
         good = rows.shape == (len(found), 4) and bool((counts > 0).all())
-        if good and _are_states(rows[:, 1], states).all() and np.isin(rows[:, 3], (0, 1)).all():
+        if good and _are_outcomes(rows, states):
             return rows, counts
     except (KeyError, IndexError, TypeError, ValueError, OverflowError):
         pass
     raise _mistake(name, table, states, actions)
 
 
-def _are_states(numbers: Any, states: int) -> Any:
-    return (numbers >= 0) & (numbers < states) & (np.floor(numbers) == numbers)
+def _are_outcomes(rows: NDArray[np.float64], states: int) -> bool:
+    """Whether all rows (M, 4) lead to states and end, or not."""
+    following = rows[:, 1]
+    are_states = (following >= 0) & (following < states) & (np.floor(following) == following)
+    return bool(are_states.all() and np.isin(rows[:, 3], (0, 1)).all())
 
 
 def _mistake(name: str, table: Any, states: int, actions: int) -> InputError:
     """The first row that is no row."""
-    for state in range(states):
-        for action in range(actions):
-            try:
-                row = table[state][action]
-            except (KeyError, IndexError, TypeError):
-                return InputError(
-                    f"{name}: P has no state {state} with action {action}, must have {states} states with "
-                    f"{actions} actions each"
-                )
-            if not _is_row(row, states):
-                return InputError(
-                    f"{name}: P[{state}][{action}] is {str(row)[:100]}, must be a list of (probability, next "
-                    f"state from 0 to {states - 1}, reward, terminated)"
-                )
+    for state, action in itertools.product(range(states), range(actions)):
+        try:
+            row = table[state][action]
+        except (KeyError, IndexError, TypeError):
+            return InputError(
+                f"{name}: P has no state {state} with action {action}, must have {states} states with "
+                f"{actions} actions each"
+            )
+        try:
+            numbers = np.array(list(row), dtype=np.float64)
+            good = numbers.ndim == 2 and numbers.shape[1] == 4 and _are_outcomes(numbers, states)
+        except (TypeError, ValueError, OverflowError):
+            good = False
+        if not good:
+            return InputError(
+                f"{name}: P[{state}][{action}] is {str(row)[:100]}, must be a list of (probability, next "
+                f"state from 0 to {states - 1}, reward, terminated)"
+            )
     return InputError(f"{name}: P is no table of {states} states and {actions} actions")
-
-
-def _is_row(row: Any, states: int) -> bool:
-    try:
-        numbers = np.array(list(row), dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return False
-    if numbers.ndim != 2 or numbers.shape[1] != 4 or not len(numbers):
-        return False
-    return bool(_are_states(numbers[:, 1], states).all() and np.isin(numbers[:, 3], (0, 1)).all())
 
 
 def _differ(table: Outcomes, other: Outcomes) -> bool:

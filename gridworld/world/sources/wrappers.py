@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from functools import cached_property
 from typing import Any
@@ -29,14 +30,13 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError, in_short
-from gridworld.world.exact.solver import backup
+from gridworld.world.exact.solver import backup, swept_values
 from gridworld.world.mdp import Mdp, checked_reward, frozen
 from gridworld.world.outcomes import thresholds_of
 from gridworld.world.sources.pure_functions import SO_UNKNOWN, asked, remembered, same
 
 NEUTRAL, LIMIT, MEMORY = "neutral", "time limit", "memory"
 _STEPS, _MOST_STEPS = 2000, 40_000  # of the copy beside the tables, in episodes
-_SWEEPS = 100  # of value iteration, for episodes that go far
 _GAMMA = 0.99
 _ROWS = 20_000  # pairs of state and action that are tried one by one, if states can be set
 _SEED = 20_261_123
@@ -64,12 +64,8 @@ _ROLES = {
     f"{_WRAPPERS}.stateful_observation:NormalizeObservation": MEMORY,
     f"{_WRAPPERS}.stateful_observation:TimeAwareObservation": MEMORY,
 }
-_COPIED = {
-    "Monitor",
-    "OrderEnforcing",
-    "RecordEpisodeStatistics",
-    "TimeLimit",
-}  # what a transform may look at
+# What a transform may look at, so that it is copied too.
+_COPIED = {"Monitor", "OrderEnforcing", "RecordEpisodeStatistics", "TimeLimit"}
 # Environments whose state can be set, by the class whose steps they run.
 _STATE_ATTRIBUTES = {
     "gridworld.envs.env:GridWorldEnv": "state",
@@ -153,11 +149,11 @@ class Wrapped:
 
     def __init__(self, where: str, env: gym.Env[Any, Any], mdp: Mdp) -> None:
         self._where, self._env, self._bare = where, env, mdp
+        self._attribute = known_class(env.unwrapped, _STATE_ATTRIBUTES, ("step", "reset"))
         roles = [(wrapper, role_of(where, wrapper)) for wrapper in list(wrappers_of(env))[::-1]]
         self.memory = [type(wrapper).__name__ for wrapper, role in roles if role == MEMORY]
         self.transforms = [wrapper for wrapper, role in roles if role in ("observation", "reward", "action")]
         changing = [wrapper for wrapper, role in roles if role in ("reward", "action")]
-        self.changes_task = bool(changing)
         self.mdp = mdp
         if changing:
             self._copied  # noqa: B018 - refused if it cannot be copied
@@ -205,10 +201,8 @@ class Wrapped:
         found = np.ones((self._bare.num_states, self.mdp.num_actions), dtype=np.bool_)
         for state in np.flatnonzero(self._bare.acting).tolist():
             setattr(env.unwrapped, self._attribute, int(self._bare.number[state]))
-            try:
+            with self._refusing("action_masks() failed"):
                 found[state] = masks()
-            except Exception as error:
-                raise InputError(f"{self._where}: action_masks() failed ({in_short(error)})") from error
 
         def check(state: int) -> None:
             if self._bare.acting[state] and not np.array_equal(found[state], masks()):
@@ -236,21 +230,24 @@ class Wrapped:
                         f"({in_short(error)}), so what it changes cannot be found out; leave it out"
                     ) from None
             seen[id(wrapper)] = real
-        self._reset(real)
+        wrappers, self._probe = list(wrappers_of(real)), _Probe(real.unwrapped)
+        if wrappers:
+            wrappers[-1].env = self._probe
+        else:
+            real = self._probe
+        with self._refusing("cannot be reset"):
+            real.reset()
         return real
 
-    @property
-    def _attribute(self) -> str | None:
-        """By which the state of the environment can be set."""
-        return known_class(self._env.unwrapped, _STATE_ATTRIBUTES, ("step", "reset"))
-
-    def _reset(self, env: gym.Env[Any, Any], **given: Any) -> Any:
+    @contextmanager
+    def _refusing(self, what: str) -> Iterator[None]:
+        """One sentence for whatever somebody's code raises."""
         try:
-            return env.reset(**given)[0]
+            yield
         except InputError:
             raise
         except Exception as error:
-            raise InputError(f"{self._where}: cannot be reset ({in_short(error)})") from error
+            raise InputError(f"{self._where}: {what} ({in_short(error)})") from error
 
     @property
     def _copied_transforms(self) -> list[Any]:
@@ -303,22 +300,19 @@ class Wrapped:
         `rows` is what is seen of each state, None if it does not count; `also` compares something else in a
         state.
         """
-        env, probe = self._copied, _Probe.below(self._copied)
-        rng = np.random.default_rng(_SEED)
+        env = self._copied
+        probe, rng = self._probe, np.random.default_rng(_SEED)
 
         def reset(**given: Any) -> None:
-            observation = self._reset(env, **given)
-            self._check_seen(rows, probe.number, observation)
+            with self._refusing("cannot be reset"):
+                observation = env.reset(**given)[0]
+            self._check_seen(rows, observation)
             also(probe.number)
 
         def step(state: int, action: int) -> None:
-            try:
+            with self._refusing("cannot be stepped"):
                 found = env.step(action)
-            except InputError:
-                raise
-            except Exception as error:
-                raise InputError(f"{self._where}: cannot be stepped ({in_short(error)})") from error
-            self._check_step(rows, probe, state, action, found)
+            self._check_step(rows, state, action, found)
             if found[2] or found[3]:
                 reset()
             else:
@@ -335,7 +329,7 @@ class Wrapped:
                 step(*divmod(pair, actions))
                 tried[pair // actions] += 1
         reset()
-        good = self._good_policy()
+        good = backup(self.mdp, swept_values(self.mdp, _GAMMA), _GAMMA).argmax(axis=1).tolist()
         for number in range(_MOST_STEPS):
             if number >= _STEPS and tried[self.mdp.acting].all():
                 break
@@ -350,31 +344,24 @@ class Wrapped:
                 "make of it could not be compared; leave them out"
             )
 
-    def _good_policy(self) -> list[int]:
-        """An optimal action of each state, up to what so many sweeps leave open."""
-        v = np.zeros(self.mdp.num_states)
-        for _ in range(_SWEEPS):
-            q = backup(self.mdp, v, _GAMMA)
-            v = q.max(axis=1)
-        return [int(action) for action in q.argmax(axis=1)]
-
-    def _check_step(self, rows: Any, probe: _Probe, state: int, action: int, step: Any) -> None:
+    def _check_step(self, rows: list[Any] | None, state: int, action: int, step: Any) -> None:
         observation, reward, terminated, _, _ = step
         reward = float(_plain(reward))
-        mdp, pair = self.mdp, (state, action)
+        mdp, pair, number = self.mdp, (state, action), self._probe.number
         following = mdp.next_state[pair]
-        same_end = (mdp.number[following] == probe.number) & (mdp.terminal[following] == bool(terminated))
+        same_end = (mdp.number[following] == number) & (mdp.terminal[following] == bool(terminated))
         possible = same_end & (mdp.reward[pair] == reward) & (mdp.probability[pair] > 0)
         if not possible.any():
             raise InputError(
                 f"{self._where}: through its wrappers, action {action} in state {state} led to state "
-                f"{probe.number} with reward {reward:g}{' and ended' if terminated else ''}, which is "
+                f"{number} with reward {reward:g}{' and ended' if terminated else ''}, which is "
                 "not what reward() and action() gave when they were asked; make them functions of their "
                 "argument alone"
             )
-        self._check_seen(rows, probe.number, observation)
+        self._check_seen(rows, observation)
 
-    def _check_seen(self, rows: list[Any] | None, number: int, observation: Any) -> None:
+    def _check_seen(self, rows: list[Any] | None, observation: Any) -> None:
+        number = self._probe.number
         if rows is not None and not same(rows[number], observation):
             raise InputError(
                 f"{self._where}: what is seen of state {number} through its wrappers is not always the same"
@@ -391,18 +378,6 @@ class _Probe(gym.Wrapper[Any, Any, Any, Any]):
     """Remembers the number that the environment below all wrappers showed last."""
 
     number = -1
-
-    @classmethod
-    def below(cls, env: gym.Env[Any, Any]) -> _Probe:
-        """Put a probe under the innermost wrapper of an environment, unless there is one."""
-        wrappers = list(wrappers_of(env))
-        if not wrappers:
-            return cls(env)
-        if isinstance(wrappers[-1], cls):
-            return wrappers[-1]
-        probe = cls(env.unwrapped)
-        wrappers[-1].env = probe
-        return probe
 
     def reset(self, **arguments: Any) -> Any:
         found = self.env.reset(**arguments)
