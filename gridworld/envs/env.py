@@ -102,21 +102,20 @@ class GridWorldEnv(gym.Env[int, int]):
 
         self._window: drawing.Window | None = None
         self._state: int = int(self.mdp.start_states[0])
-        self._describe(self.mdp.layout)
 
-    def _describe(self, world: Layout) -> None:
-        """The tutorial's public attributes."""
-        self.num_rows, self.num_cols = world.num_rows, world.num_cols
-        self.grid2state = {cell: state for state, cell in enumerate(world.cells())}
-        self.state2grid = dict(enumerate(world.cells()))
+        # The tutorial's public attributes.
+        drawn = self.mdp.layout
+        self.num_rows, self.num_cols = drawn.num_rows, drawn.num_cols
+        self.state2grid: dict[int, Cell] = dict(enumerate(drawn.cells()))
+        self.grid2state: dict[Cell, int] = {cell: state for state, cell in self.state2grid.items()}
         self.action_defs: dict[int, Callable[[int, int], Cell]] = {
             action: partial(self._move, action) for action in range(NUM_ACTIONS)
         }
-        self.gold_cell = world.goals[0]
+        self.gold_cell = drawn.goals[0]
         self.gold_state = self.grid2state[self.gold_cell]
-        self.trap_cells = list(world.traps)
-        self.trap_states = [self.grid2state[cell] for cell in world.traps]
-        self.terminal_states = [self.grid2state[cell] for cell in world.terminals]
+        self.trap_cells = list(drawn.traps)
+        self.trap_states = [self.grid2state[cell] for cell in drawn.traps]
+        self.terminal_states = [self.grid2state[cell] for cell in drawn.terminals]
 
     @property
     def mdp(self) -> GridMdp:
