@@ -129,20 +129,7 @@ class Mdp:
     @cached_property
     def steps_away(self) -> IntArray:
         """(S,), in how few steps an episode can come to each state; -1 where it cannot."""
-        themselves = np.arange(self.num_states)[:, None, None]
-        possible = np.where(self.probability > 0, self.next_state, themselves)
-        following = possible.reshape(self.num_states, -1).tolist()
-        waiting = deque(self.start_states.tolist())
-        steps = [-1] * self.num_states
-        for start in waiting:
-            steps[start] = 0
-        while waiting:
-            origin = waiting.popleft()
-            for state in following[origin]:
-                if steps[state] < 0:
-                    steps[state] = steps[origin] + 1
-                    waiting.append(state)
-        return frozen(np.array(steps))
+        return frozen(steps_from(self.start_states, self.next_state, self.probability > 0))
 
     @property
     def reachable(self) -> BoolArray:
@@ -209,6 +196,24 @@ class Mdp:
         origins = np.argsort(leads_to, kind="stable") // (leads_to.size // self.num_states)
         first = np.concatenate([[0], np.cumsum(np.bincount(leads_to, minlength=self.num_states))])
         return frozen(origins.astype(self.next_state.dtype)), frozen(first)
+
+
+def steps_from(starts: IntArray, next_state: IntArray, taken: BoolArray) -> IntArray:
+    """(S,), the fewest steps from some states by the outcomes `taken` (S, A, K); -1: there is no way."""
+    size = len(next_state)
+    themselves = np.arange(size)[:, None, None]
+    following = np.where(taken, next_state, themselves).reshape(size, -1).tolist()
+    waiting = deque(starts.tolist())
+    steps = [-1] * size
+    for start in waiting:
+        steps[start] = 0
+    while waiting:
+        origin = waiting.popleft()
+        for state in following[origin]:
+            if steps[state] < 0:
+                steps[state] = steps[origin] + 1
+                waiting.append(state)
+    return np.array(steps)
 
 
 def grid_places(num_rows: int, num_cols: int) -> NDArray[np.int64]:

@@ -29,6 +29,7 @@ from gridworld.world.mdp import (
     Mdp,
     checked_reward,
     frozen,
+    steps_from,
 )
 
 MOST_ACTIONS = 256
@@ -145,7 +146,8 @@ class _Ends:
 
     def __init__(self, outcomes: Outcomes) -> None:
         size, possible = len(outcomes.start), outcomes.probability > 0
-        playing = _playing(outcomes, possible)
+        going_on = possible & ~outcomes.terminated
+        playing = steps_from(np.flatnonzero(outcomes.start), outcomes.next_state, going_on) >= 0
         ending = possible & outcomes.terminated
         first = ending & playing[:, None, None]
         success = outcomes.success
@@ -167,18 +169,6 @@ class _Ends:
         key = every[ending]
         key = np.where(np.isin(key, keys), key, key ^ 1)
         self.leads_to[ending] = self.states[np.searchsorted(keys, key)]
-
-
-def _playing(outcomes: Outcomes, possible: BoolArray) -> BoolArray:
-    """(N,), the states in which an episode may go on."""
-    goes_on = possible & ~outcomes.terminated
-    reached = outcomes.start > 0
-    frontier: IntArray = np.flatnonzero(reached)
-    while frontier.size:
-        following = np.unique(outcomes.next_state[frontier][goes_on[frontier]])
-        frontier = following[~reached[following]]
-        reached[frontier] = True
-    return reached
 
 
 def thresholds_of(probability: FloatArray) -> FloatArray:

@@ -29,7 +29,7 @@ from gridworld.bounds import discount
 from gridworld.errors import InputError
 from gridworld.world.exact.absorption import factor
 from gridworld.world.layout import positive_int
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, steps_from
 
 ORDINARY_GAMMA = 0.9999  # up to here a plain solution of the linear system is accurate
 DENSE_STATES = 512  # up to here a dense matrix is both faster and small
@@ -199,12 +199,7 @@ class Chain:
     def endless_states(self) -> IntArray:
         """(n,), ascending, where an episode may walk for ever: of a deterministic policy its cycle."""
         mdp, taken = self.mdp, self._weight > 0
-        reached = np.zeros(mdp.num_states, dtype=np.bool_)
-        frontier: IntArray = mdp.start_states
-        while frontier.size:
-            reached[frontier] = True
-            following = np.unique(mdp.next_state[frontier][taken[frontier]])
-            frontier = following[~reached[following]]
+        reached = steps_from(mdp.start_states, mdp.next_state, taken) >= 0
         states: IntArray = np.flatnonzero(reached & ~can_reach(mdp, taken, mdp.terminal))
         while True:  # what lies on the way into a cycle has no predecessor here and drops out
             following = np.unique(mdp.next_state[states][taken[states]])

@@ -114,8 +114,8 @@ def value_iteration(mdp: Mdp, gamma: float) -> Solution:
     if gamma <= ORDINARY_GAMMA:
         return _solve_discounted(mdp, gamma, greedy)
     if gamma == 1:
-        greedy = better_or_resting(mdp, greedy)
-    found, optimal = solve_by_value_and_slope(mdp, gamma, greedy)
+        greedy = _better_or_resting(mdp, greedy)
+    found, optimal = _solve_by_value_and_slope(mdp, gamma, greedy)
     return Solution(gamma, found.value, backup(mdp, found.value, gamma), optimal, found.scale)
 
 
@@ -164,7 +164,9 @@ def swept_values(mdp: Mdp, gamma: float) -> FloatArray:
     v = np.zeros(mdp.num_states)
     playing = ~mdp.absorbing
     active = np.flatnonzero(playing)
-    for _ in range(100 + 2 * max(_farthest(mdp, ends) for ends in (mdp.goal, mdp.trap))):
+    ways = np.ones(mdp.next_state.shape, dtype=np.bool_)
+    farthest = max(int(steps_to(mdp, ways, ends).max()) for ends in (mdp.goal, mdp.trap))
+    for _ in range(102 + 2 * farthest):
         if not active.size:
             break
         new = backup(mdp, v, gamma, active).max(axis=1)
@@ -177,20 +179,7 @@ def swept_values(mdp: Mdp, gamma: float) -> FloatArray:
     return v
 
 
-def _farthest(mdp: Mdp, ends: BoolArray) -> int:
-    """Moves to the nearest of these ends from the cell that is farthest from them, past all other ends."""
-    reached = mdp.terminal.copy()
-    frontier: IntArray = np.flatnonzero(ends)
-    moves = 0
-    while frontier.size:
-        around = np.unique(mdp.predecessors(frontier))
-        frontier = around[~reached[around]]
-        reached[frontier] = True
-        moves += 1
-    return moves
-
-
-def solve_by_value_and_slope(mdp: Mdp, gamma: float, greedy: IntArray) -> tuple[Evaluation, BoolArray]:
+def _solve_by_value_and_slope(mdp: Mdp, gamma: float, greedy: IntArray) -> tuple[Evaluation, BoolArray]:
     """Policy iteration from `greedy` (S,): the larger value first, of equal values the smaller slope.
 
     With γ = 1, `greedy` has a finite value wherever a policy has. Slopes are looked at once no value can be
@@ -290,7 +279,7 @@ def _advantage(
     return gained, rounding
 
 
-def better_or_resting(mdp: Mdp, one: IntArray) -> IntArray:
+def _better_or_resting(mdp: Mdp, one: IntArray) -> IntArray:
     """A policy (S,) to begin with at γ = 1: `one` where it is worth more than one that ends or rests."""
     other = _resting_policy(mdp)
     first, second = (
