@@ -85,23 +85,25 @@ def _one_hot(mdp: Mdp, cell_size: int) -> Rows:
     return space, np.eye(size, dtype=np.float32)[mdp.number]
 
 
-def _coordinates(mdp: Mdp, cell_size: int) -> Rows:
-    """Each from 0 (first) to 1 (last), 0 where there is only one; -1 of a state that has no place."""
+def _places(mdp: Mdp, kind: str) -> IntArray:
     if mdp.places is None:
         raise InputError(
-            f"observation coordinates: the states of {mdp.name} have no places; take another observation"
+            f"observation {kind}: the states of {mdp.name} have no places; take another observation"
         )
-    panels = mdp.places[:, :1] if mdp.places[:, 0].max() > 0 else mdp.places[:, :0]
-    places = np.concatenate([mdp.places[:, 1:], panels], axis=1).astype(np.float32)
+    return mdp.places
+
+
+def _coordinates(mdp: Mdp, cell_size: int) -> Rows:
+    """Each from 0 (first) to 1 (last), 0 where there is only one; -1 of a state that has no place."""
+    given = _places(mdp, "coordinates")
+    panels = given[:, :1] if given[:, 0].max() > 0 else given[:, :0]
+    places = np.concatenate([given[:, 1:], panels], axis=1).astype(np.float32)
     scaled = np.where(places < 0, np.float32(-1), places / np.maximum(places.max(axis=0), 1))
     return spaces.Box(min(0.0, scaled.min()), 1.0, scaled.shape[1:], np.float32), scaled
 
 
 def _image(mdp: Mdp, cell_size: int) -> Rows:
-    if mdp.places is None:
-        raise InputError(
-            f"observation image: the states of {mdp.name} have no places; take another observation"
-        )
+    _places(mdp, "image")
     cell_size = positive_int("cell_size", cell_size)
     width, height = drawing.frame_size(mdp, cell_size)
     size = mdp.num_states * 3 * width * height
@@ -115,10 +117,6 @@ def _image(mdp: Mdp, cell_size: int) -> Rows:
     for state, frame in enumerate(pixels):
         frame[...] = drawing.draw_frame(mdp, state, cell_size).transpose(2, 0, 1)
     return spaces.Box(0, 255, pixels.shape[1:], np.uint8), pixels
-
-
-def _none(mdp: Mdp, cell_size: int) -> Rows:
-    return spaces.Discrete(mdp.num_numbers), mdp.number
 
 
 def _own(mdp: Mdp, cell_size: int) -> Rows:
@@ -141,7 +139,7 @@ KINDS: dict[str, Callable[[Mdp, int], Rows]] = {  # takes the world and `cell_si
     "coordinates": _coordinates,
     "image": _image,
     "own": _own,
-    "none": _none,
+    "none": lambda mdp, cell_size: (spaces.Discrete(mdp.num_numbers), mdp.number),
 }
 
 

@@ -44,20 +44,16 @@ NO_EPISODES = Returns(0, 0.0)
 class StatisticsVectorEnv(GridWorldVectorEnv):
     """A `GridWorldVectorEnv` that resets in the same step, so that every step is one that an agent chose.
 
-    `exploration_bonus` is β, at least 0; `visits` (S, A), int64, is the same array always.
+    `exploration_bonus` is β, at least 0; `visits` (S, A), int64, counts how often each action was
+    taken in each state; it is the same array always.
     """
 
     def __init__(self, num_envs: int, *, exploration_bonus: float = 0.0, **settings: Any) -> None:
         super().__init__(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
         self.exploration_bonus = exploration_bonus
-        self._visits = np.zeros((self.mdp.num_states, self.mdp.num_actions), dtype=np.int64)
-        self._flat_visits = self._visits.reshape(-1)
+        self.visits = np.zeros((self.mdp.num_states, self.mdp.num_actions), dtype=np.int64)
+        self._flat_visits = self.visits.reshape(-1)
         self._ended = NO_EPISODES  # since they were last taken
-
-    @property
-    def visits(self) -> NDArray[np.int64]:
-        """(S, A), int64, how often each action was taken in each state."""
-        return self._visits
 
     def advance(self, actions: NDArray[Any]) -> Advance:
         """See `GridWorldVectorEnv.advance`."""
@@ -112,7 +108,7 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
     def set_state(self, state: State) -> None:
         """See `GridWorldVectorEnv.set_state`."""
         super().set_state(state)
-        fill(self._visits, state["visits"], "visits")
+        fill(self.visits, state["visits"], "visits")
         self._ended = Returns(int(state["ended"]), float(state["ended_return"]))
 
     def take_returns(self) -> Returns:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.envs.frames.board import Board, Kind, Panel, board_of
+from gridworld.envs.frames.board import Board, Kind, board_of
 from gridworld.envs.frames.text_drawing import Colour as Colour
 from gridworld.envs.frames.text_drawing import import_pygame as import_pygame
 from gridworld.envs.frames.text_drawing import text_size, write
@@ -144,13 +144,9 @@ def draw_grid(surface: Any, board: Board, cell_size: int) -> None:
             for row, col in np.argwhere(board.state[rows, cols] >= 0).tolist():
                 box = left + col * cell_size, top + row * cell_size, cell_size + 1, cell_size + 1
                 draw.rect(surface, GRID_LINE, box, 1)
-        _name_panel(surface, panel, cell_size)
-
-
-def _name_panel(surface: Any, panel: Panel, cell_size: int) -> None:
-    size = text_size(panel.name, min(round(0.6 * cell_size), 16), panel.cols * cell_size)
-    if panel.name and size is not None:
-        write(surface, panel.name, (panel.left + 1) * cell_size, round((panel.top + 0.5) * cell_size), size)
+        size = text_size(panel.name, min(round(0.6 * cell_size), 16), right - left)
+        if panel.name and size is not None:
+            write(surface, panel.name, left, round((panel.top + 0.5) * cell_size), size)
 
 
 def draw_terminals(surface: Any, board: Board, cell_size: int) -> None:

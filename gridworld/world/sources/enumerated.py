@@ -201,9 +201,9 @@ class _Replays:
         way: list[int] = []
         while target != state:
             origin = int(before[target])
-            way.insert(0, int(np.argmax(mdp.next_state[origin, :, 0] == target)))
+            way.append(int(np.argmax(mdp.next_state[origin, :, 0] == target)))
             target = origin
-        return way or [int(self._random.integers(mdp.num_actions))]
+        return way[::-1] or [int(self._random.integers(mdp.num_actions))]
 
     def _seen(self, snapshots: Snapshots, observation: Any) -> tuple[bytes, bytes]:
         return snapshots.key(self._subject.ignore), key_of(observation)

@@ -11,10 +11,9 @@ import copy
 import dis
 import functools
 import pickle
-import random
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from types import CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
@@ -22,7 +21,7 @@ import gymnasium as gym
 import numpy as np
 
 from gridworld.errors import InputError, in_short
-from gridworld.world.sources.snapshots import GENERATORS, random_states
+from gridworld.world.sources.snapshots import GENERATORS, generator_state, random_states
 
 _CALLS = 1000  # at least
 _MOST_READ = 20_000  # objects
@@ -42,12 +41,20 @@ def asked(where: str, owner: Any, method: str, arguments: list[Any], chain: Iter
     `chain` are the environments that it may refer to; `where` is what messages call the environment.
     """
     name, ask = f"{method}() of {type(owner).__name__}", getattr(owner, method)
+
+    def all_of(order: list[Any]) -> list[Any]:
+        return [copy.deepcopy(ask(copy.deepcopy(each))) for each in order]
+
     try:
-        found = _all(ask, arguments)
+        found = all_of(arguments)
         before = remembered(where, name, owner, chain)
-        for _ in range(1 + _CALLS // max(1, len(arguments))):
-            _compare(where, name, arguments, found, _all(ask, arguments[::-1])[::-1])
-        _compare(where, name, arguments, found, _all(ask, arguments))
+        for order in [*[-1] * (1 + _CALLS // max(1, len(arguments))), 1]:  # backwards, at last forwards
+            again = all_of(arguments[::order])[::order]
+            for argument, one, other in zip(arguments, found, again, strict=True):
+                if not same(one, other):
+                    raise InputError(
+                        f"{where}: {name} does not always give the same for {str(argument)[:50]}{SO_UNKNOWN}"
+                    )
     except InputError:
         raise
     except Exception as error:  # it may be anybody's
@@ -55,18 +62,6 @@ def asked(where: str, owner: Any, method: str, arguments: list[Any], chain: Iter
     if remembered(where, name, owner, chain) != before:
         raise InputError(f"{where}: {name} keeps a memory or draws random numbers{SO_UNKNOWN}")
     return found
-
-
-def _all(ask: Callable[[Any], Any], arguments: list[Any]) -> list[Any]:
-    return [copy.deepcopy(ask(copy.deepcopy(each))) for each in arguments]
-
-
-def _compare(where: str, name: str, arguments: list[Any], found: list[Any], again: list[Any]) -> None:
-    for argument, one, other in zip(arguments, found, again, strict=True):
-        if not same(one, other):
-            raise InputError(
-                f"{where}: {name} does not always give the same for {str(argument)[:50]}{SO_UNKNOWN}"
-            )
 
 
 def same(one: Any, other: Any) -> bool:
@@ -134,12 +129,8 @@ class _Reader:
             if self._follows:
                 raise _AnotherEnvError
             yield "environment"
-        elif isinstance(value, np.random.Generator):
-            yield repr(value.bit_generator.state)
-        elif isinstance(value, np.random.RandomState):
-            yield repr(value.get_state())
-        elif isinstance(value, random.Random):
-            yield repr(value.getstate())
+        elif isinstance(value, GENERATORS):
+            yield repr(generator_state(value))
         elif isinstance(value, gym.Space):
             yield from (value._np_random, repr(value)) if self._follows else [repr(value)]
         elif isinstance(value, np.ndarray):

@@ -81,15 +81,16 @@ def random_states(env: gym.Env[Any, Any] | None = None) -> list[Any]:
     """The states of all generators that a step may draw from: the environment's, and those that all share."""
     torch = sys.modules.get("torch")
     shared = [] if torch is None else [torch.get_rng_state().numpy().tobytes()]
-    shared += [random.getstate(), _generator_state(np.random.mtrand._rand)]
+    shared += [random.getstate(), generator_state(np.random.mtrand._rand)]
     if env is None:
         return shared
     sources = [env, *(each for each in vars(env).values() if isinstance(each, (gym.Space, *GENERATORS)))]
     found = [getattr(each, "_np_random", each) for each in sources]
-    return shared + [_generator_state(each) for each in found if isinstance(each, GENERATORS)]
+    return shared + [generator_state(each) for each in found if isinstance(each, GENERATORS)]
 
 
-def _generator_state(generator: Any) -> Any:
+def generator_state(generator: Any) -> Any:
+    """Where a generator of `GENERATORS` is, as a value to compare."""
     if isinstance(generator, random.Random):
         return generator.getstate()
     if isinstance(generator, np.random.Generator):
