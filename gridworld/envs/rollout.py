@@ -84,11 +84,6 @@ class Episode:
         return Episode(self.states[:states], self.actions[: states - 1], self.rewards[: states - 1])
 
 
-def play_episode(mdp: Mdp, policy: FloatArray, max_episode_steps: int, seed: int) -> IntArray:
-    """The states of an episode, (steps + 1,); see `play`."""
-    return play(mdp, policy, max_episode_steps, seed).states
-
-
 def play(mdp: Mdp, policy: FloatArray, max_episode_steps: int, seed: int) -> Episode:
     """Play one episode of a policy (S, A); what it draws is independent of `seed`, the environment's."""
     policy = check_policy(mdp, policy)
