@@ -32,8 +32,8 @@ from gridworld.world.sources.wrappers import NEUTRAL, Wrapped, known_class, step
 
 # What a batch is, by the class whose methods it runs.
 _GYMNASIUM, _SB3 = "gymnasium.wrappers.vector", "stable_baselines3.common.vec_env"
-_NATIVE, _COPIES, _PROCESSES, _TABLE = "native", "copies", "other processes", "table"
-_GYMNASIUM_BATCHES = {
+_NATIVE, _COPIES, _PROCESSES, _TABLE, _OURS = "native", "copies", "other processes", "table", "native of SB3"
+_BATCHES = {
     "gridworld.envs.vector_env:GridWorldVectorEnv": _NATIVE,
     "gridworld.envs.statistics_env:StatisticsVectorEnv": _NATIVE,
     "gridworld.envs.observations:VectorTableObservation": _TABLE,
@@ -43,9 +43,7 @@ _GYMNASIUM_BATCHES = {
     f"{_GYMNASIUM}.dict_info_to_list:DictInfoToList": NEUTRAL,
     f"{_GYMNASIUM}.rendering:HumanRendering": NEUTRAL,
     f"{_GYMNASIUM}.rendering:RecordVideo": NEUTRAL,
-}
-_SB3_BATCHES = {
-    "gridworld.agents.sb3.vec_env:GridWorldVecEnv": _NATIVE,
+    "gridworld.agents.sb3.vec_env:GridWorldVecEnv": _OURS,
     f"{_SB3}.dummy_vec_env:DummyVecEnv": _COPIES,
     f"{_SB3}.subproc_vec_env:SubprocVecEnv": _PROCESSES,
     f"{_SB3}.vec_check_nan:VecCheckNan": NEUTRAL,
@@ -56,6 +54,10 @@ _SB3_BATCHES = {
     f"{_SB3}.vec_transpose:VecTransposeImage": "transpose",
     f"{_SB3}.vec_frame_stack:VecFrameStack": "memory",
 }
+_DECISIVE = (  # methods of a batch: who overrides one may do anything
+    *("step", "reset", "advance", "observations"),
+    *("step_async", "step_wait", "_save_obs", "_obs_from_buf"),
+)
 # Attributes that say where an episode is, not what is done in it.
 _OF_AN_EPISODE = {
     *("env", "_np_random", "_np_random_seed", "state", "_state", "s", "lastaction", "_elapsed_steps"),
@@ -127,10 +129,8 @@ def world_of(env: Any) -> Mdp:
 def _task(env: Any) -> Task:
     if isinstance(env, gym.Env):
         return _single(env)
-    if isinstance(env, gym.vector.VectorEnv):
-        return _gymnasium_batch(env)
-    if hasattr(env, "step_wait"):
-        return _sb3_batch(env)
+    if isinstance(env, gym.vector.VectorEnv) or hasattr(env, "step_wait"):
+        return _batch(env)
     raise _no_world(env)
 
 
@@ -260,11 +260,10 @@ def _rows(table: ObservationTable) -> Any:
     return table.stored if isinstance(table.stored, dict) else table.table()
 
 
-def _batch_kind(env: Any, table: dict[str, str], *methods: str) -> str:
-    """What is known of a batch or of a wrapper around one, by the methods that decide what it does."""
-    kind, name = known_class(env, table, methods), type(env).__name__
-    also = {_NATIVE: "advance", _TABLE: "observations"}.get(kind or "")
-    if kind is None or (also is not None and known_class(env, table, [also]) is None):
+def _batch(env: Any) -> Task:
+    """The task of a batch, or of a wrapper around one."""
+    kind, name = known_class(env, _BATCHES, _DECISIVE), type(env).__name__
+    if kind is None:
         raise InputError(
             f"env: {name} is no batch, and no wrapper of one, whose effect on the task is known, so nothing "
             "exact is known of what is in it; leave it out, or give one environment as env=..."
@@ -274,44 +273,29 @@ def _batch_kind(env: Any, table: dict[str, str], *methods: str) -> str:
             f"env: {name} has its environments in other processes, where their wrappers cannot be looked at; "
             "give one environment, made as they are, as env=..."
         )
-    return kind
-
-
-def _gymnasium_batch(env: Any) -> Task:
-    kind = _batch_kind(env, _GYMNASIUM_BATCHES, "step", "reset")
     if kind == _COPIES:
         return _copies(env)
     if kind == _NATIVE:
         verified(env.mdp, "env")
         limit = env.step_limit if env.step_limit <= MOST_STEPS else None  # what it plays by
         return Task(env.mdp, limit, seen=lambda: make_observation(env.mdp, "none"))
-    below = _gymnasium_batch(env.env)
-    return replace(below, seen=lambda: env.table) if kind == _TABLE else below
-
-
-def _sb3_batch(env: Any) -> Task:
-    kind = _batch_kind(
-        env, _SB3_BATCHES, "step", "step_async", "step_wait", "reset", "_save_obs", "_obs_from_buf"
-    )
-    if kind == _COPIES:
-        return _copies(env)
-    if kind == _NATIVE:
-        below = _gymnasium_batch(env.envs)
-        return replace(below, seen=lambda: env.observation)
-    below = _sb3_batch(env.venv)
+    if kind == _OURS:
+        return replace(_batch(env.envs), seen=lambda: env.observation)
+    below = _batch(env.env if isinstance(env, gym.vector.VectorWrapper) else env.venv)
     if kind == NEUTRAL:
         return below
+    if kind == _TABLE:
+        return replace(below, seen=lambda: env.table)
 
     def seen() -> ObservationTable:
         if kind not in _BY_METHOD:
             raise InputError(
-                f"env: {type(env).__name__} makes observations of more than the state, so no table "
-                "of the policy can be evaluated exactly; leave it out"
+                f"env: {name} makes observations of more than the state, so no table of the policy can be "
+                "evaluated exactly; leave it out"
             )
         assert below.seen is not None
-        return tabulated(
-            env.observation_space, _BY_METHOD[kind](env, _rows(below.seen())), below.mdp.num_states
-        )
+        rows = _BY_METHOD[kind](env, _rows(below.seen()))
+        return tabulated(env.observation_space, rows, below.mdp.num_states)
 
     return replace(below, seen=seen)
 
