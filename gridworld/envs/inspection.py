@@ -12,6 +12,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from os import PathLike
+from types import MethodType
 from typing import Any
 
 import gymnasium as gym
@@ -141,8 +142,8 @@ def _no_world(env: Any) -> InputError:
     )
 
 
-def _single(env: gym.Env[Any, Any], walked: bool = True) -> Task:
-    """The task of a single environment; `walked`: whether to step one with a table beside it."""
+def _single(env: gym.Env[Any, Any]) -> Task:
+    """The task of a single environment."""
     real, limit = env.unwrapped, step_limit(env)
     innermost = [env, *(wrapper.env for wrapper in wrappers_of(env))][-1]
     mdp = getattr(real, "mdp", None)
@@ -159,7 +160,7 @@ def _single(env: gym.Env[Any, Any], walked: bool = True) -> Task:
             )
         verified(mdp, "env")
     elif has_table(real):
-        mdp = compile_table(real, limit, walked)
+        mdp = compile_table(real, limit)
     else:
         raise _no_world(real)
     wrapped = Wrapped("env", env, mdp)
@@ -176,11 +177,11 @@ def _seen(env: gym.Env[Any, Any], wrapped: Wrapped, mdp: Mdp) -> ObservationTabl
     if not wrapped.transforms and not wrapped.memory:
         return make_observation(mdp, "none")
     only = wrapped.transforms[0] if len(wrapped.transforms) == 1 and not wrapped.memory else None
-    if isinstance(only, TableObservation) and type(only).observation is TableObservation.observation:
+    own = getattr(only, "observation", None)
+    if isinstance(only, TableObservation) and own == MethodType(TableObservation.observation, only):
         return only.table
-    return tabulated(
-        env.observation_space, _stacked(wrapped.observations, env.observation_space), mdp.num_states
-    )
+    space = env.observation_space
+    return tabulated(space, _stacked(wrapped.observations, space), mdp.num_states)
 
 
 def _stacked(observations: list[Any], space: gym.Space[Any]) -> Any:
@@ -219,28 +220,28 @@ def _copies(batch: Any) -> Task:
                     "environment 0; give one of them, or a batch of one task"
                 )
 
+    def otherwise(index: int, what: str) -> InputError:
+        return InputError(
+            f"env: environment {index} of the {type(batch).__name__} {what} otherwise than environment 0; "
+            "give one of them, or a batch of one kind"
+        )
+
     def seen() -> ObservationTable:
         assert task.seen is not None
         table = task.seen()
         for index, other in tasks.items():
-            if other.seen is None or not _same_table(table, other.seen()):
-                raise _otherwise(batch, index, "shows states")
+            theirs = None if other.seen is None else other.seen()
+            if theirs is None or table.space != theirs.space or not same(_rows(table), _rows(theirs)):
+                raise otherwise(index, "shows states")
         return table
 
     def masks() -> NDArray[np.bool_] | None:
         for index, other in tasks.items():
             if not np.array_equal(task.masks(), other.masks()):  # type: ignore[arg-type]
-                raise _otherwise(batch, index, "masks actions")
+                raise otherwise(index, "masks actions")
         return task.masks()
 
     return replace(task, seen=functools.cache(seen), masks=masks)
-
-
-def _otherwise(batch: Any, index: int, what: str) -> InputError:
-    return InputError(
-        f"env: environment {index} of the {type(batch).__name__} {what} otherwise than environment 0; give "
-        "one of them, or a batch of one kind"
-    )
 
 
 def _is_copy(one: gym.Env[Any, Any], other: gym.Env[Any, Any]) -> bool:
@@ -250,10 +251,6 @@ def _is_copy(one: gym.Env[Any, Any], other: gym.Env[Any, Any]) -> bool:
         return False
     pairs = list(zip(*chains, strict=True))
     return all(alike(mine, its, _OF_AN_EPISODE) for mine, its in pairs)
-
-
-def _same_table(one: ObservationTable, other: ObservationTable) -> bool:
-    return one is other or (one.space == other.space and same(_rows(one), _rows(other)))
 
 
 def _rows(table: ObservationTable) -> Any:

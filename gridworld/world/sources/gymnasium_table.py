@@ -64,17 +64,14 @@ def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> M
     return replace(mdp, truth=truth)
 
 
-def compile_table(real: gym.Env[Any, Any], limit: int | None = None, walked: bool = True) -> Mdp:
-    """Compile the table of an environment without wrappers, which is left as it is.
+def compile_table(real: gym.Env[Any, Any], limit: int | None = None) -> Mdp:
+    """Compile the table of an environment without wrappers, which is left as it is; a copy is stepped.
 
-    `limit` is the step limit of its wrappers; `walked` says whether to step a copy beside the table. The
-    world is named after the environment's id, or its class where it has none.
+    `limit` is the step limit of its wrappers. The world has the environment's id, or else its class, as name.
     """
     mdp, table = _compiled(real, real.spec.id if real.spec is not None else type(real).__name__, limit)
     if own := {"step", "reset"} & vars(real).keys():
         raise InputError(f"{mdp.name}: its {own.pop()}() was replaced, so nothing exact is known of it")
-    if not walked:
-        return mdp
     key = (type(real), mdp.text()) if type(real).__module__.startswith("gymnasium.envs.") else None
     truth = _WALKED.get(key) or _check_steps(mdp, table, copied(real))
     if key is not None:
