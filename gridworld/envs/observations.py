@@ -164,16 +164,7 @@ def make_observation(mdp: Mdp, kind: str, cell_size: int = IMAGE_CELL_SIZE) -> O
 
 
 class TableObservation(gym.ObservationWrapper[Any, int, int], gym.utils.RecordConstructorArgs):
-    """A GridWorld environment with observations of some kind, (*shape).
-
-    Args:
-        env: the environment.
-        kind: a name in `KINDS`.
-        cell_size: pixels a cell, for images.
-
-    Raises:
-        InputError: another environment; or as `make_observation` does.
-    """
+    """A GridWorld environment with observations (*shape) of a kind of `KINDS`; `cell_size` is of images."""
 
     def __init__(self, env: gym.Env[int, int], kind: str, cell_size: int = IMAGE_CELL_SIZE) -> None:
         gym.utils.RecordConstructorArgs.__init__(self, kind=kind, cell_size=cell_size)
@@ -211,16 +202,9 @@ class ImageObservation(TableObservation):
 
 
 class VectorTableObservation(VectorObservationWrapper[Any, Any, Any, Any]):
-    """A GridWorld batch with observations of some kind, (num_envs, *shape).
+    """A GridWorld batch with observations (num_envs, *shape) of a kind of `KINDS`; `cell_size` is of images.
 
-    Args:
-        env: the batch.
-        kind: a name in `KINDS`.
-        cell_size: pixels a cell, for images.
-        copy: whether every step returns a fresh array; else all write to the same one, as in SyncVectorEnv.
-
-    Raises:
-        InputError: another batch; or as `make_observation` does.
+    `copy` says whether every step returns a fresh array; else all write to the same one, as in SyncVectorEnv.
     """
 
     def __init__(

@@ -27,11 +27,7 @@ class GridMdp(Mdp):
     """The tables of a map: a state is a cell, A = 4 actions, K outcomes (1 without slip, 3 with).
 
     Attributes:
-        layout: the map.
-        slip: the probability that a move goes elsewhere.
-        step_reward: of every step.
-        goal_reward: of entering a goal.
-        trap_reward: of entering a trap or a cliff.
+        layout: the map; slip and the rewards are those of `compile_mdp`.
         neighbour: (S, A), int32, where a move leads, geometry alone: borders and walls, no slip, fall or end.
         wall: (S,), bool.
         cliff: (S,), bool.

@@ -48,17 +48,17 @@ class MapError(InputError):
 
 @dataclass(frozen=True)
 class Layout:
-    """A checked map.
+    """A checked map; the module says what the kinds of cells are.
 
     Attributes:
         name: what messages call it.
         num_rows: its height in cells.
         num_cols: its width in cells.
         starts: the cells that episodes begin in.
-        goals: see above, as for the others.
-        traps: see there.
-        walls: see there.
-        cliffs: see there.
+        goals: cells that end an episode with success.
+        traps: cells that end it without.
+        walls: cells that cannot be entered.
+        cliffs: cells that send back to the start.
 
     Raises:
         InputError: the map could not be played.

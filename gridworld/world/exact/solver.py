@@ -78,10 +78,9 @@ def pick(table: FloatArray, actions: IntArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The optimum of a world under one discount.
+    """The optimum of a world under one discount γ.
 
     Attributes:
-        gamma: the discount.
         v: (S,), float64, V*.
         q: (S, A), float64, Q*.
         optimal: (S, A), True for every action as good as the best; all actions where it is over.

@@ -22,12 +22,7 @@ def build(builder: str | Callable[..., Any], kwargs: Mapping[str, Any] | None = 
         kwargs: its arguments.
 
     Returns:
-        The world, named after the function unless what that returns has a name. A map's is an `Mdp` as any
-        other.
-
-    Raises:
-        InputError: there is no such function, it raises something, what it returns is no world, or another
-            one each time.
+        The world, named after the function unless what that returns has a name.
     """
     where = f"env.builder={_name_of(builder) if callable(builder) else str(builder)[:200]}"
     function = imported("env.builder", builder) if isinstance(builder, str) else builder

@@ -66,10 +66,6 @@ def enumerate_env(
 
     Returns:
         The world; its `truth` is "enumerated, N states", and without which attributes.
-
-    Raises:
-        InputError: it cannot be made; it has other than discrete actions, layouts that are drawn anew, random
-            steps, states that cannot be copied, or too many; or it does something else than its table.
     """
     with telling_if_slow(f"enumerating {env_id}"):
         env = make_env(env_id, kwargs)

@@ -20,7 +20,6 @@ from gridworld.errors import InputError
 from gridworld.world.exact.solver import backup
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 from gridworld.world.outcomes import Outcomes
-from gridworld.world.sources.known_envs import known_env
 from gridworld.world.sources.snapshots import Snapshots
 
 if TYPE_CHECKING:
@@ -47,9 +46,12 @@ _PROBES = 12
 _WATCHED = 5  # episodes after which it is seen which attributes change
 
 
-def walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> str:
-    """Compare steps of the real environment with its table; says what was compared, and how exactly."""
-    walker = _Walker(mdp, table, real)
+def walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any], is_known: bool) -> str:
+    """Compare steps of the real environment with its table; says what was compared, and how exactly.
+
+    `is_known`: whether it is one of Gymnasium's own classes.
+    """
+    walker = _Walker(mdp, table, real, is_known)
     walker.along_policies(_WALK)
     while walker.episodes < _RESETS:
         walker.reset()
@@ -63,7 +65,7 @@ def walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> str:
 class _Walker:
     """Steps an environment, and counts what its R = N * A rows did."""
 
-    def __init__(self, mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> None:
+    def __init__(self, mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any], is_known: bool) -> None:
         self.mdp, self.table, self.real = mdp, table, real
         self.episodes = 0
         self._rng = np.random.default_rng(SEED)
@@ -80,7 +82,7 @@ class _Walker:
         self._met: list[tuple[int, int, float, bool]] = []  # row, next state, reward, terminated
         self._state = self._elapsed = 0
         self._shows_state = True  # as the attribute `s`, so far
-        self._is_known = known_env(real.unwrapped) is not None
+        self._is_known = is_known
         self._changed: set[str] = set()
 
     def reset(self) -> None:
