@@ -86,7 +86,7 @@ def enumerate_env(
 
 def _own_limit(subject: Subject, graph: Graph) -> int | None:
     """The time at which it truncates all episodes, if any."""
-    times = np.broadcast_to(graph.depth[:, None] + 1, graph.truncated.shape)
+    times = np.broadcast_to(np.array(graph.depth)[:, None] + 1, graph.truncated.shape)
     truncating = graph.truncated & ~graph.terminated
     if not truncating.any():
         return None
