@@ -182,7 +182,12 @@ class GridWorldEnv(gym.Env[int, int]):
         Raises:
             InputError: another action.
         """
-        move = check_action(action)
+        try:
+            move = -1 if isinstance(action, bool | np.bool_) else operator.index(action)
+        except TypeError:
+            move = -1
+        if not 0 <= move < NUM_ACTIONS:
+            raise InputError(f"action={action!r}: must be 0 (up), 1 (right), 2 (down) or 3 (left)")
         state, mdp = self._state, self.mdp
         if mdp.terminal[state]:
             if self.render_mode == "human":
@@ -253,17 +258,6 @@ class GridWorldEnv(gym.Env[int, int]):
             draw.polygon(screen, colour, list(coords_list))
         else:
             raise InputError(f"coords_list: {len(coords_list)} points make no shape; give 1, 3 or more")
-
-
-def check_action(action: Any) -> int:
-    """An action as an int from 0 to 3; refuses anything else, floats and bools included."""
-    try:
-        move = -1 if isinstance(action, bool | np.bool_) else operator.index(action)
-    except TypeError:
-        move = -1
-    if not 0 <= move < NUM_ACTIONS:
-        raise InputError(f"action={action!r}: must be 0 (up), 1 (right), 2 (down) or 3 (left)")
-    return move
 
 
 def play_random_episode() -> None:

@@ -15,7 +15,7 @@ from os import PathLike
 import numpy as np
 
 from gridworld.errors import InputError
-from gridworld.world.layout import CLASSIC, MOVES, NUM_COLS, NUM_ROWS, Cell, Layout, load_by_default_size
+from gridworld.world.layout import CLASSIC, MOVES, NUM_COLS, NUM_ROWS, Cell, Layout, load, positive_int
 from gridworld.world.mdp import BoolArray, IntArray, Mdp, checked_reward, finite, frozen, grid_places
 
 ACTION_NAMES = ("up", "right", "down", "left")
@@ -149,8 +149,9 @@ def mdp_or_compiled(
     """
     described = (layout, num_rows, num_cols, slip, step_reward, goal_reward, trap_reward)
     if mdp is None:
-        world = load_by_default_size(layout, num_rows, num_cols)
-        return compile_mdp(world, slip, step_reward, goal_reward, trap_reward)
+        rows, cols = positive_int("num_rows", num_rows), positive_int("num_cols", num_cols)
+        given = load(layout, None if rows == NUM_ROWS else rows, None if cols == NUM_COLS else cols)
+        return compile_mdp(given, slip, step_reward, goal_reward, trap_reward)
     if not isinstance(mdp, Mdp):
         raise InputError(f"mdp={str(mdp)[:50]}: must be a compiled world, as `compile_mdp` makes one")
     if described != (CLASSIC, NUM_ROWS, NUM_COLS, 0.0, 0.0, 1.0, -1.0):

@@ -177,12 +177,6 @@ def load(
     return loaded
 
 
-def load_by_default_size(layout: str | PathLike[str] | Layout, num_rows: int, num_cols: int) -> Layout:
-    """`load` for callers whose default size is that of `classic`, which also means that none is given."""
-    rows, cols = positive_int("num_rows", num_rows), positive_int("num_cols", num_cols)
-    return load(layout, None if rows == NUM_ROWS else rows, None if cols == NUM_COLS else cols)
-
-
 def shipped_layouts() -> tuple[str, ...]:
     """Names of all layouts that come with the package."""
     maps = (entry.name for entry in files("gridworld").joinpath("layouts").iterdir())

@@ -220,7 +220,9 @@ class Wrapped:
         real = copied(self._env.unwrapped)
         seen: dict[int, Any] = {id(self._env.unwrapped): real}
         for wrapper in list(wrappers_of(self._env))[::-1]:
-            if wrapper in self.transforms or type(wrapper).__name__ in _COPIED or _only_adds(wrapper):
+            kind = type(wrapper)
+            only_adds = kind.step is gym.Wrapper.step and kind.reset is gym.Wrapper.reset
+            if wrapper in self.transforms or kind.__name__ in _COPIED or only_adds:
                 seen[id(getattr(wrapper, "results_writer", None))] = None  # an open file, of a Monitor
                 try:
                     real = copy.deepcopy(wrapper, seen)
@@ -367,11 +369,6 @@ class Wrapped:
                 f"{self._where}: what is seen of state {number} through its wrappers is not always the same"
                 f"{SO_UNKNOWN}"
             )
-
-
-def _only_adds(wrapper: gym.Wrapper[Any, Any, Any, Any]) -> bool:
-    """Whether a wrapper adds attributes and methods, and leaves the steps alone."""
-    return type(wrapper).step is gym.Wrapper.step and type(wrapper).reset is gym.Wrapper.reset
 
 
 class _Probe(gym.Wrapper[Any, Any, Any, Any]):
