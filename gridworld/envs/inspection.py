@@ -55,10 +55,8 @@ _BATCHES = {
     f"{_SB3}.vec_transpose:VecTransposeImage": "transpose",
     f"{_SB3}.vec_frame_stack:VecFrameStack": "memory",
 }
-_DECISIVE = (  # methods of a batch: who overrides one may do anything
-    *("step", "reset", "advance", "observations"),
-    *("step_async", "step_wait", "_save_obs", "_obs_from_buf"),
-)
+# Methods of a batch: who overrides one may do anything.
+_DECISIVE = ("step", "reset", "advance", "step_async", "step_wait", "_save_obs", "_obs_from_buf")
 # Attributes that say where an episode is, not what is done in it.
 _OF_AN_EPISODE = {
     *("env", "_np_random", "_np_random_seed", "state", "_state", "s", "lastaction", "_elapsed_steps"),
@@ -259,7 +257,8 @@ def _rows(table: ObservationTable) -> Any:
 
 def _batch(env: Any) -> Task:
     """The task of a batch, or of a wrapper around one."""
-    kind, name = known_class(env, _BATCHES, _DECISIVE), type(env).__name__
+    of_wrapper = ("observations",) if isinstance(env, gym.vector.VectorWrapper) else ()
+    kind, name = known_class(env, _BATCHES, (*_DECISIVE, *of_wrapper)), type(env).__name__
     if kind is None:
         raise InputError(
             f"env: {name} is no batch, and no wrapper of one, whose effect on the task is known, so nothing "

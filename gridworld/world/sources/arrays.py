@@ -1,6 +1,6 @@
-"""Worlds as arrays: a file of one's own (.npz), and the file that a run keeps of its world.
+"""Worlds as arrays: of a custom file (.npz) or function, and the file that a run keeps of its world.
 
-A world of one's own, with N states, A actions and at most K outcomes of each:
+A custom world, with N states, A actions and at most K outcomes of each:
 
     next_state         (N, A, K)  whole numbers from 0 to N - 1: the state that follows
     probability        (N, A, K)  of each outcome; 0 where there is none
@@ -27,7 +27,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.errors import InputError
+from gridworld.errors import InputError, in_short
+from gridworld.process.import_path import imported
 from gridworld.process.memory_budget import check_memory
 from gridworld.process.npz import npz_arrays, npz_bytes
 from gridworld.process.users_file import open_users_file
@@ -51,7 +52,7 @@ _FORMAT = np.array("gridworld world 1")
 
 
 def load_world(path: str | PathLike[str]) -> Mdp:
-    """Read a world from a file: one of one's own, or a run's `world.npz`. The module says what is in them.
+    """Read a world from a file: a custom one, or a run's `world.npz`. The module says what is in them.
 
     Args:
         path: an .npz file, relative to the folder that the program was started in.
@@ -97,6 +98,54 @@ def mdp_from_arrays(name: str, arrays: Mapping[str, Any], where: str) -> Mdp:
     )
     called = checked_text(where, "name", given["name"]) if "name" in given else name
     return verified(dataclasses.replace(mdp, name=called), where)
+
+
+def build(builder: str | Callable[..., Any], kwargs: Mapping[str, Any] | None = None) -> Mdp:
+    """Call a function that makes a world.
+
+    Args:
+        builder: the function, or its import path, `package.module.function`. It returns an `Mdp`, `Outcomes`,
+            or arrays by their names, as the module has them.
+        kwargs: its arguments.
+
+    Returns:
+        The world, named after the function unless what that returns has a name.
+    """
+    where = f"env.builder={_name_of(builder) if callable(builder) else str(builder)[:200]}"
+    function = imported("env.builder", builder) if isinstance(builder, str) else builder
+    if not callable(function):
+        raise InputError(f"{where}: must be the import path of a function, e.g. my_package.worlds.make")
+    mdp, again = (_built(where, function, dict(kwargs or {})) for _ in range(2))
+    if mdp.text() != again.text():
+        raise InputError(
+            f"{where}: makes another world each time that it is called, so that no run is about one; what it "
+            "draws must follow from env.kwargs, e.g. a seed"
+        )
+    return mdp
+
+
+def _built(where: str, function: Callable[..., Any], kwargs: dict[str, Any]) -> Mdp:
+    try:
+        found = function(**kwargs)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    except (Exception, SystemExit) as error:  # a function of the user's own may raise anything
+        raise InputError(f"{where}: raised {in_short(error)}") from error
+    name = _name_of(function)
+    if isinstance(found, Mdp):
+        plain = {field.name: getattr(found, field.name) for field in dataclasses.fields(Mdp)}
+        return verified(Mdp(**plain), where)
+    if isinstance(found, Outcomes):
+        return verified(dataclasses.replace(mdp_from_outcomes(where, found), name=name), where)
+    if isinstance(found, Mapping):
+        return mdp_from_arrays(name, found, where)
+    raise InputError(
+        f"{where}: returned {type(found).__name__}, must return an Mdp, Outcomes, or a mapping of arrays"
+    )
+
+
+def _name_of(function: Any) -> str:
+    return str(getattr(function, "__name__", type(function).__name__))
 
 
 def _check_names(where: str, arrays: Mapping[str, Any]) -> None:
