@@ -6,10 +6,9 @@ import numpy as np
 
 from gridworld.checking.training import Trained
 from gridworld.checking.worlds import BONUS
-from gridworld.world.exact.bellman import backup
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.exact.markov_chain import Chain
-from gridworld.world.exact.solver import solved
+from gridworld.world.exact.solver import backup, solved
 from gridworld.world.mdp import BoolArray, FloatArray, Mdp
 
 TOLERANCE = 0.1  # of a value, relative to the largest number in the world

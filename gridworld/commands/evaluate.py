@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from gridworld.commands import parser_for_a_run, whole_number
 from gridworld.envs.env import GridWorldEnv
 from gridworld.envs.frames.rendering import has_display
-from gridworld.envs.rollout import SampledScores, play_episode, sample_episodes
+from gridworld.envs.rollout import SampledScores, play, sample_episodes
 from gridworld.errors import InputError
 from gridworld.process.console.columns import aligned
 from gridworld.process.console.command_line import program
@@ -106,7 +106,7 @@ def _verdict(evaluator: Evaluator, policy: FloatArray, score: Score) -> str:
 
 def _show(evaluator: Evaluator, policy: FloatArray, seed: int) -> None:
     """Play one episode in a window."""
-    states = play_episode(evaluator.mdp, policy, evaluator.max_episode_steps, seed)
+    states = play(evaluator.mdp, policy, evaluator.max_episode_steps, seed).states
     env = GridWorldEnv(render_mode="human", mdp=evaluator.mdp)
     try:
         for state in states:

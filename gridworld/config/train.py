@@ -87,7 +87,7 @@ class TrainConfig:
     exploration_bonus: float = 0.0
     # share of training episodes that begin in a state drawn uniformly
     exploring_starts: float = field(default=0.0, metadata=privilege("starts anywhere"))
-    # whether environments in one state share out an action's outcomes evenly, see `gridworld.envs.stratified`
+    # whether environments in one state share out an action's outcomes evenly, see `gridworld.envs.vector_env`
     stratified_draws: bool = field(default=False, metadata=privilege("stratified draws"))
     device: Word = field(default="cpu", metadata=affects(Effect.MACHINE))
     threads: int = field(default=1, metadata=affects(Effect.MACHINE))  # of torch

@@ -188,7 +188,7 @@ class BuiltConfig(EnvConfig):
 
     def compile(self) -> Mdp:
         """See `EnvConfig.compile`."""
-        from gridworld.world.sources.built import build
+        from gridworld.world.sources.arrays import build
 
         return build(self.builder, self.kwargs)
 

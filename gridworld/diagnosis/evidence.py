@@ -19,10 +19,9 @@ from gridworld.diagnosis.split import RegretSplit, split_regret
 from gridworld.errors import InputError
 from gridworld.report.evidence.curve_reader import read_columns
 from gridworld.restore.saved_run import SavedRun, read_visits
-from gridworld.world.exact.bellman import backup, pick
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.exact.markov_chain import Chain
-from gridworld.world.exact.solver import Solution, solved
+from gridworld.world.exact.solver import Solution, backup, pick, solved
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 
 

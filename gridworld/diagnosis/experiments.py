@@ -7,10 +7,9 @@ from functools import lru_cache
 import numpy as np
 
 from gridworld.diagnosis.evidence import Evidence
-from gridworld.world.exact.bellman import backup
 from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import Chain
-from gridworld.world.exact.occupancy import discounted_visits, stopping_states
+from gridworld.world.exact.markov_chain import Chain, discounted_visits, stopping_states
+from gridworld.world.exact.solver import backup
 from gridworld.world.mdp import BoolArray, FloatArray, Mdp
 
 _SWEEPS = 1000

@@ -21,8 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gridworld.world.exact.evaluation import Evaluator, Score
-from gridworld.world.exact.markov_chain import Chain
-from gridworld.world.exact.occupancy import discounted_visits, stopping_states
+from gridworld.world.exact.markov_chain import Chain, discounted_visits, stopping_states
 from gridworld.world.mdp import BoolArray, FloatArray
 
 

@@ -16,7 +16,7 @@ from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.finding import Finding
 from gridworld.diagnosis.split import RegretSplit
 from gridworld.process.console.command_line import command
-from gridworld.world.discounts import score_of_optimum
+from gridworld.world.exact.evaluation import score_of_optimum
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 
 _MOST_CHANGES = 3

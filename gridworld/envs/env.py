@@ -102,21 +102,20 @@ class GridWorldEnv(gym.Env[int, int]):
 
         self._window: drawing.Window | None = None
         self._state: int = int(self.mdp.start_states[0])
-        self._describe(self.mdp.layout)
 
-    def _describe(self, world: Layout) -> None:
-        """The tutorial's public attributes."""
-        self.num_rows, self.num_cols = world.num_rows, world.num_cols
-        self.grid2state = {cell: state for state, cell in enumerate(world.cells())}
-        self.state2grid = dict(enumerate(world.cells()))
+        # The tutorial's public attributes.
+        drawn = self.mdp.layout
+        self.num_rows, self.num_cols = drawn.num_rows, drawn.num_cols
+        self.state2grid: dict[int, Cell] = dict(enumerate(drawn.cells()))
+        self.grid2state: dict[Cell, int] = {cell: state for state, cell in self.state2grid.items()}
         self.action_defs: dict[int, Callable[[int, int], Cell]] = {
             action: partial(self._move, action) for action in range(NUM_ACTIONS)
         }
-        self.gold_cell = world.goals[0]
+        self.gold_cell = drawn.goals[0]
         self.gold_state = self.grid2state[self.gold_cell]
-        self.trap_cells = list(world.traps)
-        self.trap_states = [self.grid2state[cell] for cell in world.traps]
-        self.terminal_states = [self.grid2state[cell] for cell in world.terminals]
+        self.trap_cells = list(drawn.traps)
+        self.trap_states = [self.grid2state[cell] for cell in drawn.traps]
+        self.terminal_states = [self.grid2state[cell] for cell in drawn.terminals]
 
     @property
     def mdp(self) -> GridMdp:
@@ -183,7 +182,12 @@ class GridWorldEnv(gym.Env[int, int]):
         Raises:
             InputError: another action.
         """
-        move = check_action(action)
+        try:
+            move = -1 if isinstance(action, bool | np.bool_) else operator.index(action)
+        except TypeError:
+            move = -1
+        if not 0 <= move < NUM_ACTIONS:
+            raise InputError(f"action={action!r}: must be 0 (up), 1 (right), 2 (down) or 3 (left)")
         state, mdp = self._state, self.mdp
         if mdp.terminal[state]:
             if self.render_mode == "human":
@@ -227,20 +231,11 @@ class GridWorldEnv(gym.Env[int, int]):
             self._window = None
 
     def get_coords(self, row: int, col: int, loc: str = "center") -> Point | list[Point]:
-        """Pixels for drawing into a cell.
+        """Pixels for drawing into a cell: one (x, y) for `center`, else a list of them.
 
-        Args:
-            row: of the cell, from 0.
-            col: of the cell, from 0.
-            loc: `center`; `interior_corners` are the corners of a square that lies MARGIN inside the cell,
-                clockwise from the top left; `interior_triangle` is bottom middle, top right, top left, a
-                third of a cell from the centre.
-
-        Returns:
-            One (x, y) for `center`, else a list of them.
-
-        Raises:
-            InputError: another `loc`.
+        `interior_corners` are the corners of a square that lies MARGIN inside the cell, clockwise from the
+        top left; `interior_triangle` is bottom middle, top right, top left, a third of a cell from the
+        centre.
         """
         x, y = drawing.cell_centre(row, col, self.cell_size)
         if loc == "center":
@@ -254,15 +249,7 @@ class GridWorldEnv(gym.Env[int, int]):
         raise InputError(f"loc={loc!r}: must be center, interior_corners or interior_triangle")
 
     def draw_object(self, screen: Any, coords_list: Sequence[Point]) -> None:
-        """Draw one point as a disc of 0.45 cell, three as a triangle, more as a polygon.
-
-        Args:
-            screen: pygame's surface to draw on.
-            coords_list: the points (x, y), in pixels.
-
-        Raises:
-            InputError: no points, or two.
-        """
+        """Draw one point (x, y) in pixels as a disc of 0.45 cell, three as a triangle, more as a polygon."""
         draw = drawing.import_pygame().draw
         if len(coords_list) == 1:
             draw.circle(screen, drawing.TRAP, coords_list[0], int(0.45 * self.cell_size))
@@ -271,24 +258,6 @@ class GridWorldEnv(gym.Env[int, int]):
             draw.polygon(screen, colour, list(coords_list))
         else:
             raise InputError(f"coords_list: {len(coords_list)} points make no shape; give 1, 3 or more")
-
-
-def check_action(action: Any) -> int:
-    """Check an action.
-
-    Returns:
-        It as an int from 0 to 3.
-
-    Raises:
-        InputError: it is anything else, floats and bools included.
-    """
-    try:
-        move = -1 if isinstance(action, bool | np.bool_) else operator.index(action)
-    except TypeError:
-        move = -1
-    if not 0 <= move < NUM_ACTIONS:
-        raise InputError(f"action={action!r}: must be 0 (up), 1 (right), 2 (down) or 3 (left)")
-    return move
 
 
 def play_random_episode() -> None:

@@ -12,6 +12,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from os import PathLike
+from types import MethodType
 from typing import Any
 
 import gymnasium as gym
@@ -25,15 +26,15 @@ from gridworld.errors import InputError
 from gridworld.world.grid import GridMdp, compile_mdp
 from gridworld.world.layout import Layout, load, positive_int
 from gridworld.world.mdp import Mdp
+from gridworld.world.outcomes import verified
 from gridworld.world.sources.gymnasium_table import compile_table, has_table
 from gridworld.world.sources.pure_functions import alike, same
-from gridworld.world.sources.verification import verified
 from gridworld.world.sources.wrappers import NEUTRAL, Wrapped, known_class, step_limit, wrappers_of
 
 # What a batch is, by the class whose methods it runs.
 _GYMNASIUM, _SB3 = "gymnasium.wrappers.vector", "stable_baselines3.common.vec_env"
-_NATIVE, _COPIES, _PROCESSES, _TABLE = "native", "copies", "other processes", "table"
-_GYMNASIUM_BATCHES = {
+_NATIVE, _COPIES, _PROCESSES, _TABLE, _OURS = "native", "copies", "other processes", "table", "native of SB3"
+_BATCHES = {
     "gridworld.envs.vector_env:GridWorldVectorEnv": _NATIVE,
     "gridworld.envs.statistics_env:StatisticsVectorEnv": _NATIVE,
     "gridworld.envs.observations:VectorTableObservation": _TABLE,
@@ -43,9 +44,7 @@ _GYMNASIUM_BATCHES = {
     f"{_GYMNASIUM}.dict_info_to_list:DictInfoToList": NEUTRAL,
     f"{_GYMNASIUM}.rendering:HumanRendering": NEUTRAL,
     f"{_GYMNASIUM}.rendering:RecordVideo": NEUTRAL,
-}
-_SB3_BATCHES = {
-    "gridworld.agents.sb3.vec_env:GridWorldVecEnv": _NATIVE,
+    "gridworld.agents.sb3.vec_env:GridWorldVecEnv": _OURS,
     f"{_SB3}.dummy_vec_env:DummyVecEnv": _COPIES,
     f"{_SB3}.subproc_vec_env:SubprocVecEnv": _PROCESSES,
     f"{_SB3}.vec_check_nan:VecCheckNan": NEUTRAL,
@@ -56,29 +55,14 @@ _SB3_BATCHES = {
     f"{_SB3}.vec_transpose:VecTransposeImage": "transpose",
     f"{_SB3}.vec_frame_stack:VecFrameStack": "memory",
 }
+# Methods of a batch: who overrides one may do anything.
+_DECISIVE = ("step", "reset", "advance", "step_async", "step_wait", "_save_obs", "_obs_from_buf")
 # Attributes that say where an episode is, not what is done in it.
 _OF_AN_EPISODE = {
-    *(
-        "env",
-        "_np_random",
-        "_np_random_seed",
-        "state",
-        "_state",
-        "s",
-        "lastaction",
-        "_elapsed_steps",
-        "_has_reset",
-    ),
-    *(
-        "needs_reset",
-        "rewards",
-        "t_start",
-        "total_steps",
-        "current_reset_info",
-        "results_writer",
-        "_cached_spec",
-    ),
-    *("episode_returns", "episode_lengths", "episode_times", "episode_start_time", "checked_step"),
+    *("env", "_np_random", "_np_random_seed", "state", "_state", "s", "lastaction", "_elapsed_steps"),
+    *("_has_reset", "needs_reset", "rewards", "t_start", "total_steps", "current_reset_info"),
+    *("results_writer", "_cached_spec", "checked_step"),
+    *("episode_returns", "episode_lengths", "episode_times", "episode_start_time"),
 }
 _BY_METHOD: dict[str, Callable[[Any, Any], Any]] = {  # what SB3's wrappers make of observations (S, ...)
     "extract": lambda wrapper, rows: rows[wrapper.key],
@@ -133,11 +117,7 @@ def task_of(env: Any, max_episode_steps: int | None = None) -> Task:
 
 
 def world_of(env: Any) -> Mdp:
-    """The world of an environment or a batch, with its step limit.
-
-    Raises:
-        InputError: as `task_of`.
-    """
+    """The world of an environment or a batch, with its step limit."""
     task = _task(env)
     usual = STEP_LIMIT if isinstance(task.mdp, GridMdp) else task.mdp.max_episode_steps  # what a map's means
     return (
@@ -148,10 +128,8 @@ def world_of(env: Any) -> Mdp:
 def _task(env: Any) -> Task:
     if isinstance(env, gym.Env):
         return _single(env)
-    if isinstance(env, gym.vector.VectorEnv):
-        return _gymnasium_batch(env)
-    if hasattr(env, "step_wait"):
-        return _sb3_batch(env)
+    if isinstance(env, gym.vector.VectorEnv) or hasattr(env, "step_wait"):
+        return _batch(env)
     raise _no_world(env)
 
 
@@ -162,8 +140,8 @@ def _no_world(env: Any) -> InputError:
     )
 
 
-def _single(env: gym.Env[Any, Any], walked: bool = True) -> Task:
-    """The task of a single environment; `walked`: whether to step one with a table beside it."""
+def _single(env: gym.Env[Any, Any]) -> Task:
+    """The task of a single environment."""
     real, limit = env.unwrapped, step_limit(env)
     innermost = [env, *(wrapper.env for wrapper in wrappers_of(env))][-1]
     mdp = getattr(real, "mdp", None)
@@ -180,7 +158,7 @@ def _single(env: gym.Env[Any, Any], walked: bool = True) -> Task:
             )
         verified(mdp, "env")
     elif has_table(real):
-        mdp = compile_table(real, limit, walked)
+        mdp = compile_table(real, limit)
     else:
         raise _no_world(real)
     wrapped = Wrapped("env", env, mdp)
@@ -197,11 +175,11 @@ def _seen(env: gym.Env[Any, Any], wrapped: Wrapped, mdp: Mdp) -> ObservationTabl
     if not wrapped.transforms and not wrapped.memory:
         return make_observation(mdp, "none")
     only = wrapped.transforms[0] if len(wrapped.transforms) == 1 and not wrapped.memory else None
-    if isinstance(only, TableObservation) and type(only).observation is TableObservation.observation:
+    own = getattr(only, "observation", None)
+    if isinstance(only, TableObservation) and own == MethodType(TableObservation.observation, only):
         return only.table
-    return tabulated(
-        env.observation_space, _stacked(wrapped.observations, env.observation_space), mdp.num_states
-    )
+    space = env.observation_space
+    return tabulated(space, _stacked(wrapped.observations, space), mdp.num_states)
 
 
 def _stacked(observations: list[Any], space: gym.Space[Any]) -> Any:
@@ -240,28 +218,28 @@ def _copies(batch: Any) -> Task:
                     "environment 0; give one of them, or a batch of one task"
                 )
 
+    def otherwise(index: int, what: str) -> InputError:
+        return InputError(
+            f"env: environment {index} of the {type(batch).__name__} {what} otherwise than environment 0; "
+            "give one of them, or a batch of one kind"
+        )
+
     def seen() -> ObservationTable:
         assert task.seen is not None
         table = task.seen()
         for index, other in tasks.items():
-            if other.seen is None or not _same_table(table, other.seen()):
-                raise _otherwise(batch, index, "shows states")
+            theirs = None if other.seen is None else other.seen()
+            if theirs is None or table.space != theirs.space or not same(_rows(table), _rows(theirs)):
+                raise otherwise(index, "shows states")
         return table
 
     def masks() -> NDArray[np.bool_] | None:
         for index, other in tasks.items():
             if not np.array_equal(task.masks(), other.masks()):  # type: ignore[arg-type]
-                raise _otherwise(batch, index, "masks actions")
+                raise otherwise(index, "masks actions")
         return task.masks()
 
     return replace(task, seen=functools.cache(seen), masks=masks)
-
-
-def _otherwise(batch: Any, index: int, what: str) -> InputError:
-    return InputError(
-        f"env: environment {index} of the {type(batch).__name__} {what} otherwise than environment 0; give "
-        "one of them, or a batch of one kind"
-    )
 
 
 def _is_copy(one: gym.Env[Any, Any], other: gym.Env[Any, Any]) -> bool:
@@ -273,19 +251,15 @@ def _is_copy(one: gym.Env[Any, Any], other: gym.Env[Any, Any]) -> bool:
     return all(alike(mine, its, _OF_AN_EPISODE) for mine, its in pairs)
 
 
-def _same_table(one: ObservationTable, other: ObservationTable) -> bool:
-    return one is other or (one.space == other.space and same(_rows(one), _rows(other)))
-
-
 def _rows(table: ObservationTable) -> Any:
     return table.stored if isinstance(table.stored, dict) else table.table()
 
 
-def _batch_kind(env: Any, table: dict[str, str], *methods: str) -> str:
-    """What is known of a batch or of a wrapper around one, by the methods that decide what it does."""
-    kind, name = known_class(env, table, methods), type(env).__name__
-    also = {_NATIVE: "advance", _TABLE: "observations"}.get(kind or "")
-    if kind is None or (also is not None and known_class(env, table, [also]) is None):
+def _batch(env: Any) -> Task:
+    """The task of a batch, or of a wrapper around one."""
+    of_wrapper = ("observations",) if isinstance(env, gym.vector.VectorWrapper) else ()
+    kind, name = known_class(env, _BATCHES, (*_DECISIVE, *of_wrapper)), type(env).__name__
+    if kind is None:
         raise InputError(
             f"env: {name} is no batch, and no wrapper of one, whose effect on the task is known, so nothing "
             "exact is known of what is in it; leave it out, or give one environment as env=..."
@@ -295,44 +269,29 @@ def _batch_kind(env: Any, table: dict[str, str], *methods: str) -> str:
             f"env: {name} has its environments in other processes, where their wrappers cannot be looked at; "
             "give one environment, made as they are, as env=..."
         )
-    return kind
-
-
-def _gymnasium_batch(env: Any) -> Task:
-    kind = _batch_kind(env, _GYMNASIUM_BATCHES, "step", "reset")
     if kind == _COPIES:
         return _copies(env)
     if kind == _NATIVE:
         verified(env.mdp, "env")
         limit = env.step_limit if env.step_limit <= MOST_STEPS else None  # what it plays by
         return Task(env.mdp, limit, seen=lambda: make_observation(env.mdp, "none"))
-    below = _gymnasium_batch(env.env)
-    return replace(below, seen=lambda: env.table) if kind == _TABLE else below
-
-
-def _sb3_batch(env: Any) -> Task:
-    kind = _batch_kind(
-        env, _SB3_BATCHES, "step", "step_async", "step_wait", "reset", "_save_obs", "_obs_from_buf"
-    )
-    if kind == _COPIES:
-        return _copies(env)
-    if kind == _NATIVE:
-        below = _gymnasium_batch(env.envs)
-        return replace(below, seen=lambda: env.observation)
-    below = _sb3_batch(env.venv)
+    if kind == _OURS:
+        return replace(_batch(env.envs), seen=lambda: env.observation)
+    below = _batch(env.env if isinstance(env, gym.vector.VectorWrapper) else env.venv)
     if kind == NEUTRAL:
         return below
+    if kind == _TABLE:
+        return replace(below, seen=lambda: env.table)
 
     def seen() -> ObservationTable:
         if kind not in _BY_METHOD:
             raise InputError(
-                f"env: {type(env).__name__} makes observations of more than the state, so no table "
-                "of the policy can be evaluated exactly; leave it out"
+                f"env: {name} makes observations of more than the state, so no table of the policy can be "
+                "evaluated exactly; leave it out"
             )
         assert below.seen is not None
-        return tabulated(
-            env.observation_space, _BY_METHOD[kind](env, _rows(below.seen())), below.mdp.num_states
-        )
+        rows = _BY_METHOD[kind](env, _rows(below.seen()))
+        return tabulated(env.observation_space, rows, below.mdp.num_states)
 
     return replace(below, seen=seen)
 
@@ -343,32 +302,21 @@ def tabulated(space: gym.Space[Any], rows: Any, num_states: int) -> ObservationT
 
 
 def observation_like(mdp: Mdp, space: gym.Space[Any]) -> ObservationTable:
-    """The observation of a world that has this space.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The observation of a world that has this space."""
+    needs = {"coordinates": mdp.places, "own": mdp.own_observation}
     for kind in KINDS:
-        table = make_observation(mdp, kind, _cell_size(mdp, space)) if _may_be(mdp, kind, space) else None
-        if table is not None and table.space == space:
+        cell_size = 1
+        if kind == "image":
+            if not isinstance(mdp, GridMdp) or space.dtype != np.uint8 or len(space.shape or ()) != 3:
+                continue
+            border, width = frame_size(mdp, 1)[0], (space.shape or (1,))[-1]
+            cell_size = max(1, (width - border) // (frame_size(mdp, 2)[0] - border) + 1)
+        elif kind in needs and needs[kind] is None:
+            continue
+        table = make_observation(mdp, kind, cell_size)
+        if table.space == space:
             return table
     raise InputError(
         f"the model sees {space}, and no observation of this world ({mdp.num_states} states) is like that; "
         f"give the environment that it was trained on, or train on one of {', '.join(KINDS)}"
     )
-
-
-def _may_be(mdp: Mdp, kind: str, space: gym.Space[Any]) -> bool:
-    if kind == "image":
-        return isinstance(mdp, GridMdp) and space.dtype == np.uint8 and len(space.shape or ()) == 3
-    needs = {"coordinates": mdp.places, "own": mdp.own_observation}
-    return kind not in needs or needs[kind] is not None
-
-
-def _cell_size(mdp: Mdp, space: gym.Space[Any]) -> int:
-    """Of the images that have this space, as their width has it; 1 where there is none."""
-    if not isinstance(mdp, GridMdp):
-        return 1
-    width = (space.shape or (1,))[-1]
-    per_cell, border = frame_size(mdp, 2)[0] - frame_size(mdp, 1)[0], frame_size(mdp, 1)[0]
-    return max(1, (width - border) // per_cell + 1)

@@ -26,20 +26,11 @@ class Estimate:
 
 
 def wilson_interval(count: int, total: int) -> tuple[float, float]:
-    """Wilson's score interval for a share, which is meaningful also where none, or every one, is a hit.
+    """Wilson's score interval, from 0 to 1, for the share of `count` hits in `total` samples, one or more.
 
     It is `scipy.stats.binomtest(count, total).proportion_ci(0.95, method="wilson")`. By hand, since
-    `scipy.stats` takes a second to import, and `evaluate.py` needs nothing else of it.
-
-    Args:
-        count: hits.
-        total: samples, one or more.
-
-    Returns:
-        Its lower and upper bound, from 0 to 1.
-
-    References: E. B. Wilson, Journal of the American Statistical Association 22, 1927; the form is that of
-    R. G. Newcombe, Statistics in Medicine 17, 1998 (his method 3).
+    `scipy.stats` takes a second to import. References: E. B. Wilson, Journal of the American Statistical
+    Association 22, 1927; the form is method 3 of R. G. Newcombe, Statistics in Medicine 17, 1998.
     """
     share = count / total
     scale = 2 * (total + _Z**2)
@@ -57,16 +48,11 @@ def estimate_share(hits: BoolArray) -> Estimate:
 def estimate_mean(
     samples: FloatArray, unseen: float, unseen_if_equal: float, bounds: tuple[float, float] = _UNBOUNDED
 ) -> Estimate:
-    """The mean of samples, with a normal interval that is widened by what rare samples may hide.
+    """The mean of samples (n,), with a normal interval that is widened by what rare samples may hide.
 
-    With n samples, the half-width is z²R/2n + z √(s²/n + z²R²/4n²): z²R/n for equal samples, z s/√n for many.
-    So it is widened as Wilson's interval is for a share.
-
-    Args:
-        samples: (n,) numbers.
-        unseen: the least that the range R of the samples is taken for.
-        unseen_if_equal: R where all samples are equal.
-        bounds: no sample is outside of them, and so is no end of the interval.
+    The half-width is z²R/2n + z √(s²/n + z²R²/4n²): z²R/n for equal samples, z s/√n for many, widened as
+    Wilson's interval is for a share. R, their range, is at least `unseen`, or `unseen_if_equal` where all are
+    equal. No sample is outside of `bounds`, and so is no end of the interval.
     """
     count, mean, seen = len(samples), float(samples.mean()), float(np.ptp(samples))
     spread = max(unseen, seen) if seen else unseen_if_equal

@@ -57,15 +57,7 @@ class ObservationTable:
     stored: NDArray[Any] | None
 
     def rows(self, states: IntArray, out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Look observations up.
-
-        Args:
-            states: (...), state numbers.
-            out: (..., *shape), is written to.
-
-        Returns:
-            (..., *shape), `out` or a fresh array.
-        """
+        """Look up the observations (..., *shape) of states (...), in `out` or a fresh array."""
         if self.stored is not None:
             # States are within the table; "clip" merely spares numpy a buffered copy.
             return np.take(self.stored, states, axis=0, out=out, mode="clip" if out is not None else "raise")
@@ -93,28 +85,25 @@ def _one_hot(mdp: Mdp, cell_size: int) -> Rows:
     return space, np.eye(size, dtype=np.float32)[mdp.number]
 
 
-def _coordinates(mdp: Mdp, cell_size: int) -> Rows:
-    """Each from 0 (first) to 1 (last), 0 where there is only one; -1 of a state that has no place.
-
-    Raises:
-        InputError: no state has a place.
-    """
+def _places(mdp: Mdp, kind: str) -> IntArray:
     if mdp.places is None:
         raise InputError(
-            f"observation coordinates: the states of {mdp.name} have no places; take another observation"
+            f"observation {kind}: the states of {mdp.name} have no places; take another observation"
         )
-    panels = mdp.places[:, :1] if mdp.places[:, 0].max() > 0 else mdp.places[:, :0]
-    places = np.concatenate([mdp.places[:, 1:], panels], axis=1).astype(np.float32)
+    return mdp.places
+
+
+def _coordinates(mdp: Mdp, cell_size: int) -> Rows:
+    """Each from 0 (first) to 1 (last), 0 where there is only one; -1 of a state that has no place."""
+    given = _places(mdp, "coordinates")
+    panels = given[:, :1] if given[:, 0].max() > 0 else given[:, :0]
+    places = np.concatenate([given[:, 1:], panels], axis=1).astype(np.float32)
     scaled = np.where(places < 0, np.float32(-1), places / np.maximum(places.max(axis=0), 1))
     return spaces.Box(min(0.0, scaled.min()), 1.0, scaled.shape[1:], np.float32), scaled
 
 
 def _image(mdp: Mdp, cell_size: int) -> Rows:
-    """Raises `InputError` where states have no places, or all frames would not fit into 1 GiB."""
-    if mdp.places is None:
-        raise InputError(
-            f"observation image: the states of {mdp.name} have no places; take another observation"
-        )
+    _places(mdp, "image")
     cell_size = positive_int("cell_size", cell_size)
     width, height = drawing.frame_size(mdp, cell_size)
     size = mdp.num_states * 3 * width * height
@@ -130,16 +119,8 @@ def _image(mdp: Mdp, cell_size: int) -> Rows:
     return spaces.Box(0, 255, pixels.shape[1:], np.uint8), pixels
 
 
-def _none(mdp: Mdp, cell_size: int) -> Rows:
-    return spaces.Discrete(mdp.num_numbers), mdp.number
-
-
 def _own(mdp: Mdp, cell_size: int) -> Rows:
-    """As it is, within the bounds of the table; pixels are flat, for SB3 would take others for CnnPolicy's.
-
-    Raises:
-        InputError: the world has none.
-    """
+    """As it is, within the table's bounds; pixels are flat, for SB3 would take others for CnnPolicy's."""
     table = mdp.own_observation
     if table is None:
         raise InputError(
@@ -158,7 +139,7 @@ KINDS: dict[str, Callable[[Mdp, int], Rows]] = {  # takes the world and `cell_si
     "coordinates": _coordinates,
     "image": _image,
     "own": _own,
-    "none": _none,
+    "none": lambda mdp, cell_size: (spaces.Discrete(mdp.num_numbers), mdp.number),
 }
 
 
@@ -183,16 +164,7 @@ def make_observation(mdp: Mdp, kind: str, cell_size: int = IMAGE_CELL_SIZE) -> O
 
 
 class TableObservation(gym.ObservationWrapper[Any, int, int], gym.utils.RecordConstructorArgs):
-    """A GridWorld environment with observations of some kind, (*shape).
-
-    Args:
-        env: the environment.
-        kind: a name in `KINDS`.
-        cell_size: pixels a cell, for images.
-
-    Raises:
-        InputError: another environment; or as `make_observation` does.
-    """
+    """A GridWorld environment with observations (*shape) of a kind of `KINDS`; `cell_size` is of images."""
 
     def __init__(self, env: gym.Env[int, int], kind: str, cell_size: int = IMAGE_CELL_SIZE) -> None:
         gym.utils.RecordConstructorArgs.__init__(self, kind=kind, cell_size=cell_size)
@@ -230,16 +202,9 @@ class ImageObservation(TableObservation):
 
 
 class VectorTableObservation(VectorObservationWrapper[Any, Any, Any, Any]):
-    """A GridWorld batch with observations of some kind, (num_envs, *shape).
+    """A GridWorld batch with observations (num_envs, *shape) of a kind of `KINDS`; `cell_size` is of images.
 
-    Args:
-        env: the batch.
-        kind: a name in `KINDS`.
-        cell_size: pixels a cell, for images.
-        copy: whether every step returns a fresh array; else all write to the same one, as in SyncVectorEnv.
-
-    Raises:
-        InputError: another batch; or as `make_observation` does.
+    `copy` says whether every step returns a fresh array; else all write to the same one, as in SyncVectorEnv.
     """
 
     def __init__(

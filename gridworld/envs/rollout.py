@@ -31,16 +31,9 @@ class SampledScores:
 
 
 def sample_episodes(evaluator: Evaluator, policy: FloatArray, episodes: int, seed: int) -> SampledScores:
-    """Estimate a policy's scores from episodes that are played in one batch.
+    """Estimate the scores of a policy (S, A) from episodes that are played in one batch.
 
-    Args:
-        evaluator: has the world, the step limit and the discount.
-        policy: (S, A) probabilities of actions.
-        episodes: how many.
-        seed: of the environments; what the policy draws is independent of it.
-
-    Raises:
-        InputError: `policy` is none for this world.
+    `seed` is of the environments; what the policy draws is independent of it.
     """
     policy = check_policy(evaluator.mdp, policy)
     envs = GridWorldVectorEnv(
@@ -80,13 +73,7 @@ def sample_episodes(evaluator: Evaluator, policy: FloatArray, episodes: int, see
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """One episode of n steps.
-
-    Attributes:
-        states: (n + 1,) the states in order, from the start to the end or the step limit.
-        actions: (n,) the action taken in each but the last of them.
-        rewards: (n,) what each action paid.
-    """
+    """One episode: states (n + 1,) from start to end or step limit, actions and rewards (n,)."""
 
     states: IntArray
     actions: IntArray
@@ -97,23 +84,8 @@ class Episode:
         return Episode(self.states[:states], self.actions[: states - 1], self.rewards[: states - 1])
 
 
-def play_episode(mdp: Mdp, policy: FloatArray, max_episode_steps: int, seed: int) -> IntArray:
-    """The states of an episode, (steps + 1,); see `play`."""
-    return play(mdp, policy, max_episode_steps, seed).states
-
-
 def play(mdp: Mdp, policy: FloatArray, max_episode_steps: int, seed: int) -> Episode:
-    """Play one episode.
-
-    Args:
-        mdp: the world.
-        policy: (S, A) probabilities of actions.
-        max_episode_steps: the step limit.
-        seed: of the environment; what the policy draws is independent of it.
-
-    Raises:
-        InputError: `policy` is none for this world.
-    """
+    """Play one episode of a policy (S, A); what it draws is independent of `seed`, the environment's."""
     policy = check_policy(mdp, policy)
     env = GridWorldVectorEnv(1, max_episode_steps=max_episode_steps, autoreset_mode="Disabled", mdp=mdp)
     chance = independent_generator(seed)  # the environment takes the seed's own

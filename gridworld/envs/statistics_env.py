@@ -1,8 +1,5 @@
 """The batch that agents learn on: it counts visits, and the returns of the episodes that ended.
 
-Both can be counted only while training happens. It costs some microseconds a step of the whole batch, however
-many cells the world has. The return and length of every single episode stand in `vector_env.Ended`.
-
 From the counts N(s, a) it can pay for exploring: a step that takes action a in state s pays its reward and
 β / sqrt(N(s, a)), with the visits of this step counted. Returns are those of the world's own rewards.
 
@@ -47,26 +44,16 @@ NO_EPISODES = Returns(0, 0.0)
 class StatisticsVectorEnv(GridWorldVectorEnv):
     """A `GridWorldVectorEnv` that resets in the same step, so that every step is one that an agent chose.
 
-    Args:
-        num_envs: see `GridWorldVectorEnv`.
-        exploration_bonus: β, at least 0.
-        settings: the other arguments of `GridWorldVectorEnv`.
-
-    Attributes:
-        visits: (S, A), int64, how often each action was taken in each state; the same array always.
+    `exploration_bonus` is β, at least 0; `visits` (S, A), int64, counts how often each action was
+    taken in each state; it is the same array always.
     """
 
     def __init__(self, num_envs: int, *, exploration_bonus: float = 0.0, **settings: Any) -> None:
         super().__init__(num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
         self.exploration_bonus = exploration_bonus
-        self._visits = np.zeros((self.mdp.num_states, self.mdp.num_actions), dtype=np.int64)
-        self._flat_visits = self._visits.reshape(-1)
+        self.visits = np.zeros((self.mdp.num_states, self.mdp.num_actions), dtype=np.int64)
+        self._flat_visits = self.visits.reshape(-1)
         self._ended = NO_EPISODES  # since they were last taken
-
-    @property
-    def visits(self) -> NDArray[np.int64]:
-        """See the class."""
-        return self._visits
 
     def advance(self, actions: NDArray[Any]) -> Advance:
         """See `GridWorldVectorEnv.advance`."""
@@ -92,7 +79,7 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
             np.add.at(self._flat_visits, pairs.ravel(), 1)
 
     def add_returns(self, steps: NDArray[Any], returns: FloatArray) -> None:
-        """Add the returns (m,) of episodes that ended, of which `steps` (m,), ascending, tells the step."""
+        """Add the returns (m,) of episodes that ended in `steps` (m,), ascending."""
         bounds = np.flatnonzero(np.diff(steps)) + 1
         self._add_returns(part for part in np.split(returns, bounds) if len(part))
 
@@ -121,7 +108,7 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
     def set_state(self, state: State) -> None:
         """See `GridWorldVectorEnv.set_state`."""
         super().set_state(state)
-        fill(self._visits, state["visits"], "visits")
+        fill(self.visits, state["visits"], "visits")
         self._ended = Returns(int(state["ended"]), float(state["ended_return"]))
 
     def take_returns(self) -> Returns:

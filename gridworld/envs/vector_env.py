@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 from gridworld.bounds import STEP_LIMIT
 from gridworld.envs.frames import rendering as drawing
 from gridworld.envs.frames.rendering import CELL_SIZE, Frame
-from gridworld.envs.stratified import stratified_numbers
 from gridworld.errors import InputError
 from gridworld.storage.rng_state import generator_state, set_generator_state
 from gridworld.storage.serialization import State, StateError, fill
 from gridworld.world.grid import mdp_or_compiled
 from gridworld.world.layout import CLASSIC, NUM_COLS, NUM_ROWS, Layout, positive_int
-from gridworld.world.mdp import BoolArray, FloatArray, Mdp
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+
+_RADIX_SORTED = 2**16  # numpy sorts numbers below it in linear time, if they are stored as such
 
 StateArray = NDArray[np.int64]
 Step = tuple[StateArray, FloatArray, BoolArray, BoolArray, dict[str, Any]]
@@ -78,8 +79,8 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
     `GridWorldEnv`; `render_mode="rgb_array"` gives one frame per environment.
 
     With `stratified`, environments that take the same action in the same state at the same time share out its
-    outcomes evenly, and those that start at the same time the starts: see `envs.stratified`. The episodes of
-    each have the same probabilities as without.
+    outcomes evenly, and those that start at the same time the starts (see `stratified_numbers`). The episodes
+    of each have the same probabilities as without.
 
     Raises:
         InputError: a setting that makes no world or no batch.
@@ -140,9 +141,13 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         self._num_actions = self.mdp.num_actions
         self._num_outcomes = self.mdp.next_state.shape[2]
         next_state = self.mdp.next_state.ravel().astype(np.int64)
-        self.tables = Tables(
-            next_state, self.mdp.reward.ravel(), self.mdp.terminal[next_state], _of_pairs(self.mdp.thresholds)
+        thresholds = self.mdp.thresholds.reshape(
+            -1 if self.mdp.thresholds.size else 1, self._num_outcomes - 1
         )
+        alike = (thresholds == thresholds[:1]).all()
+        thresholds = thresholds[0] if alike else np.ascontiguousarray(thresholds.T)
+        terminated = self.mdp.terminal[next_state]
+        self.tables = Tables(next_state, self.mdp.reward.ravel(), terminated, thresholds)
         self._next_state, self._reward, self._terminated, self._thresholds = self.tables
         self._state: StateArray = np.full(self.num_envs, self.mdp.start_states[0], dtype=np.int64)
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)  # steps of the episodes under way
@@ -209,21 +214,22 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
             InputError: other actions.
         """
         states, rewards, terminated, truncated, ended = self.advance(actions)
-        infos = {} if ended is None else _final_infos(ended.states, ended.mask)
+        infos: dict[str, Any] = {}
+        if ended is not None:  # as `SyncVectorEnv` has them for environments without infos of their own
+            final_obs = np.full(self.num_envs, None, dtype=object)
+            final_obs[ended.mask] = ended.states[
+                ended.mask
+            ].tolist()  # plain ints, as of a single environment
+            infos = {"final_obs": final_obs, "_final_obs": ended.mask}
+            infos |= {"final_info": {}, "_final_info": ended.mask.copy()}
         return states, rewards, terminated, truncated, infos
 
     def advance(self, actions: NDArray[Any]) -> Advance:
-        """`step` in arrays alone, for training: a step that ends episodes makes no object for each of them.
-
-        Args:
-            actions: (num_envs,), integers from 0 to 3.
+        """`step` in arrays alone, for training: a step that ends episodes makes no object for each.
 
         Returns:
-            (num_envs,) states (int64), rewards (float64), terminated and truncated (bool), as `step` does.
-            Of a batch that resets in the same step, the episodes that ended, where any did; else None.
-
-        Raises:
-            InputError: other actions.
+            (num_envs,) states (int64), rewards (float64), terminated and truncated (bool), as `step` does,
+            and of a batch that resets in the same step, the episodes that ended, or None.
         """
         index = self._state * self._num_actions
         index += self._check_actions(actions)
@@ -274,11 +280,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         }
 
     def set_state(self, state: State) -> None:
-        """Mirrors `get_state`, of a batch of the same size on the same world.
-
-        Raises:
-            ValueError: the state of another kind of batch.
-        """
+        """Mirrors `get_state`, of a batch of the same size on the same world."""
         states = state["states"]
         if (
             isinstance(states, np.ndarray)
@@ -312,11 +314,8 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
     def draw_numbers(self, situations: StateArray) -> FloatArray:
         """A number from [0, 1) for each of some environments, to draw what happens to it.
 
-        Args:
-            situations: (n,), the same number where the same may happen with the same probabilities.
-
-        Returns:
-            (n,), evenly spread over each situation where the batch is stratified, else independent.
+        In a stratified batch, those of one of the `situations` (n,), in which the same may happen with the
+        same probabilities, are evenly spread.
         """
         if self.stratified:
             return stratified_numbers(situations, self.np_random)
@@ -357,14 +356,31 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         )
 
 
-def _of_pairs(thresholds: FloatArray) -> FloatArray:
-    """(K - 1,) thresholds where all states and actions have the same, else (K - 1, S * A)."""
-    by_pair = thresholds.reshape(-1 if thresholds.size else 1, thresholds.shape[2])
-    return by_pair[0] if (by_pair == by_pair[:1]).all() else np.ascontiguousarray(by_pair.T)
+def stratified_numbers(groups: IntArray, rng: np.random.Generator) -> FloatArray:
+    """Random numbers that the members of a group share out evenly.
 
+    Independent numbers leave the share of each outcome to chance: of n environments in the same situation, an
+    outcome of probability p meets np, give or take √(np(1-p)). Those of a group of m are 1/m apart, from a
+    random one on, so it meets np rounded down or up. Each number by itself is uniform in [0, 1), and
+    independent of all that came before; so each episode has the probabilities that it has anyway.
 
-def _final_infos(states: StateArray, over: BoolArray) -> dict[str, Any]:
-    """As `gymnasium.vector.SyncVectorEnv` has them for environments without infos of their own."""
-    final_obs = np.full(len(over), None, dtype=object)
-    final_obs[over] = states[over].tolist()  # plain ints, as the single environment has them
-    return {"final_obs": final_obs, "_final_obs": over, "final_info": {}, "_final_info": over.copy()}
+    References: R. Cranley and T. Patterson, Randomization of Number Theoretic Methods for Multiple
+    Integration, 1976; P. L'Ecuyer, C. Lécot and B. Tuffin, A Randomized Quasi-Monte Carlo Simulation Method
+    for Markov Chains, 2008.
+
+    Args:
+        groups: (n,), integers from 0 up to about n, the group of each.
+        rng: draws one number for each group that has members, in ascending order.
+
+    Returns:
+        (n,) numbers.
+    """
+    sizes = np.bincount(groups)
+    shifts = np.zeros(len(sizes))
+    present = np.flatnonzero(sizes)
+    shifts[present] = rng.random(len(present))
+    order = np.argsort(groups.astype(np.uint16) if len(sizes) <= _RADIX_SORTED else groups, kind="stable")
+    ranks = np.arange(len(groups)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    numbers = np.empty(len(groups))
+    numbers[order] = (ranks / np.repeat(sizes, sizes) + np.repeat(shifts, sizes)) % 1.0
+    return numbers

@@ -16,8 +16,7 @@ from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
 from gridworld.visualization.picture import drawer
 from gridworld.visualization.video import require_video
-from gridworld.world.discounts import fitting_discounts, score_of_optimum
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.exact.evaluation import Evaluator, fitting_discounts, score_of_optimum
 from gridworld.world.mdp import Mdp
 
 _QUICKLY_SOLVED = 6000  # outcomes of all states and actions

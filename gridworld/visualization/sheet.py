@@ -9,9 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from gridworld.envs.frames.rendering import BACKGROUND, UNKNOWN, Frame, Packed, Point, surface_to_frame
-from gridworld.envs.frames.text_drawing import INK as INK
-from gridworld.envs.frames.text_drawing import SMALLEST_TEXT, Colour, font, import_pygame, text_width, write
+from gridworld.envs.frames.rendering import (
+    BACKGROUND,
+    SMALLEST_TEXT,
+    UNKNOWN,
+    Colour,
+    Frame,
+    Packed,
+    Point,
+    font,
+    import_pygame,
+    surface_to_frame,
+    text_width,
+    write,
+)
+from gridworld.envs.frames.rendering import INK as INK
 from gridworld.visualization.colormaps import ColourArray, Scale
 
 PAPER: Colour = BACKGROUND

@@ -15,7 +15,7 @@ from os import PathLike
 import numpy as np
 
 from gridworld.errors import InputError
-from gridworld.world.layout import CLASSIC, MOVES, NUM_COLS, NUM_ROWS, Cell, Layout, load_by_default_size
+from gridworld.world.layout import CLASSIC, MOVES, NUM_COLS, NUM_ROWS, Cell, Layout, load, positive_int
 from gridworld.world.mdp import BoolArray, IntArray, Mdp, checked_reward, finite, frozen, grid_places
 
 ACTION_NAMES = ("up", "right", "down", "left")
@@ -27,11 +27,7 @@ class GridMdp(Mdp):
     """The tables of a map: a state is a cell, A = 4 actions, K outcomes (1 without slip, 3 with).
 
     Attributes:
-        layout: the map.
-        slip: the probability that a move goes elsewhere.
-        step_reward: of every step.
-        goal_reward: of entering a goal.
-        trap_reward: of entering a trap or a cliff.
+        layout: the map; slip and the rewards are those of `compile_mdp`.
         neighbour: (S, A), int32, where a move leads, geometry alone: borders and walls, no slip, fall or end.
         wall: (S,), bool.
         cliff: (S,), bool.
@@ -75,10 +71,10 @@ def compile_mdp(
 
     Args:
         layout: the map.
-        slip: a probability.
-        step_reward: see `GridMdp`, as for the others.
-        goal_reward: see there.
-        trap_reward: see there.
+        slip: the probability that a move goes to one side instead.
+        step_reward: of every step.
+        goal_reward: of entering a goal.
+        trap_reward: of entering a trap or a cliff.
 
     Raises:
         InputError: a setting that makes no world.
@@ -147,28 +143,15 @@ def mdp_or_compiled(
     goal_reward: float,
     trap_reward: float,
 ) -> Mdp:
-    """The world of an environment, from the arguments of its constructor.
+    """The world of an environment's arguments: `mdp`, or else the one that the others describe.
 
-    Args:
-        mdp: a compiled world, or None: the world that the others describe is compiled.
-        layout: see `load`.
-        num_rows: the size of the layout `classic`; the default also means that none is given.
-        num_cols: the same.
-        slip: see `compile_mdp`, as for the rewards.
-        step_reward: see there.
-        goal_reward: see there.
-        trap_reward: see there.
-
-    Returns:
-        `mdp`, or the compiled world.
-
-    Raises:
-        InputError: no world; or a compiled one and arguments that describe another.
+    `num_rows` and `num_cols` of the layout `classic` also mean by their defaults that none are given.
     """
     described = (layout, num_rows, num_cols, slip, step_reward, goal_reward, trap_reward)
     if mdp is None:
-        world = load_by_default_size(layout, num_rows, num_cols)
-        return compile_mdp(world, slip, step_reward, goal_reward, trap_reward)
+        rows, cols = positive_int("num_rows", num_rows), positive_int("num_cols", num_cols)
+        given = load(layout, None if rows == NUM_ROWS else rows, None if cols == NUM_COLS else cols)
+        return compile_mdp(given, slip, step_reward, goal_reward, trap_reward)
     if not isinstance(mdp, Mdp):
         raise InputError(f"mdp={str(mdp)[:50]}: must be a compiled world, as `compile_mdp` makes one")
     if described != (CLASSIC, NUM_ROWS, NUM_COLS, 0.0, 0.0, 1.0, -1.0):

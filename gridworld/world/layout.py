@@ -48,17 +48,17 @@ class MapError(InputError):
 
 @dataclass(frozen=True)
 class Layout:
-    """A checked map.
+    """A checked map; the module says what the kinds of cells are.
 
     Attributes:
         name: what messages call it.
         num_rows: its height in cells.
         num_cols: its width in cells.
         starts: the cells that episodes begin in.
-        goals: see above, as for the others.
-        traps: see there.
-        walls: see there.
-        cliffs: see there.
+        goals: cells that end an episode with success.
+        traps: cells that end it without.
+        walls: cells that cannot be entered.
+        cliffs: cells that send back to the start.
 
     Raises:
         InputError: the map could not be played.
@@ -103,9 +103,6 @@ def classic(num_rows: int = NUM_ROWS, num_cols: int = NUM_COLS) -> Layout:
     """The GridWorld of the tutorial: start in the corner, a goal with a trap on three of its sides.
 
     Only the cell right of the goal leads into it, by a way around the traps.
-
-    Raises:
-        InputError: a size that does not hold the goal and its traps, or in which they close every way.
     """
     num_rows, num_cols = positive_int("num_rows", num_rows), positive_int("num_cols", num_cols)
     row, col = num_rows // 2, num_cols - 2
@@ -119,15 +116,7 @@ def classic(num_rows: int = NUM_ROWS, num_cols: int = NUM_COLS) -> Layout:
 
 
 def parse(text: str, name: str) -> Layout:
-    """Read a map from its text.
-
-    Args:
-        text: one line a row and one sign a cell.
-        name: what messages call the map.
-
-    Raises:
-        InputError: the text is no map that could be played.
-    """
+    """Read a map from its text: one line a row and one sign a cell; `name` is what messages call it."""
     lines = [line.rstrip() for line in text.replace("\r\n", "\n").replace("\r", "\n").split("\n")]
     while lines and not lines[-1]:
         lines.pop()
@@ -188,16 +177,6 @@ def load(
     return loaded
 
 
-def load_by_default_size(layout: str | PathLike[str] | Layout, num_rows: int, num_cols: int) -> Layout:
-    """`load` for callers whose default is the size of `classic`, which then also means that none is given.
-
-    Raises:
-        InputError: as `load` does.
-    """
-    rows, cols = positive_int("num_rows", num_rows), positive_int("num_cols", num_cols)
-    return load(layout, None if rows == NUM_ROWS else rows, None if cols == NUM_COLS else cols)
-
-
 def shipped_layouts() -> tuple[str, ...]:
     """Names of all layouts that come with the package."""
     maps = (entry.name for entry in files("gridworld").joinpath("layouts").iterdir())
@@ -205,18 +184,7 @@ def shipped_layouts() -> tuple[str, ...]:
 
 
 def positive_int(what: str, value: Any) -> int:
-    """Check a whole number.
-
-    Args:
-        what: its name, for the message.
-        value: an int or one of numpy's integers. Bools, floats and strings are refused.
-
-    Returns:
-        It as an int of at least 1.
-
-    Raises:
-        InputError: it is anything else.
-    """
+    """A whole number of at least 1 as an int; refuses bools, floats and strings."""
     try:
         number = None if isinstance(value, bool) else operator.index(value)
     except TypeError:

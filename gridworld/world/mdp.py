@@ -129,20 +129,7 @@ class Mdp:
     @cached_property
     def steps_away(self) -> IntArray:
         """(S,), in how few steps an episode can come to each state; -1 where it cannot."""
-        themselves = np.arange(self.num_states)[:, None, None]
-        possible = np.where(self.probability > 0, self.next_state, themselves)
-        following = possible.reshape(self.num_states, -1).tolist()
-        waiting = deque(self.start_states.tolist())
-        steps = [-1] * self.num_states
-        for start in waiting:
-            steps[start] = 0
-        while waiting:
-            origin = waiting.popleft()
-            for state in following[origin]:
-                if steps[state] < 0:
-                    steps[state] = steps[origin] + 1
-                    waiting.append(state)
-        return frozen(np.array(steps))
+        return frozen(steps_from(self.start_states, self.next_state, self.probability > 0))
 
     @property
     def reachable(self) -> BoolArray:
@@ -155,12 +142,9 @@ class Mdp:
         return frozen(self.reachable & ~self.absorbing)
 
     def with_exploring_starts(self, share: float) -> Self:
-        """The same world, in which a share of the episodes begins in any state that can be come to.
+        """The same world, in which a share of the episodes begins in a state drawn uniformly from `acting`.
 
         Reference: R. Sutton and A. Barto, Reinforcement Learning, 2nd ed., 2018, section 5.3.
-
-        Args:
-            share: a probability. Their start is drawn uniformly from the states of `acting`.
         """
         start = (1 - share) * self.start + share * self.acting / self.acting.sum()
         return dataclasses.replace(self, start=frozen(start))
@@ -198,14 +182,7 @@ class Mdp:
         return f"{', '.join(others)} or {last}" if others else last
 
     def predecessors(self, states: IntArray) -> IntArray:
-        """States with an outcome, whatever its probability, that leads into one of these; some repeatedly.
-
-        Args:
-            states: (n,), state numbers.
-
-        Returns:
-            (m,), state numbers in no particular order.
-        """
+        """States, some repeatedly, with an outcome of whatever probability into one of `states` (n,)."""
         sources, first = self._incoming
         counts = first[states + 1] - first[states]
         skipped = first[states] - (np.cumsum(counts) - counts)
@@ -221,6 +198,24 @@ class Mdp:
         return frozen(origins.astype(self.next_state.dtype)), frozen(first)
 
 
+def steps_from(starts: IntArray, next_state: IntArray, taken: BoolArray) -> IntArray:
+    """(S,), the fewest steps from some states by the outcomes `taken` (S, A, K); -1: there is no way."""
+    size = len(next_state)
+    themselves = np.arange(size)[:, None, None]
+    following = np.where(taken, next_state, themselves).reshape(size, -1).tolist()
+    waiting = deque(starts.tolist())
+    steps = [-1] * size
+    for start in waiting:
+        steps[start] = 0
+    while waiting:
+        origin = waiting.popleft()
+        for state in following[origin]:
+            if steps[state] < 0:
+                steps[state] = steps[origin] + 1
+                waiting.append(state)
+    return np.array(steps)
+
+
 def grid_places(num_rows: int, num_cols: int) -> NDArray[np.int64]:
     """`Mdp.places` of a grid in one panel, row by row from the top left: (num_rows * num_cols, 3)."""
     row, col = np.divmod(np.arange(num_rows * num_cols), num_cols)
@@ -228,32 +223,20 @@ def grid_places(num_rows: int, num_cols: int) -> NDArray[np.int64]:
 
 
 def frozen(table: Table) -> Table:
-    """Make an array read-only.
-
-    Returns:
-        The same array.
-    """
+    """The same array, made read-only."""
     table.setflags(write=False)
     return table
 
 
 def checked_reward(what: str, value: Any) -> float:
-    """Check a reward.
-
-    Raises:
-        InputError: it is no finite number, or too large or too small to be added up.
-    """
+    """A finite number that is neither too large nor too small to be added up."""
     number = finite(what, value)
     within_size(what, number, LEAST_REWARD, MOST_REWARD)
     return number
 
 
 def finite(what: str, value: Any) -> float:
-    """Check a number.
-
-    Raises:
-        InputError: it is anything but a finite number.
-    """
+    """A finite number as a float; refuses anything else."""
     try:
         plain = isinstance(value, Real) and not isinstance(value, bool | np.bool_)
         number = float(value) if plain else math.nan

@@ -15,10 +15,6 @@ from gridworld.world.exact.evaluation import Evaluator, Score
 _ROUNDING = 1e-12  # of a regret, which may be below 0 for it
 
 
-def _rounded(number: float) -> str:
-    return f"{number:.4g}"
-
-
 def regret_text(number: float) -> str:
     """A regret as messages have it; what is 0 but for rounding is 0."""
     return "0" if number < _ROUNDING else f"{number:.3g}"
@@ -40,7 +36,7 @@ class Metric:
     within_limit: bool = True  # it is of an episode within the step limit
     in_tables: bool = True
     in_report: bool = False  # a report has the mean over seeds of its last value
-    text: Callable[[float], str] = _rounded  # in tables
+    text: Callable[[float], str] = "{:.4g}".format  # in tables
 
     def row(self, *found: float | None) -> tuple[str, ...]:
         """The label and the numbers as a table has them; a cell is empty where there is no number."""

@@ -29,6 +29,7 @@ from gridworld.world.mdp import (
     Mdp,
     checked_reward,
     frozen,
+    steps_from,
 )
 
 MOST_ACTIONS = 256
@@ -37,6 +38,9 @@ _SUM = 1e-9  # how far probabilities may be from 1 in sum
 _DOUBLE = 8  # bytes of a number
 _BYTES = 64  # of an outcome in all tables, and while they are made
 _MOST_BYTES = 4 * 2**30
+_LONGEST_TEXT = 200
+_MOST_PLACES = 2**22  # cells of all panels
+_SAME = 1e-9  # how far a threshold may be from the sum of its probabilities
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -134,18 +138,21 @@ class _Ends:
     """The terminal states that outcomes need.
 
     Attributes:
-        states: (E,), integers, the terminal states.
-        success: (E,), bool, which of them are goals.
-        number: (S,), integers, the number of every state: of the N numbered ones, then of further ends.
-        leads_to: (N, A, K), integers, the state that each outcome leads to.
+        states: (E,), the terminal states.
+        success: (E,), which of them are goals.
+        number: (S,), the number of every state: of the N numbered ones, then of further ends.
+        leads_to: (N, A, K), the state that each outcome leads to.
     """
 
     def __init__(self, outcomes: Outcomes) -> None:
         size, possible = len(outcomes.start), outcomes.probability > 0
-        playing = _playing(outcomes, possible)
+        going_on = possible & ~outcomes.terminated
+        playing = steps_from(np.flatnonzero(outcomes.start), outcomes.next_state, going_on) >= 0
         ending = possible & outcomes.terminated
         first = ending & playing[:, None, None]
-        success = outcomes.success if outcomes.success is not None else _best_paid(outcomes.reward, first)
+        success = outcomes.success
+        if success is None:
+            success = outcomes.reward == outcomes.reward[first].max(initial=-np.inf)
         # An end is told from others by its number and whether it is a success: the last bit of its key.
         every = 2 * outcomes.next_state.astype(np.int64) + success
         keys = np.unique(every[first])
@@ -164,23 +171,6 @@ class _Ends:
         self.leads_to[ending] = self.states[np.searchsorted(keys, key)]
 
 
-def _playing(outcomes: Outcomes, possible: BoolArray) -> BoolArray:
-    """(N,), the states in which an episode may go on."""
-    goes_on = possible & ~outcomes.terminated
-    reached = outcomes.start > 0
-    frontier: IntArray = np.flatnonzero(reached)
-    while frontier.size:
-        following = np.unique(outcomes.next_state[frontier][goes_on[frontier]])
-        frontier = following[~reached[following]]
-        reached[frontier] = True
-    return reached
-
-
-def _best_paid(reward: FloatArray, ending: BoolArray) -> BoolArray:
-    best = reward[ending].max(initial=-np.inf)
-    return np.asarray(reward == best)
-
-
 def thresholds_of(probability: FloatArray) -> FloatArray:
     """`Mdp.thresholds`: running sums; no draw reaches those behind the last possible outcome."""
     sums: FloatArray = np.cumsum(probability, axis=2)[:, :, :-1]
@@ -190,11 +180,7 @@ def thresholds_of(probability: FloatArray) -> FloatArray:
 
 
 def check_size(name: str, states: int, actions: int, outcomes: int) -> None:
-    """Refuse tables that are too large. Call it before allocating them.
-
-    Raises:
-        InputError: too many states, actions or outcomes; or tables that are above the memory budget.
-    """
+    """Refuse tables that are too large; call it before they are allocated."""
     if states > MOST_STATES or actions > MOST_ACTIONS:
         raise InputError(
             f"{name}: {states:,} states and {actions:,} actions are too many; at most {MOST_STATES:,} "
@@ -220,17 +206,9 @@ _KINDS = {  # of arrays, as numpy's `dtype.kind` names them
 
 
 def checked(name: str, outcomes: Outcomes) -> Outcomes:
-    """Check the tables of outcomes, and convert them to the types that are computed with.
+    """Outcomes of any kind of numbers, checked and converted to float64 and int64.
 
-    Args:
-        name: of the world, for messages.
-        outcomes: of any kind of numbers. What is impossible may lead anywhere and pay anything.
-
-    Returns:
-        The same in float64 and int64. Probabilities of less precision than that are made to sum to 1.
-
-    Raises:
-        InputError: see `mdp_from_outcomes`.
+    What is impossible may lead anywhere and pay anything. Less precise probabilities are made to sum to 1.
     """
     _check_kinds(name, outcomes)
     least = outcomes.probability.dtype, outcomes.start.dtype
@@ -250,8 +228,17 @@ def checked(name: str, outcomes: Outcomes) -> Outcomes:
         start=_summing_to_one(start, least[1]),
         reward=np.where(possible, outcomes.reward.astype(np.float64), 0.0),
     )
-    _check_next_states(name, found.next_state)
-    _check_rewards(name, found.reward)
+    wrong = (found.next_state < 0) | (found.next_state >= len(start))
+    for row in np.argwhere(wrong)[:1]:
+        raise InputError(
+            f"{name}: next_state of state {row[0]}, action {row[1]} is {found.next_state[tuple(row)]}, "
+            f"must be from 0 to {len(start) - 1}"
+        )
+    size = np.abs(found.reward)
+    wrong = (found.reward != 0) & ~((size >= LEAST_REWARD) & (size <= MOST_REWARD))
+    for row in np.argwhere(wrong)[:1]:
+        where = f"{name}: reward of state {row[0]}, action {row[1]}"
+        checked_reward(where, float(found.reward[tuple(row)]))
     return found
 
 
@@ -280,24 +267,6 @@ def _check_kinds(name: str, outcomes: Outcomes) -> None:
     if outcomes.start.shape != shape[:1]:
         raise InputError(f"{name}: start has shape {outcomes.start.shape}, must be ({shape[0]},)")
     check_size(name, *shape)
-
-
-def _check_next_states(name: str, next_state: IntArray) -> None:
-    wrong = (next_state < 0) | (next_state >= len(next_state))
-    for state, action, outcome in np.argwhere(wrong)[:1]:
-        raise InputError(
-            f"{name}: next_state of state {state}, action {action} is "
-            f"{next_state[state, action, outcome]}, must be from 0 to {len(next_state) - 1}"
-        )
-
-
-def _check_rewards(name: str, reward: FloatArray) -> None:
-    size = np.abs(reward)
-    for state, action, outcome in np.argwhere(
-        (reward != 0) & ~((size >= LEAST_REWARD) & (size <= MOST_REWARD))
-    )[:1]:
-        where = f"{name}: reward of state {state}, action {action}"
-        checked_reward(where, float(reward[state, action, outcome]))
 
 
 def _check_extras(
@@ -330,3 +299,98 @@ def _check_distribution(name: str, what: str, table: FloatArray, given: np.dtype
             f"{name}: {what}{place} is [{shown}{more}], with sum "
             f"{table[tuple(where)].sum():.12g}; must be probabilities with sum 1"
         )
+
+
+def checked_text(where: str, key: str, value: Any) -> str:
+    """A short text on one line; refuses anything else."""
+    text = value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
+    if not isinstance(text, str) or not 0 < len(text) <= _LONGEST_TEXT or not text.isprintable():
+        raise InputError(f"{where}: {key} is {str(text)[:50]!r}, must be 1 to {_LONGEST_TEXT} letters")
+    return str(text)
+
+
+def verified(mdp: Mdp, where: str) -> Mdp:
+    """The same world, if all of its tables are what `Mdp` says; `where` is what messages call it."""
+    for key in ("name", "truth"):
+        checked_text(where, key, getattr(mdp, key))
+    if not isinstance(mdp.action_names, tuple) or not mdp.action_names:
+        raise InputError(f"{where}: action_names is {str(mdp.action_names)[:50]}, must be a tuple of strings")
+    for name in mdp.action_names:
+        checked_text(where, "action_names", name)
+    if mdp.max_episode_steps is not None:
+        positive_int(f"{where}: max_episode_steps", mdp.max_episode_steps)
+    _check_shapes(mdp, where)
+    found = checked(
+        where,
+        Outcomes(
+            next_state=mdp.next_state,
+            probability=mdp.probability,
+            reward=mdp.reward,
+            terminated=np.zeros(mdp.next_state.shape, dtype=np.bool_),
+            start=mdp.start,
+        ),
+    )
+    for key in ("next_state", "reward"):
+        if not np.array_equal(getattr(found, key), getattr(mdp, key)):
+            raise InputError(f"{where}: {key} of an outcome of probability 0 must be 0 or a state")
+    _check_states(mdp, where)
+    if mdp.state_names and len(mdp.state_names) != mdp.num_numbers:
+        raise InputError(f"{where}: state_names must be one for each of {mdp.num_numbers} numbers")
+    return mdp
+
+
+def _check_shapes(mdp: Mdp, where: str) -> None:
+    shape = np.shape(mdp.next_state)
+    size, actions, outcomes = shape if len(shape) == 3 else (0, 0, 0)
+    per_state = {"terminal": np.bool_, "goal": np.bool_, "absorbing": np.bool_, "number": np.int64}
+    expected: dict[str, tuple[Any, tuple[int, ...]]] = {
+        "next_state": (np.int32, (size, len(mdp.action_names), outcomes)),
+        "probability": (np.float64, shape),
+        "reward": (np.float64, shape),
+        "thresholds": (np.float64, (size, actions, max(outcomes - 1, 0))),
+        "start": (np.float64, (size,)),
+        **{name: (dtype, (size,)) for name, dtype in per_state.items()},
+    }
+    if mdp.places is not None:
+        expected["places"] = (np.int64, (size, 3))
+    for name, (dtype, wanted) in expected.items():
+        table = getattr(mdp, name)
+        if not isinstance(table, np.ndarray) or table.dtype != dtype or table.shape != wanted:
+            told = f"{table.dtype} {table.shape}" if isinstance(table, np.ndarray) else type(table).__name__
+            raise InputError(f"{where}: {name} is {told}, must be {np.dtype(dtype)} {wanted}")
+    shown = mdp.own_observation
+    if shown is not None and (
+        not isinstance(shown, np.ndarray) or shown.dtype.kind not in "biuf" or shown.shape[:1] != (size,)
+    ):
+        raise InputError(f"{where}: own_observation must be numbers, the first of its axes {size} states")
+
+
+def _check_states(mdp: Mdp, where: str) -> None:
+    own = np.arange(mdp.num_states)[:, None, None]
+    possible = mdp.probability > 0
+    stays = (~possible | (mdp.next_state == own)).all(axis=(1, 2))
+    unpaid = (~possible | (mdp.reward == 0)).all(axis=(1, 2))
+    sums = thresholds_of(mdp.probability)
+    last = np.isinf(sums)  # behind the last possible outcome
+    near = np.abs(np.where(last, 0.0, mdp.thresholds - np.where(last, 0.0, sums))) <= _SAME
+    fine = np.where(last, mdp.thresholds >= 1 - _SAME, near)
+    fine[:, :, 1:] &= mdp.thresholds[:, :, 1:] >= mdp.thresholds[:, :, :-1]
+    number = mdp.number
+    for wrong, mistake in (
+        (mdp.terminal & ~mdp.absorbing, "is terminal and not absorbing"),
+        (mdp.absorbing & ~(stays & unpaid), "is absorbing and goes on, or pays"),
+        (mdp.goal & ~mdp.terminal, "is a goal and not terminal"),
+        (mdp.terminal & (mdp.start > 0), "is terminal and a start"),
+        (~fine.all(axis=(1, 2)), "has thresholds that are not the sums of its probabilities"),
+        ((number < 0) | (number >= len(number)), f"has a number that is not from 0 to {len(number) - 1}"),
+        (() if mdp.places is None else (mdp.places < -1).any(axis=1), "has a place below -1"),
+    ):
+        if np.any(wrong):
+            raise InputError(f"{where}: state {int(np.argmax(wrong))} {mistake}")
+    if mdp.places is not None:
+        panels, rows, cols = (int(most) + 1 for most in mdp.places.max(axis=0))
+        if panels * rows * cols > _MOST_PLACES:
+            raise InputError(
+                f"{where}: places are {panels:,} panels of {rows:,} rows and {cols:,} columns; pictures have "
+                f"room for {_MOST_PLACES:,} cells"
+            )

@@ -28,6 +28,7 @@ from stable_baselines3.common.vec_env import (
 
 import gridworld
 from gridworld import InputError
+from gridworld.envs.inspection import task_of
 
 DRAWS = np.random.default_rng(0)  # a generator that wrappers reach as a global
 
@@ -647,6 +648,17 @@ def test_observations_are_what_a_batch_makes_of_them() -> None:
     model = PPO("MlpPolicy", halves(np.uint8), device="cpu")
     with pytest.raises(InputError, match="give the space the right dtype"):
         gridworld.evaluate(model)
+
+
+def test_a_replaced_observation_is_what_is_seen() -> None:
+    env = gridworld.OneHotObservation(gridworld.GridWorldEnv())
+    seen = task_of(env).seen
+    assert seen is not None
+    assert seen() is env.table
+    env.observation = lambda state: np.zeros(30, np.float32)  # type: ignore[method-assign]
+    seen = task_of(env).seen
+    assert seen is not None
+    assert not seen().table().any()
 
 
 def test_a_table_is_by_what_the_environment_shows() -> None:

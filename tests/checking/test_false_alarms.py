@@ -21,9 +21,8 @@ from gridworld.checking.probes import PROBES, Probe
 from gridworld.checking.settings import settings
 from gridworld.checking.subject import subject
 from gridworld.checking.training import Trained, train
-from gridworld.world.exact.bellman import backup
 from gridworld.world.exact.markov_chain import Chain
-from gridworld.world.exact.solver import solved
+from gridworld.world.exact.solver import backup, solved
 
 TRIALS = int(os.environ.get("GRIDWORLD_TRIALS", "0"))
 CLASSES = (

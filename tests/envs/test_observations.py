@@ -102,17 +102,6 @@ def test_observations_are_fresh(kind):
     assert np.array_equal(env.reset()[0], before[0])
 
 
-def test_one_hot_rows_of_a_large_world():
-    world = "\n".join(["S" + "." * 63, *["." * 64] * 62, "." * 63 + "G"])
-    env = gridworld.OneHotObservation(GridWorldEnv(layout=parse(world, "large")))
-    for state in (0, 77, 4095):
-        env.unwrapped.state = state
-        observation = env.observation(state)
-        assert observation in env.observation_space
-        assert np.flatnonzero(observation).tolist() == [state]
-    assert env.table.rows(np.array([[5, 6]])).shape == (1, 2, 4096)
-
-
 def test_wrappers_refuse_what_they_cannot_show():
     with pytest.raises(InputError, match="GridWorld"):
         gridworld.OneHotObservation(gym.make("FrozenLake-v1"))
@@ -129,18 +118,6 @@ def test_a_wrapped_env_can_be_made_again_from_its_spec():
     again = gym.make(env.spec)
     assert again.observation_space == env.observation_space
     assert np.array_equal(again.reset(seed=0)[0], env.reset(seed=0)[0])
-
-
-@pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
-def test_wrapped_batches_show_the_rows_of_their_states(mode):
-    envs = gridworld.VectorOneHotObservation(gridworld.GridWorldVectorEnv(4, autoreset_mode=mode))
-    assert envs.single_observation_space == gym.spaces.Box(0, 1, (30,), np.float32)
-    assert envs.observation_space.shape == (4, 30)
-    observations, _ = envs.reset(seed=0)
-    for actions in np.random.default_rng(0).integers(4, size=(60, 4)):
-        assert np.array_equal(observations.argmax(axis=1), envs.unwrapped.states)
-        assert np.array_equal(observations.sum(axis=1), np.ones(4))
-        observations, *_ = envs.step(actions)
 
 
 @pytest.mark.parametrize("kind", ["one_hot", "coordinates", "image"])

@@ -79,30 +79,6 @@ def test_the_corners_of_the_agent():
     assert (around == WHITE).all()
 
 
-def test_the_grid_has_lines_at_every_edge_and_none_in_the_border():
-    frame = frame_of(DEFAULT_ROWS, 0)
-    black = (frame == BLACK).all(axis=2)
-    assert np.flatnonzero(black[150]).tolist() == [100, 200, 300, 400, 500, 600, 700]  # along a row
-    assert np.flatnonzero(black[:, 210]).tolist() == [100, 200, 300, 400, 500, 600]  # down a column
-    assert np.flatnonzero(black[100]).tolist() == list(range(100, 701))
-    assert np.flatnonzero(black[:, 700]).tolist() == list(range(100, 601))
-
-
-def test_the_shapes_of_goal_and_traps():
-    frame = frame_of(DEFAULT_ROWS, 0)
-    x, y = 550, 450  # the centre of the trap in row 3, column 4
-    for along, across in ((0, 32), (32, 0), (0, -32), (-32, 0), (22, 22)):
-        assert tuple(frame[y + across, x + along]) == TRAP
-    for along, across in ((0, 35), (35, 0), (0, -35), (-35, 0), (26, 26)):
-        assert tuple(frame[y + across, x + along]) == WHITE
-    goal = (frame == GOAL).all(axis=2)
-    rows, cols = np.nonzero(goal)
-    assert (rows.min(), rows.max()) == pytest.approx((320, 380), abs=1)
-    assert (cols.min(), cols.max()) == pytest.approx((520, 580), abs=1)
-    assert cols[rows == rows.min()].mean() == pytest.approx(550, abs=1)  # the tip points up
-    assert goal.sum() == pytest.approx(60 * 60 / 2, rel=0.06)
-
-
 def test_the_agent_is_drawn_over_the_goal():
     frame = frame_of(DEFAULT_ROWS, 16)
     assert (frame[320:380, 520:580] == AGENT).all()

@@ -11,8 +11,7 @@ from scipy import stats
 from gridworld import GridWorldEnv
 from gridworld.engine.environments import Environments
 from gridworld.envs.statistics_env import StatisticsVectorEnv
-from gridworld.envs.stratified import stratified_numbers
-from gridworld.envs.vector_env import GridWorldVectorEnv
+from gridworld.envs.vector_env import GridWorldVectorEnv, stratified_numbers
 from gridworld.errors import InputError
 from gridworld.world.mdp import FloatArray, IntArray
 

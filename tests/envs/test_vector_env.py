@@ -290,3 +290,59 @@ def test_a_frame_per_environment():
     assert np.array_equal(first, one.render())
     assert not np.array_equal(first, second)
     assert GridWorldVectorEnv(2).render() is None
+
+
+def corridor(mode, limit=None):
+    """Two worlds of three cells; going right twice reaches the goal."""
+    layout = parse("S.G", "corridor")
+    return GridWorldVectorEnv(2, layout=layout, autoreset_mode=mode, max_episode_steps=limit)
+
+
+def lists(result):
+    """Observations, rewards, ends and truncations of a step, as plain lists."""
+    return [part.tolist() for part in result[:4]]
+
+
+def test_limits_by_name():
+    assert gym.make_vec("GridWorld-v0").unwrapped.max_episode_steps == 100
+    assert gym.make_vec("GridWorld-v0", max_episode_steps=7).unwrapped.max_episode_steps == 7
+    endless = GridWorldVectorEnv(1, max_episode_steps=None)
+    endless.reset()
+    assert not any(endless.step([UP])[3].any() for _ in range(300))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_reset_starts_all_anew(mode):
+    envs = corridor(mode, limit=3)
+    envs.reset()
+    envs.step([RIGHT, UP])
+    envs.step([RIGHT, UP])
+    assert envs.reset()[0].tolist() == [0, 0]
+    assert lists(envs.step([RIGHT, RIGHT])) == [[1, 1], [0, 0], [False] * 2, [False] * 2]
+    assert not envs.step([UP, UP])[3].any()
+    assert envs.step([UP, UP])[3].all()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_returned_arrays_are_fresh(mode):
+    touched, left_alone = (GridWorldVectorEnv(4, slip=0.2, autoreset_mode=mode) for _ in range(2))
+    left_alone.reset(seed=3)
+    touched.reset(seed=3)[0][:] = 29
+    touched.states[:] = 29
+    for actions in np.random.default_rng(0).integers(4, size=(150, 4)):
+        mine, theirs = touched.step(actions), left_alone.step(actions)
+        assert lists(mine) == lists(theirs)
+        infos = mine[4]
+        for part in (*mine[:4], *(infos[key] for key in infos if key != "final_info")):
+            part[:] = 1
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [np.array([True]), np.array([1, 0, 1]), np.zeros(3, dtype=bool), np.array([[True] * 3]), "all"],
+    ids=repr,
+)
+def test_a_reset_mask_is_one_boolean_per_environment(mask):
+    envs = GridWorldVectorEnv(3)
+    with pytest.raises(InputError, match="reset_mask"):
+        envs.reset(options={"reset_mask": mask})

@@ -14,12 +14,12 @@ from gridworld.agents import family
 from gridworld.engine.environments import Environments
 from gridworld.envs import rollout
 from gridworld.envs.observations import make_observation
-from gridworld.envs.rollout import play_episode, sample_episodes
+from gridworld.envs.rollout import play, sample_episodes
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.training.setup import make_context
 from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import one_hot_policy
+from gridworld.world.exact.markov_chain import Chain, _openblas, one_hot_policy
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse, shipped_layouts
 from gridworld.world.mdp import Mdp
@@ -137,7 +137,7 @@ def test_slips_do_not_depend_on_sampled_actions(monkeypatch, layout: str, slip: 
     assert_independent(slip_table(evaluator.mdp, Recorder.walked))
     Recorder.walked = []
     for episode in range(400 if layout == "four_rooms" else 0):
-        play_episode(evaluator.mdp, uniform, 100, seed=1000 * seed + episode)
+        play(evaluator.mdp, uniform, 100, seed=1000 * seed + episode)
     if Recorder.walked:
         assert_independent(slip_table(evaluator.mdp, Recorder.walked))
 
@@ -219,16 +219,16 @@ def test_circles_are_found_without_being_walked() -> None:
     policy = one_hot_policy(actions, 4)
     assert CLASSIC.endless_states(policy) == [0, 1, 6, 7]
     assert CLASSIC.score(policy).outcome.timeout == 1
-    assert len(play_episode(CLASSIC.mdp, policy, 100, seed=0)) == 101
+    assert len(play(CLASSIC.mdp, policy, 100, seed=0).states) == 101
 
 
 def test_an_episode_is_the_policys_own_walk() -> None:
-    states = play_episode(CLASSIC.mdp, CLASSIC.optimal_policy(), 100, seed=0)
+    states = play(CLASSIC.mdp, CLASSIC.optimal_policy(), 100, seed=0).states
     assert states[0] == 0
     assert states[-1] == 16
     assert len(states) == 9
     uniform = np.full((30, 4), 0.25)
-    walks = [play_episode(CLASSIC.mdp, uniform, 100, seed).tolist() for seed in (0, 0, 1)]
+    walks = [play(CLASSIC.mdp, uniform, 100, seed).states.tolist() for seed in (0, 0, 1)]
     assert walks[0] == walks[1] != walks[2]
 
 
@@ -257,3 +257,21 @@ def test_undiscounted_optima_end_and_certify(world: list[str], slip: float, step
     mdp = compile_mdp(parse("\n".join(world), "random"), slip, step, 0.8, -0.19)
     evaluator = Evaluator(mdp, 1.0, 100)
     assert evaluator.score(evaluator.optimal_policy()).certified
+
+
+@pytest.mark.parametrize("env", ["four_rooms", "maze"])
+def test_a_value_has_the_same_bits_with_any_number_of_threads(env: str) -> None:
+    mdp = configure(f"env={env}").env.compile()
+    policy = np.random.default_rng(0).dirichlet(np.ones(mdp.num_actions), mdp.num_states)
+    count, limit = _openblas()
+    before, found = count(), set()
+    try:
+        for threads in (1, 2, 3):
+            limit(threads)
+            chain = Chain(mdp, policy)
+            numbers = [chain.value(0.99), chain.discounted_return(50, 0.9), chain.outcome(50).expected_return]
+            found.add(b"".join(np.asarray(number).tobytes() for number in numbers))
+            assert count() in (1, threads)  # it is left as it was; not every library has so many
+    finally:
+        limit(before)
+    assert len(found) == 1

@@ -10,7 +10,6 @@ from helpers.oracle import World, maps
 from hypothesis import given
 
 from gridworld import GridWorldEnv, InputError, Layout, shipped_layouts
-from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.layout import classic, load, parse
 
 SHIPPED = (
@@ -188,17 +187,6 @@ def test_classic_takes_exactly_the_sizes_that_can_be_won():
         with pytest.raises(InputError, match=f"{num_rows} x {num_cols} cells: .*({reason}).* 4 rows and 3"):
             classic(num_rows, num_cols)
     assert won == set(itertools.product(range(4, 13), range(3, 13)))  # as the sentence says
-
-
-@pytest.mark.parametrize(("num_rows", "num_cols"), [(4, 3), (5, 3), (9, 3), (4, 4)])
-def test_the_smallest_sizes_are_worlds_to_walk_through(num_rows, num_cols):
-    env, world = GridWorldEnv(num_rows, num_cols), World(formula(num_rows, num_cols))
-    state, way = env.reset()[0], world.steps_to_goal((0, 0))
-    evaluator = Evaluator(env.mdp, 0.99, 100)
-    assert evaluator.optimal_value == pytest.approx(0.99 ** (way - 1))
-    for _ in range(way):
-        state, reward, ended, _, _ = env.step(int(evaluator.optimal_policy()[state].argmax()))
-    assert (state, reward, ended) == (env.gold_state, 1, True)
 
 
 def test_a_mistake_in_a_map_passes_between_processes():

@@ -61,16 +61,6 @@ def test_predecessors_are_the_origins_of_all_outcomes(world):
     assert mdp.predecessors(np.array([], dtype=np.int32)).size == 0
 
 
-@given(worlds())
-def test_shapes_and_sums(world):
-    mdp = compiled(world)
-    outcomes = 1 if world.settings["slip"] == 0 else 3
-    for table in (mdp.next_state, mdp.probability, mdp.reward):
-        assert table.shape == (len(world.cells), 4, outcomes)
-    assert mdp.probability.sum(axis=2) == pytest.approx(1, abs=1e-12)
-    assert mdp.start.sum() == pytest.approx(1, abs=1e-12)
-
-
 TABLES = ["neighbour", "next_state", "probability", "reward", "terminal", "goal", "wall", "cliff", "start"]
 
 
@@ -114,26 +104,6 @@ def test_numbers_of_any_kind_will_do(value):
     mdp = compile_mdp(load("classic"), slip=value, step_reward=value)
     assert (mdp.slip, mdp.step_reward) == (float(value), float(value))
     assert type(mdp.slip) is type(mdp.step_reward) is float
-
-
-def test_rewards_and_slip_by_hand():
-    mdp = compile_mdp(
-        parse("S.T\n.#.\n..G", "map"), slip=0.5, step_reward=-0.1, goal_reward=2, trap_reward=-3
-    )
-    assert mdp.next_state[1, 1].tolist() == [2, 1, 1]  # right into the trap; down is a wall, up the border
-    assert mdp.probability[1, 1].tolist() == [0.5, 0.25, 0.25]
-    assert mdp.reward[1, 1].tolist() == pytest.approx([-3.1, -0.1, -0.1])
-    assert mdp.reward[2].tolist() == [[0.0] * 3] * 4  # it is over
-
-
-def test_a_fall_by_hand():
-    mdp = compile_mdp(parse("...\nSCG", "map"), slip=0.2, step_reward=-0.5, trap_reward=-3)
-    assert mdp.next_state[3, 1].tolist() == [3, 3, 0]  # off the cliff and back; the border; floor
-    assert mdp.reward[3, 1].tolist() == [-3.5, -0.5, -0.5]
-    assert mdp.next_state[1, 2].tolist() == [3, 0, 2]
-    assert mdp.reward[1, 2].tolist() == [-3.5, -0.5, -0.5]
-    assert not mdp.terminal[[3, 4]].any()
-    assert mdp.neighbour[3, 1] == 4  # geometry alone
 
 
 def test_a_cliff_that_pays_is_refused():

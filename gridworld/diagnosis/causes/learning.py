@@ -13,7 +13,7 @@ from gridworld.diagnosis.experiments import (
     visits_needed,
 )
 from gridworld.diagnosis.finding import Finding, costliest, falling, faster, longer, slower
-from gridworld.world.exact.bellman import backup
+from gridworld.world.exact.solver import backup
 from gridworld.world.mdp import BoolArray
 
 _SPREAD = 0.5  # of the entropy of a uniform policy: above, it has hardly made up its mind

@@ -7,9 +7,8 @@ import numpy as np
 from gridworld.diagnosis.evidence import Evidence, entropy
 from gridworld.diagnosis.experiments import entropy_optimum, optimum_of_epsilon
 from gridworld.diagnosis.finding import Finding, costliest
-from gridworld.world.discounts import fitting_discounts
-from gridworld.world.exact.bellman import pick
-from gridworld.world.exact.solver import solved
+from gridworld.world.exact.evaluation import fitting_discounts
+from gridworld.world.exact.solver import pick, solved
 from gridworld.world.mdp import BoolArray, FloatArray
 
 _NOTHING = 1e-9  # of the scale of the values

@@ -91,13 +91,12 @@ _boards: WeakKeyDictionary[Mdp, Board] = WeakKeyDictionary()
 def board_of(mdp: Mdp) -> Board:
     """The board of a world, made once. Of two states in one place the first that can be reached is shown."""
     if mdp not in _boards:
-        _boards[mdp] = _card(mdp) if mdp.places is None else _board(mdp, mdp.places)
+        if mdp.places is None:
+            tables = np.full((mdp.num_states, 2), -1), np.full(_CARD, -1), np.full(_CARD, Kind.BLANK)
+            _boards[mdp] = Board(*_CARD, (), *map(frozen, tables))
+        else:
+            _boards[mdp] = _board(mdp, mdp.places)
     return _boards[mdp]
-
-
-def _card(mdp: Mdp) -> Board:
-    nowhere = np.full((mdp.num_states, 2), -1)
-    return Board(*_CARD, (), frozen(nowhere), frozen(np.full(_CARD, -1)), frozen(np.full(_CARD, Kind.BLANK)))
 
 
 def _board(mdp: Mdp, places: IntArray) -> Board:

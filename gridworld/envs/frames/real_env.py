@@ -22,15 +22,10 @@ _OFF_SCREEN = {"SDL_VIDEODRIVER": "dummy", "SDL_AUDIODRIVER": "dummy"}
 
 
 class RealEnvFrames:
-    """Renders episodes.
+    """Renders episodes, in frames of at most `max_pixels`.
 
     An environment with a transition table is put into each state. Others are enumerated: from a reset on, the
     actions that lead through the states are taken.
-
-    Args:
-        env_id: the registered id.
-        kwargs: the arguments of `gymnasium.make`.
-        max_pixels: larger frames are made smaller.
     """
 
     def __init__(
@@ -39,19 +34,7 @@ class RealEnvFrames:
         self._env_id, self._kwargs, self._max_pixels = env_id, dict(kwargs or {}), max_pixels
 
     def episode(self, mdp: Mdp, states: Sequence[int]) -> list[Frame]:
-        """Render the states of an episode.
-
-        Args:
-            mdp: the world that was made from the environment.
-            states: n, of which the first is a start.
-
-        Returns:
-            n frames (height, width, 3), uint8, RGB.
-
-        Raises:
-            InputError: the environment cannot be made or rendered, or no action leads from one of the states
-                to the next.
-        """
+        """Frames (height, width, 3), uint8, RGB, of an episode's states, of which the first is a start."""
         with _off_screen():
             env = make_env(self._env_id, self._kwargs, render_mode="rgb_array")
             try:

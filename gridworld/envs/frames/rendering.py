@@ -9,23 +9,24 @@ only `Window` opens one.
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import sys
 import time
 from collections.abc import Sequence
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.envs.frames.board import Board, Kind, Panel, board_of
-from gridworld.envs.frames.text_drawing import Colour as Colour
-from gridworld.envs.frames.text_drawing import import_pygame as import_pygame
-from gridworld.envs.frames.text_drawing import text_size, write
+from gridworld.envs.frames.board import Board, Kind, board_of
 from gridworld.errors import InputError
 from gridworld.world.grid import GridMdp
 from gridworld.world.mdp import Mdp
+
+Colour = tuple[int, int, int]
 
 CELL_SIZE = 100  # pixels
 MARGIN = 10  # pixels
@@ -34,6 +35,7 @@ Point = tuple[float, float]
 Frame = NDArray[np.uint8]  # (height, width, 3), RGB
 Packed = NDArray[np.uint32]  # (height, width), 0xRRGGBB: a number per colour
 
+INK: Colour = (0, 0, 0)
 BACKGROUND: Colour = (255, 255, 255)
 GRID_LINE: Colour = (0, 0, 0)
 UNKNOWN: Colour = (222, 222, 222)  # of states that nothing is known of, or that cannot be reached
@@ -43,18 +45,33 @@ TRAP: Colour = (50, 50, 50)
 GOAL: Colour = (230, 180, 50)
 AGENT: Colour = (100, 100, 220)
 
+SMALLEST_TEXT = 10  # pixels
+_GREYS = 17  # steps between ink and paper at the edge of a letter
+
 MAX_PIXELS = 64_000_000
 MAX_SIDE = 65_535  # pixels; GIF counts no further, and hardly a viewer does
 
 _log = logging.getLogger("gridworld")
+_fonts: dict[int, Any] = {}  # a font draws its letters once, and takes its time over it
+
+
+@functools.cache  # it is asked for by every line of a picture
+def import_pygame() -> ModuleType:
+    """pygame, without its greeting, and without `pkg_resources`, which takes longest to import."""
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    hidden = {"pygame", "pkg_resources"}.isdisjoint(sys.modules)
+    if hidden:
+        sys.modules["pkg_resources"] = None  # type: ignore[assignment]
+    try:
+        import pygame
+    finally:
+        if hidden:
+            del sys.modules["pkg_resources"]
+    return pygame
 
 
 def frame_size(mdp: Mdp, cell_size: int = CELL_SIZE) -> tuple[int, int]:
-    """Width and height of a frame in pixels: the grid and one empty cell of border all round.
-
-    Raises:
-        InputError: the frame is too large to draw.
-    """
+    """Width and height of a frame in pixels: the grid and one empty cell of border all round."""
     board = board_of(mdp)
     width, height = (board.cols + 2) * cell_size, (board.rows + 2) * cell_size
     if width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
@@ -72,19 +89,7 @@ def fitting_cell_size(mdp: Mdp, longest_side: int, largest: int = CELL_SIZE) -> 
 
 
 def draw_frame(mdp: Mdp, state: int | None, cell_size: int = CELL_SIZE) -> Frame:
-    """Draw a frame.
-
-    Args:
-        mdp: the world.
-        state: where the agent is; None: without an agent.
-        cell_size: pixels.
-
-    Returns:
-        (height, width, 3), uint8, RGB, a fresh array.
-
-    Raises:
-        InputError: the frame is too large to draw.
-    """
+    """A frame (height, width, 3), uint8, RGB, a fresh array; `state` None: without an agent."""
     pygame = import_pygame()
     surface = pygame.Surface(frame_size(mdp, cell_size))
     draw_world(surface, mdp, state, cell_size)
@@ -160,13 +165,9 @@ def draw_grid(surface: Any, board: Board, cell_size: int) -> None:
             for row, col in np.argwhere(board.state[rows, cols] >= 0).tolist():
                 box = left + col * cell_size, top + row * cell_size, cell_size + 1, cell_size + 1
                 draw.rect(surface, GRID_LINE, box, 1)
-        _name_panel(surface, panel, cell_size)
-
-
-def _name_panel(surface: Any, panel: Panel, cell_size: int) -> None:
-    size = text_size(panel.name, min(round(0.6 * cell_size), 16), panel.cols * cell_size)
-    if panel.name and size is not None:
-        write(surface, panel.name, (panel.left + 1) * cell_size, round((panel.top + 0.5) * cell_size), size)
+        size = text_size(panel.name, min(round(0.6 * cell_size), 16), right - left)
+        if panel.name and size is not None:
+            write(surface, panel.name, left, round((panel.top + 0.5) * cell_size), size)
 
 
 def draw_terminals(surface: Any, board: Board, cell_size: int) -> None:
@@ -209,12 +210,7 @@ def has_display() -> bool:
 
 
 class Window:
-    """The window of human mode. `surface` and `clock` are pygame's.
-
-    Args:
-        size: width and height in pixels.
-        title: of the window.
-    """
+    """The window of human mode, of a size in pixels. `surface` and `clock` are pygame's."""
 
     def __init__(self, size: tuple[int, int], title: str) -> None:
         pygame = import_pygame()
@@ -235,18 +231,7 @@ class Window:
         display.set_caption(self._title)
 
     def show(self, mdp: Mdp, state: int, cell_size: int, fps: int, delay: float) -> None:
-        """Draw and show one frame.
-
-        Args:
-            mdp: the world.
-            state: where the agent is.
-            cell_size: pixels.
-            fps: frames per second to keep to.
-            delay: seconds to wait after that.
-
-        Raises:
-            SystemExit: the user closed the window, which shuts pygame down.
-        """
+        """Draw and show one frame; keep `fps`, then wait. SystemExit if the user closed the window."""
         pygame = import_pygame()
         if not pygame.display.get_init():  # pygame has one display a process, and another window closed it
             self._open()
@@ -264,3 +249,46 @@ class Window:
         pygame = import_pygame()
         pygame.display.quit()
         pygame.quit()
+
+
+def font(size: int) -> Any:
+    """pygame's font of a size in pixels."""
+    pygame = import_pygame()
+    if not (_fonts and pygame.font.get_init()):
+        _fonts.clear()
+        pygame.font.init()
+        pygame.register_quit(_fonts.clear)  # they end with pygame
+    if size not in _fonts:
+        _fonts[size] = pygame.font.Font(None, round(1.2 * size))
+    return _fonts[size]
+
+
+@functools.lru_cache(maxsize=1 << 12)
+def text_width(text: str, size: int) -> int:
+    """The width of a text in pixels."""
+    return int(font(size).size(text)[0])
+
+
+def text_size(text: str, size: int, room: float) -> int | None:
+    """The size, at most `size`, at which a text is at most `room` pixels wide; None: too small to read."""
+    if size < SMALLEST_TEXT:
+        return None
+    fitting = int(size * min(1.0, room / max(1, text_width(text, size))))
+    return fitting if fitting >= SMALLEST_TEXT else None
+
+
+def write(surface: Any, text: str, left: int, middle: int, size: int) -> int:
+    """Write a text on paper, in few greys for the palettes of animations; where it ends, in pixels."""
+    image = _in_greys(text, size)
+    surface.blit(image, (left, middle - image.get_height() // 2))
+    return left + int(image.get_width())
+
+
+@functools.lru_cache(maxsize=1 << 7)  # captions and legends of a run's pictures have many words in common
+def _in_greys(text: str, size: int) -> Any:
+    image = font(size).render(text, True, INK)
+    alpha = import_pygame().surfarray.pixels_alpha(image)
+    step = 255 // (_GREYS - 1)
+    alpha[...] = alpha // step * step
+    del alpha  # unlocks the image
+    return image

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from gridworld.envs.frames import rendering as drawing
 from gridworld.envs.frames.board import board_of
-from gridworld.envs.frames.rendering import AGENT, UNKNOWN, Colour, Point
-from gridworld.envs.frames.text_drawing import SMALLEST_TEXT
+from gridworld.envs.frames.rendering import AGENT, SMALLEST_TEXT, UNKNOWN, Colour, Point
 from gridworld.errors import InputError
 from gridworld.visualization.canvas import Canvas, shown
 from gridworld.visualization.colormaps import VIRIDIS, Scale, is_dark, linear

@@ -13,8 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
-from gridworld.envs.frames.rendering import AGENT, UNKNOWN, Colour, Frame
-from gridworld.envs.frames.text_drawing import SMALLEST_TEXT, import_pygame, text_size, text_width, write
+from gridworld.envs.frames.rendering import (
+    AGENT,
+    SMALLEST_TEXT,
+    UNKNOWN,
+    Colour,
+    Frame,
+    import_pygame,
+    text_size,
+    text_width,
+    write,
+)
 from gridworld.visualization.colormaps import BLUES, ORANGES, VIRIDIS, Scale, counting, is_dark, linear
 from gridworld.visualization.sheet import DISAGREES, INK, NEVER_VISITED, PAPER, Sheet, Swatch, short
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp

@@ -18,7 +18,8 @@ used for them too, in a band around the diagonal.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
@@ -29,24 +30,11 @@ from gridworld.world.mdp import FloatArray
 _ACCURACY = 1e-11
 
 
-class Absorption(Protocol):
-    """A factored system."""
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Solve for x (n, columns), given right-hand sides (n, columns), both float64."""
-
-
 class Elimination:
     """Elimination without subtractions. Right-hand sides must not be negative."""
 
     def __init__(self, weights: FloatArray, leak: FloatArray, band: int) -> None:
-        """Factor the system; both arrays are overwritten.
-
-        Args:
-            weights: (n, n), float64, the w_ij; the diagonal does not count.
-            leak: (n,), float64, the l_i.
-            band: w_ij = 0 where |i - j| is larger, and these entries are not read.
-        """
+        """Overwrites weights (n, n), of which only |i - j| <= band is read, and leak (n,)."""
         size = len(weights)
         self._table = weights  # above the diagonal each pivot row's shares, below it what was eliminated
         self._pivots = np.empty(size)
@@ -64,7 +52,6 @@ class Elimination:
             self._below.append(below)
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """See `Absorption.solve`."""
         x = right.copy()
         for k, below in enumerate(self._below):
             x[k] /= self._pivots[k]
@@ -78,15 +65,7 @@ class BandedElimination:
     """The same for a sparse system: its states are renumbered so that a narrow band holds all weights."""
 
     def __init__(self, weights: Any, leak: FloatArray) -> None:
-        """Factor the system.
-
-        Args:
-            weights: a scipy CSR array (n, n) of the w_ij without a diagonal.
-            leak: (n,), float64, the l_i.
-
-        Raises:
-            BudgetError: the band does not fit into memory.
-        """
+        """Factor weights (n, n), a scipy CSR array without a diagonal, and leak (n,)."""
         from scipy.sparse.csgraph import reverse_cuthill_mckee
 
         self._order = reverse_cuthill_mckee(weights)
@@ -100,43 +79,35 @@ class BandedElimination:
         self._elimination = Elimination(table, leak[self._order], band)
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """See `Absorption.solve`."""
         x = np.empty_like(right)
         x[self._order] = self._elimination.solve(right[self._order])
         return x
 
 
-def factor(weights: Any, leak: FloatArray) -> Absorption:
-    """Factor a system.
+def factor(weights: Any, leak: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """A solver of the system, for right-hand sides (n, columns); it overwrites what it is given.
 
-    Args:
-        weights: (n, n), the w_ij, a numpy array or a scipy CSR array; it is overwritten.
-        leak: (n,), float64, the l_i.
-
-    Raises:
-        BudgetError: the factors do not fit into memory.
+    `weights` (n, n) is a numpy array or a scipy CSR array, `leak` is (n,).
     """
     if isinstance(weights, np.ndarray):
-        return Elimination(weights, leak, band=len(leak))
-    weights.setdiag(0.0)
-    weights.eliminate_zeros()
-    try:
-        sparse = _sparse_factors(weights, leak)
-        is_accurate = np.abs(sparse.solve(leak) - 1).max() <= _ACCURACY
-    except RuntimeError:  # rounding has made it singular
-        is_accurate = False
-    return sparse if is_accurate else BandedElimination(weights, leak)
-
-
-def _sparse_factors(weights: Any, leak: FloatArray) -> Absorption:
+        return Elimination(weights, leak, band=len(leak)).solve
     from scipy.sparse import diags_array
     from scipy.sparse.linalg import splu
 
+    weights.setdiag(0.0)
+    weights.eliminate_zeros()
     matrix = diags_array(leak + weights.sum(axis=1), format="csr") - weights
-    factors: Absorption = splu(
-        matrix.tocsc(),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
+    try:
+        factors = splu(
+            matrix.tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+        is_accurate = np.abs(factors.solve(leak) - 1).max() <= _ACCURACY
+    except RuntimeError:  # rounding has made it singular
+        is_accurate = False
+    solve: Callable[[FloatArray], FloatArray] = (
+        factors.solve if is_accurate else BandedElimination(weights, leak).solve
     )
-    return factors
+    return solve

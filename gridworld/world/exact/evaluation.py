@@ -1,12 +1,11 @@
 """How good a policy is, exactly: by solving for its value.
 
-Two horizons stand side by side. Value and regret are without a step limit, as in the theory that the
-certificate rests on. What becomes of an episode (goal, trap and time-out probability, return, length) is
-within the step limit, as training and sampling see it. The discounted return within the limit links the two:
-it is what sampled episodes (`envs.rollout`) estimate, and comes near to the value where few of them are cut.
+Value and regret are without a step limit, as in the theory that the certificate rests on. What becomes of an
+episode (goal, trap and time-out probability, return, length) is within the step limit, as training and
+sampling see it. The discounted return within the limit links the two: sampled episodes estimate it.
 
-The exact scores carry no sampling noise and cannot hang: a policy that walks in circles has a time-out
-probability of 1, whatever its number of steps.
+Another discount may make another policy optimal: a shorter horizon takes a risk, or a detour, that a longer
+one does not. Then no agent that learns perfectly with it can be certified.
 """
 
 from __future__ import annotations
@@ -20,6 +19,8 @@ from gridworld.world.exact.markov_chain import Chain, Outcome, one_hot_policy
 from gridworld.world.exact.solver import Solution, solved
 from gridworld.world.mdp import FloatArray, Mdp
 
+_USUAL_DISCOUNTS = (0.8, 0.9, 0.95, 0.97, 0.99)
+_QUICKLY_SOLVED = 20_000  # outcomes of all states and actions: a few tenths of a second
 REGRET_TOLERANCE = 1e-6  # relative; a detour of one step costs at least 1 % at the default discount
 
 
@@ -70,10 +71,7 @@ class Evaluator:
         return one_hot_policy(np.argmax(self.solution.optimal, axis=1), self.mdp.num_actions)
 
     def score(self, policy: FloatArray) -> Score:
-        """Score a policy exactly.
-
-        Args:
-            policy: (S, A), action probabilities.
+        """Score a policy (S, A) of action probabilities exactly.
 
         Raises:
             InputError: it is no policy of this world.
@@ -85,28 +83,29 @@ class Evaluator:
         return Score(value, regret, certified, chain.outcome(self.max_episode_steps))
 
     def discounted_return(self, policy: FloatArray) -> float:
-        """The exact expected discounted return of an episode within the step limit.
-
-        Args:
-            policy: (S, A), action probabilities.
-
-        Raises:
-            InputError: it is no policy of this world.
-        """
+        """The exact expected discounted return of an episode within the step limit, of a policy (S, A)."""
         return Chain(self.mdp, policy).discounted_return(self.max_episode_steps, self.solution.gamma)
 
     def endless_states(self, policy: FloatArray) -> list[int]:
-        """The states in which a policy may loop for ever, ascending; empty for a policy that always ends.
-
-        Args:
-            policy: (S, A), action probabilities.
-
-        Raises:
-            InputError: it is no policy of this world.
-        """
+        """The states in which a policy (S, A) may loop for ever, ascending; empty if it always ends."""
         states = Chain(self.mdp, policy).endless_states()
         return [int(state) for state in states if not self.mdp.absorbing[state]]
 
     def _at_start(self, values: FloatArray) -> float:
         starts = self.mdp.start_states
         return float(values[starts] @ self.mdp.start[starts])
+
+
+def score_of_optimum(judge: Evaluator, gamma: float) -> Score:
+    """The score of the optimum under another discount; of its ties, the actions that `judge` finds best."""
+    mdp, best = judge.mdp, judge.solution
+    own = solved(mdp, gamma)
+    rank = np.where(own.optimal, np.maximum(best.q, np.finfo(np.float64).min), -np.inf)
+    return judge.score(one_hot_policy(rank.argmax(axis=1), mdp.num_actions))
+
+
+def fitting_discounts(judge: Evaluator) -> list[float]:
+    """The usual discounts, and the judge's own, whose optimum is certified; in a large world its own only."""
+    usual = _USUAL_DISCOUNTS if judge.mdp.probability.size <= _QUICKLY_SOLVED else ()
+    gammas = sorted({*usual, judge.solution.gamma})
+    return [gamma for gamma in gammas if score_of_optimum(judge, gamma).certified]

@@ -13,7 +13,11 @@ Reference: M. L. Puterman, Markov Decision Processes, 1994, chapters 6 and 7 and
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import itertools
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -23,14 +27,44 @@ from numpy.typing import ArrayLike
 
 from gridworld.bounds import discount
 from gridworld.errors import InputError
-from gridworld.world.exact.absorption import Absorption, factor
-from gridworld.world.exact.one_thread import in_one_thread
+from gridworld.world.exact.absorption import factor
 from gridworld.world.layout import positive_int
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, steps_from
 
 ORDINARY_GAMMA = 0.9999  # up to here a plain solution of the linear system is accurate
 DENSE_STATES = 512  # up to here a dense matrix is both faster and small
 _STEPS_AT_ONCE = 32  # of an episode, before looking whether it can still go on
+
+
+@contextmanager
+def in_one_thread() -> Iterator[None]:
+    """OpenBLAS in one thread, however many the machine has; another library is left as it is.
+
+    It divides products and systems of a hundred states or more among threads. That changes their last bits,
+    so that a run's numbers would depend on the number of cores. And its threads wait for one another at work:
+    where other processes need the cores, for ten times the processor time.
+    """
+    count, limit = _openblas()
+    before = count()
+    if before != 1:
+        limit(1)
+    try:
+        yield
+    finally:
+        if before != 1:
+            limit(before)
+
+
+@functools.cache
+def _openblas() -> tuple[Callable[[], int], Callable[[int], Any]]:
+    """OpenBLAS's functions that tell and set the number of its threads."""
+    library: Any = ctypes.CDLL(np.linalg._umath_linalg.__file__)
+    for prefix in ("scipy_openblas", "openblas"):
+        for suffix in ("64_", "_64", ""):
+            tell, limit = (f"{prefix}_{verb}_num_threads{suffix}" for verb in ("get", "set"))
+            if hasattr(library, tell) and hasattr(library, limit):
+                return getattr(library, tell), getattr(library, limit)
+    return (lambda: 1), (lambda threads: None)
 
 
 @dataclass(frozen=True)
@@ -64,17 +98,10 @@ class Evaluation:
 class Chain:
     """States under one policy.
 
-    Args:
-        mdp: the world.
-        policy: (S, A), action probabilities.
-
     Attributes:
         policy: (S, A), float64, rows sum to 1.
         reward: (S,), r_π, the expected reward of a step.
         transition: (S, S), P_π, a numpy array, or in large worlds a scipy CSR array.
-
-    Raises:
-        InputError: a table that is no policy of this world.
     """
 
     def __init__(self, mdp: Mdp, policy: ArrayLike) -> None:
@@ -95,24 +122,16 @@ class Chain:
         used = weight > 0
         return csr_array((weight[used], (rows[used], self.mdp.next_state[used])), shape=(size, size))
 
-    @in_one_thread
+    @in_one_thread()
     def value(self, gamma: float) -> FloatArray:
-        """The expected discounted sum of rewards, without a step limit.
+        """V_π (S,), the expected discounted sum of rewards, without a step limit.
 
-        Args:
-            gamma: the discount γ, from 0 to 1.
-
-        Returns:
-            (S,), V_π. With γ = 1 it is ±inf where a policy may go on earning or paying for ever, NaN where
-            it goes on doing both.
-
-        Raises:
-            InputError: another discount.
+        With γ = 1 it is ±inf where a policy may earn or pay for ever, NaN where it goes on doing both.
         """
         gamma = check_gamma(gamma)
         if gamma > ORDINARY_GAMMA:
             return self.evaluation(gamma).value
-        states = np.flatnonzero(self._in_play)
+        states = np.flatnonzero(~self.mdp.absorbing)
         if not isinstance(self.transition, np.ndarray):
             return self._sums(self.reward[:, None], gamma)[:, 0]
         value = np.zeros(self.mdp.num_states)
@@ -120,16 +139,12 @@ class Chain:
         value[states] = np.linalg.solve(matrix, self.reward[states])
         return value
 
-    @in_one_thread
+    @in_one_thread()
     def evaluation(self, gamma: float, with_slope: bool = False) -> Evaluation:
         """The value and what else policy iteration needs, in which tiny values are accurate too.
 
         Gains and losses are solved for apart, as sums of non-negative numbers, whose error is small beside
         each state's own scale, not only beside the largest one.
-
-        Args:
-            gamma: the discount γ, from 0 to 1.
-            with_slope: whether to compute the slopes too.
         """
         signs = (np.maximum(self.mdp.reward, 0), np.maximum(-self.mdp.reward, 0))
         paid = np.stack([(self._weight * part).sum(axis=(1, 2)) for part in signs], axis=1)
@@ -140,13 +155,9 @@ class Chain:
         slopes = self._sums(self.transition @ np.where(finite, sums, 0.0), gamma)
         return Evaluation(*_value_and_scale(sums), *_value_and_scale(np.where(finite, slopes, np.inf)))
 
-    @in_one_thread
+    @in_one_thread()
     def outcome(self, max_steps: int) -> Outcome:
-        """The outcome of an episode of at most `max_steps` steps, exact.
-
-        Raises:
-            InputError: `max_steps` is no whole number of at least 1.
-        """
+        """The exact outcome of an episode of at most `max_steps` steps."""
         positive_int("max_steps", max_steps)
         live = ~self.mdp.terminal
         counted = np.stack([live, self.reward], axis=1)  # summed over an episode: its length and return
@@ -160,13 +171,9 @@ class Chain:
         goal, trap = float(mass[self.mdp.goal].sum()), float(mass[self.mdp.trap].sum())
         return Outcome(goal, trap, float(mass[live].sum()), float(total[1]), float(total[0]))
 
-    @in_one_thread
+    @in_one_thread()
     def discounted_return(self, max_steps: int, gamma: float) -> float:
-        """The expected discounted sum of rewards of an episode of at most `max_steps` steps, exact.
-
-        Raises:
-            InputError: `max_steps` is no whole number of at least 1.
-        """
+        """The exact discounted sum of rewards of an episode of at most `max_steps` steps."""
         positive_int("max_steps", max_steps)
         total, mass = 0.0, self.mdp.start
         for first in range(0, max_steps, _STEPS_AT_ONCE):
@@ -190,20 +197,9 @@ class Chain:
         return visits
 
     def endless_states(self) -> IntArray:
-        """The states that an episode may come to walk in for ever.
-
-        For a deterministic policy in a world without slip these are the cells of its cycle.
-
-        Returns:
-            (n,), ascending; empty for a policy that always ends.
-        """
+        """(n,), ascending, where an episode may walk for ever: of a deterministic policy its cycle."""
         mdp, taken = self.mdp, self._weight > 0
-        reached = np.zeros(mdp.num_states, dtype=np.bool_)
-        frontier: IntArray = mdp.start_states
-        while frontier.size:
-            reached[frontier] = True
-            following = np.unique(mdp.next_state[frontier][taken[frontier]])
-            frontier = following[~reached[following]]
+        reached = steps_from(mdp.start_states, mdp.next_state, taken) >= 0
         states: IntArray = np.flatnonzero(reached & ~can_reach(mdp, taken, mdp.terminal))
         while True:  # what lies on the way into a cycle has no predecessor here and drops out
             following = np.unique(mdp.next_state[states][taken[states]])
@@ -211,29 +207,22 @@ class Chain:
                 return states
             states = following
 
-    @cached_property
-    def _in_play(self) -> BoolArray:
-        return ~self.mdp.absorbing
-
     def _sums(self, right: FloatArray, gamma: float) -> FloatArray:
         """x = right + γ P_π x for each column, x = 0 where nothing moves any more.
 
         With γ = 1 the columns must not be negative; x is infinite where it does not stop growing.
         """
         sums = np.zeros_like(right)
-        playing = self._in_play
+        playing = ~self.mdp.absorbing
         if gamma == 1:
             sums[self._growing(right)] = np.inf
             playing = playing & ~(self._recurrent > 0) & np.isfinite(sums).all(axis=1)
         states = np.flatnonzero(playing)
         if states.size:
-            sums[states] = self._system(gamma, states).solve(right[states])
+            leaving = self.transition[states][:, np.flatnonzero(~playing)].sum(axis=1)
+            leak = (1 - gamma) + gamma * leaving
+            sums[states] = factor(gamma * self.transition[states][:, states], leak)(right[states])
         return sums
-
-    def _system(self, gamma: float, states: IntArray) -> Absorption:
-        outside = np.flatnonzero(~np.isin(np.arange(self.mdp.num_states), states))
-        leak = (1 - gamma) + gamma * self.transition[states][:, outside].sum(axis=1)
-        return factor(gamma * self.transition[states][:, states], leak)
 
     def _growing(self, right: FloatArray) -> BoolArray:
         """(S, columns), states from which a column is collected for ever with some probability."""
@@ -248,7 +237,9 @@ class Chain:
     def _recurrent(self) -> IntArray:
         """(S,), a number from 1 on for each class of states that it never leaves, 0 for all other states."""
         recurrent = np.zeros(self.mdp.num_states, dtype=np.int64)
-        endless = np.flatnonzero(self._in_play & ~can_reach(self.mdp, self._weight > 0, self.mdp.terminal))
+        endless = np.flatnonzero(
+            ~self.mdp.absorbing & ~can_reach(self.mdp, self._weight > 0, self.mdp.terminal)
+        )
         if endless.size:
             from scipy.sparse import coo_array
             from scipy.sparse.csgraph import connected_components
@@ -260,15 +251,39 @@ class Chain:
         return recurrent
 
 
-def check_gamma(gamma: float) -> float:
-    """Check a discount.
+def stopping_states(chain: Chain, gamma: float) -> BoolArray:
+    """(S,), where nothing is counted any more; with γ = 1, where an episode cannot end any more."""
+    mdp = chain.mdp
+    if gamma < 1:
+        return mdp.absorbing
+    taken = (chain.policy[:, :, None] > 0) & (mdp.probability > 0)
+    return mdp.absorbing | ~can_reach(mdp, taken, mdp.terminal)
 
-    Returns:
-        It as a float from 0 to 1.
 
-    Raises:
-        InputError: it is anything else, or so near to 1 that the cost of a step gets lost in rounding.
+@in_one_thread()
+def discounted_visits(chain: Chain, gamma: float, stops: BoolArray) -> FloatArray:
+    """Discounted visits (S,) from the start distribution on: d(s) = Σ_t γ^t P(s_t = s).
+
+    No one leaves a state of `stops` (S,); there it is the discounted probability to come there.
     """
+    start, going = chain.mdp.start, np.flatnonzero(~stops)
+    ahead = gamma * chain.transition[going]
+    visits = start.copy()
+    if isinstance(ahead, np.ndarray):
+        visits[going] = np.linalg.solve(np.eye(len(going)) - ahead[:, going].T, start[going])
+    else:
+        from scipy.sparse import eye_array
+        from scipy.sparse.linalg import spsolve
+
+        matrix = (eye_array(len(going)) - ahead[:, going].T).tocsc()
+        visits[going] = spsolve(matrix, start[going])
+    visits[stops] += (ahead.T @ visits[going])[stops]
+    visits[visits < 0] = 0.0  # rounding
+    return visits
+
+
+def check_gamma(gamma: float) -> float:
+    """A discount as a float, from 0 to 1 and not so near to 1 that the cost of a step is lost in rounding."""
     if isinstance(gamma, bool) or not isinstance(gamma, int | float | np.number) or not 0 <= gamma <= 1:
         raise InputError(f"gamma={gamma!r}: a discount must be a number from 0 to 1")
     discount("gamma", float(gamma))
@@ -283,18 +298,7 @@ def one_hot_policy(actions: IntArray, num_actions: int) -> FloatArray:
 
 
 def check_policy(mdp: Mdp, policy: ArrayLike) -> FloatArray:
-    """Check a policy.
-
-    Args:
-        mdp: the world that it is for.
-        policy: (S, A), action probabilities.
-
-    Returns:
-        (S, A), float64; rows sum to 1.
-
-    Raises:
-        InputError: it is no policy of this world.
-    """
+    """A policy (S, A) of this world as float64 whose rows sum to 1; refuses anything else."""
     try:
         table: FloatArray = np.asarray(policy, dtype=np.float64)
     except (TypeError, ValueError):
@@ -314,30 +318,12 @@ def check_policy(mdp: Mdp, policy: ArrayLike) -> FloatArray:
 
 
 def can_reach(mdp: Mdp, taken: BoolArray, targets: BoolArray) -> BoolArray:
-    """The states from which others can be reached.
-
-    Args:
-        mdp: the world.
-        taken: (S, A, K), the outcomes that may be taken.
-        targets: (S,), the states to reach, which reach themselves.
-
-    Returns:
-        (S,), True where a target can be reached.
-    """
+    """(S,), from where `targets` (S,) can be reached by the outcomes `taken` (S, A, K)."""
     return steps_to(mdp, taken, targets) >= 0
 
 
 def steps_to(mdp: Mdp, taken: BoolArray, targets: BoolArray) -> IntArray:
-    """The fewest steps to some states.
-
-    Args:
-        mdp: the world.
-        taken: (S, A, K), the outcomes that may be taken.
-        targets: (S,), the states to reach.
-
-    Returns:
-        (S,), integers; -1 where no target can be reached.
-    """
+    """(S,), the fewest steps to `targets` (S,) by the outcomes `taken` (S, A, K); -1: there is no way."""
     steps = np.where(targets, 0, -1)
     frontier: IntArray = np.flatnonzero(targets)
     distance = 0

@@ -1,6 +1,6 @@
-"""Worlds as arrays: a file of one's own (.npz), and the file that a run keeps of its world.
+"""Worlds as arrays: of a custom file (.npz) or function, and the file that a run keeps of its world.
 
-A world of one's own, with N states, A actions and at most K outcomes of each:
+A custom world, with N states, A actions and at most K outcomes of each:
 
     next_state         (N, A, K)  whole numbers from 0 to N - 1: the state that follows
     probability        (N, A, K)  of each outcome; 0 where there is none
@@ -27,7 +27,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
@@ -35,13 +35,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.errors import InputError
+from gridworld.errors import InputError, in_short
+from gridworld.process.import_path import imported
 from gridworld.process.memory_budget import check_memory
 from gridworld.process.npz import npz_arrays, npz_bytes
 from gridworld.process.users_file import open_users_file
 from gridworld.world.mdp import Mdp, frozen
-from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
-from gridworld.world.sources.verification import checked_text, verified
+from gridworld.world.outcomes import Outcomes, checked_text, mdp_from_outcomes, verified
 
 _TABLES = ("next_state", "probability", "reward", "terminated", "success")
 _NEEDED = ("next_state", "reward", "terminated", "start")
@@ -52,7 +52,7 @@ _FORMAT = np.array("gridworld world 1")
 
 
 def load_world(path: str | PathLike[str]) -> Mdp:
-    """Read a world from a file: one of one's own, or a run's `world.npz`. The module says what is in them.
+    """Read a world from a file: a custom one, or a run's `world.npz`. The module says what is in them.
 
     Args:
         path: an .npz file, relative to the folder that the program was started in.
@@ -71,16 +71,7 @@ def load_world(path: str | PathLike[str]) -> Mdp:
 
 
 def mdp_from_arrays(name: str, arrays: Mapping[str, Any], where: str) -> Mdp:
-    """Compile the arrays of a world of one's own; the module says which.
-
-    Args:
-        name: of the world, where `arrays` has none.
-        arrays: arrays, or what numpy makes arrays of, by name.
-        where: where they come from, for messages.
-
-    Raises:
-        InputError: arrays that make no world.
-    """
+    """Compile the arrays of a custom world, or what numpy makes arrays of, by name; see the module."""
     _check_names(where, arrays)
     given = {key: _array(where, key, value) for key, value in arrays.items()}
     shape = given["next_state"].shape
@@ -94,16 +85,67 @@ def mdp_from_arrays(name: str, arrays: Mapping[str, Any], where: str) -> Mdp:
         given.setdefault("probability", np.ones(given["next_state"].shape))
     elif "probability" not in given:
         raise InputError(f"{where}: has no probability; without it, next_state must be (states, actions)")
+    places = given.get("places")
+    if places is not None and places.ndim == 2 and places.shape[1] == 2 and places.dtype.kind in "iu":
+        places = np.concatenate([np.where(places[:, :1] < 0, -1, 0), places], axis=1)  # of one panel
     tables = Outcomes(**{key: given[key] for key in (*_TABLES, "start") if key in given})
     mdp = mdp_from_outcomes(
         where,
         tables,
         action_names=_names(where, "action_names", given.get("action_names")),
-        places=_places(where, given.get("places")),
+        places=places,
         max_episode_steps=_whole(where, "max_episode_steps", given.get("max_episode_steps")),
     )
     called = checked_text(where, "name", given["name"]) if "name" in given else name
     return verified(dataclasses.replace(mdp, name=called), where)
+
+
+def build(builder: str | Callable[..., Any], kwargs: Mapping[str, Any] | None = None) -> Mdp:
+    """Call a function that makes a world.
+
+    Args:
+        builder: the function, or its import path, `package.module.function`. It returns an `Mdp`, `Outcomes`,
+            or arrays by their names, as the module has them.
+        kwargs: its arguments.
+
+    Returns:
+        The world, named after the function unless what that returns has a name.
+    """
+    where = f"env.builder={_name_of(builder) if callable(builder) else str(builder)[:200]}"
+    function = imported("env.builder", builder) if isinstance(builder, str) else builder
+    if not callable(function):
+        raise InputError(f"{where}: must be the import path of a function, e.g. my_package.worlds.make")
+    mdp, again = (_built(where, function, dict(kwargs or {})) for _ in range(2))
+    if mdp.text() != again.text():
+        raise InputError(
+            f"{where}: makes another world each time that it is called, so that no run is about one; what it "
+            "draws must follow from env.kwargs, e.g. a seed"
+        )
+    return mdp
+
+
+def _built(where: str, function: Callable[..., Any], kwargs: dict[str, Any]) -> Mdp:
+    try:
+        found = function(**kwargs)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    except (Exception, SystemExit) as error:  # a function of the user's own may raise anything
+        raise InputError(f"{where}: raised {in_short(error)}") from error
+    name = _name_of(function)
+    if isinstance(found, Mdp):
+        plain = {field.name: getattr(found, field.name) for field in dataclasses.fields(Mdp)}
+        return verified(Mdp(**plain), where)
+    if isinstance(found, Outcomes):
+        return verified(dataclasses.replace(mdp_from_outcomes(where, found), name=name), where)
+    if isinstance(found, Mapping):
+        return mdp_from_arrays(name, found, where)
+    raise InputError(
+        f"{where}: returned {type(found).__name__}, must return an Mdp, Outcomes, or a mapping of arrays"
+    )
+
+
+def _name_of(function: Any) -> str:
+    return str(getattr(function, "__name__", type(function).__name__))
 
 
 def _check_names(where: str, arrays: Mapping[str, Any]) -> None:
@@ -113,13 +155,9 @@ def _check_names(where: str, arrays: Mapping[str, Any]) -> None:
     for key in arrays:
         if key not in _NEEDED + _OPTIONAL:
             near = difflib.get_close_matches(str(key), _OPTIONAL, n=1)
-            told = f"did you mean {near[0]}?" if near else f"beside what is needed it may hold {_listed()}"
+            listed = f"{', '.join(_OPTIONAL[:-1])} and {_OPTIONAL[-1]}"
+            told = f"did you mean {near[0]}?" if near else f"beside what is needed it may hold {listed}"
             raise InputError(f"{where}: {str(key)[:50]} is no array of a world; {told}")
-
-
-def _listed() -> str:
-    *others, last = _OPTIONAL
-    return f"{', '.join(others)} and {last}"
 
 
 def _array(where: str, key: str, value: Any) -> NDArray[Any]:
@@ -138,12 +176,6 @@ def _names(where: str, key: str, given: NDArray[Any] | None) -> list[str] | None
     if given.ndim != 1 or given.dtype.kind != "U":
         raise InputError(f"{where}: {key} is {given.dtype} {given.shape}, must be one string each")
     return [checked_text(where, key, name) for name in given]
-
-
-def _places(where: str, given: NDArray[Any] | None) -> NDArray[Any] | None:
-    if given is not None and given.ndim == 2 and given.shape[1] == 2 and given.dtype.kind in "iu":
-        return np.concatenate([np.where(given[:, :1] < 0, -1, 0), given], axis=1)
-    return given
 
 
 def _whole(where: str, key: str, given: NDArray[Any] | None) -> int | None:
@@ -182,14 +214,7 @@ def _read(path: str | PathLike[str]) -> bytes:
 
 
 def world_bytes(mdp: Mdp) -> bytes:
-    """A world as the content of a file, all its tables bit for bit.
-
-    Args:
-        mdp: any world. Of a map, what only `GridMdp` has is left out.
-
-    Returns:
-        The same bytes for the same world.
-    """
+    """A world as the content of a file, its tables bit for bit, but for what only `GridMdp` has."""
     arrays = {"format": _FORMAT}
     for field in dataclasses.fields(Mdp):
         value = getattr(mdp, field.name)
@@ -202,15 +227,7 @@ def world_bytes(mdp: Mdp) -> bytes:
 
 
 def world_from_bytes(content: bytes, where: str) -> Mdp:
-    """Mirrors `world_bytes`.
-
-    Args:
-        content: of the file.
-        where: the file, for messages.
-
-    Raises:
-        InputError: it is no such file, or the tables in it are no world.
-    """
+    """Mirrors `world_bytes`."""
     return _from_fields(npz_arrays(where, content, "a world"), where)
 
 

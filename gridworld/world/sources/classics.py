@@ -38,9 +38,6 @@ def river_swim(length: int = 6) -> Mdp:
 
     Args:
         length: number of states, at least 2.
-
-    Raises:
-        InputError: another length.
     """
     _check_whole("length", length, 2, MOST_STATES)
     state = np.arange(length)
@@ -85,9 +82,6 @@ def deep_sea(size: int = 10, seed: int | None = None) -> Mdp:
         size: rows, and columns; at least 2.
         seed: None: action 1 is right in every cell. A number: which action is right is drawn for each cell,
             as bsuite draws it for the same `mapping_seed`, so that no generalisation over cells helps.
-
-    Raises:
-        InputError: another size or seed.
     """
     _check_whole("size", size, 2, 500)
     cells = size * size
@@ -132,9 +126,6 @@ def combination_lock(length: int = 10, num_actions: int = 2, seed: int | None = 
         length: number of actions that open it, at least 1.
         num_actions: at least 2.
         seed: None: the last action is the right one of every state. A number: the right ones are drawn.
-
-    Raises:
-        InputError: other arguments.
     """
     _check_whole("length", length, 1, MOST_STATES - 1)
     _check_whole("num_actions", num_actions, 2, MOST_ACTIONS)
@@ -171,9 +162,6 @@ def random_walk(length: int = 5) -> Mdp:
 
     Args:
         length: number of states without the ends, odd, so that there is a middle.
-
-    Raises:
-        InputError: another length.
     """
     _check_whole("length", length, 1, MOST_STATES - 2)
     if length % 2 == 0:

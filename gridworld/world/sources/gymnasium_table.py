@@ -12,8 +12,9 @@ be an outcome of its row, and as frequent as the row says, as far as that can be
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+import itertools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
@@ -21,9 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError
-from gridworld.world.mdp import IntArray, Mdp
+from gridworld.world.mdp import IntArray, Mdp, grid_places
 from gridworld.world.outcomes import Outcomes, check_size, mdp_from_outcomes
-from gridworld.world.sources.known_envs import known_env
 from gridworld.world.sources.making import make_env, told
 from gridworld.world.sources.table_walk import walk
 from gridworld.world.sources.wrappers import copied, refuse_transformed, step_limit
@@ -41,10 +41,6 @@ def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> M
 
     Returns:
         The world, with the id as its name and the step limit of the registered id.
-
-    Raises:
-        InputError: no such id, arguments that the environment refuses, no table, or an environment that is
-            not what its table says.
     """
     arguments = dict(kwargs or {})
     env = make_env(env_id, arguments)
@@ -63,25 +59,14 @@ def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> M
     return replace(mdp, truth=truth)
 
 
-def compile_table(real: gym.Env[Any, Any], limit: int | None = None, walked: bool = True) -> Mdp:
-    """Compile the transition table of an environment without wrappers, which is left as it is.
+def compile_table(real: gym.Env[Any, Any], limit: int | None = None) -> Mdp:
+    """Compile the table of an environment without wrappers, which is left as it is; a copy is stepped.
 
-    Args:
-        real: an environment with `P` and `initial_state_distrib`.
-        limit: the step limit of its wrappers.
-        walked: whether to step a copy beside the table.
-
-    Returns:
-        The world, with the environment's id as its name, or its class where it has none.
-
-    Raises:
-        InputError: no table, or an environment that does not do what the table says.
+    `limit` is the step limit of its wrappers. The world has the environment's id, or else its class, as name.
     """
     mdp, table = _compiled(real, real.spec.id if real.spec is not None else type(real).__name__, limit)
     if own := {"step", "reset"} & vars(real).keys():
         raise InputError(f"{mdp.name}: its {own.pop()}() was replaced, so nothing exact is known of it")
-    if not walked:
-        return mdp
     key = (type(real), mdp.text()) if type(real).__module__.startswith("gymnasium.envs.") else None
     truth = _WALKED.get(key) or _check_steps(mdp, table, copied(real))
     if key is not None:
@@ -120,9 +105,13 @@ def _table(name: str, real: Any) -> Outcomes:
             f"{name}: has no transition table P, so its truth cannot be read off; env=enumerated may fit, "
             "which tries out what a deterministic environment does"
         )
-    states, actions = (
-        _size(name, what, getattr(real, f"{what}_space", None)) for what in ("observation", "action")
-    )
+    sizes = []
+    for what in ("observation", "action"):
+        space = getattr(real, f"{what}_space", None)
+        if not isinstance(space, gym.spaces.Discrete) or space.start != 0:
+            raise InputError(f"{name}: its {what} space is {space}, must be Discrete(n) that starts at 0")
+        sizes.append(int(space.n))
+    states, actions = sizes
     check_size(name, states, actions, 1)
     rows, counts = _rows(name, real.P, states, actions)
     longest = int(counts.max())
@@ -143,14 +132,6 @@ def _table(name: str, real: Any) -> Outcomes:
         terminated=padded[..., 3] == 1,
         start=_start(name, real, states),
     )
-
-
-def _size(name: str, what: str, space: Any) -> int:
-    from gymnasium.spaces import Discrete
-
-    if not isinstance(space, Discrete) or space.start != 0:
-        raise InputError(f"{name}: its {what} space is {space}, must be Discrete(n) that starts at 0")
-    return int(space.n)
 
 
 def _start(name: str, real: Any, states: int) -> NDArray[np.float64]:
@@ -178,44 +159,41 @@ def _rows(name: str, table: Any, states: int, actions: int) -> tuple[NDArray[np.
                 found.extend(row)
         rows = np.array(found, dtype=np.float64)
         good = rows.shape == (len(found), 4) and bool((counts > 0).all())
-        if good and _are_states(rows[:, 1], states).all() and np.isin(rows[:, 3], (0, 1)).all():
+        if good and _are_outcomes(rows, states):
             return rows, counts
     except (KeyError, IndexError, TypeError, ValueError, OverflowError):
         pass
     raise _mistake(name, table, states, actions)
 
 
-def _are_states(numbers: Any, states: int) -> Any:
-    return (numbers >= 0) & (numbers < states) & (np.floor(numbers) == numbers)
+def _are_outcomes(rows: NDArray[np.float64], states: int) -> bool:
+    """Whether all rows (M, 4) lead to states and end, or not."""
+    following = rows[:, 1]
+    are_states = (following >= 0) & (following < states) & (np.floor(following) == following)
+    return bool(are_states.all() and np.isin(rows[:, 3], (0, 1)).all())
 
 
 def _mistake(name: str, table: Any, states: int, actions: int) -> InputError:
     """The first row that is no row."""
-    for state in range(states):
-        for action in range(actions):
-            try:
-                row = table[state][action]
-            except (KeyError, IndexError, TypeError):
-                return InputError(
-                    f"{name}: P has no state {state} with action {action}, must have {states} states with "
-                    f"{actions} actions each"
-                )
-            if not _is_row(row, states):
-                return InputError(
-                    f"{name}: P[{state}][{action}] is {str(row)[:100]}, must be a list of (probability, next "
-                    f"state from 0 to {states - 1}, reward, terminated)"
-                )
+    for state, action in itertools.product(range(states), range(actions)):
+        try:
+            row = table[state][action]
+        except (KeyError, IndexError, TypeError):
+            return InputError(
+                f"{name}: P has no state {state} with action {action}, must have {states} states with "
+                f"{actions} actions each"
+            )
+        try:
+            numbers = np.array(list(row), dtype=np.float64)
+            good = numbers.ndim == 2 and numbers.shape[1] == 4 and _are_outcomes(numbers, states)
+        except (TypeError, ValueError, OverflowError):
+            good = False
+        if not good:
+            return InputError(
+                f"{name}: P[{state}][{action}] is {str(row)[:100]}, must be a list of (probability, next "
+                f"state from 0 to {states - 1}, reward, terminated)"
+            )
     return InputError(f"{name}: P is no table of {states} states and {actions} actions")
-
-
-def _is_row(row: Any, states: int) -> bool:
-    try:
-        numbers = np.array(list(row), dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return False
-    if numbers.ndim != 2 or numbers.shape[1] != 4 or not len(numbers):
-        return False
-    return bool(_are_states(numbers[:, 1], states).all() and np.isin(numbers[:, 3], (0, 1)).all())
 
 
 def _differ(table: Outcomes, other: Outcomes) -> bool:
@@ -227,7 +205,7 @@ def _check_steps(mdp: Mdp, table: Outcomes, env: gym.Env[Any, Any]) -> str:
     """What `walk` says."""
     real, mistake, found = env.unwrapped, None, ""
     try:
-        found = walk(mdp, table, env)
+        found = walk(mdp, table, env, known_env(real) is not None)
     except InputError as error:
         mistake = error
     except Exception as error:  # an environment of the user's own may raise anything
@@ -240,3 +218,48 @@ def _check_steps(mdp: Mdp, table: Outcomes, env: gym.Env[Any, Any]) -> str:
     if mistake is not None:
         raise mistake
     return found
+
+
+@dataclass(frozen=True)
+class _KnownEnv:
+    """What is known of a class of environments beside its table."""
+
+    action_names: tuple[str, ...]
+    places: Callable[[Any], NDArray[np.int64]]  # (N, 3), see `Mdp`
+    panel_names: tuple[str, ...] = ()  # see `Mdp`
+    refused: Callable[[Any], str] = lambda env: ""  # why its table is not true, if that can be seen
+
+
+def _taxi_places(env: Any) -> NDArray[np.int64]:
+    """One panel for each passenger and destination: passenger * 4 + destination."""
+    cell, panel = np.divmod(np.arange(500), 20)
+    return np.stack([panel, cell // 5, cell % 5], axis=1).astype(np.int64)
+
+
+def _is_fickle(env: Any) -> str:
+    if not (getattr(env, "fickle_passenger", False) and getattr(env, "fickle_probability", 1) > 0):
+        return ""
+    return (
+        "fickle_passenger=True changes the destination in a way that its table P does not have, so no exact "
+        "truth is known; leave it out"
+    )
+
+
+_KNOWN = {
+    "FrozenLakeEnv": _KnownEnv(("left", "down", "right", "up"), lambda env: grid_places(*env.desc.shape)),
+    "CliffWalkingEnv": _KnownEnv(("up", "right", "down", "left"), lambda env: grid_places(*env.shape)),
+    "TaxiEnv": _KnownEnv(
+        ("south", "north", "east", "west", "pickup", "dropoff"),
+        _taxi_places,
+        tuple(f"{passenger} to {destination}" for passenger in (*"RGYB", "taxi") for destination in "RGYB"),
+        refused=_is_fickle,
+    ),
+}
+
+
+def known_env(real: Any) -> _KnownEnv | None:
+    """What is known of an environment, if anything is."""
+    for each in type(real).__mro__:
+        if each.__module__.startswith("gymnasium.envs.toy_text."):
+            return _KNOWN.get(each.__name__)
+    return None

@@ -20,13 +20,8 @@ def make_env(
 ) -> gym.Env[Any, Any]:
     """Make an environment of Gymnasium.
 
-    Args:
-        env_id: its registered id; "module:id" imports the module first.
-        kwargs: the arguments of `gymnasium.make`.
-        render_mode: how it renders.
-
-    Raises:
-        InputError: an unknown id, a package that is not installed, or arguments that it refuses.
+    `env_id` is a registered id, in which "module:id" imports the module first; `kwargs` are the arguments of
+    `gymnasium.make`.
     """
     arguments = dict(kwargs or {})
     if arguments.get("render_mode") is not None:
@@ -38,7 +33,11 @@ def make_env(
         _import_module(env_id, module)
     for beginning, package in _PACKAGES.items():
         if registered.startswith(beginning):
-            _import(env_id, package)
+            try:
+                importlib.import_module(package)
+            except ImportError:
+                needed = f"needs the package {package}; install it with {install_command(package)}"
+                raise InputError(f"env.id={env_id}: {needed}") from None
     try:
         spec = gym.spec(registered)
     except Exception as error:  # an id may name a module, which may raise anything
@@ -50,7 +49,8 @@ def make_env(
         with np.errstate(all="ignore"):
             return gym.make(env_id, **{"disable_env_checker": True, **arguments, "render_mode": render_mode})
     except Exception as error:  # as above
-        given = f"env.kwargs={_shown(arguments)}: {env_id}" if arguments else f"env.id={env_id}:"
+        shown = ", ".join(f"{key}: {value}" for key, value in arguments.items())[:100]
+        given = f"env.kwargs={{{shown}}}: {env_id}" if arguments else f"env.id={env_id}:"
         takes = _arguments(spec) if arguments else ""
         raise InputError(f"{given} cannot be made ({told(error)}){takes}") from None
 
@@ -58,10 +58,6 @@ def make_env(
 def told(error: BaseException) -> str:
     """What an exception says, in short."""
     return in_short(error).split(" was raised from the environment creator")[0].rstrip(" .")
-
-
-def _shown(arguments: Mapping[str, Any]) -> str:
-    return "{" + ", ".join(f"{key}: {value}" for key, value in arguments.items())[:100] + "}"
 
 
 def _arguments(spec: Any) -> str:
@@ -89,12 +85,3 @@ def _import_module(env_id: str, module: str) -> None:
         if missing and f"{module}.".startswith(f"{missing}."):
             reason = f"there is no module {missing}; install it, or name its folder in PYTHONPATH"
         raise InputError(f"env.id={str(env_id)[:80]}: {reason}") from None
-
-
-def _import(env_id: str, package: str) -> None:
-    try:
-        importlib.import_module(package)
-    except ImportError:
-        raise InputError(
-            f"env.id={env_id}: needs the package {package}; install it with {install_command(package)}"
-        ) from None

@@ -11,10 +11,9 @@ import copy
 import dis
 import functools
 import pickle
-import random
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from types import CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
@@ -22,6 +21,7 @@ import gymnasium as gym
 import numpy as np
 
 from gridworld.errors import InputError, in_short
+from gridworld.world.sources.snapshots import GENERATORS, generator_state, random_states
 
 _CALLS = 1000  # at least
 _MOST_READ = 20_000  # objects
@@ -29,7 +29,6 @@ _LIBRARIES = {
     *sys.stdlib_module_names,
     *("gymnasium", "gridworld", "minigrid", "numpy", "sb3_contrib", "scipy", "stable_baselines3", "torch"),
 } - {"__main__"}
-_GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
 SO_UNKNOWN = (
     ", so what it makes of the task is not exactly known; "
     "leave it out, or make it a function of its argument alone"
@@ -37,25 +36,25 @@ SO_UNKNOWN = (
 
 
 def asked(where: str, owner: Any, method: str, arguments: list[Any], chain: Iterable[Any] = ()) -> list[Any]:
-    """What a method makes of each argument.
+    """What a method of `owner` makes of (copies of) each argument; refuses what is no function of it alone.
 
-    Args:
-        where: what messages call the environment.
-        owner: whose method it is.
-        method: its name.
-        arguments: copies of these are given.
-        chain: the environments that it may refer to.
-
-    Raises:
-        InputError: it is no function of its argument alone, or raises something.
+    `chain` are the environments that it may refer to; `where` is what messages call the environment.
     """
     name, ask = f"{method}() of {type(owner).__name__}", getattr(owner, method)
+
+    def all_of(order: list[Any]) -> list[Any]:
+        return [copy.deepcopy(ask(copy.deepcopy(each))) for each in order]
+
     try:
-        found = _all(ask, arguments)
+        found = all_of(arguments)
         before = remembered(where, name, owner, chain)
-        for _ in range(1 + _CALLS // max(1, len(arguments))):
-            _compare(where, name, arguments, found, _all(ask, arguments[::-1])[::-1])
-        _compare(where, name, arguments, found, _all(ask, arguments))
+        for order in [*[-1] * (1 + _CALLS // max(1, len(arguments))), 1]:  # backwards, at last forwards
+            again = all_of(arguments[::order])[::order]
+            for argument, one, other in zip(arguments, found, again, strict=True):
+                if not same(one, other):
+                    raise InputError(
+                        f"{where}: {name} does not always give the same for {str(argument)[:50]}{SO_UNKNOWN}"
+                    )
     except InputError:
         raise
     except Exception as error:  # it may be anybody's
@@ -63,18 +62,6 @@ def asked(where: str, owner: Any, method: str, arguments: list[Any], chain: Iter
     if remembered(where, name, owner, chain) != before:
         raise InputError(f"{where}: {name} keeps a memory or draws random numbers{SO_UNKNOWN}")
     return found
-
-
-def _all(ask: Callable[[Any], Any], arguments: list[Any]) -> list[Any]:
-    return [copy.deepcopy(ask(copy.deepcopy(each))) for each in arguments]
-
-
-def _compare(where: str, name: str, arguments: list[Any], found: list[Any], again: list[Any]) -> None:
-    for argument, one, other in zip(arguments, found, again, strict=True):
-        if not same(one, other):
-            raise InputError(
-                f"{where}: {name} does not always give the same for {str(argument)[:50]}{SO_UNKNOWN}"
-            )
 
 
 def same(one: Any, other: Any) -> bool:
@@ -98,25 +85,8 @@ def alike(one: Any, other: Any, without: Iterable[str] = ()) -> bool:
     return parts[0] == parts[1]
 
 
-def random_states() -> list[Any]:
-    """The states of the generators that all share: of Python, numpy and torch."""
-    torch = sys.modules.get("torch")
-    drawn = [] if torch is None else [torch.get_rng_state().numpy().tobytes()]
-    return [random.getstate(), pickle.dumps(np.random.get_state()), *drawn]
-
-
 def remembered(where: str, name: str, owner: Any, chain: Iterable[Any] = ()) -> list[Any]:
-    """Whatever a method of `owner` could change or draw from, as values to compare.
-
-    Args:
-        where: as for `asked`, as are the others.
-        name: what messages call the method.
-        owner: see there.
-        chain: see there.
-
-    Raises:
-        InputError: it refers to an environment outside of the chain.
-    """
+    """Whatever a method of `owner` could change or draw from, to compare; refuses other environments."""
     reader = _Reader([*chain, owner])
     try:
         reader.read({key: value for key, value in vars(owner).items() if key != "env"})
@@ -159,12 +129,8 @@ class _Reader:
             if self._follows:
                 raise _AnotherEnvError
             yield "environment"
-        elif isinstance(value, np.random.Generator):
-            yield repr(value.bit_generator.state)
-        elif isinstance(value, np.random.RandomState):
-            yield repr(value.get_state())
-        elif isinstance(value, random.Random):
-            yield repr(value.getstate())
+        elif isinstance(value, GENERATORS):
+            yield repr(generator_state(value))
         elif isinstance(value, gym.Space):
             yield from (value._np_random, repr(value)) if self._follows else [repr(value)]
         elif isinstance(value, np.ndarray):
@@ -221,7 +187,7 @@ def _globals_of(code: CodeType) -> set[str]:
 def _of_module(module: ModuleType) -> Iterator[Any]:
     """Its data: what it imports and defines may be anything."""
     for value in list(vars(module).values()):
-        if isinstance(value, int | float | str | list | dict | set | np.ndarray | _GENERATORS):
+        if isinstance(value, int | float | str | list | dict | set | np.ndarray | GENERATORS):
             yield value if not isinstance(value, dict) or "__name__" not in value else None
 
 

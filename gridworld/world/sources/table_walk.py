@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
 from gridworld.errors import InputError
-from gridworld.world.exact.bellman import backup
+from gridworld.world.exact.solver import backup
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 from gridworld.world.outcomes import Outcomes
-from gridworld.world.sources.enumeration.snapshots import Snapshots
-from gridworld.world.sources.known_envs import known_env
+from gridworld.world.sources.snapshots import Snapshots
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -47,21 +46,12 @@ _PROBES = 12
 _WATCHED = 5  # episodes after which it is seen which attributes change
 
 
-def walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> str:
-    """Compare steps of the real environment with its table.
+def walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any], is_known: bool) -> str:
+    """Compare steps of the real environment with its table; says what was compared, and how exactly.
 
-    Args:
-        mdp: the world that was made of the table.
-        table: what the environment says of itself.
-        real: the environment, which is stepped.
-
-    Returns:
-        What was compared, and how exactly, for `Mdp.truth`.
-
-    Raises:
-        InputError: starts or steps that are not those of the table.
+    `is_known`: whether it is one of Gymnasium's own classes.
     """
-    walker = _Walker(mdp, table, real)
+    walker = _Walker(mdp, table, real, is_known)
     walker.along_policies(_WALK)
     while walker.episodes < _RESETS:
         walker.reset()
@@ -75,7 +65,7 @@ def walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> str:
 class _Walker:
     """Steps an environment, and counts what its R = N * A rows did."""
 
-    def __init__(self, mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> None:
+    def __init__(self, mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any], is_known: bool) -> None:
         self.mdp, self.table, self.real = mdp, table, real
         self.episodes = 0
         self._rng = np.random.default_rng(SEED)
@@ -92,7 +82,7 @@ class _Walker:
         self._met: list[tuple[int, int, float, bool]] = []  # row, next state, reward, terminated
         self._state = self._elapsed = 0
         self._shows_state = True  # as the attribute `s`, so far
-        self._is_known = known_env(real.unwrapped) is not None
+        self._is_known = is_known
         self._changed: set[str] = set()
 
     def reset(self) -> None:
@@ -108,11 +98,7 @@ class _Walker:
             )
 
     def _step(self, action: int) -> bool:
-        """Take an action.
-
-        Returns:
-            Whether the episode is over.
-        """
+        """Take an action; whether the episode is over."""
         observation, reward, terminated, truncated, _ = self.real.step(action)
         row = self._state * self.mdp.num_actions + action
         self._state = _number(self.mdp, observation)
@@ -222,11 +208,7 @@ class _Walker:
         self.check()
 
     def check(self) -> None:
-        """Count what was met since the last time, and judge all counts.
-
-        Raises:
-            InputError: they are not those of the table.
-        """
+        """Count what was met since the last time, and refuse counts that are not those of the table."""
         if self._met:
             self._count()
         seen = np.flatnonzero(self._counts.any(axis=1))

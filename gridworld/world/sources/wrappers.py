@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from functools import cached_property
 from typing import Any
@@ -29,14 +30,13 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError, in_short
-from gridworld.world.exact.bellman import backup
+from gridworld.world.exact.solver import backup, swept_values
 from gridworld.world.mdp import Mdp, checked_reward, frozen
 from gridworld.world.outcomes import thresholds_of
 from gridworld.world.sources.pure_functions import SO_UNKNOWN, asked, remembered, same
 
 NEUTRAL, LIMIT, MEMORY = "neutral", "time limit", "memory"
 _STEPS, _MOST_STEPS = 2000, 40_000  # of the copy beside the tables, in episodes
-_SWEEPS = 100  # of value iteration, for episodes that go far
 _GAMMA = 0.99
 _ROWS = 20_000  # pairs of state and action that are tried one by one, if states can be set
 _SEED = 20_261_123
@@ -64,12 +64,8 @@ _ROLES = {
     f"{_WRAPPERS}.stateful_observation:NormalizeObservation": MEMORY,
     f"{_WRAPPERS}.stateful_observation:TimeAwareObservation": MEMORY,
 }
-_COPIED = {
-    "Monitor",
-    "OrderEnforcing",
-    "RecordEpisodeStatistics",
-    "TimeLimit",
-}  # what a transform may look at
+# What a transform may look at, so that it is copied too.
+_COPIED = {"Monitor", "OrderEnforcing", "RecordEpisodeStatistics", "TimeLimit"}
 # Environments whose state can be set, by the class whose steps they run.
 _STATE_ATTRIBUTES = {
     "gridworld.envs.env:GridWorldEnv": "state",
@@ -87,15 +83,9 @@ def wrappers_of(env: Any) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
 
 
 def known_class(thing: Any, table: dict[str, str], methods: Sequence[str]) -> str | None:
-    """What a table says of the class whose methods an object runs.
+    """What a table by "module:class" says of the class whose `methods` an object runs.
 
-    Args:
-        thing: a wrapper, an environment or a batch.
-        table: by "module:class".
-        methods: those that decide what it does.
-
-    Returns:
-        The entry of its first known ancestor; None: there is none, or a method is its own.
+    It is the entry of its first known ancestor; None if there is none, or a method is its own.
     """
     kind = type(thing)
     for base in kind.__mro__:
@@ -108,15 +98,7 @@ def known_class(thing: Any, table: dict[str, str], methods: Sequence[str]) -> st
 
 
 def role_of(where: str, wrapper: gym.Wrapper[Any, Any, Any, Any]) -> str:
-    """What a wrapper does: an entry of the table at the top of this module.
-
-    Args:
-        where: what messages call the environment.
-        wrapper: the wrapper.
-
-    Raises:
-        InputError: it may do anything.
-    """
+    """What a wrapper does, as in `_ROLES`; refuses one that may do anything."""
     name, role = type(wrapper).__name__, known_class(wrapper, _ROLES, ("step", "reset"))
     if role is None:
         raise InputError(
@@ -139,11 +121,7 @@ def role_of(where: str, wrapper: gym.Wrapper[Any, Any, Any, Any]) -> str:
 
 
 def refuse_transformed(where: str, env: gym.Env[Any, Any]) -> None:
-    """Refuse an environment whose wrappers change its task or what is seen of it.
-
-    Raises:
-        InputError: one of them does.
-    """
+    """Refuse an environment whose wrappers change its task or what is seen of it."""
     for wrapper in wrappers_of(env):
         if (role := role_of(where, wrapper)) not in (NEUTRAL, LIMIT):
             changed = "observation" if role == MEMORY else role
@@ -164,24 +142,18 @@ def step_limit(env: gym.Env[Any, Any]) -> int | None:
 
 
 class Wrapped:
-    """An environment's world, as it is through its wrappers.
+    """The world of an environment as it is through its wrappers; the environment is left as it is.
 
-    Args:
-        where: what messages call the environment.
-        env: the environment, which is left as it is.
-        mdp: the world of the environment below all wrappers, which shows its state's number.
-
-    Raises:
-        InputError: a wrapper that changes the task otherwise than by a function.
+    `mdp` is the world below all wrappers, which shows its state's number.
     """
 
     def __init__(self, where: str, env: gym.Env[Any, Any], mdp: Mdp) -> None:
         self._where, self._env, self._bare = where, env, mdp
+        self._attribute = known_class(env.unwrapped, _STATE_ATTRIBUTES, ("step", "reset"))
         roles = [(wrapper, role_of(where, wrapper)) for wrapper in list(wrappers_of(env))[::-1]]
         self.memory = [type(wrapper).__name__ for wrapper, role in roles if role == MEMORY]
         self.transforms = [wrapper for wrapper, role in roles if role in ("observation", "reward", "action")]
         changing = [wrapper for wrapper, role in roles if role in ("reward", "action")]
-        self.changes_task = bool(changing)
         self.mdp = mdp
         if changing:
             self._copied  # noqa: B018 - refused if it cannot be copied
@@ -196,11 +168,7 @@ class Wrapped:
 
     @cached_property
     def observations(self) -> list[Any]:
-        """What an agent sees of each state: S of them, arrays or of any other kind.
-
-        Raises:
-            InputError: it sees more than the state, or something that is no function of it.
-        """
+        """What an agent sees of each state: S of them, arrays or of any other kind."""
         if self.memory:
             raise InputError(
                 f"{self._where}: {self.memory[0]} makes observations of more than the state's number, so no "
@@ -217,11 +185,7 @@ class Wrapped:
 
     @cached_property
     def action_masks(self) -> NDArray[np.bool_] | None:
-        """What `action_masks()` of the environment allows, (S, A); None: there is none.
-
-        Raises:
-            InputError: it is no function of the state, or states cannot be set.
-        """
+        """What `action_masks()` of the environment allows, (S, A); None: there is none."""
         if not self._env.has_wrapper_attr("action_masks"):
             return None
         env, chain = self._copied, [self._copied.unwrapped, *wrappers_of(self._copied)]
@@ -237,10 +201,8 @@ class Wrapped:
         found = np.ones((self._bare.num_states, self.mdp.num_actions), dtype=np.bool_)
         for state in np.flatnonzero(self._bare.acting).tolist():
             setattr(env.unwrapped, self._attribute, int(self._bare.number[state]))
-            try:
+            with self._refusing("action_masks() failed"):
                 found[state] = masks()
-            except Exception as error:
-                raise InputError(f"{self._where}: action_masks() failed ({in_short(error)})") from error
 
         def check(state: int) -> None:
             if self._bare.acting[state] and not np.array_equal(found[state], masks()):
@@ -258,7 +220,9 @@ class Wrapped:
         real = copied(self._env.unwrapped)
         seen: dict[int, Any] = {id(self._env.unwrapped): real}
         for wrapper in list(wrappers_of(self._env))[::-1]:
-            if wrapper in self.transforms or type(wrapper).__name__ in _COPIED or _only_adds(wrapper):
+            kind = type(wrapper)
+            only_adds = kind.step is gym.Wrapper.step and kind.reset is gym.Wrapper.reset
+            if wrapper in self.transforms or kind.__name__ in _COPIED or only_adds:
                 seen[id(getattr(wrapper, "results_writer", None))] = None  # an open file, of a Monitor
                 try:
                     real = copy.deepcopy(wrapper, seen)
@@ -268,21 +232,24 @@ class Wrapped:
                         f"({in_short(error)}), so what it changes cannot be found out; leave it out"
                     ) from None
             seen[id(wrapper)] = real
-        self._reset(real)
+        wrappers, self._probe = list(wrappers_of(real)), _Probe(real.unwrapped)
+        if wrappers:
+            wrappers[-1].env = self._probe
+        else:
+            real = self._probe
+        with self._refusing("cannot be reset"):
+            real.reset()
         return real
 
-    @property
-    def _attribute(self) -> str | None:
-        """By which the state of the environment can be set."""
-        return known_class(self._env.unwrapped, _STATE_ATTRIBUTES, ("step", "reset"))
-
-    def _reset(self, env: gym.Env[Any, Any], **given: Any) -> Any:
+    @contextmanager
+    def _refusing(self, what: str) -> Iterator[None]:
+        """One sentence for whatever somebody's code raises."""
         try:
-            return env.reset(**given)[0]
+            yield
         except InputError:
             raise
         except Exception as error:
-            raise InputError(f"{self._where}: cannot be reset ({in_short(error)})") from error
+            raise InputError(f"{self._where}: {what} ({in_short(error)})") from error
 
     @property
     def _copied_transforms(self) -> list[Any]:
@@ -332,29 +299,22 @@ class Wrapped:
     def _check_steps(self, rows: list[Any] | None, also: Callable[[int], None] = lambda state: None) -> None:
         """Step the copy beside the tables: from every state that can be set, then in whole episodes.
 
-        Args:
-            rows: what is seen of each state; None: it does not count.
-            also: what else to compare in a state.
-
-        Raises:
-            InputError: a step is not what the tables say.
+        `rows` is what is seen of each state, None if it does not count; `also` compares something else in a
+        state.
         """
-        env, probe = self._copied, _Probe.below(self._copied)
-        rng = np.random.default_rng(_SEED)
+        env = self._copied
+        probe, rng = self._probe, np.random.default_rng(_SEED)
 
         def reset(**given: Any) -> None:
-            observation = self._reset(env, **given)
-            self._check_seen(rows, probe.number, observation)
+            with self._refusing("cannot be reset"):
+                observation = env.reset(**given)[0]
+            self._check_seen(rows, observation)
             also(probe.number)
 
         def step(state: int, action: int) -> None:
-            try:
+            with self._refusing("cannot be stepped"):
                 found = env.step(action)
-            except InputError:
-                raise
-            except Exception as error:
-                raise InputError(f"{self._where}: cannot be stepped ({in_short(error)})") from error
-            self._check_step(rows, probe, state, action, found)
+            self._check_step(rows, state, action, found)
             if found[2] or found[3]:
                 reset()
             else:
@@ -371,7 +331,7 @@ class Wrapped:
                 step(*divmod(pair, actions))
                 tried[pair // actions] += 1
         reset()
-        good = self._good_policy()
+        good = backup(self.mdp, swept_values(self.mdp, _GAMMA), _GAMMA).argmax(axis=1).tolist()
         for number in range(_MOST_STEPS):
             if number >= _STEPS and tried[self.mdp.acting].all():
                 break
@@ -386,31 +346,24 @@ class Wrapped:
                 "make of it could not be compared; leave them out"
             )
 
-    def _good_policy(self) -> list[int]:
-        """An optimal action of each state, up to what so many sweeps leave open."""
-        v = np.zeros(self.mdp.num_states)
-        for _ in range(_SWEEPS):
-            q = backup(self.mdp, v, _GAMMA)
-            v = q.max(axis=1)
-        return [int(action) for action in q.argmax(axis=1)]
-
-    def _check_step(self, rows: Any, probe: _Probe, state: int, action: int, step: Any) -> None:
+    def _check_step(self, rows: list[Any] | None, state: int, action: int, step: Any) -> None:
         observation, reward, terminated, _, _ = step
         reward = float(_plain(reward))
-        mdp, pair = self.mdp, (state, action)
+        mdp, pair, number = self.mdp, (state, action), self._probe.number
         following = mdp.next_state[pair]
-        same_end = (mdp.number[following] == probe.number) & (mdp.terminal[following] == bool(terminated))
+        same_end = (mdp.number[following] == number) & (mdp.terminal[following] == bool(terminated))
         possible = same_end & (mdp.reward[pair] == reward) & (mdp.probability[pair] > 0)
         if not possible.any():
             raise InputError(
                 f"{self._where}: through its wrappers, action {action} in state {state} led to state "
-                f"{probe.number} with reward {reward:g}{' and ended' if terminated else ''}, which is "
+                f"{number} with reward {reward:g}{' and ended' if terminated else ''}, which is "
                 "not what reward() and action() gave when they were asked; make them functions of their "
                 "argument alone"
             )
-        self._check_seen(rows, probe.number, observation)
+        self._check_seen(rows, observation)
 
-    def _check_seen(self, rows: list[Any] | None, number: int, observation: Any) -> None:
+    def _check_seen(self, rows: list[Any] | None, observation: Any) -> None:
+        number = self._probe.number
         if rows is not None and not same(rows[number], observation):
             raise InputError(
                 f"{self._where}: what is seen of state {number} through its wrappers is not always the same"
@@ -418,27 +371,10 @@ class Wrapped:
             )
 
 
-def _only_adds(wrapper: gym.Wrapper[Any, Any, Any, Any]) -> bool:
-    """Whether a wrapper adds attributes and methods, and leaves the steps alone."""
-    return type(wrapper).step is gym.Wrapper.step and type(wrapper).reset is gym.Wrapper.reset
-
-
 class _Probe(gym.Wrapper[Any, Any, Any, Any]):
     """Remembers the number that the environment below all wrappers showed last."""
 
     number = -1
-
-    @classmethod
-    def below(cls, env: gym.Env[Any, Any]) -> _Probe:
-        """Put a probe under the innermost wrapper of an environment, unless there is one."""
-        wrappers = list(wrappers_of(env))
-        if not wrappers:
-            return cls(env)
-        if isinstance(wrappers[-1], cls):
-            return wrappers[-1]
-        probe = cls(env.unwrapped)
-        wrappers[-1].env = probe
-        return probe
 
     def reset(self, **arguments: Any) -> Any:
         found = self.env.reset(**arguments)

@@ -8,7 +8,7 @@ import pytest
 from gridworld import InputError, compile_mdp, load
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import Outcomes
-from gridworld.world.sources.built import build
+from gridworld.world.sources.arrays import build
 from gridworld.world.sources.classics import river_swim
 
 ARRAYS = {"next_state": [[0]], "reward": [[1.0]], "terminated": [[True]], "start": [1.0]}

@@ -14,8 +14,8 @@ from gridworld.errors import InputError
 from gridworld.process.console.progress import ProgressLine
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
+from gridworld.world.sources import exploring
 from gridworld.world.sources.enumerated import enumerate_env
-from gridworld.world.sources.enumeration import exploring
 
 CELLS = 5
 MINIGRID = "MiniGrid-Empty-5x5-v0"

@@ -87,47 +87,6 @@ def test_the_step_limit_is_that_of_the_id(world, name):
     assert compile_gymnasium(env_id, {"max_episode_steps": 7}).max_episode_steps == 7
 
 
-WALKS, LENGTH = 500, 200  # 100,000 steps
-
-
-def real_walks(env, actions):
-    """(walks, steps) of state, next state, reward, terminated, truncated, and whether an episode began."""
-    found = np.zeros((*actions.shape, 6))
-    env.reset(seed=0)
-    for walk, chosen in enumerate(actions.tolist()):
-        state, begins = env.reset()[0], True
-        for step, action in enumerate(chosen):
-            following, reward, terminated, truncated, _ = env.step(action)
-            found[walk, step] = state, following, reward, terminated, truncated, begins
-            begins = terminated or truncated
-            state = env.reset()[0] if begins else following
-    return found
-
-
-@pytest.mark.parametrize("name", DETERMINISTIC)
-def test_100_000_random_steps_are_identical(world, name):
-    mdp, env = world(name)
-    actions = np.random.default_rng(1).integers(mdp.num_actions, size=(WALKS, LENGTH))
-    real = real_walks(env, actions)
-    ours = GridWorldVectorEnv(
-        WALKS, mdp=mdp, max_episode_steps=mdp.max_episode_steps, autoreset_mode="Disabled"
-    )
-    ours.reset(seed=0)
-    for step in range(LENGTH):
-        state, following, reward, terminated, truncated, begins = real[:, step].T
-        if begins.any():
-            ours.reset(options={"reset_mask": begins == 1})
-            there = ours.get_state()
-            there["states"] = np.where(begins == 1, state, there["states"]).astype(np.int64)
-            ours.set_state(there)
-        found, *others, _ = ours.step(actions[:, step])
-        for mine, theirs in zip(
-            [mdp.number[found], *others], [following, reward, terminated, truncated], strict=True
-        ):
-            assert np.array_equal(mine, theirs)
-    assert real[..., 3].sum() > 0 or name != "frozen_lake"
-
-
 def statistic(mdp, pair, found):
     """Chi-square of (next number, reward) counts of a state and an action, and its degrees of freedom."""
     rows = zip(mdp.number[mdp.next_state[pair]].tolist(), mdp.reward[pair].tolist(), strict=True)

@@ -25,7 +25,8 @@ from gridworld.envs.observations import KINDS, ObservationTable
 from gridworld.errors import InputError, in_short
 from gridworld.world.exact.markov_chain import one_hot_policy
 from gridworld.world.mdp import FloatArray, IntArray
-from gridworld.world.sources.pure_functions import random_states, same
+from gridworld.world.sources.pure_functions import same
+from gridworld.world.sources.snapshots import random_states
 from gridworld.world.sources.wrappers import is_discrete
 
 _LIBRARIES = ("stable_baselines3.", "sb3_contrib.", "gridworld.")

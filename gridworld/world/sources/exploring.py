@@ -6,7 +6,6 @@ Everything that changes is state, the elapsed time too, but for the attributes t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -18,9 +17,8 @@ from gridworld.errors import InputError
 from gridworld.process.console.progress import ProgressLine
 from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import check_memory
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 from gridworld.world.outcomes import MOST_ACTIONS
-from gridworld.world.sources.enumeration.snapshots import Snapshots, key_of, random_states
+from gridworld.world.sources.snapshots import Snapshots, key_of, random_states
 
 _BEYOND = 1_000  # states further than a step limit that are found too, so that a small world is whole
 _DEEPEST = 10_000  # steps from the start
@@ -35,18 +33,7 @@ _FIXED = "; take an environment with a fixed layout and start, or name in env.ig
 class Subject:
     """The environment that is enumerated: one object, into which copies of its states are put.
 
-    Args:
-        name: what messages call it.
-        env: an environment, wrapped or not.
-        ignore: the names of attributes that are no part of a state.
-
-    Attributes:
-        num_actions: A.
-        snapshots: of it.
-
-    Raises:
-        InputError: other actions than numbers from 0 on; no such attributes; or its resets lead to different
-            states.
+    `ignore` names attributes that are no part of a state.
     """
 
     def __init__(self, name: str, env: gym.Env[Any, Any], ignore: Sequence[str] = ()) -> None:
@@ -65,9 +52,6 @@ class Subject:
                 f"env.ignore={list(ignore)}: {name} has no attribute {unknown[0]}; it has "
                 f"{', '.join(vars(self.env))}"
             )
-        self._check_resets()
-
-    def _check_resets(self) -> None:
         key, before = self.key(), self._keys()
         for seed in range(_SEEDS):
             self.env.reset(seed=seed)
@@ -104,14 +88,7 @@ class Subject:
             raise self.refusal(f"its state cannot be copied: {error}") from error
 
     def steps(self, snapshot: bytes) -> list[tuple[bytes, Any, float, bool, bool]]:
-        """Take each action in a copy of a state.
-
-        Returns:
-            Of each, a copy of the state that follows, the observation, reward, terminated and truncated.
-
-        Raises:
-            InputError: a step fails, or draws a random number.
-        """
+        """Of each action in a copy of a state: a copy of what follows, observation, reward, both ends."""
         found = []
         before = random_states(self.env)
         for action in range(self.num_actions):
@@ -152,50 +129,13 @@ def _listed(names: Any) -> str:
     return ", ".join(sorted(names)) or "nothing"
 
 
-@dataclass(eq=False)
-class Graph:
-    """N states, the start first.
-
-    Attributes:
-        next_state: (N, A), integers; of states that are not tried, themselves.
-        reward: (N, A), float64.
-        terminated: (N, A), bool.
-        truncated: (N, A), bool.
-        tried: (N,), bool, whether steps from it were tried: it goes on from there.
-        depth: (N,), integers, the least steps from the start.
-        keys: N keys.
-        seen: N digests of observations.
-        observations: N observations, as arrays; empty where they are none.
-        names: N names, all empty where nothing is known of the environment's attributes.
-    """
-
-    next_state: IntArray
-    reward: FloatArray
-    terminated: BoolArray
-    truncated: BoolArray
-    tried: BoolArray
-    depth: IntArray
-    keys: list[bytes]
-    seen: list[bytes]
-    observations: list[NDArray[Any]]
-    names: list[str]
-
-
 def explore(subject: Subject, most_states: int, limit: int | None) -> Graph:
     """Find all states that can be reached, breadth first, and what every action does there.
 
     Episodes are over at the step limit. What lies beyond it is left out where states hold the time; elsewhere
     it is found too if it is little.
-
-    Args:
-        subject: the environment.
-        most_states: more are refused.
-        limit: the step limit, if one is known.
-
-    Raises:
-        InputError: too many states; or what `Subject` refuses.
     """
-    search = _Search(subject, most_states)
+    search = Graph(subject, most_states)
     search.go_on(limit or _DEEPEST)
     if search.pending and limit is None:
         raise subject.refusal(
@@ -203,31 +143,41 @@ def explore(subject: Subject, most_states: int, limit: int | None) -> Graph:
         )
     inside = len(search.depth)
     if search.pending and search.holds_time():
-        return search.graph(inside, limit)
+        return search.kept(inside, limit)
     if search.pending:
         search.most_states = min(most_states, inside + _BEYOND)
         try:
             search.go_on(None)
         except InputError:
-            return search.graph(inside, limit)
-    return search.graph(len(search.depth), None)
+            return search.kept(inside, limit)
+    return search.kept(len(search.depth), None)
 
 
-class _Search:
-    """A search, breadth first, that can stop at a depth: `pending` is what is to be tried."""
+class Graph:
+    """N states, the start first, found by a search, breadth first, that can stop at a depth.
+
+    Attributes:
+        pending: the states that are still to be tried.
+        depth: of each state, the least steps from the start.
+        seen, names: N digests of observations, and names, all empty where none are known.
+        observations: N arrays; empty where observations are none.
+        keys: N keys of states, once what is kept is known, as for all below.
+        tried: (N,), whether steps from it were tried: it goes on from there.
+        next_state, reward, terminated, truncated: (N, A); a state that was not tried leads to itself.
+    """
 
     def __init__(self, subject: Subject, most_states: int) -> None:
         self.subject, self.most_states = subject, most_states
-        self.depth: list[int] = []
         self.pending = [0]
+        self.depth: list[int] = []
+        self.seen: list[bytes] = []
+        self.names: list[str] = []
+        self.observations: list[NDArray[Any]] = []
         self._as_array = _array_reader(subject)
         self._rows: dict[int, list[tuple[int, float, bool, bool]]] = {}
         self._goes_on = {0}
         self._state_of_copy: dict[bytes, int] = {}  # by a digest of a copy, of which a state may have several
         self._state: dict[bytes, int] = {}  # by its key
-        self._seen: list[bytes] = []
-        self._observations: list[NDArray[Any]] = []
-        self._names: list[str] = []
         self._snapshots: list[bytes] = []
         self._num_bytes = 0
         observation, _ = subject.env.reset(seed=0)
@@ -280,22 +230,24 @@ class _Search:
             state = self._state_of_copy[short] = self._state.setdefault(subject.key(), len(self._state))
         if state == len(self.depth):
             self._add(copy, seen, observation, depth)
-        elif self._seen[state] != seen:
+        elif self.seen[state] != seen:
+            left_out = ", ".join(subject.ignore)
+            without = f" without {left_out}, which env.ignore leaves out" if left_out else ""
             raise subject.refusal(
                 "the same state is shown by different observations, so that what an agent sees is no "
-                f"function of the state{_without(subject.ignore)}"
+                f"function of the state{without}"
             )
         return state
 
     def _add(self, copy: bytes, seen: bytes, observation: Any, depth: int) -> None:
         self.depth.append(depth)
         self._snapshots.append(copy)
-        self._seen.append(seen)
-        self._names.append(self.subject.state_name())
+        self.seen.append(seen)
+        self.names.append(self.subject.state_name())
         self._num_bytes += len(copy)
         array = self._as_array(observation)
         if array is not None:
-            self._observations.append(array)
+            self.observations.append(array)
             self._num_bytes += array.nbytes
         size = len(self.depth)
         if size > self.most_states:
@@ -317,29 +269,18 @@ class _Search:
             f"leave out what nothing depends on, e.g. env.ignore=[{found.split(',')[0]}]"
         )
 
-    def graph(self, size: int, limit: int | None) -> Graph:
-        """The first states of those found; from a limit on they are not tried."""
-        tried = [state for state in self._rows if state < size and self.depth[state] != limit]
-        rows = [[(state, 0.0, False, False)] * self.subject.num_actions for state in range(size)]
-        for state in tried:
-            rows[state] = self._rows[state]
+    def kept(self, size: int, limit: int | None) -> Graph:
+        """The first states of those found; from a limit on they count as not tried."""
+        for each in (self.depth, self.seen, self.names, self.observations):
+            del each[size:]
+        self.keys = list(self._state)[:size]
+        self.tried = np.array([state in self._rows and self.depth[state] != limit for state in range(size)])
+        still = [[(state, 0.0, False, False)] * self.subject.num_actions for state in range(size)]
+        rows = [self._rows[state] if self.tried[state] else still[state] for state in range(size)]
         columns = np.array(rows, dtype=np.float64).reshape(size, self.subject.num_actions, 4)
-        return Graph(
-            next_state=columns[:, :, 0].astype(np.int64),
-            reward=columns[:, :, 1],
-            terminated=columns[:, :, 2] > 0,
-            truncated=columns[:, :, 3] > 0,
-            tried=np.isin(np.arange(size), tried),
-            depth=np.array(self.depth[:size]),
-            keys=list(self._state)[:size],
-            seen=self._seen[:size],
-            observations=self._observations[:size],
-            names=self._names[:size],
-        )
-
-
-def _without(ignore: Sequence[str]) -> str:
-    return f" without {', '.join(ignore)}, which env.ignore leaves out" if ignore else ""
+        self.next_state, self.reward = columns[:, :, 0].astype(np.int64), columns[:, :, 1]
+        self.terminated, self.truncated = columns[:, :, 2] > 0, columns[:, :, 3] > 0
+        return self
 
 
 def _array_reader(subject: Subject) -> Callable[[Any], NDArray[Any] | None]:

@@ -14,6 +14,7 @@ import io
 import marshal
 import pickle
 import random
+import sys
 from collections import deque
 from collections.abc import Collection
 from enum import Enum
@@ -23,14 +24,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-_GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
+GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
 _KEPT = (
     gym.Space,
     gym.envs.registration.EnvSpec,
     FunctionType,
     BuiltinFunctionType,
     ModuleType,
-    *_GENERATORS,
+    *GENERATORS,
 )
 _PLAIN = frozenset({int, float, str, bool, bytes, type(None)})
 _CONTAINERS = (list, tuple, dict, set, frozenset, deque, bytearray)
@@ -39,22 +40,14 @@ _SHORT = 16  # numbers; a position is the same whether it is a tuple or an array
 
 
 class Snapshots:
-    """Takes copies of an environment's state, and puts them back.
-
-    Args:
-        env: the environment, unwrapped; the same object all the time.
-    """
+    """Takes copies of the state of an unwrapped environment, always the same one; puts them back."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         self._env = env
         self._kept: dict[int, Any] = {}  # by id
 
     def take(self) -> bytes:
-        """A copy of the state. Equal copies are of equal states; equal states may have several.
-
-        Raises:
-            TypeError, pickle.PicklingError, AttributeError: something in it cannot be copied.
-        """
+        """A copy of the state. Equal copies are of equal states; equal states may have several."""
         buffer = io.BytesIO()
         _Pickler(buffer, self._env, self._kept).dump(vars(self._env))
         return buffer.getvalue()
@@ -67,14 +60,7 @@ class Snapshots:
         attributes.update(unpickler.load())
 
     def key(self, without: Collection[str] = ()) -> bytes:
-        """A digest of the state, 16 bytes.
-
-        Args:
-            without: the names of attributes that do not count.
-
-        Raises:
-            TypeError: it holds what cannot be compared, such as an iterator.
-        """
+        """A digest of the state, 16 bytes, but for some attributes; TypeError where it cannot be compared."""
         attributes = {name: value for name, value in self._attributes() if name not in without}
         return _digest(_Reader(self._env).read(attributes))
 
@@ -91,18 +77,20 @@ def key_of(value: Any) -> bytes:
     return _digest(_Reader(None).read(value))
 
 
-def random_states(env: gym.Env[Any, Any]) -> list[Any]:
-    """The states of all generators that an environment's steps may draw from, for comparison.
-
-    These are its own, those among its attributes, those of its spaces, and the global ones.
-    """
-    sources = [env, *(each for each in vars(env).values() if isinstance(each, (gym.Space, *_GENERATORS)))]
+def random_states(env: gym.Env[Any, Any] | None = None) -> list[Any]:
+    """The states of all generators that a step may draw from: the environment's, and those that all share."""
+    torch = sys.modules.get("torch")
+    shared = [] if torch is None else [torch.get_rng_state().numpy().tobytes()]
+    shared += [random.getstate(), generator_state(np.random.mtrand._rand)]
+    if env is None:
+        return shared
+    sources = [env, *(each for each in vars(env).values() if isinstance(each, (gym.Space, *GENERATORS)))]
     found = [getattr(each, "_np_random", each) for each in sources]
-    own = [_generator_state(each) for each in found if isinstance(each, _GENERATORS)]
-    return [*own, random.getstate(), _generator_state(np.random.mtrand._rand)]
+    return shared + [generator_state(each) for each in found if isinstance(each, GENERATORS)]
 
 
-def _generator_state(generator: Any) -> Any:
+def generator_state(generator: Any) -> Any:
+    """Where a generator of `GENERATORS` is, as a value to compare."""
     if isinstance(generator, random.Random):
         return generator.getstate()
     if isinstance(generator, np.random.Generator):
