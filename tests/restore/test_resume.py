@@ -19,6 +19,10 @@ CASES = {
         *(*SHORT["dqn"], "agent.engine=stock", "n_envs=8"),
         *("agent.buffer_size=2000", "agent.gradient_steps=4"),
     ],
+    "dqn stock that stores an observation once": [
+        *(*SHORT["dqn"], "agent.engine=stock", "n_envs=8", "agent.optimize_memory_usage=true"),
+        "+agent.replay_buffer_kwargs.handle_timeout_termination=false",
+    ],
     "ppo": [
         *SHORT["ppo"],
         "agent.ent_coef=quad_0.5",
