@@ -34,7 +34,7 @@ class DQN(Population):
 
     same: ClassVar[tuple[str, ...]] = (
         *("batch_size", "buffer_size", "learning_starts", "train_freq", "gradient_steps"),
-        *("target_update_interval", "tau", "replay_buffer_class"),
+        *("target_update_interval", "tau"),
     )
 
     def __init__(self, runs: Sequence[Run], states: Sequence[State | None]) -> None:
@@ -56,7 +56,7 @@ class DQN(Population):
     def kind(cls, run: Run) -> Hashable:
         """See `Population.kind`; runs that count episodes make steps of their own."""
         by_episode = run.model.train_freq.unit is TrainFrequencyUnit.EPISODE
-        return id(run) if by_episode else super().kind(run)
+        return id(run) if by_episode else (super().kind(run), run.counts_transitions)
 
     def iterate(self) -> None:
         """See `Population.iterate`: some steps into the replay, and an update by it."""

@@ -70,8 +70,9 @@ class Population:
         settings = [repr(getattr(model, name)) for name in cls.same]
         optimizer = {**model.policy.optimizer.param_groups[0], "lr": None, "params": None}
         return (
-            *(cls, mdp.text(), envs.num_envs, envs.step_limit, envs.stratified),
-            *(repr(model.policy), str(model.device), repr(optimizer), run.reward_scale, run.inputs.digest()),
+            *(cls, mdp.digest(), envs.num_envs, envs.step_limit, envs.stratified),
+            *(repr(model.policy), str(model.device), type(model.policy.optimizer), repr(optimizer)),
+            *(run.reward_scale, run.inputs.digest()),
             *(model.num_timesteps, run.total_timesteps, *settings),
         )
 

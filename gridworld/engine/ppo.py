@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -34,6 +34,11 @@ class PPO(OnPolicy):
         self.clips_values = model.clip_range_vf is not None
         limits = [np.inf if run.model.target_kl is None else 1.5 * run.model.target_kl for run in runs]
         self.most_divergence = np.array(limits) if min(limits) < np.inf else None
+
+    @classmethod
+    def kind(cls, run: Run) -> Hashable:
+        """See `Population.kind`; of a range that is None, nothing is clipped."""
+        return super().kind(run), run.model.clip_range_vf is None
 
     def update(self, old: tuple[Array, Array], pairs: IntArray, advantages: Array, returns: Array) -> None:
         """See `OnPolicy.update`."""

@@ -149,14 +149,18 @@ class Mdp:
         start = (1 - share) * self.start + share * self.acting / self.acting.sum()
         return dataclasses.replace(self, start=frozen(start))
 
-    def text(self) -> str:
-        """A text that tells this world from others, for a run's manifest."""
+    def digest(self) -> str:
+        """The sha256 of the tables, equal for worlds in which the same happens with the same chances."""
         digest = hashlib.sha256()
         for table in (self.next_state, self.probability, self.reward, self.terminal, self.goal, self.start):
             digest.update(np.ascontiguousarray(table).tobytes())
         digest.update(np.ascontiguousarray(self.number).tobytes())
+        return digest.hexdigest()
+
+    def text(self) -> str:
+        """What a run's manifest has of this world, beside its settings."""
         sizes = f"{self.num_states} states, {self.num_actions} actions"
-        return f"{self.name}: {sizes}, sha256 {digest.hexdigest()}"
+        return f"{self.name}: {sizes}, sha256 {self.digest()}"
 
     def coordinates(self, state: int) -> tuple[int, ...]:
         """What tells a state from others in a run's files: its number; of a map, row and column."""

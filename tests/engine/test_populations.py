@@ -253,6 +253,44 @@ def test_runs_that_differ_in_all_that_may_differ(agent: str, meetings: list[int]
     assert max(meetings) == 3
 
 
+# Pairs of which each needs its own arrays, or its own branch of an update.
+APART: list[tuple[str, str]] = [
+    ("env.slip=0", "env.slip=0.2"),
+    ("env.slip=0.1", "env.slip=0.2"),
+    ("env.step_reward=-0.01", "env.step_reward=-0.1"),
+    ("env.goal_reward=1", "env.goal_reward=2"),
+    ("env.trap_reward=-1", "env.trap_reward=-2"),
+    ("exploring_starts=0", "exploring_starts=0.5"),
+    ("env=classic", "env=cliff"),
+    ("env.max_episode_steps=9", "env.max_episode_steps=20"),
+    ("stratified_draws=false", "stratified_draws=true"),
+    ("n_envs=4", "n_envs=8"),
+]
+OWN_APART = {
+    "ppo": [
+        ("agent.clip_range_vf=null", "agent.clip_range_vf=0.2"),
+        ("agent.target_kl=null", "agent.target_kl=1e-4"),
+    ],
+    "dqn": [
+        ("agent.reward_scale=null", "agent.reward_scale=0.5"),
+        ("agent.replay_buffer_class=null", f"agent.replay_buffer_class={COUNTS}"),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("agent", "pair"),
+    [(agent, pair) for agent in ("ppo", "dqn") for pair in APART + OWN_APART[agent]],
+    ids=str,
+)
+def test_runs_of_other_worlds_or_branches_train_as_alone_in_either_order(
+    agent: str, pair: tuple[str, str]
+) -> None:
+    runs = [(*SMALL[agent], each, "seed=3") for each in pair]
+    assert_as_alone(runs)
+    assert_as_alone(runs[::-1])
+
+
 WRITTEN = {
     "ppo one step": ("ppo", ("agent.n_steps=1", "agent.batch_size=4")),
     "ppo one sample": (

@@ -38,7 +38,6 @@ _NUMBERS = ("exploration_rate", "_current_progress_remaining")
 _OF_CALLBACKS: dict[type[BaseCallback], tuple[str, ...]] = {  # SB3's own, and what these count
     sb3_callbacks.CallbackList: (),
     sb3_callbacks.CheckpointCallback: (),
-    sb3_callbacks.ConvertCallback: (),
     sb3_callbacks.EveryNTimesteps: ("last_time_trigger",),
     sb3_callbacks.StopTrainingOnMaxEpisodes: ("n_episodes", "_total_max_episodes"),
 }
