@@ -10,7 +10,7 @@ from gridworld.config.composition.presets import LARGE, STOCHASTIC, fitting_pres
 from gridworld.config.pictures import PICTURES
 from gridworld.config.train import AUTO, TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
-from gridworld.envs.frames.rendering import frame_size
+from gridworld.envs.rendering import frame_size
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError

@@ -24,7 +24,7 @@ from tensorboard.plugins.text import metadata as text_metadata
 from gridworld.config.flatten import flat
 from gridworld.config.settings_by_effect import ON_RESULT, with_effects
 from gridworld.config.train import TrainConfig
-from gridworld.envs.frames.rendering import Frame
+from gridworld.envs.rendering import Frame
 from gridworld.storage.append_log import AppendLog
 from gridworld.storage.event_file import EventFile
 from gridworld.visualization.png import encode_png

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from gridworld.envs.frames import rendering as drawing
-from gridworld.envs.frames.rendering import Frame, Packed
+from gridworld.envs import rendering as drawing
+from gridworld.envs.rendering import Frame, Packed
 from gridworld.envs.rollout import Episode
 from gridworld.errors import InputError
 from gridworld.world.layout import positive_int
@@ -151,7 +151,7 @@ def animation_of_frames(frames: Iterable[Frame | Packed], likely: Iterable[Seque
     """Show frames one after the other.
 
     Args:
-        frames: (height, width, 3) each, RGB, or (height, width), see `envs.frames.rendering.Packed`.
+        frames: (height, width, 3) each, RGB, or (height, width), see `envs.rendering.Packed`.
         likely: colours that the palette begins with; to know those of most pixels before saves time.
 
     Returns:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
 from gridworld.config.train import TrainConfig
-from gridworld.envs.frames.rendering import Frame
+from gridworld.envs.rendering import Frame
 from gridworld.storage.atomic_write import write_bytes
 from gridworld.visualization.animation import Animation
 from gridworld.visualization.video import encode_gif, save_animation, save_png, save_pngs

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from gridworld.envs.frames.rendering import Frame
+from gridworld.envs.rendering import Frame
 
 _UP = 2  # the filter's number
 _RGB, _PALETTE = 2, 3  # the colour type's

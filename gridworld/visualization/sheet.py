@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gridworld.envs.frames.rendering import (
+from gridworld.envs.rendering import (
     BACKGROUND,
     SMALLEST_TEXT,
     UNKNOWN,
@@ -23,7 +23,7 @@ from gridworld.envs.frames.rendering import (
     text_width,
     write,
 )
-from gridworld.envs.frames.rendering import INK as INK
+from gridworld.envs.rendering import INK as INK
 from gridworld.visualization.colormaps import ColourArray, Scale
 
 PAPER: Colour = BACKGROUND

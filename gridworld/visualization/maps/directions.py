@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridworld.envs.frames.board import board_of
+from gridworld.envs.board import board_of
 from gridworld.world.grid import GridMdp
 from gridworld.world.layout import MOVES
 from gridworld.world.mdp import FloatArray, IntArray, Mdp

@@ -13,9 +13,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.envs.frames import rendering as drawing
-from gridworld.envs.frames.board import board_of
-from gridworld.envs.frames.rendering import AGENT, SMALLEST_TEXT, UNKNOWN, Colour, Point
+from gridworld.envs import rendering as drawing
+from gridworld.envs.board import board_of
+from gridworld.envs.rendering import AGENT, SMALLEST_TEXT, UNKNOWN, Colour, Point
 from gridworld.errors import InputError
 from gridworld.visualization.canvas import Canvas, shown
 from gridworld.visualization.colormaps import VIRIDIS, Scale, is_dark, linear

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
-from gridworld.envs.frames.board import board_of
-from gridworld.envs.frames.rendering import Colour, Frame
+from gridworld.envs.board import board_of
+from gridworld.envs.rendering import Colour, Frame
 from gridworld.visualization.canvas import Canvas, shown
 from gridworld.visualization.colormaps import ORANGES, is_dark, linear
 from gridworld.visualization.maps.directions import moving_actions

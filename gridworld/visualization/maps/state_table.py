@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
-from gridworld.envs.frames.rendering import (
+from gridworld.envs.rendering import (
     AGENT,
     SMALLEST_TEXT,
     UNKNOWN,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.envs.frames.board import board_of
-from gridworld.envs.frames.rendering import Frame
+from gridworld.envs.board import board_of
+from gridworld.envs.rendering import Frame
 from gridworld.visualization.canvas import Canvas, shown
 from gridworld.visualization.colormaps import BLUES, counting, is_dark
 from gridworld.visualization.maps.state_table import draw_visit_table, table_states
