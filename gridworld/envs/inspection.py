@@ -88,7 +88,8 @@ def task_of(env: Any, max_episode_steps: int | None = None) -> Task:
     """Find out which task an environment is; refuses what has no world in it or may change it unseen.
 
     `env` is an environment or a batch of Gymnasium or SB3, wrapped or not, of a GridWorld or with a
-    transition table; a compiled world; or what `load` takes. Without a limit it is the environment's own, or else 100.
+    transition table; a compiled world; or what `load` takes. Without a limit it is the
+    environment's own, or else 100.
     """
     if isinstance(env, Mdp):
         task = Task(env, env.max_episode_steps)

@@ -34,7 +34,7 @@ class Returns(NamedTuple):
         return self.total / self.episodes if self.episodes else None
 
     def merged(self, others: Returns) -> Returns:
-        """The returns of these and of `others`."""
+        """These and `others`."""
         return Returns(self.episodes + others.episodes, self.total + others.total)
 
 

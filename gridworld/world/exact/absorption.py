@@ -11,8 +11,8 @@ subtraction anywhere, every x_i has a small error relative to itself, however sm
 (W. Grassmann, M. Taksar and D. Heyman, Regenerative analysis and steady state distributions for Markov
 chains, Operations Research 33, 1985; C. O'Cinneide, Numerische Mathematik 65, 1993). This needs right >= 0.
 
-Large systems are factored sparsely by SuperLU, if that is accurate: with the leaks for a right-hand side, x is
-the probability of ever leaving, which is 1. Otherwise the elimination is used, in a band around the diagonal.
+Large systems are factored sparsely by SuperLU, if that is accurate: with the leaks for a right-hand side, x
+is the probability of ever leaving, which is 1. Else it is eliminated in a band around the diagonal.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class BandedElimination:
 
 
 def factor(weights: Any, leak: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """A solver for right-hand sides (n, columns); it overwrites `weights` (n, n), numpy or CSR, and `leak` (n,)."""
+    """Solves for right-hand sides (n, columns); overwrites `weights` (n, n), numpy or CSR, and `leak` (n,)."""
     if isinstance(weights, np.ndarray):
         return Elimination(weights, leak, band=len(leak)).solve
     from scipy.sparse import diags_array
