@@ -60,16 +60,12 @@ class RecordingConfig:
 
     # values and greedy actions
     policy_map: bool = field(
-        default=True, metadata=picture("policy.png", "maps.policy_map", "policy", while_training=True)
+        default=True, metadata=picture("policy.png", "policy_map", "policy", while_training=True)
     )
     # how far the values are from the true ones
-    q_error: bool = field(
-        default=True, metadata=picture("q_error.png", "maps.q_error_map", "error of its values")
-    )
+    q_error: bool = field(default=True, metadata=picture("q_error.png", "q_error_map", "error of its values"))
     # where training has been
-    visits: bool = field(
-        default=True, metadata=picture("visits.png", "maps.visit_map", "visits while it learnt")
-    )
+    visits: bool = field(default=True, metadata=picture("visits.png", "visit_map", "visits while it learnt"))
     # the policy over training
     learning: bool = field(
         default=True, metadata=picture("learning.gif", "policy_history", "policy while it learnt")

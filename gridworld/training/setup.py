@@ -14,8 +14,8 @@ from gridworld.envs.frames.rendering import frame_size
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
+from gridworld.visualization.files import require_video
 from gridworld.visualization.picture import drawer
-from gridworld.visualization.video import require_video
 from gridworld.world.exact.evaluation import Evaluator, fitting_discounts, score_of_optimum
 from gridworld.world.mdp import Mdp
 

@@ -26,7 +26,7 @@ from gridworld.config.train import TrainConfig
 from gridworld.envs.frames.rendering import Frame
 from gridworld.storage.append_log import AppendLog
 from gridworld.storage.event_file import EventFile
-from gridworld.visualization.png import encode_png
+from gridworld.visualization.files import encode_png
 
 HParamValue = bool | float | str | None
 
