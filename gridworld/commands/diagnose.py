@@ -21,7 +21,7 @@ from gridworld.process.signals import Interrupted
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.folder import shown
 from gridworld.storage.safe_read import check_no_link
-from gridworld.visualization.video import save_png
+from gridworld.visualization.files import save_png
 
 PICTURE = "diagnosis.png"
 _MOST_ROWS = 8

@@ -23,10 +23,10 @@ from gridworld.restore.saved_run import SavedRun, choose_policy, read_visits
 from gridworld.run.claim import check_inside, check_writable
 from gridworld.storage.safe_read import check_no_link
 from gridworld.storage.symlinks import make_inside
-from gridworld.visualization import video
+from gridworld.visualization import files
 from gridworld.visualization.animation import Animation
 from gridworld.visualization.episode import film
-from gridworld.visualization.picture import Subject, drawer, save
+from gridworld.visualization.picture import Subject, drawer
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 
@@ -76,7 +76,7 @@ def _record(options: argparse.Namespace) -> None:
     subject = _SavedSubject(saved, options.trust)
     drawn = {kind: drawer(MAPS[kind]).draw(subject)(options.cell_size) for kind in formats if kind in MAPS}
     episodes = _film(saved.mdp, subject, options)
-    video.check_size(episodes, formats)
+    files.check_size(episodes, formats)
     if options.out is None:
         make_inside(options.run, folder.name)
     else:
@@ -87,7 +87,7 @@ def _record(options: argparse.Namespace) -> None:
             check_no_link(path)
         else:
             path = folder / (f"{kind}.png" if kind in MAPS else f"episode.{kind}")
-        save(drawn.get(kind, episodes), path, options.fps)
+        files.save(drawn.get(kind, episodes), path, options.fps)
         print(printable(str(path)))
 
 
@@ -96,9 +96,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--format",
         nargs="+",
-        choices=(*video.FORMATS, *MAPS),
+        choices=(*files.FORMATS, *MAPS),
         default=["png", "gif"],
-        help=f"one or more of {' '.join(video.FORMATS)} for episodes, {' '.join(MAPS)} for maps "
+        help=f"one or more of {' '.join(files.FORMATS)} for episodes, {' '.join(MAPS)} for maps "
         "(default png gif; mp4 needs the extra `video`)",
     )
     parser.add_argument(
@@ -123,7 +123,7 @@ def _check(options: argparse.Namespace) -> None:
     if options.out is not None:
         check_inside(options.out, "--out")
     if "mp4" in options.format:
-        video.require_video()
+        files.require_video()
 
 
 def _film(mdp: Mdp, subject: Subject, options: argparse.Namespace) -> Animation:

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import gridworld
-from gridworld.config.flatten import flat
+from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import SOURCES
 from gridworld.errors import InputError

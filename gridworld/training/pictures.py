@@ -23,9 +23,9 @@ from gridworld.storage.serialization import State
 from gridworld.training.learning_curve import Evaluation
 from gridworld.training.tensorboard import EventWriter
 from gridworld.visualization.animation import Animation
-from gridworld.visualization.picture import Draw, drawer, save
+from gridworld.visualization.files import encode_gif, save
+from gridworld.visualization.picture import Draw, drawer
 from gridworld.visualization.policy_history import PolicyHistory
-from gridworld.visualization.video import encode_gif
 from gridworld.world.exact.evaluation import Evaluator
 
 _GROUP = "pictures"  # of TensorBoard's tags: behind the learning curve

@@ -10,12 +10,12 @@ from gridworld.config.composition.presets import LARGE, STOCHASTIC, fitting_pres
 from gridworld.config.pictures import PICTURES
 from gridworld.config.train import AUTO, TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
-from gridworld.envs.rendering import frame_size
 from gridworld.envs.observations import ObservationTable
+from gridworld.envs.rendering import frame_size
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
+from gridworld.visualization.files import require_video
 from gridworld.visualization.picture import drawer
-from gridworld.visualization.video import require_video
 from gridworld.world.exact.evaluation import Evaluator, fitting_discounts, score_of_optimum
 from gridworld.world.mdp import Mdp
 

@@ -20,7 +20,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.bounds import within_size
+from gridworld.bounds import Bounds
 from gridworld.errors import InputError
 
 IntArray = NDArray[np.integer[Any]]
@@ -211,7 +211,7 @@ def frozen(table: Table) -> Table:
 def checked_reward(what: str, value: Any) -> float:
     """A finite number that is neither too large nor too small to be added up."""
     number = finite(what, value)
-    within_size(what, number, LEAST_REWARD, MOST_REWARD)
+    Bounds(-MOST_REWARD, MOST_REWARD, least=LEAST_REWARD).check(what, number)
     return number
 
 

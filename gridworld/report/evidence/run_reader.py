@@ -12,10 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gridworld.config.flatten import flat
-from gridworld.config.privileges import privileges
-from gridworld.config.settings_by_effect import is_newer
-from gridworld.config.train import TrainConfig
+from gridworld.config.settings import NEWER, flat, privileges
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import printable
 from gridworld.report.evidence.curve_reader import read_curve
@@ -51,7 +48,7 @@ class Evidence:
     curve: Mapping[str, FloatArray]  # (evaluations,): `curve_reader.REQUIRED`, and what else the file has
     pictures: Mapping[str, str | None]  # as `RunReader.pictures`
     step_limit: Any = None  # of an episode, as the summary has it
-    privileges: Sequence[str] = ()  # as `config.privileges` finds them in its settings
+    privileges: Sequence[str] = ()  # as `config.settings.privileges` finds them in its settings
     damage: tuple[str, ...] = ()  # a sentence for each of its other files that is not the one that it wrote
 
     @property
@@ -153,7 +150,7 @@ def _evidence(run: RunReader) -> Evidence:
         curve=curve,
         pictures=run.pictures(),
         step_limit=summary.get("max_episode_steps"),
-        privileges=privileges(TrainConfig, config),
+        privileges=privileges(config),
     )
     last, told = evidence.curve["regret"][-1], summary.get("regret")
     same = told is None and not math.isfinite(last)
@@ -186,7 +183,7 @@ def _unfinished(run: RunReader) -> str:
 def _settings(config: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """Dotted names, and values as JSON."""
     for key, value in flat(config):
-        if value or not is_newer(key):
+        if value or key not in NEWER:
             text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
             yield printable(key), printable(text)
 

@@ -84,7 +84,7 @@ class BandedElimination:
 
 
 def factor(weights: Any, leak: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Solves for right-hand sides (n, columns); overwrites `weights` (n, n), numpy or CSR, and `leak` (n,)."""
+    """Solve for right-hand sides (n, columns); overwrites `weights` (n, n), numpy or CSR, and `leak` (n,)."""
     if isinstance(weights, np.ndarray):
         return Elimination(weights, leak, band=len(leak)).solve
     from scipy.sparse import diags_array
