@@ -527,11 +527,7 @@ def test_a_predict_of_its_own_is_what_is_scored() -> None:
     assert differ
     with pytest.raises(InputError, match=r"has its own predict\(\), so the distribution"):
         gridworld.evaluate(rotating, deterministic=False)
-    for kind, told in (
-        (Whimsical, "draws random numbers"),
-        (FirstOnly, "same action"),
-        (Failing, "raised"),
-    ):
+    for kind, told in ((Whimsical, "draws random numbers"), (FirstOnly, "same action"), (Failing, "raised")):
         with pytest.raises(InputError, match=told):
             gridworld.evaluate(kind("MlpPolicy", env, buffer_size=10, seed=0))
 
