@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 
 from gridworld.checking.run import CheckResult, Finding
-from gridworld.process.console.columns import aligned
+from gridworld.process.console.terminal import aligned
 
 _WIDTH = 100
 _WORDS = {True: "passed", False: "FAILED", None: "-"}

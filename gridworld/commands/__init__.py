@@ -15,7 +15,7 @@ from gridworld.config.composition.words import digits
 from gridworld.errors import EXIT_CODE, InputError, failure
 from gridworld.process.console.terminal import prepare, printing, tell_error
 from gridworld.process.early_signals import AtWork
-from gridworld.process.garbage import collect_less_often
+from gridworld.process.memory_budget import collect_less_often
 
 Main = Callable[[Sequence[str]], None]
 

@@ -12,10 +12,9 @@ from gridworld.diagnosis.picture import draw_diagnosis
 from gridworld.diagnosis.trials import beside, check_trusted, try_offers
 from gridworld.diagnosis.verdict import Diagnosis, diagnose
 from gridworld.errors import InputError
-from gridworld.process.console.columns import aligned
 from gridworld.process.console.command_line import program
 from gridworld.process.console.progress import telling_if_slow
-from gridworld.process.console.terminal import printable, tell
+from gridworld.process.console.terminal import aligned, printable, tell
 from gridworld.process.memory_budget import limited
 from gridworld.process.signals import Interrupted
 from gridworld.restore.saved_run import SavedRun

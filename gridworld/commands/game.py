@@ -14,7 +14,7 @@ import numpy as np
 from gridworld.envs.env import GridWorldEnv
 from gridworld.envs.frames import rendering as drawing
 from gridworld.envs.frames.rendering import Frame
-from gridworld.storage.rng_state import independent_generator
+from gridworld.storage.serialization import independent_generator
 from gridworld.visualization.canvas import Canvas
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray

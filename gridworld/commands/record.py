@@ -21,8 +21,8 @@ from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
 from gridworld.restore.saved_run import SavedRun, choose_policy, read_visits
 from gridworld.run.claim import check_inside, check_writable
+from gridworld.storage.atomic_write import make_inside
 from gridworld.storage.safe_read import check_no_link
-from gridworld.storage.symlinks import make_inside
 from gridworld.visualization import video
 from gridworld.visualization.animation import Animation
 from gridworld.visualization.episode import film

@@ -29,9 +29,8 @@ from gridworld.restore.repeat import lengths, population, repeat, without_pictur
 from gridworld.restore.saved_run import settings_of
 from gridworld.run.claim import check_free, check_inside
 from gridworld.run.folder import MANIFEST
-from gridworld.run.identity.provenance import describe, differences, source_differences
-from gridworld.run.identity.stored_world import stored_world
-from gridworld.run.reader import RunReader, open_run, read_run
+from gridworld.run.provenance import describe, differences, source_differences
+from gridworld.run.reader import RunReader, open_run, read_run, stored_world
 from gridworld.world.mdp import Mdp
 
 DIFFERENT = 1  # exit code

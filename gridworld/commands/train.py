@@ -32,7 +32,7 @@ from gridworld.errors import EXIT_CODE, FolderLostError, InputError
 from gridworld.process.console.command_line import called_from
 from gridworld.process.console.terminal import prepare, printable, printing, result_is_in_files, tell_error
 from gridworld.process.early_signals import AtWork
-from gridworld.process.garbage import collect_less_often
+from gridworld.process.memory_budget import collect_less_often
 from gridworld.run.claim import claimed
 from gridworld.run.folder import SWEEP_JSON, shown
 from gridworld.storage.file_lock import check_ours

@@ -16,8 +16,13 @@ from gridworld.config.agents import Decay
 from gridworld.engine.inputs import Inputs
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
-from gridworld.storage.rng_state import generator_state, plain_state, set_generator_state, set_plain_state
-from gridworld.storage.serialization import State, StateError
+from gridworld.storage.serialization import (
+    State,
+    StateError,
+    generator_state,
+    set_generator_state,
+    set_plain_state,
+)
 from gridworld.world.mdp import FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -145,7 +150,7 @@ class Run:
         excluded = model.logger.name_to_excluded
         return {
             "torch_generator": self.torch_generator.get_state().numpy().copy(),
-            "numpy_generator": plain_state(self.numpy_generator.get_state(legacy=False)),
+            "numpy_generator": self.numpy_generator.get_state(legacy=False),
             "action_generator": generator_state(model.action_space.np_random),
             "environments": self.envs.get_state(),
             "num_timesteps": int(model.num_timesteps),

@@ -24,7 +24,7 @@ from gridworld.engine.population import Population
 from gridworld.engine.run import Run
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.statistics_env import StatisticsVectorEnv
-from gridworld.storage.rng_state import independent_generator
+from gridworld.storage.serialization import independent_generator
 
 Kind = Literal["flat", "fixed", "patches", "any"]
 

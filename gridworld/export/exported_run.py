@@ -26,8 +26,7 @@ from gridworld.report.evidence.curve_reader import ONLINE, read_columns
 from gridworld.report.evidence.run_reader import Evidence, Unusable
 from gridworld.report.evidence.run_reader import read as read_evidence
 from gridworld.run.folder import WORLD
-from gridworld.run.identity.stored_world import stored_world
-from gridworld.run.reader import LARGEST_RESULT, RunReader, open_run
+from gridworld.run.reader import LARGEST_RESULT, RunReader, open_run, stored_world
 from gridworld.storage.safe_read import sha256
 from gridworld.world.metrics import METRICS
 from gridworld.world.sources.arrays import world_bytes

@@ -23,10 +23,9 @@ from gridworld.process.parallel.together import mixing
 from gridworld.restore.resume import open_unfinished
 from gridworld.restore.saved_run import settings_of
 from gridworld.run.folder import MANIFEST
-from gridworld.run.identity.fingerprint import settings_hash
-from gridworld.run.identity.stored_world import stored_world
 from gridworld.run.manifest import NUMBERS_DEPEND_ON
-from gridworld.run.reader import RunReader, read_run
+from gridworld.run.provenance import settings_hash
+from gridworld.run.reader import RunReader, read_run, stored_world
 from gridworld.run.summary import Summary
 from gridworld.training.together import Training, run_alone, run_together
 from gridworld.training.train import training

@@ -27,11 +27,8 @@ from gridworld.process.console.terminal import printable, tell
 from gridworld.restore.saved_run import settings_of
 from gridworld.run.checkpoints import MOST_STEPS, Checkpoints, steps_of
 from gridworld.run.folder import CHECKPOINTS, CURVE, MANIFEST
-from gridworld.run.identity.fingerprint import environment, identity, settings
-from gridworld.run.identity.provenance import git, source_differences
-from gridworld.run.identity.stored_world import stored_world
-from gridworld.run.reader import RunReader
-from gridworld.run.recovery import is_started, run_to_resume
+from gridworld.run.provenance import environment, git, identity, settings, source_differences
+from gridworld.run.reader import RunReader, is_started, read_run, stored_world
 from gridworld.run.summary import Summary
 from gridworld.run.train_log import TrainLog
 from gridworld.run.writer import RunWriter
@@ -85,7 +82,7 @@ def open_unfinished(folder: Path, trust: bool = False) -> Unfinished:
         folder: The run's folder.
         trust: Import the classes that its settings name, wherever they are from.
     """
-    run = run_to_resume(folder)
+    run = read_run(folder)
     config = settings_of(run, trust, allow="trust=true")
     return Unfinished(run, config, stored_world(run, config.env), trust)
 
@@ -199,9 +196,7 @@ class Unfinished:
         def begin() -> RunWriter:
             return RunWriter.resume(run, steps, config.total_timesteps, differs)
 
-        return (
-            yield from carry_out(config, run.folder, mdp, begin, log, self.is_trusted, (run, state), on_built)
-        )
+        return (yield from carry_out(config, run.folder, mdp, begin, log, self.is_trusted, state, on_built))
 
     def _tell_if_map_changed(self) -> None:
         env = self.config.env
@@ -285,7 +280,7 @@ def _why_not(path: Path, state: State | StateError, folder: Path, own: str) -> s
         return str(state)
     if state.get("format") != FORMAT:
         return "another version of gridworld wrote it"
-    kinds = {"manifest": str} | {key: type(value) for key, value in state.items()}
+    kinds = {key: type(value) for key, value in state.items()}
     if kinds != CONTENT or state["marks"].keys() != LOGS.keys():
         return "it lacks what a checkpoint has"
     if state["identity"] != own:

@@ -15,8 +15,7 @@ from gridworld.errors import FolderLostError, InputError, MachineError, reason
 from gridworld.process.signals import Interrupted
 from gridworld.restore.resume import training_or_resumption
 from gridworld.run.folder import ERROR_FILE, LOCK, MANIFEST
-from gridworld.run.reader import read_run
-from gridworld.run.recovery import find_run
+from gridworld.run.reader import find_run, read_run
 from gridworld.run.writer import clear, record_failure
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.file_lock import locked

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import logging
 import shlex
 import traceback
 from collections.abc import Callable
@@ -13,15 +14,13 @@ from gridworld.agents import Agent, family
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import make_observation
-from gridworld.errors import FolderLostError, InputError, MachineError, reason
+from gridworld.errors import InputError, MachineError, reason
 from gridworld.process.console.command_line import recorded_command_line
 from gridworld.process.console.terminal import tell
 from gridworld.process.signals import Interrupted
 from gridworld.run.folder import RunFolder, shown
-from gridworld.run.reader import RunReader
 from gridworld.run.summary import Summary, interruption_text
 from gridworld.run.train_log import TrainLog
-from gridworld.run.undo import FilesBefore
 from gridworld.run.writer import RunWriter
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.serialization import State, StateError
@@ -95,7 +94,7 @@ def carry_out(
     begin: Callable[[], RunWriter],
     log: TrainLog,
     is_trusted: bool,
-    earlier: tuple[RunReader, State] | None = None,
+    state: State | None = None,
     on_built: OnBuilt = ignore,
 ) -> Training[Summary]:
     """Train from the start or continue from a state, with settings that were checked.
@@ -107,7 +106,7 @@ def carry_out(
         begin: writes the manifest, once the agent is built.
         log: takes what is warned about; its file is opened here.
         is_trusted: whether the environment that the settings name may be made.
-        earlier: the run as its folder has it and the content of a checkpoint; None: from the start.
+        state: the content of a checkpoint; None: from the start.
         on_built: as for `train`.
 
     Returns:
@@ -118,8 +117,6 @@ def carry_out(
     """
     observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
     evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
-    before = None if earlier is None else FilesBefore(*earlier)
-    state = None if earlier is None else earlier[1]
     events = None
     if config.logging.tensorboard:
         events = EventWriter(folder, None if state is None else state["marks"]["events"])
@@ -137,8 +134,6 @@ def carry_out(
     session = None
     try:
         session = Session(config, run, evaluator, agent, context, events, state, is_trusted)
-        if before is not None and before.has_result():
-            session.checkpoints.held = before.steps
         summary = yield from session.run()
     except Interrupted as interruption:
         run.end("interrupted", str(interruption), **_progress(session))
@@ -146,8 +141,7 @@ def carry_out(
         raise
     except BaseException as error:
         with contextlib.suppress(OSError):  # nothing can be written perhaps
-            if before is None or not _undo(before, run, log, error, session):
-                _note_failure(run, log, error, _progress(session))
+            _note_failure(run, log, error, _progress(session))
         if isinstance(error, StateError):
             raise InputError(f"{folder}: its checkpoint does not fit this run: {error}") from None
         if isinstance(error, OSError):
@@ -157,25 +151,6 @@ def carry_out(
     run.end("finished", None, **_progress(session))
     log.add(f"finished after {session.reached:,} steps")
     return summary
-
-
-def _undo(
-    before: FilesBefore, run: RunWriter, log: TrainLog, error: BaseException, session: Session | None
-) -> bool:
-    """Put a run back as it was, if it cannot be resumed at all, or was finished and cannot be made longer."""
-    has_gone_on = session is not None and session.reached != before.steps
-    if isinstance(error, InputError | StateError) and not has_gone_on:
-        before.put_back()
-        log.add(f"cannot be resumed: {reason(error)}", "ERROR")
-        return True
-    if not _is_failure(error) or isinstance(error, FolderLostError) or not before.has_result():
-        return False
-    before.put_back()
-    log.add(f"cannot be made longer: {reason(error)}", "ERROR")
-    if not isinstance(error, InputError | StateError):
-        write_text(run.error_file, traceback.format_exc())
-    tell(f"{shown(run.folder)}: stays as it was, finished after {before.steps:,} steps")
-    return True
 
 
 def _is_failure(error: BaseException) -> bool:
@@ -189,7 +164,7 @@ def _note_failure(
     """Write to the manifest and the log why a run ended, and the traceback of what nobody has foreseen."""
     failed = _is_failure(error)
     status = "failed" if failed else "interrupted"
-    log.add(f"{status}: {reason(error)}", "ERROR")
+    log.add(f"{status}: {reason(error)}", logging.ERROR)
     if failed and not isinstance(error, InputError | StateError):
         write_text(run.error_file, traceback.format_exc())
     run.end(status, reason(error), **progress)

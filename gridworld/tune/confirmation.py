@@ -24,9 +24,8 @@ from gridworld.process.console.terminal import printable, tell
 from gridworld.process.parallel.together import LARGEST
 from gridworld.report.analysis import statistics
 from gridworld.report.table import number, steps_up_to
-from gridworld.run.damage import damage
-from gridworld.run.recovery import find_run
-from gridworld.storage.symlinks import check_no_links, make_inside, names_inside, remove_inside
+from gridworld.run.reader import find_run
+from gridworld.storage.atomic_write import check_no_links, make_inside, names_inside, remove_inside
 from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.job_table import FAILED, JobTable, run_status
 from gridworld.sweep.plan import plan, shape
@@ -97,7 +96,7 @@ def _damage(folder: Path) -> list[str]:
         run = find_run(folder)
     except InputError as error:
         return [str(error)]
-    return [] if run is None or not run.is_finished else list(damage(run).values())
+    return [] if run is None or not run.is_finished else list(run.damage().values())
 
 
 def run_held_out(all_runs: HeldOutRuns, worker: int, parent: int) -> None:

@@ -30,13 +30,12 @@ from gridworld.process.console.command_line import recorded_command_line
 from gridworld.report.evidence.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
 from gridworld.run.claim import check_writable
 from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON
-from gridworld.run.identity.provenance import versions
-from gridworld.storage.atomic_write import make_folder, tidy, write_json, write_text
+from gridworld.run.provenance import versions
+from gridworld.storage.atomic_write import check_no_links, make_folder, tidy, write_json, write_text
 from gridworld.storage.csv_text import csv_text
-from gridworld.storage.file_lock import locked
+from gridworld.storage.file_lock import noted
 from gridworld.storage.safe_read import LARGEST_CSV, file_sha256
 from gridworld.storage.sealed_json import read_sealed, sealed
-from gridworld.storage.symlinks import check_no_links
 from gridworld.tune.confirmation import CONFIRM
 from gridworld.tune.recipe import EXPERIMENT
 from gridworld.tune.search.objective import ERROR, SEEDS, WORKER
@@ -82,7 +81,8 @@ def at_work_in(folder: Path) -> Iterator[None]:
     make_folder(folder)
     lock = folder / LOCK
     try:
-        with locked(lock, shared=True):
+        lock.touch()
+        with noted(lock):
             tidy(folder)
             yield
     finally:

@@ -20,7 +20,7 @@ from gridworld.config.tune import DimensionConfig
 from gridworld.errors import InputError
 from gridworld.report.evidence.grouping import arrange, learning_key, task_key
 from gridworld.report.evidence.run_reader import Evidence, read
-from gridworld.run.identity.fingerprint import identity, settings_hash
+from gridworld.run.provenance import identity, settings_hash
 from gridworld.training.tensorboard import hparams
 from gridworld.tune.recipe import _relevant, write_recipe
 from gridworld.tune.search.search_space import SearchSpace

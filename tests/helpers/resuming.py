@@ -131,7 +131,6 @@ def last_state(folder: Path) -> dict[str, Any] | None:
     if not files:
         return None
     state = decode(files[0].read_bytes())
-    state.pop("manifest", None)  # has the time of the start; older ones have none
     for key in ("seconds", "marks"):
         del state[key]
     curve = state["curve"]

@@ -49,7 +49,7 @@ import gridworld
 from gridworld.config.composition.compose import compose
 from gridworld.envs.frames.rendering import import_pygame
 from gridworld.process.console import progress
-from gridworld.process.garbage import collect_less_often
+from gridworld.process.memory_budget import collect_less_often
 from gridworld.report import page
 from gridworld.tune import progress as search_progress
 

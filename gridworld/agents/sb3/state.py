@@ -24,13 +24,15 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import Tensor
 
-from gridworld.storage.rng_state import (
+from gridworld.storage.serialization import (
+    State,
+    StateError,
+    fill,
     generator_state,
     global_state,
     set_generator_state,
     set_global_state,
 )
-from gridworld.storage.serialization import State, StateError, fill
 
 _LIBRARIES = ("stable_baselines3", "sb3_contrib", "torch", "gridworld")
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_n_calls")

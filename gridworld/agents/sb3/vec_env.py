@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices,
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.vector_env import GridWorldVectorEnv, StateArray
 from gridworld.errors import InputError
-from gridworld.storage.rng_state import independent_generator
+from gridworld.storage.serialization import independent_generator
 
 _MASKS = "action_masks"  # asked for by agents that respect them; here nothing is ever forbidden
 

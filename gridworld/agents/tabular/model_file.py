@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError
-from gridworld.process.npz import npz_arrays, npz_bytes
+from gridworld.process.user_input import npz_arrays, npz_bytes
 from gridworld.storage.safe_read import read_bytes
 
 _ALGORITHM = "algorithm"

@@ -32,8 +32,14 @@ from gridworld.bounds import at_least, within, within_size
 from gridworld.config.agents import MOST_KEPT, Schedule, check_exploration, parse_schedule
 from gridworld.config.effects import Effect, affects
 from gridworld.errors import InputError
-from gridworld.storage.rng_state import generator_state, independent_generator, set_generator_state
-from gridworld.storage.serialization import State, fill, fitting
+from gridworld.storage.serialization import (
+    State,
+    fill,
+    fitting,
+    generator_state,
+    independent_generator,
+    set_generator_state,
+)
 from gridworld.world.mdp import LEAST_REWARD, MOST_REWARD, FloatArray, IntArray
 
 if TYPE_CHECKING:

@@ -12,8 +12,7 @@ import numpy as np
 from gridworld.config.worlds import schema_of
 from gridworld.report.evidence.curve_reader import ONLINE, SAMPLED_RETURN, reported
 from gridworld.report.evidence.run_reader import Evidence
-from gridworld.run.identity.stored_world import stored_world
-from gridworld.run.reader import read_run
+from gridworld.run.reader import read_run, stored_world
 from gridworld.world.exact.evaluation import Evaluator
 
 _MOST_CELLS = 100_000  # beyond, solving the world again would take longer than the report

@@ -19,7 +19,6 @@ from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import printable
 from gridworld.report.evidence.curve_reader import read_curve
-from gridworld.run.damage import damage
 from gridworld.run.folder import CURVE, SUMMARY
 from gridworld.run.reader import RunReader, read_run
 from gridworld.storage.safe_read import read_object
@@ -119,7 +118,7 @@ def read(folder: Path) -> Evidence | Unusable:
     if not run.is_finished:
         state = _printable(run.manifest["status"])
         return dataclasses.replace(unusable, reasons=(_unfinished(run),), state=state)
-    damaged = damage(run)
+    damaged = run.damage()
     try:
         if not damaged.keys() & {CURVE, SUMMARY}:
             return dataclasses.replace(_evidence(run), damage=tuple(damaged.values()))

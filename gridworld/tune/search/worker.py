@@ -17,9 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from filelock import ReadWriteLock, Timeout
+
 from gridworld.errors import reason
 from gridworld.process.parallel.parent_watch import end_with
-from gridworld.process.signals import set_on
 from gridworld.storage.file_lock import locked
 from gridworld.sweep.job_table import one_line
 from gridworld.training.together import Training, run_together
@@ -71,12 +72,12 @@ def among_workers(study: Study, context: StudyContext) -> Iterator[None]:
     """
     from gridworld.tune.search.storage import give_up_running
 
-    lock, settings = context.folder / WORKERS, context.storage.settings
+    guard, settings = ReadWriteLock(context.folder / WORKERS), context.storage.settings
     if settings.storage is None:
-        with locked(lock, wait=_ORPHAN_SECONDS if settings.workers == 1 else 0) as is_alone:
-            if is_alone:
-                give_up_running(study)
-    with locked(lock, shared=True):
+        wait = _ORPHAN_SECONDS if settings.workers == 1 else 0
+        with contextlib.suppress(Timeout), guard.write_lock(timeout=wait):
+            give_up_running(study)
+    with guard.read_lock():
         yield
 
 
@@ -129,7 +130,7 @@ def study_of(context: StudyContext) -> Iterator[StudyStorage]:
 
 def become_worker(parent: int) -> None:
     """Leave Ctrl-C to the parent; stop at its SIGTERM, and when it is gone."""
-    set_on(signal.SIGTERM, _stopped)
+    signal.signal(signal.SIGTERM, lambda number, frame: _stopped.set())
     end_with(parent)
 
 

@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 from gridworld.errors import FolderLostError
 from gridworld.process.console.terminal import tell_error
 from gridworld.process.signals import StopRequest, blocking, signal_name
-from gridworld.storage.file_lock import Held, held, work_for
 
 # What a worker's process runs: (what it needs to know, the worker's number, its parent's process id). It ends
 # with the parent, however that ends.
@@ -92,15 +91,14 @@ def share(work: Sequence[T], worker: int, workers: int) -> Sequence[T]:
 
 def _start(main: WorkerMain, context: Any, number: int) -> SpawnProcess:
     process = multiprocessing.get_context("spawn").Process(
-        target=_run, args=(main, held(), context, number, os.getpid()), daemon=True
+        target=_run, args=(main, context, number, os.getpid()), daemon=True
     )
     with blocking(signal.SIGINT):  # Ctrl-C is for this process
         process.start()
     return process
 
 
-def _run(main: WorkerMain, holder: Held, context: Any, number: int, parent: int) -> None:
-    work_for(holder)
+def _run(main: WorkerMain, context: Any, number: int, parent: int) -> None:
     try:
         main(context, number, parent)
     except FolderLostError as error:

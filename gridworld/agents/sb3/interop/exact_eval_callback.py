@@ -14,8 +14,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wra
 from gridworld.agents.sb3.interop.foreign_model import ForeignPolicy
 from gridworld.bounds import at_least, discount
 from gridworld.envs.inspection import Task, task_of
-from gridworld.run.evaluations_file import write_evaluations
 from gridworld.run.folder import BEST_MODEL, EVALUATIONS
+from gridworld.run.writer import write_evaluations
 from gridworld.storage.atomic_write import replacing
 from gridworld.world.exact.evaluation import Evaluator, Score
 from gridworld.world.metrics import numbers

@@ -21,7 +21,7 @@ from gridworld.agents.sb3.settings.schemas import SB3CheckedConfig, SB3ClassConf
 from gridworld.agents.sb3.settings.validation import FALLING, SCHEDULES
 from gridworld.config.agents import falls, parse_schedule
 from gridworld.errors import InputError
-from gridworld.process.import_path import imported
+from gridworld.process.user_input import imported
 
 Arguments = dict[str, Any]
 
