@@ -24,14 +24,14 @@ from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
 from gridworld.process.signals import Interrupted
-from gridworld.restore.comparison import Finding, check_whole, compare
-from gridworld.restore.repeat import lengths, population, repeat, without_pictures
+from gridworld.restore.reproduce import Finding, check_whole, compare, lengths, population, repeat
 from gridworld.restore.saved_run import settings_of
 from gridworld.run.claim import check_free, check_inside
 from gridworld.run.folder import MANIFEST
 from gridworld.run.identity.provenance import describe, differences, source_differences
 from gridworld.run.identity.stored_world import stored_world
 from gridworld.run.reader import RunReader, open_run, read_run
+from gridworld.training.setup import without_pictures
 from gridworld.world.mdp import Mdp
 
 DIFFERENT = 1  # exit code
@@ -148,4 +148,4 @@ def _tell_resumed(run: RunReader) -> None:
 
 def _tell(finding: Finding) -> None:
     verdict = {True: "identical", False: "DIFFERENT", None: "UNKNOWN"}[finding.same]
-    print(f"  {finding.part:<20}{verdict:<9}  {printable(finding.told)}")
+    print(f"  {finding.part:<20}{verdict:<9}  {printable(finding.detail)}")
