@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from gridworld.commands import parser_for_a_run, whole_number
 from gridworld.envs.env import GridWorldEnv
-from gridworld.envs.frames.rendering import has_display
+from gridworld.envs.rendering import has_display
 from gridworld.envs.rollout import SampledScores, play, sample_episodes
 from gridworld.errors import InputError
 from gridworld.process.console.columns import aligned

@@ -11,9 +11,9 @@ from enum import Enum
 
 import numpy as np
 
+from gridworld.envs import rendering as drawing
 from gridworld.envs.env import GridWorldEnv
-from gridworld.envs.frames import rendering as drawing
-from gridworld.envs.frames.rendering import Frame
+from gridworld.envs.rendering import Frame
 from gridworld.storage.rng_state import independent_generator
 from gridworld.visualization.canvas import Canvas
 from gridworld.world.exact.evaluation import Evaluator

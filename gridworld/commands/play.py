@@ -12,7 +12,7 @@ from gridworld.commands import add_best, whole_number
 from gridworld.commands.game import Game, Key, draw
 from gridworld.config.train import EvaluationConfig
 from gridworld.config.worlds import MapConfig
-from gridworld.envs.frames import rendering as drawing
+from gridworld.envs import rendering as drawing
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import program
 from gridworld.process.console.progress import telling_if_slow

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gridworld.commands import parser_for_a_run, whole_number
 from gridworld.config.pictures import PICTURES
-from gridworld.envs.frames.rendering import frame_size
+from gridworld.envs.rendering import frame_size
 from gridworld.envs.rollout import play
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import program

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from gridworld.diagnosis.verdict import Diagnosis
-from gridworld.envs.frames.board import board_of
-from gridworld.envs.frames.rendering import AGENT, Frame
+from gridworld.envs.board import board_of
+from gridworld.envs.rendering import AGENT, Frame
 from gridworld.visualization.canvas import Canvas, shown
 from gridworld.visualization.paths import directions, draw_paths, greedy_paths
 from gridworld.visualization.sheet import INK, ORANGES, PAPER, UNREACHABLE, Swatch, is_dark, linear, short

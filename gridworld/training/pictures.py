@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gridworld.agents import PolicySnapshot
 from gridworld.config.pictures import PICTURES, Picture
 from gridworld.config.train import TrainConfig
-from gridworld.envs.frames.rendering import Frame, fitting_cell_size
+from gridworld.envs.rendering import Frame, fitting_cell_size
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State
 from gridworld.training.learning_curve import Evaluation

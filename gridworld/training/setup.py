@@ -12,6 +12,7 @@ from gridworld.config.pictures import PICTURES
 from gridworld.config.train import AUTO, TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import ObservationTable
+from gridworld.envs.rendering import frame_size
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
 from gridworld.world.exact.evaluation import Evaluator, fitting_discounts, score_of_optimum

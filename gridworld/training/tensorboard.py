@@ -21,7 +21,7 @@ from tensorboard.plugins.text import metadata as text_metadata
 
 from gridworld.config.settings import ON_RESULT, flat, with_effects
 from gridworld.config.train import TrainConfig
-from gridworld.envs.frames.rendering import Frame
+from gridworld.envs.rendering import Frame
 from gridworld.storage.append_log import AppendLog
 from gridworld.storage.event_file import EventFile
 from gridworld.visualization.files import encode_png

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from gridworld.envs.frames import rendering as drawing
-from gridworld.envs.frames.rendering import Frame, Packed
+from gridworld.envs import rendering as drawing
+from gridworld.envs.rendering import Frame, Packed
 from gridworld.envs.rollout import Episode
 from gridworld.errors import InputError
 from gridworld.world.layout import positive_int

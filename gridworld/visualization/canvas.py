@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.envs.frames import rendering as drawing
-from gridworld.envs.frames.board import Kind, board_of
-from gridworld.envs.frames.rendering import UNKNOWN, Colour, Frame, Point
+from gridworld.envs import rendering as drawing
+from gridworld.envs.board import Kind, board_of
+from gridworld.envs.rendering import UNKNOWN, Colour, Frame, Point
 from gridworld.visualization.sheet import (
     INK,
     PAPER,

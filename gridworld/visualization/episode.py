@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from gridworld.config.worlds import EnvConfig, GymnasiumConfig
-from gridworld.envs.frames.board import board_of
-from gridworld.envs.frames.real_env import RealEnvFrames
-from gridworld.envs.frames.rendering import Frame, frame_size
+from gridworld.envs.board import board_of
+from gridworld.envs.real_env import RealEnvFrames
+from gridworld.envs.rendering import Frame, frame_size
 from gridworld.envs.rollout import Episode, play
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import printable, tell

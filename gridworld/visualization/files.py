@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import GifImagePlugin, ImageChops
 
-from gridworld.envs.frames.rendering import Frame
+from gridworld.envs.rendering import Frame
 from gridworld.errors import InputError, install_command
 from gridworld.storage.atomic_write import replacing, replacing_folder, write_bytes
 from gridworld.visualization.animation import Animation

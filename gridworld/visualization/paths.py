@@ -12,8 +12,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.envs.frames.board import board_of
-from gridworld.envs.frames.rendering import AGENT
+from gridworld.envs.board import board_of
+from gridworld.envs.rendering import AGENT
 from gridworld.visualization.canvas import Canvas
 from gridworld.world.grid import GridMdp
 from gridworld.world.layout import MOVES

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
 from gridworld.config.train import TrainConfig
-from gridworld.envs.frames.rendering import Frame
+from gridworld.envs.rendering import Frame
 from gridworld.errors import InputError
 from gridworld.visualization.animation import Animation
 from gridworld.world.exact.evaluation import Evaluator

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
-from gridworld.envs.frames.board import board_of
-from gridworld.envs.frames.rendering import fitting_cell_size
+from gridworld.envs.board import board_of
+from gridworld.envs.rendering import fitting_cell_size
 from gridworld.storage.serialization import State
 from gridworld.visualization.animation import Animation, animation_of_frames
 from gridworld.visualization.canvas import shown

@@ -13,9 +13,9 @@ import math
 import numpy as np
 
 from gridworld.agents import PolicySnapshot
-from gridworld.envs.frames import rendering as drawing
-from gridworld.envs.frames.board import board_of
-from gridworld.envs.frames.rendering import AGENT, SMALLEST_TEXT, UNKNOWN, Colour, Point
+from gridworld.envs import rendering as drawing
+from gridworld.envs.board import board_of
+from gridworld.envs.rendering import AGENT, SMALLEST_TEXT, UNKNOWN, Colour, Point
 from gridworld.visualization.canvas import Canvas, shown
 from gridworld.visualization.paths import directions, draw_paths, explored, greedy_paths
 from gridworld.visualization.picture import IMAGES_TAB, Draw, Subject, agents_gamma, visits_of

@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from gridworld.agents import PolicySnapshot
-from gridworld.envs.frames.board import board_of
-from gridworld.envs.frames.rendering import Frame
+from gridworld.envs.board import board_of
+from gridworld.envs.rendering import Frame
 from gridworld.visualization.canvas import Canvas, shown
 from gridworld.visualization.paths import moving_actions
 from gridworld.visualization.picture import IMAGES_TAB, Draw, Subject, agents_gamma, visits_of

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.envs.frames.rendering import (
+from gridworld.envs.rendering import (
     BACKGROUND,
     SMALLEST_TEXT,
     UNKNOWN,
@@ -29,7 +29,7 @@ from gridworld.envs.frames.rendering import (
     text_width,
     write,
 )
-from gridworld.envs.frames.rendering import INK as INK
+from gridworld.envs.rendering import INK as INK
 from gridworld.world.mdp import BoolArray, FloatArray
 
 ColourArray = NDArray[np.uint8]  # (..., 3), RGB

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.envs.frames.rendering import (
+from gridworld.envs.rendering import (
     SMALLEST_TEXT,
     UNKNOWN,
     Colour,

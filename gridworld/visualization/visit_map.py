@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.envs.frames.board import board_of
-from gridworld.envs.frames.rendering import Frame
+from gridworld.envs.board import board_of
+from gridworld.envs.rendering import Frame
 from gridworld.visualization.canvas import Canvas, shown
 from gridworld.visualization.picture import IMAGES_TAB, Draw, Subject
 from gridworld.visualization.sheet import BLUES, Scale, counting, short

@@ -10,7 +10,7 @@ from PIL import Image
 
 from gridworld.agents import PolicySnapshot
 from gridworld.config.pictures import PICTURES
-from gridworld.envs.frames.rendering import AGENT, CLIFF, GOAL, TRAP, WALL, Frame
+from gridworld.envs.rendering import AGENT, CLIFF, GOAL, TRAP, WALL, Frame
 from gridworld.visualization.canvas import Canvas
 from gridworld.visualization.paths import explored, greedy_paths
 from gridworld.visualization.picture import drawer

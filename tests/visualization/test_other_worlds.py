@@ -14,9 +14,9 @@ from gridworld.agents import PolicySnapshot
 from gridworld.config.pictures import PICTURES
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, GymnasiumConfig
-from gridworld.envs.frames.board import Kind, Panel, board_of
-from gridworld.envs.frames.real_env import RealEnvFrames
-from gridworld.envs.frames.rendering import (
+from gridworld.envs.board import Kind, Panel, board_of
+from gridworld.envs.real_env import RealEnvFrames
+from gridworld.envs.rendering import (
     AGENT,
     GOAL,
     TRAP,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gridworld.envs.frames.rendering import draw_frame, pack
+from gridworld.envs.rendering import draw_frame, pack
 from gridworld.errors import InputError, failure
 from gridworld.storage.atomic_write import replacing, replacing_folder, write_array, write_json
 from gridworld.visualization import files as record

@@ -62,13 +62,15 @@ def same(one: Any, other: Any) -> bool:
 
 def alike(one: Any, other: Any, without: Iterable[str] = ()) -> bool:
     """Whether two objects of one class hold the same values and functions, but for some attributes."""
+    if type(one) is not type(other):
+        return False
     digests = set()
     for each in (one, other):
         reader = Reader([each], deep=True, skips_envs=True)
         digests.add(reader.digest(*((k, v) for k, v in sorted(vars(each).items()) if k not in without)))
         if not reader.is_complete:
             return False
-    return type(one) is type(other) and len(digests) == 1
+    return len(digests) == 1
 
 
 def remembered(where: str, name: str, owner: Any, chain: Iterable[Any] = ()) -> list[Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from PIL import Image
 
-from gridworld.envs.frames.rendering import Frame, import_pygame
+from gridworld.envs.rendering import Frame, import_pygame
 from gridworld.errors import InputError, in_short
 from gridworld.world.mdp import Mdp
 from gridworld.world.sources.making import make_env
@@ -39,8 +38,7 @@ class RealEnvFrames:
             env = make_env(self._env_id, self._kwargs, render_mode="rgb_array")
             try:
                 env.reset(seed=0)
-                walk = _set_states if hasattr(env.unwrapped, "P") else _replayed
-                return [self._frame(env) for _ in walk(env, mdp, states)]
+                return [self._frame(env) for _ in _walk(env, mdp, states)]
             except InputError:
                 raise
             except Exception as error:  # whatever it raises
@@ -58,31 +56,25 @@ class RealEnvFrames:
         return np.asarray(Image.fromarray(frame).resize(size, Image.Resampling.BOX))
 
 
-def _set_states(env: gym.Env[Any, Any], mdp: Mdp, states: Sequence[int]) -> Iterator[None]:
-    for state in states:
-        env.unwrapped.s = int(mdp.number[state])  # type: ignore[attr-defined]
-        env.unwrapped.lastaction = None  # type: ignore[attr-defined]
-        yield
-
-
-def _replayed(env: gym.Env[Any, Any], mdp: Mdp, states: Sequence[int]) -> Iterator[None]:
-    yield
-    for state, following in itertools.pairwise(states):
-        leading = np.flatnonzero(mdp.next_state[state, :, 0] == following)
-        if not leading.size:
-            raise InputError(
-                f"{mdp.name}: no action leads from {mdp.state_name(state)} to {mdp.state_name(following)}"
-            )
-        env.step(int(leading[0]))
+def _walk(env: gym.Env[Any, Any], mdp: Mdp, states: Sequence[int]) -> Iterator[None]:
+    """Put the environment into one state after the other."""
+    real: Any = env.unwrapped
+    for before, state in zip([None, *states], states, strict=False):
+        if hasattr(real, "P"):
+            real.s, real.lastaction = int(mdp.number[state]), None
+        elif before is not None:
+            leading = np.flatnonzero(mdp.next_state[before, :, 0] == state)
+            if not leading.size:
+                raise InputError(
+                    f"{mdp.name}: no action leads from {mdp.state_name(before)} to {mdp.state_name(state)}"
+                )
+            env.step(int(leading[0]))
         yield
 
 
 @contextmanager
 def _off_screen() -> Iterator[None]:
-    """Without a display and a sound card, unless pygame has opened a display already.
-
-    Environments start pygame as a whole, which would look for both. Afterwards it is as if it never had been.
-    """
+    """Without a display and a sound card, which environments look for, unless pygame has a display."""
     pygame = import_pygame()
     if pygame.display.get_init():
         yield
@@ -94,7 +86,5 @@ def _off_screen() -> Iterator[None]:
     finally:
         pygame.quit()
         for name, value in before.items():
-            if value is None:
-                os.environ.pop(name)
-            else:
-                os.environ[name] = value
+            os.environ.pop(name)
+            os.environ.update({} if value is None else {name: value})

@@ -1,8 +1,7 @@
 """What a picture of a world lies on: cells in rows and columns, and what is in each.
 
-The states of a map lie in one panel. Other worlds may have several (`Mdp.places`), which stand side by side
-and one below the other, with a blank row or column between two. A world without places has no panels; its
-pictures are tables and cards of text.
+The states of a map lie in one panel. Other worlds may have several (`Mdp.places`), in rows and columns with a
+blank one between two. A world without places has no panels; its pictures are tables and cards of text.
 """
 
 from __future__ import annotations
@@ -21,10 +20,10 @@ _CARD = 1, 4  # rows and columns of the text that stands for a world without pla
 
 
 class Kind(IntEnum):
-    """What is in a cell."""
+    """What is in a cell: no state, one that no episode comes to, and so on."""
 
-    BLANK = 0  # no state
-    UNREACHABLE = 1  # a state that no episode comes to
+    BLANK = 0
+    UNREACHABLE = 1
     FLOOR = 2
     WALL = 3
     CLIFF = 4
@@ -34,10 +33,10 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True)
 class Panel:
-    """A part of the board."""
+    """A part of the board, from its first cell on."""
 
-    top: int  # row of its first cell
-    left: int  # column of its first cell
+    top: int
+    left: int
     rows: int
     cols: int
     name: str = ""
@@ -45,23 +44,14 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class Board:
-    """The cells of a world's pictures.
-
-    Attributes:
-        rows: its height in cells.
-        cols: its width in cells.
-        panels: its parts; none for a world without places.
-        cell: (S, 2), row and column of each state's cell; -1 where it has none.
-        state: (rows, cols), the state that each cell shows; -1 where it shows none.
-        kind: (rows, cols), a `Kind` each.
-    """
+    """The cells of a world's pictures, `rows` high and `cols` wide."""
 
     rows: int
     cols: int
-    panels: tuple[Panel, ...]
-    cell: IntArray
-    state: IntArray
-    kind: IntArray
+    panels: tuple[Panel, ...]  # none for a world without places
+    cell: IntArray  # (S, 2), row and column of each state's cell; -1 where it has none
+    state: IntArray  # (rows, cols), the state that each cell shows; -1 where it shows none
+    kind: IntArray  # (rows, cols), a `Kind` each
 
     @functools.cached_property
     def place(self) -> list[list[int]]:
@@ -70,12 +60,9 @@ class Board:
         return places
 
     @functools.cached_property
-    def _by_kind(self) -> dict[int, list[list[int]]]:
+    def cells(self) -> dict[Kind, list[list[int]]]:
+        """Row and column of all cells of each kind."""
         return {kind: np.argwhere(self.kind == kind).tolist() for kind in Kind}
-
-    def cells(self, kind: Kind) -> list[list[int]]:
-        """Row and column of all cells of a kind."""
-        return self._by_kind[kind]
 
     @functools.cached_property
     def floor(self) -> BoolArray:

@@ -1,10 +1,7 @@
 """Pictures of the world: a frame from (mdp, state), and the window of human mode.
 
-A frame shows the world's board (`gridworld.envs.frames.board`); that of a world without places is a card
-with the state's name.
-
-pygame is imported when the first picture is drawn. Drawing goes to a plain surface, which needs no display;
-only `Window` opens one.
+A frame shows the world's board; that of a world without places is a card with the state's name. pygame is
+imported when the first picture is drawn; drawing goes to a plain surface, and only `Window` opens a display.
 """
 
 from __future__ import annotations
@@ -21,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.envs.frames.board import Board, Kind, board_of
+from gridworld.envs.board import Board, Kind, board_of
 from gridworld.errors import InputError
 from gridworld.world.grid import GridMdp
 from gridworld.world.mdp import Mdp
@@ -55,7 +52,7 @@ _log = logging.getLogger("gridworld")
 _fonts: dict[int, Any] = {}  # a font draws its letters once, and takes its time over it
 
 
-@functools.cache  # it is asked for by every line of a picture
+@functools.cache
 def import_pygame() -> ModuleType:
     """pygame, without its greeting, and without `pkg_resources`, which takes longest to import."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -120,7 +117,7 @@ def draw_world(surface: Any, mdp: Mdp, state: int | None, cell_size: int = CELL_
         draw_card(surface, [] if state is None else [mdp.state_name(state)])
         return
     for colour, kind in ((UNKNOWN, Kind.UNREACHABLE), (WALL, Kind.WALL), (CLIFF, Kind.CLIFF)):
-        for row, col in board.cells(kind):
+        for row, col in board.cells[kind]:
             surface.fill(colour, ((col + 1) * cell_size, (row + 1) * cell_size, cell_size, cell_size))
     draw_grid(surface, board, cell_size)
     draw_terminals(surface, board, cell_size)
@@ -155,17 +152,18 @@ def draw_grid(surface: Any, board: Board, cell_size: int) -> None:
     for panel in board.panels:
         rows, cols = slice(panel.top, panel.top + panel.rows), slice(panel.left, panel.left + panel.cols)
         left, top = (panel.left + 1) * cell_size, (panel.top + 1) * cell_size
-        right, bottom = left + panel.cols * cell_size, top + panel.rows * cell_size
-        if (board.state[rows, cols] >= 0).all():
-            for x in range(left, right + 1, cell_size):
-                draw.line(surface, GRID_LINE, (x, top), (x, bottom))
-            for y in range(top, bottom + 1, cell_size):
-                draw.line(surface, GRID_LINE, (left, y), (right, y))
+        shown = board.state[rows, cols] >= 0
+        if shown.all():
+            width, height = panel.cols * cell_size, panel.rows * cell_size
+            for x in range(0, width + 1, cell_size):
+                surface.fill(GRID_LINE, (left + x, top, 1, height + 1))
+            for y in range(0, height + 1, cell_size):
+                surface.fill(GRID_LINE, (left, top + y, width + 1, 1))
         else:
-            for row, col in np.argwhere(board.state[rows, cols] >= 0).tolist():
+            for row, col in np.argwhere(shown).tolist():
                 box = left + col * cell_size, top + row * cell_size, cell_size + 1, cell_size + 1
                 draw.rect(surface, GRID_LINE, box, 1)
-        size = text_size(panel.name, min(round(0.6 * cell_size), 16), right - left)
+        size = text_size(panel.name, min(round(0.6 * cell_size), 16), panel.cols * cell_size)
         if panel.name and size is not None:
             write(surface, panel.name, left, round((panel.top + 0.5) * cell_size), size)
 
@@ -173,9 +171,9 @@ def draw_grid(surface: Any, board: Board, cell_size: int) -> None:
 def draw_terminals(surface: Any, board: Board, cell_size: int) -> None:
     """Traps as discs, goals as triangles."""
     draw = import_pygame().draw
-    for row, col in board.cells(Kind.TRAP):
+    for row, col in board.cells[Kind.TRAP]:
         draw.circle(surface, TRAP, cell_centre(row, col, cell_size), cell_size // 3)
-    for row, col in board.cells(Kind.GOAL):
+    for row, col in board.cells[Kind.GOAL]:
         x, y = (col + 1) * cell_size, (row + 1) * cell_size
         corners = [(0.5, 0.2), (0.8, 0.8), (0.2, 0.8)]
         points = [(x + round(right * cell_size), y + round(down * cell_size)) for right, down in corners]
@@ -202,11 +200,8 @@ def ansi(mdp: Mdp, state: int) -> str:
 
 def has_display() -> bool:
     """Whether a window could be seen: a screen, or an SDL driver that somebody chose on purpose."""
-    if os.environ.get("SDL_VIDEODRIVER"):
-        return True
-    if not sys.platform.startswith("linux"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    chosen = ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY")
+    return not sys.platform.startswith("linux") or any(os.environ.get(name) for name in chosen)
 
 
 class Window:
@@ -246,9 +241,7 @@ class Window:
 
     def close(self) -> None:
         """Close the window and shut pygame down."""
-        pygame = import_pygame()
-        pygame.display.quit()
-        pygame.quit()
+        import_pygame().quit()
 
 
 def font(size: int) -> Any:
