@@ -19,14 +19,7 @@ from gridworld.storage.symlinks import check_no_links
 
 
 def run_folder(config: DictConfig) -> AbstractContextManager[None]:
-    """Check the folder of a single run.
-
-    Args:
-        config: The whole composition, Hydra's part included.
-
-    Returns:
-        The block in which this process holds the folder, see `claimed`.
-    """
+    """Check the folder of a single run, and return the block in which this process holds it."""
     folder = Path(config.hydra.run.dir)
     check_inside(folder, "hydra.run.dir")
     _check_names(config)
@@ -51,7 +44,7 @@ def check_settings_of(config: DictConfig) -> None:
 
 
 def check_sweep_folder(config: DictConfig) -> None:
-    """Check the folder of a sweep, as far as it can be done without its jobs; as `run_folder`."""
+    """Check the folder of a sweep, as far as it can be done without its jobs."""
     check_inside(Path(config.hydra.sweep.dir), "hydra.sweep.dir")
     _check_names(config)
 

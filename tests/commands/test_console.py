@@ -40,7 +40,8 @@ def test_help_has_a_line_for_each_command(words: list[str], tmp_path: Path) -> N
         assert re.search(rf"^  {name} +{re.escape(about)}$", done.stdout, re.MULTILINE)
 
 
-def test_version(tmp_path: Path) -> None:
+def test_version_and_checkout(tmp_path: Path) -> None:
+    assert conf_folder() == CONF
     assert gridworld("--version", cwd=tmp_path).stdout == f"gridworld {__version__}\n"
 
 
@@ -175,7 +176,3 @@ def test_it_trains_from_the_wheel(wheel: Path, tmp_path: Path) -> None:
         *("hydra.sweep.dir=sweep", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),
     )
     assert "sweep sweep: 2 jobs: 2 done" in told
-
-
-def test_the_checkout_has_its_own_conf() -> None:
-    assert conf_folder() == CONF
