@@ -20,7 +20,7 @@ from gridworld.process.console.command_line import program
 from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
-from gridworld.report.build import MOST_TOLD, Reason, Report, gather, reasons
+from gridworld.report.build import MOST_SHOWN, Reason, Report, gather, reasons
 from gridworld.report.writer import FORMATS, MARKERS, check_markers, check_out, write_readme, write_report
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.claim import check_inside
@@ -111,9 +111,9 @@ def _usual_out(runs: Sequence[Path]) -> Path:
 
 def _tell(report: Report) -> None:
     sentences = report.sentences()
-    for sentence in sentences[:MOST_TOLD]:
+    for sentence in sentences[:MOST_SHOWN]:
         print(f"warning: {printable(sentence)}", file=sys.stderr)
-    if len(sentences) > MOST_TOLD:
-        print(f"warning: and {len(sentences) - MOST_TOLD} more, all in the report", file=sys.stderr)
+    if len(sentences) > MOST_SHOWN:
+        print(f"warning: and {len(sentences) - MOST_SHOWN} more, all in the report", file=sys.stderr)
     for note in (*report.study.notes, *report.notes):
         print(f"note: {printable(note)}", file=sys.stderr)
