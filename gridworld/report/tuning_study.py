@@ -89,7 +89,7 @@ def find_tunings(paths: Sequence[Path]) -> tuple[list[TuningStudy], list[str]]:
 def _read(folder: Path) -> TuningStudy:
     file, trials = folder / STUDY_JSON, folder / TRIALS_CSV
     content, of_trials = read_sealed(file), read_bytes(trials, LARGEST_CSV)
-    if content.get(TRIALS_SUM) != sha256(of_trials):
+    if content.get(TRIALS_SUM, digest := sha256(of_trials)) != digest:  # the first format has none
         raise InputError(
             f"{trials}: is not the table that {STUDY_JSON} was written with; it was changed or damaged, or "
             "the search was continued and has not finished"
