@@ -1,4 +1,4 @@
-"""A module per command, behind `gridworld` (`shell/console.py`) and the files in `scripts/`.
+"""A module per command, behind `gridworld` (`console.py`) and the files in `scripts/`.
 
 A module has `main(arguments)`, which `run` calls with the command line's words. That of `train` has no
 arguments, and reads `sys.argv` as Hydra does.

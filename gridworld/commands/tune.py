@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gridworld.commands.shell.help import choices
+from gridworld.commands.manual import choices
 from gridworld.config.composition.conf_folder import conf_folder
 from gridworld.config.composition.words import refuse_dashes
 from gridworld.errors import InputError, install_command

@@ -19,7 +19,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.bounds import MOST_STEPS, STEP_LIMIT, at_most
+from gridworld.bounds import MOST_STEPS, STEP_LIMIT, Bounds
 from gridworld.envs.frames.rendering import frame_size
 from gridworld.envs.observations import KINDS, ObservationTable, TableObservation, make_observation
 from gridworld.errors import InputError
@@ -112,7 +112,7 @@ def task_of(env: Any, max_episode_steps: int | None = None) -> Task:
         task = _task(env)
     limit = task.own_limit if max_episode_steps is None else max_episode_steps
     limit = STEP_LIMIT if limit is None else positive_int("max_episode_steps", limit)
-    at_most("max_episode_steps", limit, MOST_STEPS)
+    Bounds(high=MOST_STEPS).check("max_episode_steps", limit)
     return replace(task, max_episode_steps=limit)
 
 

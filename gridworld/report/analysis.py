@@ -10,6 +10,7 @@ from itertools import combinations
 
 import numpy as np
 
+from gridworld.config.train import check_bounds
 from gridworld.config.worlds import schema_of
 from gridworld.report import statistics
 from gridworld.report.evidence import ONLINE, SAMPLED_RETURN, Evidence, reported
@@ -50,7 +51,7 @@ def reference(run: Evidence) -> Reference:
         if len(lines) * max(map(len, lines)) > _MOST_CELLS:
             raise ValueError(f"it has more than {_MOST_CELLS:,} cells")
         env = schema(**run.world)
-        env.check()
+        check_bounds(env, "env.")
         mdp = stored_world(read_run(run.folder), env)
         evaluator = Evaluator(mdp, run.gamma, env.step_limit(mdp))
         random = evaluator.score(np.full(evaluator.mdp.probability.shape[:2], 1 / evaluator.mdp.num_actions))

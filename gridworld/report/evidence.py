@@ -18,10 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from gridworld.config.flatten import flat
-from gridworld.config.privileges import privileges
-from gridworld.config.settings_by_effect import is_newer
-from gridworld.config.train import TrainConfig
+from gridworld.config.settings import NEWER, flat, privileges
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import printable
 from gridworld.run.damage import damage
@@ -65,7 +62,7 @@ class Evidence:
     curve: Mapping[str, FloatArray]  # (evaluations,): the columns in `REQUIRED`, and what else the file has
     pictures: Mapping[str, str | None]  # as `RunReader.pictures`
     step_limit: Any = None  # of an episode, as the summary has it
-    privileges: Sequence[str] = ()  # as `config.privileges` finds them in its settings
+    privileges: Sequence[str] = ()  # as `config.settings.privileges` finds them in its settings
     damage: tuple[str, ...] = ()  # a sentence for each of its other files that is not the one that it wrote
 
     @property
@@ -187,7 +184,7 @@ def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
         curve=_read_curve(run),
         pictures=run.pictures(),
         step_limit=summary.get("max_episode_steps"),
-        privileges=privileges(TrainConfig, config),
+        privileges=privileges(config),
         damage=damaged,
     )
 
@@ -195,7 +192,7 @@ def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
 def _settings(config: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """Dotted names, and values as JSON."""
     for key, value in flat(config):
-        if value or not is_newer(key):
+        if value or key not in NEWER:
             text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
             yield printable(key), printable(text)
 

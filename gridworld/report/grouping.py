@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridworld.config.effects import Effect
-from gridworld.config.settings_by_effect import effect_of, is_of_network
+from gridworld.config.fields import Effect
+from gridworld.config.settings import effect_of
 from gridworld.report.evidence import Evidence, Settings
 from gridworld.storage.safe_read import sha256
 
@@ -137,7 +137,7 @@ def differing(settings: Sequence[Settings]) -> list[str]:
     """Names of the settings that are not the same in all, the agent's first, a network's last."""
     names = sorted(
         {name for each in settings for name in each},
-        key=lambda name: (is_of_network(name), name[:6] != "agent.", name),
+        key=lambda name: (".policy_kwargs." in name, name[:6] != "agent.", name),
     )
     return [name for name in names if len({each.get(name, _UNSET) for each in settings}) > 1]
 

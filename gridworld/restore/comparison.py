@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import family
-from gridworld.config.flatten import flat
+from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
 from gridworld.restore.saved_run import read_visits
 from gridworld.run.folder import BEST_MODEL, EVENTS, MODEL

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.config.agents import AgentConfig, falls, parse_schedule
-from gridworld.config.flatten import flat
 from gridworld.config.plain_settings import foreign
+from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import BuiltConfig, EnvConfig, GymnasiumConfig, MapConfig
 from gridworld.errors import InputError

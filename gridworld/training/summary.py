@@ -6,7 +6,7 @@ import dataclasses
 import math
 from typing import Any
 
-from gridworld.config.privileges import privileges
+from gridworld.config.settings import privileges
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.run.summary import MOST_NAMED, Summary
 from gridworld.training.learning_curve import Evaluation, LearningCurve
@@ -38,7 +38,7 @@ def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, secon
         "seed": config.seed,
         "recipe": config.recipe,
         "preset": config.preset if config.preset != AUTO else "none",
-        "privileges": privileges(TrainConfig, dataclasses.asdict(config)),
+        "privileges": privileges(dataclasses.asdict(config)),
         "total_timesteps": config.total_timesteps,
         "timesteps": last.step,
         "gamma": config.evaluation.gamma,

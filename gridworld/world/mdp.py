@@ -4,8 +4,6 @@ A world is a Markov decision process with S states, A actions and at most K outc
 state: where a source says that a transition ends the episode, it leads to a terminal state. Terminal states
 absorb: every action stays there and pays nothing.
 
-`gridworld.world.grid` makes the worlds of maps, `gridworld.world.sources` makes those of other descriptions.
-
 Reference: M. L. Puterman, Markov Decision Processes, 1994, chapter 2.
 """
 
@@ -14,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-from collections import deque
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
@@ -23,7 +20,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.bounds import within_size
+from gridworld.bounds import Bounds
 from gridworld.errors import InputError
 
 IntArray = NDArray[np.integer[Any]]
@@ -152,9 +149,8 @@ class Mdp:
     def digest(self) -> str:
         """The sha256 of the tables, equal for worlds in which the same happens with the same chances."""
         digest = hashlib.sha256()
-        for table in (self.next_state, self.probability, self.reward, self.terminal, self.goal, self.start):
-            digest.update(np.ascontiguousarray(table).tobytes())
-        digest.update(np.ascontiguousarray(self.number).tobytes())
+        for name in ("next_state", "probability", "reward", "terminal", "goal", "start", "number"):
+            digest.update(np.ascontiguousarray(getattr(self, name)).tobytes())
         return digest.hexdigest()
 
     def text(self) -> str:
@@ -207,12 +203,11 @@ def steps_from(starts: IntArray, next_state: IntArray, taken: BoolArray) -> IntA
     size = len(next_state)
     themselves = np.arange(size)[:, None, None]
     following = np.where(taken, next_state, themselves).reshape(size, -1).tolist()
-    waiting = deque(starts.tolist())
+    waiting = starts.tolist()
     steps = [-1] * size
     for start in waiting:
         steps[start] = 0
-    while waiting:
-        origin = waiting.popleft()
+    for origin in waiting:  # which grows
         for state in following[origin]:
             if steps[state] < 0:
                 steps[state] = steps[origin] + 1
@@ -235,7 +230,7 @@ def frozen(table: Table) -> Table:
 def checked_reward(what: str, value: Any) -> float:
     """A finite number that is neither too large nor too small to be added up."""
     number = finite(what, value)
-    within_size(what, number, LEAST_REWARD, MOST_REWARD)
+    Bounds(-MOST_REWARD, MOST_REWARD, least=LEAST_REWARD).check(what, number)
     return number
 
 

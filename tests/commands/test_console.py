@@ -13,7 +13,7 @@ import pytest
 from helpers.support import CONF, ROOT, SHORT, script
 
 from gridworld import __version__
-from gridworld.commands.shell.console import COMMANDS
+from gridworld.commands.console import COMMANDS
 from gridworld.config.composition.conf_folder import conf_folder
 from gridworld.errors import DISTRIBUTION
 from gridworld.process.console import command_line
@@ -64,7 +64,7 @@ def test_asking_imports_nothing_heavy(tmp_path: Path) -> None:
     command = [sys.executable, "-X", "importtime", "-m", "gridworld", "--help"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     loaded = {line.split("|")[-1].strip() for line in done.stderr.splitlines()}
-    assert "gridworld.commands.shell.console" in loaded
+    assert "gridworld.commands.console" in loaded
     assert not loaded & {"numpy", "hydra", "torch", "gymnasium", "scipy"}
     ours = (ROOT / "gridworld" / "__main__.py").read_text()
     assert ours.index("listen()  # before") < ours.index("from gridworld.commands")

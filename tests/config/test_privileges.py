@@ -8,8 +8,7 @@ from helpers.support import CONF, NO_FILES, configure, train_in
 
 from gridworld.commands.report import main as report
 from gridworld.config.agents import agent_schemas
-from gridworld.config.privileges import _declared, privileges
-from gridworld.config.train import TrainConfig
+from gridworld.config.settings import privileges
 from gridworld.run.summary import summary_text
 
 AGENTS = sorted(file.stem for file in (CONF / "agent").glob("*.yaml"))
@@ -17,15 +16,10 @@ PLANS = "plans with the tables"
 
 
 def used(*words: str) -> list[str]:
-    return privileges(TrainConfig, dataclasses.asdict(configure(*words)))
+    return privileges(dataclasses.asdict(configure(*words)))
 
 
 def test_each_field_that_is_declared_is_found() -> None:
-    assert {(".".join(path), name) for path, name, _ in _declared(TrainConfig)} == {
-        ("exploring_starts", "starts anywhere"),
-        ("stratified_draws", "stratified draws"),
-        ("agent.algorithm", PLANS),
-    }
     assert used("exploring_starts=0.1", "stratified_draws=true") == ["starts anywhere", "stratified draws"]
     assert used("agent=value_iteration") == [PLANS]
 
@@ -37,11 +31,9 @@ def test_the_default_world_and_no_preset_use_none(agent: str) -> None:
 
 
 def test_settings_from_a_manifest_may_be_anything() -> None:
-    assert (
-        privileges(TrainConfig, {}) == privileges(TrainConfig, {"agent": 3, "exploring_starts": None}) == []
-    )
+    assert privileges({}) == privileges({"agent": 3, "exploring_starts": None}) == []
     for schema in agent_schemas().values():
-        assert privileges(TrainConfig, {"agent": {"algorithm": schema.algorithm}}) in ([], [PLANS])
+        assert privileges({"agent": {"algorithm": schema.algorithm}}) in ([], [PLANS])
 
 
 def test_a_result_and_a_report_name_them(tmp_path: Path) -> None:

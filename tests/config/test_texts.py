@@ -9,8 +9,8 @@ from helpers.support import configure
 
 from gridworld.config.composition.recipe_file import with_recipe
 from gridworld.config.composition.setting_names import settings_of_a_run
+from gridworld.config.fields import Text
 from gridworld.config.plain_settings import foreign, texts_in
-from gridworld.config.texts import Text
 from gridworld.errors import InputError
 
 
@@ -33,7 +33,7 @@ def says_what_it_is(hint: Any) -> bool:
 @pytest.mark.parametrize("name", settings_of_a_run())
 def test_every_text_says_what_it_is(name: str) -> None:
     for hint in settings_of_a_run()[name]:
-        assert says_what_it_is(hint), f"{name}: {hint}: annotate it with one of gridworld.config.texts"
+        assert says_what_it_is(hint), f"{name}: {hint}: annotate it with one of gridworld.config.fields"
 
 
 def test_the_walk_finds_what_says_nothing() -> None:
