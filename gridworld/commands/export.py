@@ -21,7 +21,7 @@ from gridworld.export.targets import TARGETS, check_installed
 from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
-from gridworld.report.evidence.discovery import find_runs
+from gridworld.report.evidence import find_runs
 from gridworld.run.claim import check_inside, check_writable
 from gridworld.storage.safe_read import check_no_link
 
@@ -36,10 +36,10 @@ def main(arguments: Sequence[str]) -> None:
     check_installed(options.to)
     check_no_link(out)
     check_writable(out, "--out")
-    found = find_runs(options.runs)
-    problems, place = list(found.problems), None
+    folders, problems = find_runs(options.runs)
+    place = None
     with telling_if_slow("exporting the runs"):
-        for folder in found.folders:
+        for folder in folders:
             try:
                 place = _export(folder, options.to, out, options.project)
                 print(printable(f"{folder}: {place}"), flush=True)

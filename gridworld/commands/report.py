@@ -18,7 +18,7 @@ from gridworld.commands import parser_of, whole
 from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
-from gridworld.report.build import MOST_TOLD, Reason, gather, reasons
+from gridworld.report.build import MOST_SHOWN, Reason, gather, reasons
 from gridworld.report.writer import FORMATS, MARKERS, check_markers, check_out, write_readme, write_report
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.claim import check_inside
@@ -47,9 +47,9 @@ def main(arguments: Sequence[str]) -> None:
     if options.readme is not None:
         write_readme(report, options.readme)
     sentences = report.sentences()
-    lines = [f"warning: {printable(sentence)}" for sentence in sentences[:MOST_TOLD]]
-    if len(sentences) > MOST_TOLD:
-        lines.append(f"warning: and {len(sentences) - MOST_TOLD} more, all in the report")
+    lines = [f"warning: {printable(sentence)}" for sentence in sentences[:MOST_SHOWN]]
+    if len(sentences) > MOST_SHOWN:
+        lines.append(f"warning: and {len(sentences) - MOST_SHOWN} more, all in the report")
     lines += [f"note: {printable(note)}" for note in (*report.study.notes, *report.notes)]
     for line in lines:
         print(line, file=sys.stderr)

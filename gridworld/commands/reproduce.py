@@ -71,7 +71,7 @@ def main(arguments: Sequence[str]) -> None:
             findings = list(compare(then, read_run(folder), again, mdp))
         for finding in findings:
             verdict = {True: "identical", False: "DIFFERENT", None: "UNKNOWN"}[finding.same]
-            print(f"  {finding.part:<20}{verdict:<9}  {printable(finding.told)}")
+            print(f"  {finding.part:<20}{verdict:<9}  {printable(finding.detail)}")
         verdicts = {finding.same for finding in findings}
         return next((verdict for verdict in (False, None) if verdict in verdicts), True)
 

@@ -12,7 +12,6 @@ from gridworld.config.pictures import PICTURES
 from gridworld.config.train import AUTO, TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import ObservationTable
-from gridworld.envs.rendering import frame_size
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
 from gridworld.world.exact.evaluation import Evaluator, fitting_discounts, score_of_optimum
@@ -41,7 +40,7 @@ def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = comp
 
         require_video()
     if wanted.cell_size is not None and (wanted.frames or wanted.gif or wanted.mp4):
-        from gridworld.envs.frames.rendering import frame_size
+        from gridworld.envs.rendering import frame_size
 
         frame_size(mdp, wanted.cell_size)
     return mdp

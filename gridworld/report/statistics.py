@@ -3,7 +3,7 @@
 Interquartile mean (IQM): the mean without the lowest and the highest ⌊n/4⌋ values, as
 `scipy.stats.trim_mean(x, 0.25)`. Intervals: the 95 % percentile bootstrap, runs drawn anew within each task
 (the strata), as `scipy.stats.bootstrap` does; the same draws serve every point of a curve. Both come to
-SciPy's bits, but by hand: a sweep ends with them, and `scipy.stats` takes as long to import as two runs to
+SciPy's numbers, but by hand: a sweep ends with them, and `scipy.stats` takes as long to import as two runs to
 train.
 
 Infinity is a value like any other: a run that was never certified took infinitely many steps.
@@ -24,13 +24,12 @@ import numpy as np
 from gridworld.envs.intervals import wilson_interval
 from gridworld.world.mdp import FloatArray
 
-LEVEL = 0.95
 RESAMPLES = 2000
 TRIMMED = 0.25  # of the values, at either end
-
-_FAR = 1e100  # stands in for infinity while sums and differences are taken; whatever it touches is infinite
 INFINITE = 1e90  # numbers beyond stand for infinity
 
+_BOUNDS = (0.025, 0.975)  # quantiles
+_FAR = 1e100  # stands in for infinity while sums and differences are taken; whatever it touches is infinite
 _LARGEST_BATCH = 4_000_000  # numbers that one batch of resamples may hold, 32 MB
 
 
@@ -52,8 +51,14 @@ class Share:
     low: float
     high: float
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether it is all of them."""
+        return self.count == self.total
 
-Statistic = Callable[..., FloatArray]  # (*samples, axis=-1); samples (..., n)
+
+# Of all samples (..., n) together: (*samples, axis=-1)
+Statistic = Callable[..., FloatArray]
 
 
 def mean(*samples: FloatArray, axis: int = -1) -> FloatArray:
@@ -96,53 +101,38 @@ def bands(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """A statistic of samples (..., n), one for each stratum, with its 95 % bootstrap interval at each point.
 
-    Returns:
-        Point, low and high, (...) each; low and high are NaN where a stratum has one run.
+    Returns point, low and high, (...) each; low and high are NaN where a stratum has one run. Points with the
+    same values, such as those of a curve that has arrived, have the same draws, and so the same statistics,
+    which are taken once.
     """
-    finite = [np.clip(sample, -_FAR, _FAR) for sample in samples]
-    point = statistic(*finite, axis=-1)
-    if min(sample.shape[-1] for sample in finite) < 2:
+    samples = [np.clip(sample, -_FAR, _FAR) for sample in samples]
+    point, sizes = statistic(*samples, axis=-1), [sample.shape[-1] for sample in samples]
+    if min(sizes) < 2:
         unknown = np.full(point.shape, math.nan)
         return _extended(point), unknown, unknown
-    drawn = _bootstrapped(statistic, finite, np.random.default_rng(seed), resamples)
-    tail = (1 - LEVEL) / 2
-    return _extended(point), _extended(_quantile(drawn, tail)), _extended(_quantile(drawn, 1 - tail))
-
-
-def _bootstrapped(
-    statistic: Statistic, samples: Sequence[FloatArray], chance: np.random.Generator, resamples: int
-) -> FloatArray:
-    """The statistic of samples (..., n) that are drawn anew, (..., resamples) in order of size.
-
-    Points with the same values, such as those of a curve that has arrived, have the same draws, and so the
-    same statistics, which are taken once.
-    """
-    batch = max(1, _LARGEST_BATCH // sum(sample.size for sample in samples))
     joined = np.concatenate(samples, axis=-1)
-    rows_of_all = joined.reshape(-1, joined.shape[-1])
-    _, first, place = np.unique(rows_of_all, axis=0, return_index=True, return_inverse=True)
+    rows = joined.reshape(-1, joined.shape[-1])
+    _, first, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     samples = [sample.reshape(-1, sample.shape[-1])[first] for sample in samples]
+    chance, batch = np.random.default_rng(seed), max(1, _LARGEST_BATCH // joined.size)
     parts = []
     for begun in range(0, resamples, batch):
-        rows = min(batch, resamples - begun)
-        counts = [sample.shape[-1] for sample in samples]
-        drawn = [
-            sample[..., chance.integers(0, count, (rows, count))]
-            for sample, count in zip(samples, counts, strict=True)
-        ]
+        draws = [chance.integers(0, size, (min(batch, resamples - begun), size)) for size in sizes]
+        drawn = [sample[..., draw] for sample, draw in zip(samples, draws, strict=True)]
         parts.append(statistic(*drawn, axis=-1))
-    ordered = np.sort(np.concatenate(parts, axis=-1), axis=-1)
-    return np.asarray(ordered[place.reshape(joined.shape[:-1])])
+    bounds = np.quantile(np.concatenate(parts, axis=-1), _BOUNDS, axis=-1)[:, place.reshape(point.shape)]
+    return _extended(point), _extended(bounds[0]), _extended(bounds[1])
 
 
-def _quantile(ordered: FloatArray, share: float) -> FloatArray:
-    """A quantile of ordered values (..., n), interpolated linearly: `scipy.stats.quantile`."""
-    count = ordered.shape[-1]
-    place = share * count + (1 - share) - 1  # from 0
-    below = int(place // 1)
-    weight = place % 1
-    above = min(below + 1, count - 1)
-    return np.asarray((1 - weight) * ordered[..., below] + weight * ordered[..., above])
+def _extended(numbers: FloatArray) -> FloatArray:
+    """Numbers beyond `INFINITE` as infinities."""
+    numbers = np.asarray(numbers, dtype=np.float64)
+    return np.where(np.abs(numbers) > INFINITE, np.copysign(math.inf, numbers), numbers)
+
+
+def interval(statistic: Statistic, samples: Sequence[FloatArray], seed: int) -> Interval:
+    """The same as `bands` for samples (n,)."""
+    return Interval(*(float(number) for number in bands(statistic, samples, seed)))
 
 
 def profile(samples: Sequence[FloatArray], levels: FloatArray, seed: int) -> tuple[FloatArray, ...]:
@@ -156,11 +146,6 @@ def profile(samples: Sequence[FloatArray], levels: FloatArray, seed: int) -> tup
         return np.asarray(np.mean([each.mean(axis=axis) for each in above], axis=0))
 
     return bands(mean_share, [(sample > levels[:, None]).astype(np.float64) for sample in samples], seed)
-
-
-def interval(statistic: Statistic, samples: Sequence[FloatArray], seed: int) -> Interval:
-    """The same as `bands` for samples (n,)."""
-    return Interval(*(float(number) for number in bands(statistic, samples, seed)))
 
 
 def improvement(pairs: Sequence[tuple[FloatArray, FloatArray]], seed: int) -> Interval:
@@ -193,9 +178,3 @@ def _times_drawn(places: FloatArray) -> FloatArray:
     rows = places.reshape(-1, count).astype(np.int64)
     offsets = count * np.arange(len(rows))[:, None]
     return np.bincount((rows + offsets).ravel(), minlength=rows.size).reshape(places.shape).astype(np.float64)
-
-
-def _extended(numbers: FloatArray) -> FloatArray:
-    """Numbers beyond `INFINITE` as infinities."""
-    numbers = np.asarray(numbers, dtype=np.float64)
-    return np.where(np.abs(numbers) > INFINITE, np.copysign(math.inf, numbers), numbers)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from types import MappingProxyType
 from typing import Any
 
@@ -16,20 +15,17 @@ from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
-from gridworld.report.analysis.analyse import Comparison, Overall, Result, TaskAnalysis
-from gridworld.report.analysis.curves import Band
-from gridworld.report.analysis.metrics import BY_KEY, METRICS
-from gridworld.report.analysis.statistics import INFINITE, Interval
-from gridworld.report.charts import chart
-from gridworld.report.charts.chart import INK, LINE, MUTED, PAPER, Chart, Styles, house_style
-from gridworld.report.charts.sweep_charts import sweep_charts, sweeps
-from gridworld.world.mdp import FloatArray, IntArray
+from gridworld.report import chart
+from gridworld.report.analysis import BY_KEY, METRICS, Band, Comparison, Overall, Result, TaskAnalysis
+from gridworld.report.chart import INK, LINE, MUTED, PAPER, Chart, Styles, house_style
+from gridworld.report.setting_charts import sweep_charts, sweeps
+from gridworld.report.statistics import INFINITE, Interval
+from gridworld.world.mdp import FloatArray
 
 _HEIGHT = 190.0  # points, of curves
-_DASH = 6.0  # points, of curves that lie on others
 _NAME = 25  # characters, the width of a name at a row
 _BOOTSTRAP = "interquartile mean (IQM) with 95 % bootstrap bands"
-_MOST_DRAWN = chart.AGENT_PAINTS  # agents in one figure
+_MOST_DRAWN = len(chart.COLOURS)  # agents in one figure
 _MOST_PAIRS = 21  # those of seven agents
 _REFERENCES = {"optimum": (0, (5.0, 4.0)), "uniformly random": (0, (1.5, 3.0))}  # lines across
 
@@ -44,12 +40,10 @@ def task_charts(analysis: TaskAnalysis, styles: Styles) -> Iterator[Chart]:
     for sweep in sweeps(analysis.results):
         yield from sweep_charts(sweep, analysis.task)
     shown = [result for result in analysis.results if result in analysis.ranked[:_MOST_DRAWN]]
-    drawn = replace(analysis, results=tuple(shown))
-    more = (
-        f"; the {_MOST_DRAWN} best of {len(analysis.results)}" if len(analysis.results) > len(shown) else ""
-    )
+    drawn, count = replace(analysis, results=tuple(shown)), len(analysis.results)
+    more = f"; the {_MOST_DRAWN} best of {count}" if count > len(shown) else ""
     yield from _curves(drawn, styles, more)
-    if all(len(result.group.runs) == 1 for result in analysis.results) and len(analysis.results) == 1:
+    if count == 1 and len(shown[0].group.runs) == 1:
         return  # a strip would have one dot
     for key in ("regret", "steps", "online_return", "online_return_end"):
         if any(result.samples[key].any() for result in shown):
@@ -58,49 +52,43 @@ def task_charts(analysis: TaskAnalysis, styles: Styles) -> Iterator[Chart]:
 
 def _curves(analysis: TaskAnalysis, styles: Styles, more: str) -> Iterator[Chart]:
     results, world, task = analysis.results, analysis.world, analysis.task
-    told = partial(_told, results=results, more=more)
-    draw = partial(
-        _draw_curves,
-        names=_names(results),
-        lines=[styles[result.group.agent].line for result in results],
-        log_steps=analysis.log_steps,
-    )
-    if any(result.regret.point.any() for result in results):
-        bands = [result.regret for result in results]
-        highest = np.concatenate([band.point if np.isnan(band.high).any() else band.high for band in bands])
-        top = float(highest[highest < INFINITE].max(initial=0.0)) * 1.06 or 1.0
+    describe = partial(_description, results=results, more=more)
+    draw = partial(_draw_curves, styles=styles, log_steps=analysis.log_steps)
+    bands = {result.group.agent: result.regret for result in results}
+    if any(band.point.any() for band in bands.values()):
+        highest = [band.point if np.isnan(band.high).any() else band.high for band in bands.values()]
+        top = max((float(high) for high in np.concatenate(highest) if high < INFINITE), default=0.0)
         yield draw(
             f"{task} regret",
             f"Regret on {task}",
-            told("regret of the greedy policy, exact", _BOOTSTRAP) + "; 0 is optimal",
+            describe("regret of the greedy policy, exact", _BOOTSTRAP) + "; 0 is optimal",
             bands,
             label="regret",
-            bounds=(0.0, top),
+            bounds=(0.0, 1.06 * top or 1.0),
             references={"optimum": 0.0, "uniformly random": world.optimal_value - world.random_value},
         )
     if any(result.certificates.point.any() for result in results):
-        wilson = "bands are Wilson's 95 % intervals"
         yield draw(
             f"{task} certified",
             f"Seeds certified optimal on {task}",
-            told("share of seeds whose greedy policy is optimal from the start", wilson),
-            list(map(_certificates, results)),
+            describe(
+                "share of seeds whose greedy policy is optimal from the start",
+                "bands are Wilson's 95 % intervals",
+            ),
+            {result.group.agent: _certificates(result) for result in results},
             label="seeds certified",
             bounds=(0.0, 1.0),
             form=chart.percent,
         )
-    online = [result for result in results if result.online is not None]
-    bands = [result.online for result in online if result.online is not None]
-    if any(band.point.any() for band in bands):
+    bands = {result.group.agent: result.online for result in results if result.online is not None}
+    if any(band.point.any() for band in bands.values()):
         yield draw(
             f"{task} on-line return",
             f"On-line return on {task}",
-            told("mean return of the training episodes, exploration included", _BOOTSTRAP),
+            describe("mean return of the training episodes, exploration included", _BOOTSTRAP),
             bands,
-            names=_names(online),
-            lines=[styles[result.group.agent].line for result in online],
             label="return",
-            bounds=_online_bounds(bands),
+            bounds=_online_bounds(list(bands.values())),
             references={"optimum": world.optimal_return},
         )
 
@@ -112,21 +100,12 @@ def _certificates(result: Result) -> Band:
     return band if len(result.group.runs) > 1 else replace(band, low=unknown, high=unknown)
 
 
-def _told(what: str, statistic: str, results: Sequence[Result], more: str) -> str:
-    """What a figure shows, with the statistic and the number of seeds: "5 seeds", "3 to 5 seeds"."""
-    counts = sorted({len(result.group.runs) for result in results})
-    if counts == [1]:
+def _description(what: str, statistic: str, results: Sequence[Result], more: str) -> str:
+    """What a figure shows, with the statistic and the number of seeds."""
+    counts = [len(result.group.runs) for result in results]
+    if set(counts) == {1}:
         return f"{what}; one seed, so no interval{more}"
-    return f"{what}: {statistic}, {' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} seeds{more}"
-
-
-def _names(results: Sequence[Result]) -> list[str]:
-    """What a figure calls agents, with the number of their seeds where that is not all of them."""
-    agents = chart.without_shared([result.group.agent for result in results])
-    return [
-        f"{agent}, {result.group.seeds}" if result.group.seeds else agent
-        for agent, result in zip(agents, results, strict=True)
-    ]
+    return f"{what}: {statistic}, {chart.seed_counts(counts)}{more}"
 
 
 def _online_bounds(bands: Sequence[Band]) -> Bounds:
@@ -145,9 +124,8 @@ def _draw_curves(
     name: str,
     title: str,
     description: str,
-    bands: Sequence[Band],
-    names: Sequence[str],
-    lines: Sequence[dict[str, Any]],
+    bands: Mapping[str, Band],
+    styles: Styles,
     label: str,
     bounds: Bounds,
     form: Callable[..., str] = chart.compact,
@@ -155,24 +133,38 @@ def _draw_curves(
     levels: Bounds | None = None,
     references: Mapping[str, float] = MappingProxyType({}),
 ) -> Chart:
-    """Curves with their bands against environment steps, or `levels` of optimality; references are lines."""
+    """Each agent's curve with its band against environment steps, or `levels` of optimality.
+
+    References are lines across. Curves are bold as far as all runs go, and dotted from where the first ended.
+    """
     seen = {mark: level for mark, level in references.items() if bounds[0] <= level <= bounds[1]}
-    across: list[dict[str, Any]] = [{"color": INK, "linestyle": _REFERENCES[mark]} for mark in seen]
-    handles = [Line2D([], [], linewidth=2.2, **look) for look in (*lines, *across)]
-    legend = list(zip(handles, [*chart.wrapped_apart(names, 56), *seen], strict=True))
+    looks = [styles[agent] for agent in bands]
+    looks += [{"color": INK, "linestyle": _REFERENCES[mark]} for mark in seen]
+    names = [chart.wrapped(agent, 56) for agent in chart.without_shared(list(bands))]
+    handles = [Line2D([], [], linewidth=2.2, **look) for look in looks]
+    legend = list(zip(handles, [*names, *seen], strict=True))
     figure, axes = chart.new_figure(title, _HEIGHT, "y", legend)
     axes.set(ylim=bounds, ylabel=label)
     axes.yaxis.set_major_formatter(form)
+    first = -math.inf
     if levels is None:
-        first = _set_steps(axes, bands, log_steps)
+        first = _set_steps(axes, list(bands.values()), log_steps)
     else:
         axes.set(xlim=levels, xlabel="optimality: 0 is random, 1 is optimal")
-        first = -math.inf
-    near = 0.005 * (bounds[1] - bounds[0])
-    for index, (band, line) in enumerate(zip(bands, lines, strict=True)):
-        below = _count_below(bands, index, near)
-        _draw_band(axes, replace(band, steps=np.maximum(band.steps, first)), below, line, bounds)
-    for level, look in zip(seen.values(), across, strict=True):
+    for later, band, look in zip(range(len(bands))[::-1], bands.values(), looks, strict=False):
+        steps = np.maximum(band.steps, first)
+        values, low, high = (np.clip(numbers, *bounds) for numbers in (band.point, band.low, band.high))
+        if not np.isnan(low).any():  # one seed has no interval
+            axes.fill_between(steps, low, high, step="post", color=look["color"], alpha=0.18, linewidth=0)
+        line: dict[str, Any] = {"where": "post", "clip_on": False, "zorder": 3, **look}
+        whole = int((band.steps <= band.whole_until).sum())
+        # What is drawn first is wider, so that equal curves are all seen.
+        bold = {"linewidth": 2.2 + 0.6 * later, "markersize": 7, "marker": "o" if whole == 1 else ""}
+        axes.step(steps[:whole], values[:whole], **line | bold)
+        if whole < len(values):
+            rest, dotted = slice(max(0, whole - 1), None), {"linewidth": 1, "linestyle": (0, (2.0, 3.0))}
+            axes.step(steps[rest], values[rest], **line | dotted)
+    for level, look in zip(seen.values(), looks[len(bands) :], strict=True):
         axes.axhline(level, linewidth=1, zorder=4, clip_on=False, **look)
     return Chart(name, title, description, figure)
 
@@ -193,49 +185,14 @@ def _set_steps(axes: Axes, bands: Sequence[Band], log_steps: bool) -> float:
     return first
 
 
-def _count_below(bands: Sequence[Band], index: int, near: float) -> IntArray:
-    """(points,): how many of the curves before this one it lies on."""
-    band = bands[index]
-    count = np.zeros(len(band.steps), dtype=np.int64)
-    for other in bands[:index]:
-        _, ours, theirs = np.intersect1d(band.steps, other.steps, return_indices=True)
-        count[ours] += np.abs(band.point[ours] - other.point[theirs]) <= near
-    return count
-
-
-def _draw_band(axes: Axes, band: Band, below: IntArray, line: dict[str, Any], bounds: Bounds) -> None:
-    """Bold as far as all runs go, thin and dotted from where the first has ended.
-
-    Where it lies on other curves it has no band and is dashed, so that equal ones are seen equally much.
-    """
-    values, low, high = (np.clip(numbers, *bounds) for numbers in (band.point, band.low, band.high))
-    look: dict[str, Any] = {**line, "clip_on": False, "zorder": 3}
-    if not np.isnan(low).any():  # one seed has no interval
-        shade: dict[str, Any] = {"color": line["color"], "alpha": 0.18, "linewidth": 0, "clip_on": False}
-        axes.fill_between(band.steps, low, high, where=(below == 0).tolist(), step="post", **shade)
-    whole = int((band.steps <= band.whole_until).sum())
-    corners, levels = np.repeat(band.steps[:whole], 2)[1:], np.repeat(values[:whole], 2)[:-1]
-    for start, end in pairwise([0, *(np.flatnonzero(np.diff(below[:whole])) + 1).tolist(), whole]):
-        bold = not below[start]  # a change between a bold and a dashed piece is bold
-        leads = start > 0 and (bold or bool(below[start - 1]))
-        piece = slice(2 * start - int(leads), 2 * end + int(bold))
-        dashes = {} if bold else {"linestyle": (0, (_DASH, _DASH * int(below[start])))}
-        axes.plot(corners[piece], levels[piece], linewidth=2.2, **look | dashes)
-    if whole == 1:
-        axes.plot(band.steps[:1], values[:1], marker="o", markersize=7, **look)
-    if whole < len(values):
-        rest = slice(max(0, whole - 1), None)
-        dotted = look | {"linestyle": (0, (2.0, 3.0))}
-        axes.step(band.steps[rest], values[rest], where="post", linewidth=1, **dotted)
-
-
 @house_style()
 def _strip(analysis: TaskAnalysis, key: str, styles: Styles, more: str) -> Chart:
     """A row for each agent: the estimate with its interval, and below it a dot for every seed."""
     metric = BY_KEY[key]
     results = [result for result in analysis.results if len(result.samples[key])]
     samples = np.concatenate([result.samples[key] for result in results])
-    names = chart.wrapped_apart(_names(results), _NAME)
+    agents = [result.group.agent for result in results]
+    names = [chart.wrapped(agent, _NAME) for agent in chart.without_shared(agents)]
     title = f"{metric.title} on {analysis.task}"
     each = max(34.0, 12 + LINE * max(map(chart.line_count, names)))  # points, of a row
     figure, axes = chart.new_figure(title[0].upper() + title[1:], each * len(results), "x")
@@ -252,7 +209,7 @@ def _strip(analysis: TaskAnalysis, key: str, styles: Styles, more: str) -> Chart
         return np.where(np.isfinite(numbers), np.clip(numbers, low, high), far)
 
     for row, result in enumerate(results):
-        colour, sample = styles[result.group.agent].line["color"], result.samples[key]
+        colour, sample = styles[result.group.agent]["color"], result.samples[key]
         finite, pale = np.isfinite(sample), to_rgba(colour, 0.55)
         heights = row + (7 + 1.1 * (np.arange(len(sample)) % 5 - 2)) / each  # spread: equal ones are seen
         axes.scatter(
@@ -266,8 +223,9 @@ def _strip(analysis: TaskAnalysis, key: str, styles: Styles, more: str) -> Chart
         )
         _draw_interval(axes, row - 4 / each, result.estimates[key, metric.statistics[0]], colour, place)
     kind = "interquartile mean (IQM)" if metric.statistics[0] == "iqm" else "mean"
-    told = _told("a dot for every seed", f"above them the {kind} with 95 % bootstrap interval", results, more)
-    return Chart(f"{analysis.task} {metric.title}", title, told, figure)
+    statistic = f"above them the {kind} with 95 % bootstrap interval"
+    description = _description("a dot for every seed", statistic, results, more)
+    return Chart(f"{analysis.task} {metric.title}", title, description, figure)
 
 
 def _strip_bounds(numbers: FloatArray, key: str) -> Bounds:
@@ -283,21 +241,16 @@ def _strip_bounds(numbers: FloatArray, key: str) -> Bounds:
 def _draw_interval(
     axes: Axes,
     row: float,
-    told: Interval,
+    interval: Interval,
     colour: str,
     place: Callable[[FloatArray], FloatArray] = np.asarray,
 ) -> None:
     """A bar from end to end and a ring at the point."""
-    low, point, high = place(np.array([told.low, told.point, told.high]))
-    if not math.isnan(told.low):
+    low, point, high = place(np.array([interval.low, interval.point, interval.high]))
+    if not math.isnan(interval.low):
         axes.plot((low, high), (row, row), color=colour, linewidth=4, clip_on=False)
-    ring: dict[str, Any] = {
-        "color": PAPER,
-        "markeredgecolor": colour,
-        "markeredgewidth": 3.0,
-        "markersize": 7.0,
-    }
-    axes.plot([point], [row], "o", clip_on=False, **ring)
+    ring: dict[str, Any] = {"markeredgecolor": colour, "markeredgewidth": 3.0, "markersize": 7.0}
+    axes.plot([point], [row], "o", color=PAPER, clip_on=False, **ring)
 
 
 def overall_charts(overall: Overall, styles: Styles) -> Iterator[Chart]:
@@ -315,9 +268,8 @@ def overall_charts(overall: Overall, styles: Styles) -> Iterator[Chart]:
         "Performance profiles over all tasks",
         f"share of runs whose optimality is above each level, as the mean over tasks{most}; 95 % pointwise "
         "intervals from the stratified bootstrap",
-        [Band(levels, point, point, low, high, end) for point, low, high in profiles.values()],
-        chart.without_shared(shown),
-        [styles[agent].line for agent in shown],
+        {agent: Band(levels, point, point, low, high, end) for agent, (point, low, high) in profiles.items()},
+        styles,
         "runs above it",
         (0.0, 1.0),
         chart.percent,
@@ -334,20 +286,21 @@ def overall_charts(overall: Overall, styles: Styles) -> Iterator[Chart]:
 @house_style()
 def _improvements(metric: str, pairs: Sequence[Comparison], styles: Styles) -> Chart:
     agents = sorted({agent for each in pairs for agent in (each.agent, each.other)})
-    short = dict(zip(agents, chart.wrapped_apart(chart.without_shared(agents), _NAME), strict=True))
-    between = " >\n" if 2 * max(map(len, short.values())) + 3 > _NAME else " > "
-    names = [f"{short[each.agent]}{between}{short[each.other]}" for each in pairs]
+    names = [chart.wrapped(agent, _NAME) for agent in chart.without_shared(agents)]
+    short = dict(zip(agents, names, strict=True))
+    between = " >\n" if 2 * max(map(len, names)) + 3 > _NAME else " > "
+    rows = [f"{short[each.agent]}{between}{short[each.other]}" for each in pairs]
     title = f"Improvement in {metric}"
-    height = max(26.0, 8 + LINE * max(map(chart.line_count, names))) * len(pairs)
+    height = max(26.0, 8 + LINE * max(map(chart.line_count, rows))) * len(pairs)
     figure, axes = chart.new_figure(title, height, "x")
-    chart.rows_on(axes, names)
+    chart.rows_on(axes, rows)
     axes.set(xlim=(0.0, 1.0), xlabel="probability that the first is better")
     axes.axvline(0.5, color=MUTED, linewidth=1, linestyle=(0, (3, 3)), clip_on=False)
     for row, pair in enumerate(pairs):
-        _draw_interval(axes, row, pair.probability, styles[pair.agent].line["color"])
-    told = (
+        _draw_interval(axes, row, pair.probability, styles[pair.agent]["color"])
+    description = (
         "probability that a run of the first agent is better than one of the second, ties half: the mean "
         "over the tasks that both were run on, with 95 % intervals from the stratified bootstrap; at the "
         "dashed line neither is better"
     )
-    return Chart(f"all tasks improvement in {metric}", title, told, figure)
+    return Chart(f"all tasks improvement in {metric}", title, description, figure)

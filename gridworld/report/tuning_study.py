@@ -13,7 +13,6 @@ from typing import Any
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import plain
 from gridworld.process.memory_budget import check_memory
-from gridworld.report.evidence.discovery import real_folders
 from gridworld.report.table import Cell
 from gridworld.storage.csv_text import csv_rows
 from gridworld.storage.safe_read import LARGEST_CSV, as_table, read_bytes, sha256
@@ -62,8 +61,8 @@ class TuningStudy:
     def counts(self) -> str:
         """How its trials ended."""
         statuses = [trial.status for trial in self.trials]
-        told = [f"{statuses.count(status)} {status}" for status in dict.fromkeys(sorted(statuses))]
-        return f"{len(statuses)} trials: {', '.join(told)}"
+        counted = [f"{statuses.count(status)} {status}" for status in sorted(set(statuses))]
+        return f"{len(statuses)} trials: {', '.join(counted)}"
 
     @property
     def scored(self) -> list[TrialRow]:
@@ -76,24 +75,24 @@ def find_tunings(paths: Sequence[Path]) -> tuple[list[TuningStudy], list[str]]:
     found: dict[Path, TuningStudy] = {}
     problems = []
     for path in paths:
-        for file in (folder / STUDY_JSON for folder in real_folders(path)):
-            if not os.path.lexists(file):
-                continue
-            try:
-                found.setdefault(file.resolve(), _read(file.parent))
-            except InputError as error:
-                problems.append(str(error))
+        below = sorted(path.iterdir()) if path.is_dir() and os.access(path, os.R_OK) else []
+        for folder in [path, *(each for each in below if each.is_dir() and not each.is_symlink())]:
+            file = folder / STUDY_JSON
+            if os.path.lexists(file):
+                try:
+                    found.setdefault(file.resolve(), _read(folder))
+                except InputError as error:
+                    problems.append(str(error))
     return list(found.values()), problems
 
 
 def _read(folder: Path) -> TuningStudy:
-    file = folder / STUDY_JSON
-    trials = folder / TRIALS_CSV
+    file, trials = folder / STUDY_JSON, folder / TRIALS_CSV
     content, of_trials = read_sealed(file), read_bytes(trials, LARGEST_CSV)
-    if content.get(TRIALS_SUM, digest := sha256(of_trials)) != digest:  # the first format has no sum
+    if content.get(TRIALS_SUM, digest := sha256(of_trials)) != digest:  # the first format has none
         raise InputError(
             f"{trials}: is not the table that {STUDY_JSON} was written with; it was changed or damaged, or "
-            "the search has gone on and not come to its end"
+            "the search was continued and has not finished"
         )
     table = as_table(of_trials, trials)
     check_memory(trials, _OF_A_TRIAL * table.count("\n"))
@@ -119,22 +118,21 @@ def _read(folder: Path) -> TuningStudy:
             trials=[_trial(dict(zip(head, row, strict=True)), space) for row in rows],
         )
     except (KeyError, TypeError, ValueError, AttributeError, csv.Error) as error:
-        raise InputError(f"{file}: has no search that came to an end, or was changed ({error!r})") from None
+        raise InputError(f"{file}: is not a finished study, or was changed ({error!r})") from None
 
 
 def _certified(finalist: Mapping[str, Any]) -> str:
-    failed = int(finalist.get("failed", 0))  # an older study does not say
+    failed = int(finalist.get("failed", 0))
     return f"{finalist['certified']} / {finalist['seeds']}" + (f", {failed} failed" if failed else "")
 
 
 def _text(value: Any) -> str:
     if not isinstance(value, str):
-        raise TypeError(f"{str(value)[:40]} is no text")
+        raise TypeError(f"{str(value)[:40]} is not a text")
     return plain(value)
 
 
 def _dimension(content: Mapping[str, Any]) -> dict[str, Any]:
-    """With numbers for ends, where it has any."""
     if content["type"] == "categorical":
         return {"type": "categorical", "choices": [str(choice) for choice in content["choices"]]}
     low, high, log = float(content["low"]), float(content["high"]), bool(content["log"])

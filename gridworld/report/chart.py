@@ -1,22 +1,17 @@
-"""A figure of the report: its style, heading and legend, and what it is saved as (page, SVG, PDF, PNG).
+"""A figure of the report: its style, heading and legend, and what it is saved as (SVG, PDF, PNG).
 
-Figures are drawn in the page's light colours, which it replaces in dark mode. The agents' colours are those
-of M. Okabe and K. Ito, Color Universal Design, 2008, which people with any kind of colour vision can tell
-apart; from the eighth agent on, lines are dashed.
+The agents' colours are those of M. Okabe and K. Ito, Color Universal Design, 2008, which people with any kind
+of colour vision can distinguish; from the eighth agent on, lines are dashed.
 """
 
 from __future__ import annotations
 
 import io
-import re
 import textwrap
 import warnings
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
-from html import escape
 from typing import Any, Literal
 
 from matplotlib import style
@@ -30,23 +25,8 @@ from matplotlib.ticker import MaxNLocator
 
 from gridworld.process.console.terminal import plain
 
-_COLOURS = {  # on a light page, on a dark one
-    "paper": ("#ffffff", "#171b22"),
-    "ink": ("#1c2430", "#e8ebf0"),
-    "muted": ("#5d6878", "#9aa5b5"),
-    "grid": ("#e3e7ed", "#2b323d"),
-    "c0": ("#0072b2", "#4aa5dd"),
-    "c1": ("#d55e00", "#f0803c"),
-    "c2": ("#009e73", "#2ec495"),
-    "c3": ("#b8578f", "#e39cc6"),
-    "c4": ("#c98500", "#f0b543"),
-    "c5": ("#3a9bd9", "#8fccf3"),
-    "c6": ("#4a4f57", "#c3c9d3"),
-}
-LIGHT = {name: light for name, (light, _) in _COLOURS.items()}
-DARK = {name: dark for name, (_, dark) in _COLOURS.items()}
-INK, MUTED, GRID, PAPER = (LIGHT[name] for name in ("ink", "muted", "grid", "paper"))
-AGENT_PAINTS = 7
+INK, MUTED, GRID, PAPER = "#1c2430", "#5d6878", "#e3e7ed", "#ffffff"
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#b8578f", "#c98500", "#3a9bd9", "#4a4f57")  # of agents
 _DASHES = ((), (6.0, 3.0), (2.0, 2.5))
 
 WIDTH = 440.0  # points, of a figure; pixels in the page
@@ -55,7 +35,7 @@ SMALL, LABEL, HEADING = 11.0, 12.0, 14.0  # points, of fonts
 LINE = 14.5  # points, from one line of a text to the next
 _POINTS = 72  # an inch
 _MOST_LINES = 6  # of a name
-_LEGEND = 63  # characters that fit beside each other in a legend
+_LEGEND = 63  # characters that fit next to each other in a legend
 _HANDLE = 6  # characters that a name's line and the gaps take there
 
 _RC = {
@@ -88,20 +68,14 @@ _RC = {
     "legend.fontsize": SMALL,
     "svg.fonttype": "none",  # text stays text
 }
-
 _CHANGING = {"svg": "Date", "pdf": "CreationDate", "png": "Software"}  # entries that are left out
-_SVG_FONT = "font-family: 'DejaVu Sans', sans-serif; "  # the page has its own
-_OF_A_FILE = re.compile(r"<metadata>.*?</metadata>|<style.*?</style>", re.DOTALL)
-_TAG = re.compile(r"<[^>]*>")
-_COLOUR = re.compile("|".join(LIGHT.values()))
-_PAINTS = {colour: f"var(--{paint})" for paint, colour in LIGHT.items()}
 
 
 @contextmanager
 def house_style(salt: str = "") -> Iterator[None]:
     """Draw and save in the report's style, whatever the user's matplotlib is set to.
 
-    `salt` tells the ids in this figure's SVG from those in another's, without chance.
+    `salt` makes the ids in a figure's SVG reproducible.
     """
     with warnings.catch_warnings(), style.context(["default", _RC | {"svg.hashsalt": salt}]):
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
@@ -109,27 +83,16 @@ def house_style(salt: str = "") -> Iterator[None]:
         yield
 
 
-@dataclass(frozen=True)
-class Style:
-    """How an agent is drawn in all figures: its colour's name in `LIGHT` and `DARK`, its line's dashes."""
-
-    paint: str
-    dash: tuple[float, ...] = ()
-
-    @property
-    def line(self) -> dict[str, Any]:
-        """Arguments of matplotlib's lines: colour and dashes."""
-        return {"color": LIGHT[self.paint], "linestyle": (0, self.dash) if self.dash else "solid"}
+Styles = Mapping[str, dict[str, Any]]  # by agent: arguments of matplotlib's lines, colour and dashes
 
 
-Styles = Mapping[str, Style]  # by agent
-
-
-def styles(agents: Sequence[str]) -> dict[str, Style]:
-    """A style for each agent."""
+def styles(agents: Sequence[str]) -> Styles:
+    """How each agent is drawn in all figures."""
+    count = len(COLOURS)
+    dashes = [_DASHES[index // count % len(_DASHES)] for index in range(len(agents))]
     return {
-        agent: Style(f"c{index % AGENT_PAINTS}", _DASHES[index // AGENT_PAINTS % len(_DASHES)])
-        for index, agent in enumerate(agents)
+        agent: {"color": COLOURS[index % count], "linestyle": (0, dash) if dash else "solid"}
+        for index, (agent, dash) in enumerate(zip(agents, dashes, strict=True))
     }
 
 
@@ -140,7 +103,7 @@ class Chart:
     name: str  # of its files
     title: str  # what it is called where it cannot be seen
     description: str  # what is drawn, with which statistic of how many seeds; the caption in the page
-    figure: Figure  # in the colours of `LIGHT`
+    figure: Figure
 
     def __post_init__(self) -> None:
         if (engine := self.figure.get_layout_engine()) is not None:
@@ -157,11 +120,6 @@ class Chart:
         """The description as a sentence."""
         return plain(f"{self.description[0].upper()}{self.description[1:]}.")
 
-    @cached_property
-    def svg(self) -> str:
-        """A file whose text is text."""
-        return self.saved_as("svg").decode("utf-8")
-
     def saved_as(self, kind: str) -> bytes:
         """A file, "png", "pdf" or "svg". A PDF's text is outlines: proper fonts take 0.4 s."""
         texts = self.figure.findobj(Text) if kind == "pdf" else []
@@ -175,21 +133,6 @@ class Chart:
         for text in texts:
             text.set_path_effects([])
         return buffer.getvalue()
-
-    def svg_element(self) -> str:
-        """An SVG element in the page's font, as wide as the page lets it, its colours CSS variables."""
-        width, height = self.figure.get_size_inches() * _POINTS
-        body = self.svg[self.svg.index(">", self.svg.index("<svg ")) + 1 :]
-        body = _TAG.sub(lambda tag: _for_page(tag[0]), _OF_A_FILE.sub("", body))
-        told = escape(plain(self.title))
-        return f'<svg viewBox="0 0 {width:g} {height:g}" role="img" aria-label="{told}">{body}'
-
-
-def _for_page(tag: str) -> str:
-    """Colours, numbers and names of one of a figure's tags as they are in a page, where it is not alone."""
-    tag = re.sub(r' id="[^"]*"', "", tag) if tag.startswith("<g ") else tag
-    tag = _COLOUR.sub(lambda found: _PAINTS[found[0]], tag.replace(_SVG_FONT, ""))
-    return re.sub(r"(\.\d\d)\d+", r"\1", tag)
 
 
 def new_figure(
@@ -205,14 +148,13 @@ def new_figure(
     """
     names = [name for _, name in legend]
     columns, lines = 1, sum(map(line_count, names))
-    longest = max((len(line) for name in names for line in name.split("\n")), default=0)
-    if all("\n" not in name for name in names):
+    if names and lines == len(names):
         fits = sum(len(name) + _HANDLE for name in names) <= _LEGEND
-        columns = max(1, len(names) if fits else _LEGEND // (longest + _HANDLE))
+        columns = len(names) if fits else max(1, _LEGEND // (max(map(len, names)) + _HANDLE))
         lines = -(-len(names) // columns)
-    points = height + 64 + LINE * lines
+    size = width / _POINTS, (height + 64 + LINE * lines) / _POINTS
     layout = ConstrainedLayoutEngine(w_pad=8 / _POINTS, h_pad=4 / _POINTS)
-    figure = Figure(figsize=(width / _POINTS, points / _POINTS), dpi=_POINTS, layout=layout)
+    figure = Figure(figsize=size, dpi=_POINTS, layout=layout)
     axes = figure.add_subplot(facecolor="none")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
@@ -258,34 +200,26 @@ def clipped(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[:half]}…{text[-half:]}"
 
 
-def without_shared(names: Sequence[str]) -> list[str]:
-    """The labels of one agent's configurations without its name: "ppo (n_steps=8)" as n_steps=8."""
-    heads = {name.partition(" (")[0] for name in names if name.endswith(")")}
-    if len(names) < 2 or len(heads) > 1 or not all(" (" in name and name.endswith(")") for name in names):
-        return list(names)
-    return [name.partition(" (")[2][:-1] for name in names]
-
-
-def wrapped_apart(texts: Sequence[str], most: int) -> list[str]:
-    """Break texts into lines of at most `most` characters; long ones lose their middle lines.
-
-    Different texts that have lost what they differ in get a number.
-    """
-    told = []
-    for text in texts:
-        lines = textwrap.wrap(plain(text)[:1000], most, break_on_hyphens=False) or [""]
-        if len(lines) > _MOST_LINES:
-            lines = [*lines[: _MOST_LINES - 2], "…", lines[-1]]
-        told.append("\n".join(lines))
-    seen: dict[str, list[str]] = defaultdict(list)
-    for text, short in dict(zip(texts, told, strict=True)).items():
-        seen[short].append(text)
-    return [
-        f"{short} #{seen[short].index(text) + 1}" if len(seen[short]) > 1 else short
-        for text, short in zip(texts, told, strict=True)
-    ]
+def wrapped(text: str, most: int) -> str:
+    """Escape control characters, and break into at most six lines of `most` characters."""
+    lines = textwrap.wrap(
+        plain(text)[:1000], most, break_on_hyphens=False, max_lines=_MOST_LINES, placeholder=" …"
+    )
+    return "\n".join(lines)
 
 
 def line_count(text: str) -> int:
     """How many lines a text has."""
     return text.count("\n") + 1
+
+
+def without_shared(names: Sequence[str]) -> list[str]:
+    """The labels of one agent's configurations without its name: "ppo (n_steps=8)" as n_steps=8."""
+    parts = [name.removesuffix(")").partition(" (") for name in names]
+    is_one_agent = len(names) > 1 and len({head for head, _, _ in parts}) == 1
+    return [tail for _, _, tail in parts] if is_one_agent and all(map(all, parts)) else list(names)
+
+
+def seed_counts(counts: Sequence[int]) -> str:
+    """Write numbers of seeds: "5 seeds", "3 to 5 seeds"."""
+    return f"{' to '.join(map(str, dict.fromkeys((min(counts), max(counts)))))} seeds"
