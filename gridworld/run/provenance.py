@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.config.agents import AgentConfig
-from gridworld.config.effects import Effect
-from gridworld.config.settings_by_effect import ON_RESULT, with_effects
+from gridworld.config.fields import Effect
+from gridworld.config.settings import ON_RESULT, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.errors import DISTRIBUTION
 from gridworld.run.folder import SOURCE_DIFF

@@ -12,11 +12,10 @@ from typing import Any
 
 import pytest
 from helpers.disk import Disk, Left, put_back
-from helpers.resuming import begin, differences, go_on, left_behind, stopped_after
+from helpers.resuming import begin, begin_or_go_on, differences, go_on, left_behind, stopped_after
 from helpers.support import SHORT, configure
 
 from gridworld.errors import InputError
-from gridworld.restore.resume import train_or_resume
 from gridworld.run.reader import read_run
 from gridworld.sweep.folder import SweepFolder, open_sweep
 from gridworld.sweep.job import run_in_sweep
@@ -67,7 +66,7 @@ def check_goes_on(folder: Path, words: list[str], calm: dict[str, Any]) -> None:
             assert is_whole(folder)
         return
     folder.mkdir(exist_ok=True)
-    train_or_resume(configure(*words), folder, words)
+    begin_or_go_on(folder, *words)
     assert is_whole(folder)
     assert differences(left_behind(folder), calm) == []
 
@@ -176,7 +175,7 @@ def test_a_damaged_manifest_is_refused_and_nothing_is_lost(damage: str, tmp_path
     whole, results = file.read_bytes(), read_run(tmp_path).results()
     before = [path.read_bytes() for path in results]
     file.write_bytes(DAMAGES[damage](whole))
-    for act in (lambda: go_on(tmp_path, 3000), lambda: train_or_resume(configure(*SAVED), tmp_path, SAVED)):
+    for act in (lambda: go_on(tmp_path, 3000), lambda: begin_or_go_on(tmp_path, *SAVED)):
         with pytest.raises(InputError, match=r"manifest\.json: (is no JSON|was changed or damaged)"):
             act()
     assert [path.read_bytes() for path in results] == before
