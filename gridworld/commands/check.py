@@ -47,17 +47,9 @@ def _parser() -> argparse.ArgumentParser:
     epilog = f"The probes, and what it means where one fails:\n{probes}"
     parser = parser_of("check", __doc__, epilog=epilog)
     option = parser.add_argument
-    option(
-        "algorithm",
-        help="the import path of a class of SB3's kind, e.g. my_package.MyPPO; or a shipped agent, e.g. dqn",
-    )
-    option(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="an argument for the class, e.g. learning_rate=0.001; may be repeated",
-    )
+    option("algorithm", help="a class of SB3's kind, e.g. my_package.MyPPO; or a shipped agent, e.g. dqn")
+    argument = "an argument for the class, e.g. learning_rate=0.001; may be repeated"
+    option("--set", action="append", default=[], metavar="NAME=VALUE", help=argument)
     option("--probe", action="append", default=[], metavar="NAME", help="only this probe; may be repeated")
     option("--seed", type=whole(0), default=0, help="the first of the three that a probe may take")
     processes = min(_PROCESSES, os.cpu_count() or 1)

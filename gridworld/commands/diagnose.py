@@ -74,12 +74,8 @@ def _is_any_certified(saved: SavedRun, found: Diagnosis, options: argparse.Names
 
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("diagnose", __doc__, "run", "--trust")
-    parser.add_argument(
-        "--try",
-        dest="try_offers",
-        action="store_true",
-        help="train what there is to try, in RUN-tried, until one is certified; exit code 1 if none is",
-    )
+    tried = "train what there is to try, in RUN-tried, until one is certified; exit code 1 if none is"
+    parser.add_argument("--try", dest="try_offers", action="store_true", help=tried)
     return parser
 
 
