@@ -24,11 +24,9 @@ from gridworld.run.claim import check_inside, check_writable
 from gridworld.storage.safe_read import check_no_link
 from gridworld.storage.symlinks import make_inside
 from gridworld.visualization import files
-from gridworld.visualization.animation import Animation
 from gridworld.visualization.episode import film
-from gridworld.visualization.picture import Subject, drawer
+from gridworld.visualization.picture import drawer
 from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.mdp import Mdp
 
 MAPS = {picture.name: picture.drawer for picture in PICTURES if picture.is_map}
 
@@ -75,7 +73,10 @@ def _record(options: argparse.Namespace) -> None:
     formats = list(dict.fromkeys(options.format))
     subject = _SavedSubject(saved, options.trust)
     drawn = {kind: drawer(MAPS[kind]).draw(subject)(options.cell_size) for kind in formats if kind in MAPS}
-    episodes = _film(saved.mdp, subject, options)
+    policy, limit = choose_policy(subject.snapshot, options.policy), subject.evaluator.max_episode_steps
+    seeds = range(options.seed, options.seed + options.episodes)
+    played = [play(saved.mdp, policy, limit, seed) for seed in seeds]
+    episodes = film(saved.config.env, saved.mdp, played, options.trust)(options.cell_size)
     files.check_size(episodes, formats)
     if options.out is None:
         make_inside(options.run, folder.name)
@@ -124,10 +125,3 @@ def _check(options: argparse.Namespace) -> None:
         check_inside(options.out, "--out")
     if "mp4" in options.format:
         files.require_video()
-
-
-def _film(mdp: Mdp, subject: Subject, options: argparse.Namespace) -> Animation:
-    policy = choose_policy(subject.snapshot, options.policy)
-    limit = subject.evaluator.max_episode_steps
-    episodes = [play(mdp, policy, limit, options.seed + index) for index in range(options.episodes)]
-    return film(subject.config.env, mdp, episodes, subject.is_trusted)(options.cell_size)

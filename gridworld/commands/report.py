@@ -20,7 +20,7 @@ from gridworld.process.console.command_line import program
 from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
-from gridworld.report.build import MOST_SHOWN, Reason, Report, gather, reasons
+from gridworld.report.build import MOST_SHOWN, Reason, gather, reasons
 from gridworld.report.writer import FORMATS, MARKERS, check_markers, check_out, write_readme, write_report
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.claim import check_inside
@@ -37,24 +37,31 @@ def main(arguments: Sequence[str]) -> None:
             raise InputError(f"--{name} {getattr(options, name)}: must be at least 0")
     if options.out is not None:
         check_inside(options.out, "--out")
-    out = options.out or _usual_out(options.runs)
+    runs = options.runs
+    out = options.out or (runs[0] / "report" if len(runs) == 1 and runs[0].is_dir() else Path("runs/report"))
     check_out(out)
     if options.readme is not None:
         check_markers(options.readme)
     with telling_if_slow("reading the runs"):
-        report = gather(options.runs, options.seed, options.log_steps)
+        report = gather(runs, options.seed, options.log_steps)
     with telling_if_slow("diagnosing runs that are not certified"):
-        found, untold = reasons(report.study.groups, _reason, options.diagnose)
-        report = replace(report, reasons=found, notes=(*report.notes, *untold))
+        found, problems = reasons(report.study.groups, _reason, options.diagnose)
+        report = replace(report, reasons=found, notes=(*report.notes, *problems))
     with telling_if_slow("writing the report"):
         page = write_report(report, out, options.formats)
     if options.readme is not None:
         write_readme(report, options.readme)
-    _tell(report)
+    sentences = report.sentences()
+    for sentence in sentences[:MOST_SHOWN]:
+        print(f"warning: {printable(sentence)}", file=sys.stderr)
+    if len(sentences) > MOST_SHOWN:
+        print(f"warning: and {len(sentences) - MOST_SHOWN} more, all in the report", file=sys.stderr)
+    for note in (*report.study.notes, *report.notes):
+        print(f"note: {printable(note)}", file=sys.stderr)
     print(printable(str(page)))
     if options.open and not webbrowser.open(page.absolute().as_uri()):
         print(printable(f"--open: there is no browser here; open {page} in yours"), file=sys.stderr)
-    if not report.complete:
+    if sentences:
         sys.exit(1)
 
 
@@ -103,17 +110,3 @@ def _reason(folder: Path) -> Reason | None:
 
     found = diagnose(Evidence.of(SavedRun(folder)))
     return None if found.phrase is None else Reason(found.phrase, found.first_change)
-
-
-def _usual_out(runs: Sequence[Path]) -> Path:
-    return runs[0] / "report" if len(runs) == 1 and runs[0].is_dir() else Path("runs/report")
-
-
-def _tell(report: Report) -> None:
-    sentences = report.sentences()
-    for sentence in sentences[:MOST_SHOWN]:
-        print(f"warning: {printable(sentence)}", file=sys.stderr)
-    if len(sentences) > MOST_SHOWN:
-        print(f"warning: and {len(sentences) - MOST_SHOWN} more, all in the report", file=sys.stderr)
-    for note in (*report.study.notes, *report.notes):
-        print(f"note: {printable(note)}", file=sys.stderr)
