@@ -13,9 +13,8 @@ import textwrap
 from collections.abc import Sequence
 
 from gridworld.checking.probes import PROBES
-from gridworld.checking.run import Finding, check_all
-from gridworld.checking.subject import arguments, subject
-from gridworld.checking.table import row, verdict
+from gridworld.checking.run import Finding, check
+from gridworld.checking.settings import arguments
 from gridworld.commands import whole_number
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import program
@@ -36,21 +35,21 @@ def main(words: Sequence[str]) -> None:
     for name, least in (("processes", 1), ("seed", 0)):
         if getattr(options, name) < least:
             raise InputError(f"--{name} {getattr(options, name)}: must be at least {least}")
-    result = check_all(
-        subject(options.algorithm),
+    result = check(
+        options.algorithm,
         arguments(options.set),
         options.probe,
         options.seed,
         options.processes,
-        told=_print,
+        on_finding=_print,
     )
-    print(printable(verdict(result)))
+    print(printable(result.verdict()))
     if not result.passed:
         sys.exit(_FAILED)
 
 
 def _print(finding: Finding) -> None:
-    for line in row(finding).splitlines():
+    for line in str(finding).splitlines():
         print(printable(line), flush=True)
 
 

@@ -15,11 +15,10 @@ from stable_baselines3 import A2C, DQN, PPO
 
 import gridworld
 from gridworld.agents import PolicySnapshot
-from gridworld.checking import expectations as expect
+from gridworld.checking import probes as expect
 from gridworld.checking import run, worlds
 from gridworld.checking.probes import PROBES
-from gridworld.checking.settings import settings
-from gridworld.checking.subject import arguments, subject
+from gridworld.checking.settings import arguments, settings, subject
 from gridworld.checking.training import Trained, train
 from gridworld.errors import InputError
 from gridworld.world.exact.markov_chain import one_hot_policy

@@ -6,7 +6,7 @@ from helpers.oracle import MOVES, World, maps
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gridworld.diagnosis.split import split_regret
+from gridworld.diagnosis.evidence import split_regret
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.exact.markov_chain import one_hot_policy
 from gridworld.world.grid import compile_mdp

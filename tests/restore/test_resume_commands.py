@@ -290,7 +290,9 @@ def test_a_map_that_changed_meanwhile(tmp_path: Path) -> None:
     assert "the world world.txt has changed since" in refused.stderr
     done = script("train.py", "resume=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "its world world.txt has changed since; it continues with the one that it began with" in done.stderr
+    assert (
+        "its world world.txt has changed since; it continues with the one that it began with" in done.stderr
+    )
     assert manifest(tmp_path / "run")["layout"] == ["S..", "..G"]
 
 
