@@ -23,7 +23,7 @@ from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError, failure
 from gridworld.process.memory_budget import limited, unlimited
 from gridworld.process.signals import Interrupted
-from gridworld.report.evidence.curve_reader import read_columns
+from gridworld.report.evidence import read_columns
 from gridworld.restore.resume import unfinished_of
 from gridworld.restore.saved_run import SavedRun, read_visits
 from gridworld.run.claim import check_free, claimed

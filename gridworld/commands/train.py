@@ -20,8 +20,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.commands import run
-from gridworld.commands.shell.help import manual
-from gridworld.commands.shell.output_folder import check_settings_of, check_sweep_folder, run_folder
+from gridworld.commands.manual import manual
+from gridworld.commands.output_folder import check_settings_of, check_sweep_folder, run_folder
 from gridworld.config.composition.compose import register_schemas, to_config
 from gridworld.config.composition.conf_folder import conf_folder, own_conf_folders
 from gridworld.config.composition.hydra_errors import sentence, unreadable_file

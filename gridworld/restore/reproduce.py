@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import family
-from gridworld.config.flatten import flat
+from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.parallel.together import mixing

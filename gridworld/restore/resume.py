@@ -15,8 +15,8 @@ from functools import partial
 from pathlib import Path
 
 from gridworld.config.agents import falls
-from gridworld.config.flatten import flat
 from gridworld.config.plain_settings import foreign
+from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console.progress import telling_if_slow

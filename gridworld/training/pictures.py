@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from gridworld.agents import PolicySnapshot
 from gridworld.config.pictures import PICTURES, Picture
 from gridworld.config.train import TrainConfig
-from gridworld.envs.frames.rendering import Frame, fitting_cell_size
+from gridworld.envs.rendering import Frame, fitting_cell_size
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State
 from gridworld.training.learning_curve import Evaluation
 from gridworld.training.tensorboard import EventWriter
 from gridworld.visualization.animation import Animation
-from gridworld.visualization.picture import Draw, drawer, save
+from gridworld.visualization.files import encode_gif, save
+from gridworld.visualization.picture import Draw, drawer
 from gridworld.visualization.policy_history import PolicyHistory
-from gridworld.visualization.video import encode_gif
 from gridworld.world.exact.evaluation import Evaluator
 
 _GROUP = "pictures"  # of TensorBoard's tags: behind the learning curve

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.agents import Agent, Learning, TrainingContext
-from gridworld.config.privileges import privileges
+from gridworld.config.settings import privileges
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console.progress import Progress
@@ -326,7 +326,7 @@ def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, secon
         "seed": config.seed,
         "recipe": config.recipe,
         "preset": config.preset if config.preset != AUTO else "none",
-        "privileges": privileges(TrainConfig, dataclasses.asdict(config)),
+        "privileges": privileges(dataclasses.asdict(config)),
         "total_timesteps": config.total_timesteps,
         "timesteps": last.step,
         "gamma": config.evaluation.gamma,

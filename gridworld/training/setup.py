@@ -36,11 +36,11 @@ def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = comp
     config.env.step_limit(mdp)
     wanted = config.recording
     if wanted.mp4:
-        from gridworld.visualization.video import require_video
+        from gridworld.visualization.files import require_video
 
         require_video()
     if wanted.cell_size is not None and (wanted.frames or wanted.gif or wanted.mp4):
-        from gridworld.envs.frames.rendering import frame_size
+        from gridworld.envs.rendering import frame_size
 
         frame_size(mdp, wanted.cell_size)
     return mdp

@@ -19,13 +19,12 @@ from tensorboard.plugins.custom_scalar import metadata as layout_metadata
 from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
 from tensorboard.plugins.text import metadata as text_metadata
 
-from gridworld.config.flatten import flat
-from gridworld.config.settings_by_effect import ON_RESULT, with_effects
+from gridworld.config.settings import ON_RESULT, flat, with_effects
 from gridworld.config.train import TrainConfig
-from gridworld.envs.frames.rendering import Frame
+from gridworld.envs.rendering import Frame
 from gridworld.storage.append_log import AppendLog
 from gridworld.storage.event_file import EventFile
-from gridworld.visualization.png import encode_png
+from gridworld.visualization.files import encode_png
 
 HParamValue = bool | float | str | None
 

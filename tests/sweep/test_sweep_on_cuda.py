@@ -192,7 +192,8 @@ def test_a_run_that_went_on_says_with_whom_and_cannot_be_repeated(tmp_path: Path
         content = manifest_of(folder)
         assert content["numbers_depend_on"] == runs
         assert content["resumed"][0].get("numbers_depend_on") == (None if how == "alone" else runs)
-        with pytest.raises(InputError, match=rf"resumed after step 512 {how}, which cannot be repeated"):
+        sentence = rf"it was resumed after step 512 {how}, which cannot be repeated"
+        with pytest.raises(InputError, match=sentence):
             population(read_run(folder))
 
 
