@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from helpers.resuming import begin, differences, go_on, last_state, left_behind, stopped_after
 from helpers.support import SHORT, configure
@@ -23,36 +22,6 @@ from gridworld.storage.serialization import State, StateError, decode, encode, s
 
 CORRUPTIONS = int(os.environ.get("GRIDWORLD_CORRUPTIONS", "200"))
 LESS = [*("recording.frames=false", "recording.gif=false", "env.slip=0.1", "logging.policy_map_every=0")]
-
-SAMPLE: dict[str, Any] = {
-    "number": 3,
-    "real": -0.1,
-    "infinite": float("inf"),
-    "none": None,
-    "truth": True,
-    "text": "a\u00e9",
-    "list": [1, [2.5, {"deep": np.arange(6, dtype=np.uint8).reshape(2, 3)}]],
-    "empty": np.empty((0, 3), dtype=np.float32),
-    "zeros": np.zeros(100_000),
-    "mostly zeros": np.eye(300, dtype=np.float32)[:200],
-    "scalar": np.array(2.5),
-    "truths": np.array([True, False]),
-}
-
-
-@pytest.mark.parametrize("compress", [False, True])
-def test_a_state_comes_back_to_the_bit(compress: bool) -> None:
-    data = b"".join(encode(SAMPLE, compress))
-    assert differences(decode(data), SAMPLE) == []
-    assert len(data) < 350_000  # zeros at the end take no room
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"a": object()}, {1: 2}, {"@": 1}, {"a": (1, 2)}, {"a": np.array(["x"])}, {"a": {1, 2}}]
-)
-def test_what_is_no_state_is_not_written(wrong: Any) -> None:
-    with pytest.raises(TypeError):
-        encode(wrong)
 
 
 def damaged(data: bytes, count: int) -> Iterator[bytes]:
