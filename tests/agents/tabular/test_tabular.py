@@ -14,14 +14,20 @@ from helpers.support import ROOT, SHORT, configure, train_in
 from gridworld import GridWorldEnv, GridWorldVectorEnv, InputError
 from gridworld.agents import Agent, TrainingContext
 from gridworld.agents.tabular import build
-from gridworld.agents.tabular.algorithms.expected_sarsa import ExpectedSarsaConfig
-from gridworld.agents.tabular.algorithms.q_learning import QLearningConfig
-from gridworld.agents.tabular.algorithms.sarsa import SarsaConfig
-from gridworld.agents.tabular.algorithms.value_iteration import ValueIterationConfig
-from gridworld.agents.tabular.batch_update import StepSize, update
-from gridworld.agents.tabular.epsilon_greedy import draw_actions, epsilon_greedy
+from gridworld.agents.tabular.algorithms import (
+    ExpectedSarsaConfig,
+    QLearningConfig,
+    SarsaConfig,
+    ValueIterationConfig,
+)
 from gridworld.agents.tabular.settings import TabularConfig
-from gridworld.agents.tabular.td_control import TabularControl, TabularControlConfig
+from gridworld.agents.tabular.td_control import (
+    TabularControl,
+    TabularControlConfig,
+    draw_actions,
+    epsilon_greedy,
+    update,
+)
 from gridworld.envs.observations import make_observation
 from gridworld.world.exact.solver import value_iteration
 from gridworld.world.layout import shipped_layouts
@@ -156,7 +162,7 @@ def test_a_batch_counts_as_its_transitions_in_sequence(rate: float, power: float
     for pair, target in zip(pairs.tolist(), targets.tolist(), strict=True):
         counted[pair] += 1
         expected[pair] += rate * counted[pair] ** -power * (target - expected[pair])
-    loss = update(q, visits, pairs, targets, StepSize(rate, power))
+    loss = update(q, visits, pairs, targets, rate, power)
     assert loss == pytest.approx(np.mean(np.square(errors)))
     np.testing.assert_allclose(q, expected, rtol=0, atol=1e-12)
     assert visits.tolist() == counted
