@@ -13,8 +13,8 @@ from gridworld.envs.registration import ENV_ID, register_envs, register_when_gym
 
 TYPE_CHECKING = False  # what type checkers take for True; `typing` itself would double the import's cost
 if TYPE_CHECKING:
-    from gridworld.agents.sb3.interop.exact_eval_callback import ExactEvalCallback
-    from gridworld.agents.sb3.interop.make_vec_env import make_vec_env
+    from gridworld.agents.sb3.exact_eval import ExactEvalCallback
+    from gridworld.agents.sb3.vec_env import make_vec_env
     from gridworld.api.checking import CheckResult, check
     from gridworld.api.diagnosis import diagnose
     from gridworld.api.runs import RunResult, open_run, train
@@ -44,7 +44,7 @@ _HOME = {
     "CheckResult": "api.checking",
     "CoordinateObservation": "envs.observations",
     "Evaluator": "world.exact.evaluation",
-    "ExactEvalCallback": "agents.sb3.interop.exact_eval_callback",
+    "ExactEvalCallback": "agents.sb3.exact_eval",
     "GridWorldEnv": "envs.env",
     "GridWorldVectorEnv": "envs.vector_env",
     "ImageObservation": "envs.observations",
@@ -66,7 +66,7 @@ _HOME = {
     "load": "world.layout",
     "load_world": "world.sources.arrays",
     "make_vec": "api.worlds",
-    "make_vec_env": "agents.sb3.interop.make_vec_env",
+    "make_vec_env": "agents.sb3.vec_env",
     "open_run": "api.runs",
     "shipped_layouts": "world.layout",
     "train": "api.runs",

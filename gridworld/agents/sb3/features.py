@@ -199,6 +199,5 @@ def _image_shape(name: str, space: spaces.Space[Any], cell_size: int) -> tuple[i
     return shape[0], shape[1], shape[2]
 
 
-ImageCells = AgentByColour  # as it was called in runs of before
 FIXED = (FourierFeatures, AgentByColour)  # functions of an observation alone, which never change
 LEARNED = (PixelCNN,)  # functions of an observation and of parameters, of nothing else

@@ -181,6 +181,7 @@ class TabularControl(ABC):
 
     def class_without_state(self) -> None:
         """See `gridworld.agents.Agent.class_without_state`."""
+        return
 
     def get_state(self) -> State:
         """See `gridworld.agents.Agent.get_state`."""
@@ -299,7 +300,7 @@ def epsilon_greedy(q: FloatArray, epsilon: float) -> FloatArray:
 
 
 def draw_actions(q: FloatArray, epsilon: float, states: IntArray, draws: FloatArray) -> IntArray:
-    """Draw ε-greedy actions (n,), each the first whose cumulative probability exceeds its draw from [0, 1)."""
+    """Draw ε-greedy actions (n,): each the first whose cumulative probability exceeds its draw in [0, 1)."""
     rows, index = _rows_of(q, states)
     thresholds = epsilon_greedy(rows, epsilon)[:, :-1].cumsum(axis=1)
     actions = np.zeros(len(states), dtype=np.int64)

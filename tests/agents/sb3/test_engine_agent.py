@@ -15,8 +15,7 @@ from stable_baselines3 import A2C, DQN, PPO
 
 from gridworld.agents import Agent, TrainingContext, family
 from gridworld.agents.sb3 import check
-from gridworld.agents.sb3.agent import SB3Agent
-from gridworld.agents.sb3.engine_agent import EngineAgent
+from gridworld.agents.sb3.agent import EngineAgent, SB3Agent
 from gridworld.agents.sb3.factory import UnfitError
 from gridworld.agents.sb3.settings.engine import ACTIVATIONS
 from gridworld.envs.observations import make_observation
