@@ -9,8 +9,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridworld.engine.losses import Array, Coefficients, log_softmax, losses_of, normalized, slopes_of, sum_up
-from gridworld.engine.on_policy import OnPolicy
+from gridworld.engine.networks import Array
+from gridworld.engine.on_policy import (
+    Coefficients,
+    OnPolicy,
+    log_softmax,
+    losses_of,
+    normalized,
+    slopes_of,
+    sum_up,
+)
 from gridworld.engine.population import FEW_STATES
 from gridworld.world.mdp import IntArray
 

@@ -230,17 +230,9 @@ class DQN(Population):
     def losses_and_slopes(
         outputs: Array, index: IntArray, actions: IntArray, targets: Array, shares: FloatArray | None
     ) -> tuple[Array, Array]:
-        """Compute the Huber losses of P minibatches and their slopes, see above.
+        """The Huber losses (P,) of minibatches (P, B), and their slopes, one for each output (P, U, A).
 
-        Args:
-            outputs: (P, U, A), Q.
-            index: (P, B), which of the U states each transition begins in.
-            actions: (P, B).
-            targets: (P, B), float32.
-            shares: (P, B), see `Transitions`.
-
-        Returns:
-            The losses (P,); the slopes, as many as there are outputs, in their order.
+        `index` says which of the U states each transition begins in.
         """
         (runs, num_states, num_actions), count = outputs.shape, index.shape[1]
         pair = (index + num_states * np.arange(runs)[:, None]) * num_actions + actions

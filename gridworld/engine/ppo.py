@@ -7,16 +7,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from gridworld.engine.losses import (
-    Array,
+from gridworld.engine.networks import Array
+from gridworld.engine.on_policy import (
     Coefficients,
+    OnPolicy,
     Sums,
     divergence,
     log_softmax,
     losses_of,
     slopes_of,
 )
-from gridworld.engine.on_policy import OnPolicy
 from gridworld.engine.run import Run
 from gridworld.storage.serialization import State
 from gridworld.world.mdp import BoolArray, IntArray
