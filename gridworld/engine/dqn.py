@@ -70,7 +70,8 @@ class DQN(Population):
             self._count(step, is_last=steps == self.train_freq.frequency)
             if not self.active.any():
                 return
-            self._store(states, actions, step)
+            columns = states, actions, step.last_states, step.rewards, step.terminated
+            self.replay.store(*(each.reshape(len(self.runs), -1) for each in columns))  # type: ignore[arg-type]
             self._after_step(step)
         if self.num_timesteps > self.learning_starts:
             updates = self.gradient_steps if self.gradient_steps >= 0 else steps * self.num_envs
@@ -119,13 +120,6 @@ class DQN(Population):
                 run.keep_episodes(step.returns[part], step.lengths[part])
         scales = np.array([run.reward_scale for run in self.runs])
         rewards *= scales[:, None]
-
-    def _store(self, states: IntArray, actions: IntArray, step: Step) -> None:
-        by_run = (
-            each.reshape(len(self.runs), -1)
-            for each in (states, actions, step.last_states, step.rewards, step.terminated)
-        )
-        self.replay.store(*by_run)  # type: ignore[arg-type]
 
     def _after_step(self, step: Step) -> None:
         """Update target networks and exploration rates, and log episodes, as SB3 does after a step."""

@@ -53,14 +53,10 @@ class DenseNetworks:
     that it makes alone. The first layer's product with a unit vector is a column of its weights.
 
     Args:
-        vectors: (P, W), the weights.
+        vectors: (P, W), copied to `weights`; `gradients` (P, W) are those of the last `backward`.
         parameters: those of one network, in the order of a row.
         nets: the layers of each output.
         features: (S, n), what the first layers see of each state; None: its unit vector.
-
-    Attributes:
-        weights: (P, W).
-        gradients: (P, W), of the last `backward`.
     """
 
     def __init__(
@@ -121,14 +117,10 @@ class DenseNetworks:
             if inputs is None:
                 columns = weight.transpose(1, 2)
                 outputs = (columns if states is None else columns[:, states]) + bias[:, None]
-            elif (
-                weight.shape[1] == 1 and inputs.stride(1) == 1
-            ):  # columns of weights, which a batch adds up otherwise
+            elif weight.shape[1] == 1 and inputs.stride(1) == 1:  # which a batch would add up otherwise
                 rows = zip(inputs, weight, bias, strict=True)
                 outputs = torch.stack([nn.functional.linear(*row) for row in rows])
-            elif (
-                weight.shape[1] == 1
-            ):  # a batch of these adds up as one alone does; of those below it would not
+            elif weight.shape[1] == 1:  # a batch of these adds up as one alone does, not of those below
                 outputs = torch.bmm(weight, inputs.transpose(1, 2)).transpose(1, 2) + bias[:, None]
             else:
                 outputs = torch.baddbmm(bias[:, None], inputs, weight.transpose(1, 2))
@@ -186,13 +178,7 @@ class DenseNetworks:
 
 
 class ModuleNetworks:
-    """Any network of one run, differentiated by torch.
-
-    Args:
-        vector: (W,), the weights.
-        parameters: in the order of a row; they become views of it.
-        forward: runs it on some states, or on all: outputs (U, n).
-    """
+    """Any network of one run, differentiated by torch; its parameters become views of its row of weights."""
 
     def __init__(
         self,

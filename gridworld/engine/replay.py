@@ -175,17 +175,17 @@ Replay = UniformReplay | CountedReplay
 
 
 def systematic_sample(counts: IntArray, size: int, chance: FloatArray) -> IntArray:
-    """Draw minibatches from what was met: every N/B-th of all in a row, from a random one on.
+    """Draw n minibatches of B from N transitions: every N/B-th of all in a row, from a random one on.
 
     G. Kitagawa, Monte Carlo Filter and Smoother for Non-Gaussian Nonlinear State Space Models, 1996.
 
     Args:
         counts: (R,), how often each transition was met, N times in all.
-        size: B, of a minibatch.
-        chance: (n,), numbers from [0, 1), where each of n minibatches begins.
+        size: B.
+        chance: (n,), numbers from [0, 1), where each minibatch begins.
 
     Returns:
-        (n, R), how often each transition is in each minibatch, B in all.
+        (n, R), how often each transition is in each minibatch.
     """
     ends = np.cumsum(counts)
     before = np.ceil(size * (ends / ends[-1]) - chance[:, None])  # points before each end

@@ -55,12 +55,8 @@ class TRPO(OnPolicy):
         policies = make_networks(runs, policy_parameters, slice(0, 1))
         return [policies, make_networks(runs, value_parameters, slice(1, 2))]
 
-    @property
-    def critic(self) -> Networks:
-        """The networks of the values."""
-        return self.all_networks[1]
-
     def _optimizer(self) -> Optimizer:
+        self.critic = self.all_networks[1]  # the networks of the values
         own = [run.model.policy.optimizer for run in self.runs]
         return Optimizer(own, self.critic.weights, self.critic.gradients, [math.inf] * len(own))
 

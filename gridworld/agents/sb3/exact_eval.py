@@ -72,7 +72,7 @@ class ForeignPolicy:
         predicts = (model.predict, policy.predict)
         takes_masks = any("action_masks" in inspect.signature(each).parameters for each in predicts)
         self._masks = task.masks() if takes_masks else None
-        self._decides = self._is_of_a_library()  # by SB3's own `predict`: its network says how it explores
+        self._is_known = self._is_of_a_library()  # so that its network says how it explores
         self._check_is_a_table(self._observation())
 
     def tables(self) -> Tables:
@@ -87,7 +87,7 @@ class ForeignPolicy:
         self._policy.set_training_mode(was_training)
         epsilon = float(getattr(self._model, "exploration_rate", 0.0))
         sampled = outputs if q is None else explored(greedy, epsilon)
-        return Tables(greedy, sampled if self._decides else None, outputs)
+        return Tables(greedy, sampled if self._is_known else None, outputs)
 
     def _observation(self) -> ObservationTable:
         """What it sees of each state: what the task shows, or the world's own observation with its space."""
@@ -165,7 +165,7 @@ class ForeignPolicy:
         reached = np.flatnonzero(self._task.mdp.acting)[:_ONE_BY_ONE]
         together = self._predicted(observation)[reached]
         rounds = [np.array([self._predict(observation, state) for state in reached])]
-        rounds += [self._predicted(observation)[reached] for _ in range(1 if self._decides else _OFTEN)]
+        rounds += [self._predicted(observation)[reached] for _ in range(1 if self._is_known else _OFTEN)]
         reason = why_no_table(self._policy, observation)
         self._policy.set_training_mode(was_training)
         if reason is None and random_states() != before:
@@ -179,16 +179,13 @@ class ForeignPolicy:
             raise InputError(f"the model {reason}")
 
     def _is_of_a_library(self) -> bool:
+        """Whether no custom layer or `predict` decides on an action."""
         modules = [type(each).__module__ for each in self._policy.modules()]
-        if not all(module.startswith((*_LIBRARIES, "torch.")) for module in modules):
-            return False
         for thing in (self._model, self._policy):
-            for name in _PREDICTS:
-                method = getattr(type(thing), name, None)
-                is_own = method is not None and not method.__module__.startswith(_LIBRARIES)
-                if is_own or name in vars(thing):
-                    return False
-        return True
+            found = {name: getattr(type(thing), name, None) for name in _PREDICTS}
+            modules += [method.__module__ for method in found.values() if method is not None]
+            modules += ["custom" for name in _PREDICTS if name in vars(thing)]
+        return all(module.startswith((*_LIBRARIES, "torch.")) for module in modules)
 
 
 def tables_of(model: Any, task: Task) -> Tables:

@@ -190,13 +190,6 @@ def _make(where: str, entry: dict[str, Any], kind: type) -> Any:
     found = import_class(f"{where}.{_TARGET}", path, kind)
     arguments = {name: _value(f"{where}.{name}", value) for name, value in entry.items() if name != _TARGET}
     try:
-        inspect.signature(found).bind(**arguments)
-    except TypeError as error:
-        known = ", ".join(inspect.signature(found).parameters)
-        raise InputError(f"{where}: {path} {error}; its arguments are {known}") from None
-    except ValueError:  # it has no signature that could be read
-        pass
-    try:
         return found(**arguments)
     except Exception as error:  # the class may be anybody's
         raise InputError(f"{where}: {path} cannot be built: {first_line(error)}") from error

@@ -110,7 +110,7 @@ class TabularControl(ABC):
         """(n,), V of the policy whose Q the table is, from rows (n, A) of the table."""
 
     def _values_ahead(self, reached: IntArray) -> FloatArray:
-        """(num_envs,), what the update takes the values of the states reached for, (num_envs,)."""
+        """What the update takes the values (num_envs,) of the states reached for."""
         rows, index = _rows_of(self.q, reached)
         return self.state_values(rows)[index]
 
@@ -261,13 +261,7 @@ def update(
     make k transitions count as one. Targets may be a batch old: J. N. Tsitsiklis, Asynchronous stochastic
     approximation and Q-learning, 1994, allows for outdated values.
 
-    Args:
-        q: (S * A,), float64.
-        visits: (S * A,), int64, updates of each entry, which count these.
-        pairs: (n,), integers, s * A + a of each transition.
-        targets: (n,), float64.
-        rate: α of the first visit.
-        power: see above.
+    `q` and `visits`, which counts updates, are (S * A,); `pairs`, s * A + a, and `targets` y are (n,).
     """
 
     def sizes_at(visit: IntArray) -> FloatArray:

@@ -8,7 +8,6 @@ import pytest
 from helpers.own_class import OWN_CLASS, any_class
 from helpers.support import SHORT, configure, script, train_in
 
-from gridworld.agents import family
 from gridworld.commands.evaluate import main as evaluate
 from gridworld.errors import InputError
 from gridworld.training.train import train
@@ -26,13 +25,6 @@ agent:
   algorithm: my_agents.Mine
   arguments: {caution: 0.7, gamma: 0.9}
 """
-
-
-def test_a_class_that_asks_for_action_masks_gets_them(tmp_path: Path) -> None:
-    words = any_class(
-        "sb3_contrib.MaskablePPO", "+agent.arguments.n_steps=16", "+agent.arguments.batch_size=32"
-    )
-    assert train_in(tmp_path, *words)["timesteps"] == 512
 
 
 A2C = "stable_baselines3.A2C"
@@ -93,17 +85,6 @@ def test_what_cannot_work_is_refused_before_anything_is_written(
         train(configure(*any_class(algorithm, *overrides)), tmp_path, [])
     assert words in str(mistake.value)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_schedule_and_classes_in_the_arguments(tmp_path: Path) -> None:
-    words = any_class(
-        "stable_baselines3.A2C",
-        "+agent.arguments.learning_rate=lin_0.01",
-        "+agent.arguments.policy_kwargs={net_arch: [16], activation_fn: torch.nn.ReLU}",
-    )
-    config = configure(*words)
-    family(config.agent).check(config)
-    assert train_in(tmp_path, *words)["timesteps"] == 500
 
 
 def test_ones_own_class_in_ones_own_yaml(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

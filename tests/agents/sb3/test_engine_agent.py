@@ -135,11 +135,15 @@ def test_what_it_does_not_cover_falls_back_and_says_why(
         [],
         ["agent.policy_kwargs.activation_fn=torch.nn.modules.activation.GELU"],
         ["agent.policy_kwargs.optimizer_class=torch.optim.adamw.AdamW", "agent.policy_kwargs.net_arch=[]"],
+        ["agent.policy=stable_baselines3.POLICY"],
     ],
 )
-@pytest.mark.parametrize("agent", ["dqn", "ppo"])
-def test_what_is_known_is_covered(agent: str, settings: list[str]) -> None:
-    assert type(built(f"agent={agent}", *settings)) is EngineAgent
+@pytest.mark.parametrize(
+    ("agent", "policy"), [("dqn", "dqn.policies.DQNPolicy"), ("ppo", "common.policies.ActorCriticPolicy")]
+)
+def test_what_is_known_is_covered(agent: str, policy: str, settings: list[str]) -> None:
+    words = [each.replace("POLICY", policy) for each in settings]
+    assert type(built(f"agent={agent}", *words)) is EngineAgent
 
 
 @pytest.mark.parametrize("agent", ["a2c", "qrdqn", "trpo"])
@@ -158,11 +162,6 @@ def test_a_class_with_its_arguments_is_covered_as_well(
     assert f"engine: stock, since {reason}" in capsys.readouterr().err
     with pytest.raises(InputError, match=r"agent\.engine=fast: must be tabulated or stock"):
         check(configure(f"agent={agent}", "agent.engine=fast"))
-
-
-def test_a_policy_of_sb3s_by_its_path_is_covered() -> None:
-    for agent, path in (("dqn", "dqn.policies.DQNPolicy"), ("ppo", "common.policies.ActorCriticPolicy")):
-        assert type(built(f"agent={agent}", f"agent.policy=stable_baselines3.{path}")) is EngineAgent
 
 
 @pytest.mark.parametrize("kind", ACTIVATIONS)
