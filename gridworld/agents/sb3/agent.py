@@ -26,7 +26,7 @@ from gridworld.agents.sb3.policy_outputs import explored, read_table, why_no_tab
 from gridworld.agents.sb3.settings.schemas import SB3Config, counts_transitions, reward_scale
 from gridworld.agents.sb3.state import class_without_state
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.bounds import within
+from gridworld.bounds import Bounds
 from gridworld.engine.population import train
 from gridworld.engine.sb3_format import Kind, algorithm_of, make_run, model_file, put_weights
 from gridworld.errors import InputError
@@ -160,7 +160,7 @@ class SB3Agent:
             ) from None
         self._loaded = True
         if rate is not None:
-            within(f"{path}: exploration_rate", rate, 0, 1)
+            Bounds(0, 1).check(f"{path}: exploration_rate", rate)
             self._model.exploration_rate = rate  # type: ignore[attr-defined]
 
 

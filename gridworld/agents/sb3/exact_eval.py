@@ -18,7 +18,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped, sync_envs_normalization
 
 from gridworld.agents.sb3.policy_outputs import CHUNK, explored, read_table, why_no_table, why_unreadable
-from gridworld.bounds import at_least, discount
+from gridworld.bounds import Bounds, discount
 from gridworld.envs.inspection import Task, observation_like, tabulated, task_of
 from gridworld.envs.observations import KINDS, ObservationTable
 from gridworld.errors import InputError, in_short
@@ -251,10 +251,10 @@ class ExactEvalCallback(BaseCallback):
             InputError: an argument out of its bounds, or an environment that is no GridWorld.
         """
         super().__init__(verbose)
-        at_least("every", every, 1)
+        Bounds(1).check("every", every)
         discount("gamma", gamma)
         if stop_after is not None:
-            at_least("stop_after", stop_after, 1)
+            Bounds(1).check("stop_after", stop_after)
         self.evaluator: Evaluator | None = None
         self.best_regret = np.inf
         self.stopped_at: int | None = None

@@ -23,8 +23,7 @@ from gridworld.agents.tabular.td_control import (
     model_bytes,
     read_model,
 )
-from gridworld.config.privileges import privilege
-from gridworld.config.texts import Word
+from gridworld.config.fields import Word, privilege
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State
 from gridworld.world.exact.solver import value_iteration

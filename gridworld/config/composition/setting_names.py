@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gridworld.config.agents import WholeNumbers
-from gridworld.config.alternatives import alternatives
+from gridworld.config.settings import alternatives
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.config.tune import TuneConfig

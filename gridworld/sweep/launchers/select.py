@@ -10,7 +10,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, open_dict, read_write
 
-from gridworld.bounds import at_least
+from gridworld.bounds import Bounds
 from gridworld.errors import InputError, install_command
 
 _HYDRAS = "hydra._internal.core_plugins.basic_launcher.BasicLauncher"
@@ -43,7 +43,7 @@ def make_launcher(context: HydraContext, task: TaskFunction, config: DictConfig)
             raise InputError(f"{choice}: {package} is not installed; {install_command(extra)}")
         for key in _AT_LEAST_ONE:
             if settings.get(key) is not None:
-                at_least(f"hydra.launcher.{key}", settings[key], 1)
+                Bounds(1).check(f"hydra.launcher.{key}", settings[key])
         missing = [name for name in _COMMANDS.get(settings._target_, ()) if shutil.which(name) is None]
         if missing:
             raise InputError(
