@@ -32,19 +32,12 @@ WriteScalars = Callable[[Mapping[str, float], int], None]  # ({tag: value}, envi
 
 @dataclass(frozen=True, eq=False)
 class PolicySnapshot:
-    """What an agent has learnt about every state at one moment: all that evaluation and pictures need.
+    """What an agent has learnt about every state at one moment: all that evaluation and pictures need."""
 
-    Attributes:
-        greedy: (S,), integers, the action of the greedy policy.
-        sampled: (S, A), float64, the action probabilities of the policy that it explores with.
-        values: (S,), float64, its estimate of V.
-        q: (S, A), float64, its estimate of Q; None where it has none.
-    """
-
-    greedy: IntArray
-    sampled: FloatArray
-    values: FloatArray
-    q: FloatArray | None = None
+    greedy: IntArray  # (S,), the action of the greedy policy
+    sampled: FloatArray  # (S, A), float64, the action probabilities of the policy that it explores with
+    values: FloatArray  # (S,), float64, its estimate of V
+    q: FloatArray | None = None  # (S, A), float64, its estimate of Q; None where it has none
 
     def greedy_policy(self) -> FloatArray:
         """The greedy policy's action probabilities, (S, A)."""
@@ -56,29 +49,17 @@ class PolicySnapshot:
 
 @dataclass(frozen=True, eq=False)
 class TrainingContext:
-    """What an agent learns on.
+    """What an agent learns on."""
 
-    Attributes:
-        envs: its environments, which reset in the same step.
-        observation: what it sees of a state.
-        seed: of its own random numbers and of the environments'.
-        device: torch's name of a device, or `auto`.
-        threads: of its numerical library.
-        write_scalars: takes the agent's own training metrics; None: they are not wanted.
-        callbacks: the configured callbacks, as plain values (`config.train.TrainConfig`).
-        features: what the observation adds to an `MlpPolicy`'s settings (`config.train.ObservationConfig`).
-        only_asked: it will not learn, and needs no memory for transitions.
-    """
-
-    envs: StatisticsVectorEnv
-    observation: ObservationTable
-    seed: int
-    device: str
-    threads: int = 1
-    write_scalars: WriteScalars | None = None
-    callbacks: Sequence[Any] = ()
-    features: Mapping[str, Any] = field(default_factory=dict)
-    only_asked: bool = False
+    envs: StatisticsVectorEnv  # which reset in the same step
+    observation: ObservationTable  # what it sees of a state
+    seed: int  # of its own random numbers and of the environments'
+    device: str  # torch's name of a device, or `auto`
+    threads: int = 1  # of its numerical library
+    write_scalars: WriteScalars | None = None  # takes its training metrics; None: they are not wanted
+    callbacks: Sequence[Any] = ()  # the configured ones, as plain values (`config.train.TrainConfig`)
+    features: Mapping[str, Any] = field(default_factory=dict)  # an observation's, of an `MlpPolicy`
+    only_asked: bool = False  # it will not learn, and needs no memory for transitions
 
 
 class Agent(Protocol):

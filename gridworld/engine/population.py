@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from gridworld.engine.environments import Environments
-from gridworld.engine.networks import Array, DenseNetworks, ModuleNetworks, Networks
+from gridworld.engine.networks import DenseNetworks, ModuleNetworks, Networks
 from gridworld.engine.optimizer import Optimizer
 from gridworld.engine.run import Run
 from gridworld.process.console.terminal import tell
@@ -154,15 +154,10 @@ class Population:
                 run.diverge("the network's weights are no finite number")
         return self.remaining()
 
-    def check_losses(self, losses: Array) -> None:
-        """End the runs whose loss (P,) is no finite number."""
-        for run in self.going(~np.isfinite(losses)):
-            run.diverge("a loss is no finite number")
-
-    def check_gradients(self, finite: BoolArray) -> None:
-        """End the runs whose gradients were no finite numbers."""
+    def check(self, finite: BoolArray, what: str) -> None:
+        """End the runs (P,) that had a number that is not finite."""
         for run in self.going(~finite):
-            run.diverge("the gradient is no finite number")
+            run.diverge(f"{what} is no finite number")
 
     def get_state(self, run: Run) -> State:
         """All that a run's next steps depend on."""

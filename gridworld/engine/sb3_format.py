@@ -229,10 +229,7 @@ class Inputs:
 
 
 def _is_one_hot(observation: ObservationTable) -> bool:
-    """Whether what a policy sees of a state is the unit vector of its number, as SB3 makes one of a number.
-
-    Of a world in which states look alike it is that of another number.
-    """
+    """Whether a policy sees the unit vector of a state's number; where states look alike, it is another's."""
     if observation.kind not in ("one_hot", "none") or observation.stored is None:
         return observation.kind in ("one_hot", "none")
     numbers = np.arange(observation.num_states)

@@ -93,7 +93,7 @@ class TRPO(OnPolicy):
             run.record("train/value_loss", float(value_loss[run.row]))
             run.record("train/kl_divergence_loss", float(divergence[run.row]))
             run.record("train/is_line_search_success", float(is_improved[run.row]))
-        self.check_losses(value_loss)
+        self.check(np.isfinite(value_loss), "a loss")
 
     def _longest_steps(self, start: Array, old: Array, sums: Sums) -> Tensor:
         """(P, W), along the natural gradients to the borders of the trust regions, to second order."""
@@ -168,8 +168,7 @@ class TRPO(OnPolicy):
                 pull = sums.states * error
                 losses.append((pull * error).sum(axis=-1) + sums.deviation)
                 self.critic.backward(2 * pull[..., None])
-                finite = self.optimizer.step(learning_rates, self.active)
-                self.check_gradients(finite)
+                self.check(self.optimizer.step(learning_rates, self.active), "the gradient")
         return np.asarray(np.stack(losses, axis=1).mean(axis=1))
 
 

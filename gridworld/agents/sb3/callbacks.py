@@ -30,15 +30,9 @@ from gridworld.storage.serialization import State, fitting
 
 
 class RunCallback(BaseCallback):
-    """Calls `on_step` after every step and `on_safe_point` at rollouts' starts, and other callbacks.
+    """Calls `on_step` after every step and `on_safe_point` at rollouts' starts, as `Agent.learn` has them.
 
-    Args:
-        on_step: takes the steps so far; training ends when it returns 0.
-        on_safe_point: takes the steps so far; None: nothing is to be saved.
-        state: of `get_state`, to continue from; None: from the start.
-        log_interval: as SB3's `learn` takes it.
-        others: callbacks of the user's.
-        falling: settings that fall, which are set before `others` are called.
+    Settings that are `falling` are set before `others` are called, the user's callbacks.
     """
 
     def __init__(
@@ -88,17 +82,14 @@ class RunCallback(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         check_finite(self.model)
-        if self._on_safe_point is not None and self._is_aligned():
+        rollouts = 0
+        if isinstance(self.model, OnPolicyAlgorithm):
+            rollouts = self.model.num_timesteps // (self.model.n_steps * self.model.n_envs)
+        # SB3 counts rollouts from its `learn` on: only here would it log again as it does from the start.
+        if self._on_safe_point is not None and rollouts % self._log_interval == 0:
             self._on_safe_point(self.model.num_timesteps)
         for other in (*self._schedules, *self._others):
             other.on_rollout_start()
-
-    def _is_aligned(self) -> bool:
-        """Whether SB3, which counts rollouts in a local variable, would log as it does from the start."""
-        if not isinstance(self.model, OnPolicyAlgorithm):
-            return True
-        rollouts = self.model.num_timesteps // (self.model.n_steps * self.model.n_envs)
-        return rollouts % self._log_interval == 0
 
     def _on_rollout_end(self) -> None:
         for other in (*self._schedules, *self._others):
