@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.support import DEEP, SHORT, configure, train_in
+from helpers.support import SHORT, configure
 from sb3_contrib import QRDQN, TRPO
 from stable_baselines3 import A2C, DQN, PPO
 
@@ -52,16 +52,6 @@ def test_the_model_is_sb3s_own_and_learns_on(agent: str, tmp_path: Path) -> None
         before = each.num_timesteps
         each.learn(100, reset_num_timesteps=False)
         assert each.num_timesteps >= before + 100
-
-
-@pytest.mark.parametrize("agent", [*DEEP, "a2c", "qrdqn", "trpo"])
-def test_both_engines_train_and_leave_the_same_kind_of_run(agent: str, tmp_path: Path) -> None:
-    runs = [
-        train_in(tmp_path / engine, *SHORT[agent], f"agent.engine={engine}")
-        for engine in ("stock", "tabulated")
-    ]
-    assert runs[0].keys() == runs[1].keys()
-    assert runs[0]["timesteps"] == runs[1]["timesteps"]
 
 
 OWN_MODULES = """
