@@ -39,13 +39,9 @@ The version: {console} --version
 
 Examples:
   {console} train agent=dqn
-      one run; its folder in runs/ has the model, the curve, the pictures and a summary
   {console} evaluate runs/...
-      its scores, exact and sampled
   {console} train -m agent=dqn,ppo "seed=range(20)" hydra.sweep.dir=runs/mine
-      a sweep of forty runs, a folder each
   {console} report runs/mine
-      the sweep as a page
 """
 
 
@@ -65,22 +61,17 @@ def main() -> None:
 
 def _without_command(words: Sequence[str]) -> None:
     """Print the manual or the version."""
-    match words[0] if words else "--help":
-        case "--help" | "-h" | "help":
-            commands = "\n".join(f"  {name:<11}{about}" for name, about in COMMANDS.items())
-            print(_MANUAL.format(console=CONSOLE, commands=commands).rstrip())
-        case "--version":
-            from gridworld import __version__
+    word = words[0] if words else "--help"
+    if word in ("--help", "-h", "help"):
+        commands = "\n".join(f"  {name:<11}{about}" for name, about in COMMANDS.items())
+        print(_MANUAL.format(console=CONSOLE, commands=commands).rstrip())
+    elif word == "--version":
+        from gridworld import __version__
 
-            print(f"{CONSOLE} {__version__}")
-        case unknown:
-            raise InputError(f"{CONSOLE}: there is no command {unknown}{_meant(unknown)}")
-
-
-def _meant(unknown: str) -> str:
-    close = difflib.get_close_matches(unknown.removesuffix(".py"), COMMANDS, n=1)
-    if close:
-        return f"; did you mean {CONSOLE} {close[0]}?"
-    if "=" in unknown:
-        return f"; settings stand after a command: {CONSOLE} train {unknown}"
-    return f"; it is one of {', '.join(COMMANDS)}"
+        print(f"{CONSOLE} {__version__}")
+    else:
+        close = difflib.get_close_matches(word.removesuffix(".py"), COMMANDS, n=1)
+        advice = f"did you mean {CONSOLE} {close[0]}?" if close else f"it is one of {', '.join(COMMANDS)}"
+        if not close and "=" in word:
+            advice = f"settings stand after a command: {CONSOLE} train {word}"
+        raise InputError(f"{CONSOLE}: there is no command {word}; {advice}")

@@ -15,18 +15,11 @@ from gridworld.config.composition.compose import without_hydra
 from gridworld.errors import InputError
 from gridworld.run.claim import check_free, check_inside, claimed
 from gridworld.run.folder import MANIFEST
-from gridworld.storage.symlinks import check_no_links
+from gridworld.storage.atomic_write import check_no_links
 
 
 def run_folder(config: DictConfig) -> AbstractContextManager[None]:
-    """Check the folder of a single run.
-
-    Args:
-        config: The whole composition, Hydra's part included.
-
-    Returns:
-        The block in which this process holds the folder, see `claimed`.
-    """
+    """Check the folder of a single run, and return the block in which this process holds it."""
     folder = Path(config.hydra.run.dir)
     check_inside(folder, "hydra.run.dir")
     _check_names(config)
@@ -42,7 +35,7 @@ def check_settings_of(config: DictConfig) -> None:
     if not (folder / MANIFEST).exists():
         return
     from gridworld.restore.resume import unfinished_of  # here, since it takes a second to import
-    from gridworld.run.recovery import is_started
+    from gridworld.run.reader import is_started
 
     # An interpolation may need what Hydra knows only in the job, where the settings are compared again.
     with contextlib.suppress(OmegaConfBaseException):
@@ -51,7 +44,7 @@ def check_settings_of(config: DictConfig) -> None:
 
 
 def check_sweep_folder(config: DictConfig) -> None:
-    """Check the folder of a sweep, as far as it can be done without its jobs; as `run_folder`."""
+    """Check the folder of a sweep, as far as it can be done without its jobs."""
     check_inside(Path(config.hydra.sweep.dir), "hydra.sweep.dir")
     _check_names(config)
 

@@ -32,7 +32,7 @@ from gridworld.errors import EXIT_CODE, FolderLostError, InputError
 from gridworld.process.console.command_line import called_from
 from gridworld.process.console.terminal import prepare, printable, printing, result_is_in_files, tell_error
 from gridworld.process.early_signals import AtWork
-from gridworld.process.garbage import collect_less_often
+from gridworld.process.memory_budget import collect_less_often
 from gridworld.run.claim import claimed
 from gridworld.run.folder import SWEEP_JSON, shown
 from gridworld.storage.file_lock import check_ours
@@ -194,12 +194,22 @@ def _stop_if_lost(folder: Path) -> None:
 
 def _run_alone(config: TrainConfig, folder: Path, overrides: list[str]) -> float:
     """Train, or resume the run, in a folder that this process holds; returns the final regret."""
-    from gridworld.restore.advice import advice
-    from gridworld.restore.resume import train_or_resume
-    from gridworld.run.summary import train_and_tell
+    from gridworld.run.reader import is_started
+    from gridworld.run.summary import Summary, train_and_tell
+    from gridworld.training.train import train
 
-    summary = train_and_tell(folder, lambda: train_or_resume(config, folder, overrides), advice)
-    return float(summary["regret"])
+    run: Callable[[], Summary] = partial(train, config, folder, overrides)
+    if is_started(folder):
+        from gridworld.restore.resume import unfinished_of
+
+        run = unfinished_of(folder, config).resume
+    return float(train_and_tell(folder, run, _advice)["regret"])
+
+
+def _advice(folder: Path) -> list[str]:
+    from gridworld.restore.advice import advice  # here, since most runs are certified
+
+    return advice(folder)
 
 
 def _tell(error: Exception) -> int:

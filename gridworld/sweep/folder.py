@@ -24,14 +24,12 @@ from gridworld.process.console.command_line import recorded_command_line
 from gridworld.process.console.terminal import printable
 from gridworld.run.claim import check_writable
 from gridworld.run.folder import HYDRA, LOCK, MANIFEST, SWEEP_JSON
-from gridworld.run.identity.fingerprint import settings_hash
-from gridworld.run.identity.provenance import versions
-from gridworld.run.recovery import find_run, is_started
-from gridworld.storage.atomic_write import make_folder, tidy, write_json
+from gridworld.run.provenance import settings_hash, versions
+from gridworld.run.reader import find_run, is_started
+from gridworld.storage.atomic_write import check_no_links, make_folder, tidy, write_json
 from gridworld.storage.file_lock import locked
 from gridworld.storage.safe_read import LARGEST_JSON, read_bytes
 from gridworld.storage.sealed_json import read_sealed, sealed
-from gridworld.storage.symlinks import check_no_links, links_in
 from gridworld.sweep.plan import Job, folder_name
 
 STOP = ".stop"  # in the sweep's folder: no more jobs begin, wherever they wait
@@ -113,7 +111,7 @@ class SweepFolder:
         """
         taken = {entry.job.lower() for entry in self.entries.values()}
         taken |= {folder.name.lower() for folder in self._runs()}  # also those of no job
-        taken |= {name.lower() for name in links_in(self.path)}
+        taken |= {path.name.lower() for path in self.path.iterdir() if path.is_symlink()}
         lines = [e.overrides for e in self.entries.values()] + [job.overrides for job in jobs]
         common = set(lines[0]).intersection(*lines)
         for job in jobs:

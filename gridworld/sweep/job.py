@@ -13,10 +13,9 @@ from pathlib import Path
 from gridworld.config.train import TrainConfig
 from gridworld.errors import FolderLostError, InputError, MachineError, reason
 from gridworld.process.signals import Interrupted
-from gridworld.restore.resume import training_or_resumption
+from gridworld.restore.resume import unfinished_of
 from gridworld.run.folder import ERROR_FILE, LOCK, MANIFEST
-from gridworld.run.reader import read_run
-from gridworld.run.recovery import find_run
+from gridworld.run.reader import find_run, is_started, read_run
 from gridworld.run.writer import clear, record_failure
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.file_lock import locked
@@ -32,6 +31,7 @@ from gridworld.sweep.job_table import (
     run_status,
 )
 from gridworld.training.together import Training
+from gridworld.training.train import training
 
 _TO_GO_ON_WITH = ("running", "interrupted")  # statuses of runs that were stopped from outside
 
@@ -107,7 +107,10 @@ def _run(config: TrainConfig, folder: Path, overrides: list[str], table: JobTabl
     # The sweep has a progress line of its own.
     config = replace(config, logging=replace(config.logging, progress=False))
     try:
-        summary = yield from training_or_resumption(config, folder, overrides)
+        if is_started(folder):
+            summary = yield from unfinished_of(folder, config).resumption()
+        else:
+            summary = yield from training(config, folder, overrides)
     except Interrupted as interruption:
         table.set(job, status=INTERRUPTED, **outcome(read_run(folder)))
         sys.exit(interruption.exit_code)

@@ -17,7 +17,7 @@ from gridworld.commands.console import COMMANDS
 from gridworld.config.composition.conf_folder import conf_folder
 from gridworld.errors import DISTRIBUTION
 from gridworld.process.console import command_line
-from gridworld.run.identity.provenance import code
+from gridworld.run.provenance import code
 
 TEXTS = (".py", ".md", ".yaml", ".toml", ".cff", ".j2")
 
@@ -40,7 +40,8 @@ def test_help_has_a_line_for_each_command(words: list[str], tmp_path: Path) -> N
         assert re.search(rf"^  {name} +{re.escape(about)}$", done.stdout, re.MULTILINE)
 
 
-def test_version(tmp_path: Path) -> None:
+def test_version_and_checkout(tmp_path: Path) -> None:
+    assert conf_folder() == CONF
     assert gridworld("--version", cwd=tmp_path).stdout == f"gridworld {__version__}\n"
 
 
@@ -164,7 +165,7 @@ def test_it_trains_from_the_wheel(wheel: Path, tmp_path: Path) -> None:
 
     where = "from gridworld.config.composition.conf_folder import conf_folder as f; print(f())"
     assert run(sys.executable, "-c", where).strip() == str(site / "gridworld" / "conf")
-    same = "from gridworld.run.identity.provenance import code; print(code())"
+    same = "from gridworld.run.provenance import code; print(code())"
     assert run(sys.executable, "-c", same).strip() == code()  # a run may go on in a checkout
     command = str(site / "bin" / "gridworld")
     run(command, "train", *SHORT["q_learning"], "hydra.run.dir=run")
@@ -175,7 +176,3 @@ def test_it_trains_from_the_wheel(wheel: Path, tmp_path: Path) -> None:
         *("hydra.sweep.dir=sweep", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),
     )
     assert "sweep sweep: 2 jobs: 2 done" in told
-
-
-def test_the_checkout_has_its_own_conf() -> None:
-    assert conf_folder() == CONF

@@ -19,7 +19,7 @@ from types import FrameType
 from typing import Any, NoReturn
 
 from gridworld.process.parallel.parent_watch import end_with
-from gridworld.process.signals import blocking, handling, obey_relay, relay
+from gridworld.process.signals import blocking, exiting, handling
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -111,10 +111,7 @@ class _Crew:
         """Handle a signal: the first stops the forks in their time, the second soon, a third at once."""
         self.received.append(number)
         for fork in self._forks:
-            if len(self.received) > 2:
-                os.kill(fork.process, signal.SIGKILL)
-            else:
-                relay(number, len(self.received), fork.process)
+            os.kill(fork.process, signal.SIGKILL if len(self.received) > 2 else number)
 
     def kill(self) -> None:
         """End what is left, where waiting for it has failed."""
@@ -148,9 +145,10 @@ class _Crew:
                     fork.connection.close()
                 ours.close()
                 end_with(parent)
-                obey_relay()
+                os.setpgrp()  # a terminal's Ctrl-C reaches the parent, which passes it on once
         if process == 0:
-            self._work(others)
+            with exiting(*_SIGNALS):
+                self._work(others)
         others.close()
         return _Fork(process, ours)
 

@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 
-from gridworld.process.signals import ignore, send_sigterm
+from gridworld.process.signals import send_sigterm
 
 _SECONDS_BETWEEN_CHECKS = 0.2
 _GRACE_SECONDS = 3.0  # to close the files
@@ -23,7 +23,7 @@ def end_with(parent: int) -> None:
     Args:
         parent: its process id.
     """
-    ignore(signal.SIGINT)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:
         while os.getppid() == parent:

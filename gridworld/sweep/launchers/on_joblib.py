@@ -15,7 +15,6 @@ from hydra.core.utils import JobReturn
 from joblib import Parallel, delayed
 
 from gridworld.process.parallel.parent_watch import end_with, parent_died
-from gridworld.storage.file_lock import Held, held, work_for
 from gridworld.sweep.launchers.worker import JobRunner, unpack
 
 _end_with = functools.cache(end_with)  # once for each worker process
@@ -42,16 +41,15 @@ def launch(
     state, parent = runner.packed(), os.getpid()
     return list(
         Parallel(n_jobs=settings["n_jobs"], backend="loky", batch_size=1)(
-            delayed(_run)(state, parent, held(), list(overrides), number)
+            delayed(_run)(state, parent, list(overrides), number)
             for number, overrides in enumerate(jobs, first)
         )
     )
 
 
-def _run(state: bytes, parent: int, holder: Held, overrides: list[str], number: int) -> JobReturn:
+def _run(state: bytes, parent: int, overrides: list[str], number: int) -> JobReturn:
     if parent != os.getpid():  # the same where there is one worker only
         _end_with(parent)
-        work_for(holder)
     try:
         return unpack(state).run(overrides, number)
     except SystemExit:

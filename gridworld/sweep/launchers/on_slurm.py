@@ -26,8 +26,7 @@ from omegaconf import OmegaConf
 from gridworld.config.sweep import SlurmConfig
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import printable
-from gridworld.storage.atomic_write import replacing
-from gridworld.storage.symlinks import make_inside, remove_inside
+from gridworld.storage.atomic_write import make_inside, remove_inside, replacing
 from gridworld.sweep.folder import STOP
 from gridworld.sweep.job import StopSweep
 from gridworld.sweep.launchers.worker import JobRunner, run_in_turn
