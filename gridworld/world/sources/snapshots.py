@@ -18,7 +18,7 @@ import sys
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 from enum import Enum
-from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
+from types import BuiltinFunctionType, CodeType, FunctionType, GeneratorType, MethodType, ModuleType
 from typing import Any
 
 import gymnasium as gym
@@ -213,6 +213,9 @@ class Reader:
             return label, (value.tolist(),) if objects else ()
         if isinstance(value, FunctionType):
             return value.__qualname__, () if _is_library(value) else list(_of_function(value))
+        if isinstance(value, GeneratorType):
+            frame = value.gi_frame
+            return name, () if frame is None else (frame.f_lasti, dict(frame.f_locals))
         if isinstance(value, ModuleType):
             return value.__name__, () if _is_library(value) else list(_of_module(value))
         if isinstance(value, type):
@@ -291,5 +294,5 @@ def _globals_of(code: CodeType) -> set[str]:
 def _of_module(module: ModuleType) -> Iterator[Any]:
     """Its data: what it imports and defines may be anything."""
     for value in list(vars(module).values()):
-        if isinstance(value, int | float | str | list | dict | set | np.ndarray | GENERATORS):
+        if isinstance(value, (int, float, str, list, dict, set, np.ndarray, *GENERATORS)):
             yield value if not isinstance(value, dict) or "__name__" not in value else None
