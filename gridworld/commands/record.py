@@ -93,14 +93,9 @@ def _record(options: argparse.Namespace) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("record", __doc__, "run", "--policy", "--best", "--trust")
     option = parser.add_argument
-    option(
-        "--format",
-        nargs="+",
-        choices=(*files.FORMATS, *MAPS),
-        default=["png", "gif"],
-        help=f"one or more of {' '.join(files.FORMATS)} for episodes, {' '.join(MAPS)} for maps "
-        "(default png gif; mp4 needs the extra `video`)",
-    )
+    kinds = f"any of {' '.join(files.FORMATS)} for episodes, {' '.join(MAPS)} for maps"
+    kinds += " (default png gif; mp4 needs the extra `video`)"
+    option("--format", nargs="+", choices=(*files.FORMATS, *MAPS), default=["png", "gif"], help=kinds)
     option("--cell-size", type=whole(2), help="pixels (default 100, 80 in maps, less on large worlds)")
     option("--fps", type=whole(1, 100), default=4, help="frames a second, 1 to 100 (default 4)")
     option("--episodes", type=whole(1, 1000), default=1, help="one after the other (default 1)")

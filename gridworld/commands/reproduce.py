@@ -100,9 +100,8 @@ def _in_folder(keep: Path | None, same_in: Callable[[Path], bool | None]) -> boo
 
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("reproduce", __doc__, "run", "--trust")
-    parser.add_argument(
-        "--keep", type=Path, metavar="FOLDER", help="write the new run there, with its pictures, and keep it"
-    )
+    kept = "write the new run there, with its pictures, and keep it"
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help=kept)
     return parser
 
 

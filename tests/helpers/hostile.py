@@ -599,7 +599,7 @@ def sixteen_layers_of_4096(run: Path, base: Path) -> None:
     manifest(run, lambda c: c["config"]["agent"]["policy_kwargs"].update(net_arch=[4096] * 16))
 
 
-@hostile("its network, asked about every state: would take about", "qrdqn", 1000)
+@hostile("its network: would take about", "qrdqn", 1000)
 def many_quantiles_of_every_state(run: Path, base: Path) -> None:
     agent_has(run, arguments={"policy_kwargs": {"n_quantiles": 20_000}})
     manifest(run, lambda c: c.update(layout=["S" + "." * 62 + "G"] * 64))

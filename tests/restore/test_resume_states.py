@@ -24,36 +24,6 @@ from gridworld.storage.serialization import State, StateError, decode, encode
 CORRUPTIONS = int(os.environ.get("GRIDWORLD_CORRUPTIONS", "200"))
 LESS = [*("recording.frames=false", "recording.gif=false", "env.slip=0.1", "logging.policy_map_every=0")]
 
-SAMPLE: dict[str, Any] = {
-    "number": 3,
-    "real": -0.1,
-    "infinite": float("inf"),
-    "none": None,
-    "truth": True,
-    "text": "a\u00e9",
-    "list": [1, [2.5, {"deep": np.arange(6, dtype=np.uint8).reshape(2, 3)}]],
-    "empty": np.empty((0, 3), dtype=np.float32),
-    "zeros": np.zeros(100_000),
-    "mostly zeros": np.eye(300, dtype=np.float32)[:200],
-    "scalar": np.array(2.5),
-    "truths": np.array([True, False]),
-}
-
-
-@pytest.mark.parametrize("compress", [False, True])
-def test_a_state_comes_back_to_the_bit(compress: bool) -> None:
-    data = encode(SAMPLE, compress)
-    assert differences(decode(data), SAMPLE) == []
-    assert not compress or len(data) < 350_000  # zeros take no room
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"a": object()}, {1: 2}, {"@": 1}, {"a": (1, 2)}, {"a": np.array(["x"])}, {"a": {1, 2}}]
-)
-def test_what_is_no_state_is_not_written(wrong: Any) -> None:
-    with pytest.raises(TypeError):
-        encode(wrong)
-
 
 def damaged(data: bytes, count: int) -> Iterator[bytes]:
     """Bits flipped, bytes cut off, put in, doubled, swapped: anywhere."""

@@ -39,14 +39,9 @@ _KINDS: dict[str, type] = {
 def algorithm_and_arguments(
     config: SB3Config, features: Mapping[str, Any] = MappingProxyType({})
 ) -> tuple[type[BaseAlgorithm], Arguments]:
-    """Translate settings to a class of SB3's kind and its keyword arguments.
+    """A class of SB3's kind, and its keyword arguments but for environments, seed and device.
 
-    Args:
-        config: the agent's settings.
-        features: what the observation adds to the settings of an `MlpPolicy`.
-
-    Returns:
-        The class; its arguments but for the environments, the seed and the device.
+    `features` is what the observation adds to the settings of an `MlpPolicy`.
     """
     if isinstance(config, SB3ClassConfig):
         algorithm = algorithm_class("agent.algorithm", config.algorithm)

@@ -8,8 +8,8 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from benchmarks.measure import Comparison, Workload
 
-from gridworld.benchmark.measure import Comparison, Workload
 from gridworld.envs.env import GridWorldEnv
 from gridworld.envs.observations import VectorOneHotObservation
 from gridworld.envs.vector_env import GridWorldVectorEnv

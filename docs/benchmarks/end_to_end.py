@@ -10,8 +10,9 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 
-from gridworld.benchmark import peers
-from gridworld.benchmark.measure import Comparison, Workload
+from benchmarks import peers
+from benchmarks.measure import Comparison, Workload
+
 from gridworld.errors import InputError
 
 _STEPS = 20_000  # of environment, beside RL Zoo

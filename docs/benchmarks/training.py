@@ -10,14 +10,14 @@ from typing import Any
 
 import gymnasium as gym
 import torch
+from benchmarks import peers
+from benchmarks.measure import Comparison, Workload
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env as dummy_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
 from gridworld.agents import Learning, family, learn_together
-from gridworld.benchmark import peers
-from gridworld.benchmark.measure import Comparison, Workload
 from gridworld.envs.observations import OneHotObservation, make_observation
 from gridworld.training.setup import make_context
 from gridworld.world.mdp import Mdp

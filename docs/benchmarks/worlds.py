@@ -9,12 +9,12 @@ from typing import Any
 
 import gymnasium as gym
 import torch
+from benchmarks.measure import Comparison, Workload
+from benchmarks.training import DQN_BATCH, PPO_LARGE, STOCK, learner, sb3_learner
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env as dummy_vec_env
 
-from gridworld.benchmark.measure import Comparison, Workload
-from gridworld.benchmark.training import DQN_BATCH, PPO_LARGE, STOCK, learner, sb3_learner
 from gridworld.config.worlds import GymnasiumConfig
 
 WORLDS = ("FrozenLake-v1", "CliffWalking-v1", "Taxi-v4")

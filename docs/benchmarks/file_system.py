@@ -16,7 +16,8 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-from gridworld.benchmark.measure import Comparison, Workload
+from benchmarks.measure import Comparison, Workload
+
 from gridworld.config.pictures import PICTURES
 
 _RUN = ("agent=dqn", "total_timesteps=2000", "evaluation.every=500", "logging.progress=false")

@@ -8,11 +8,10 @@ from collections.abc import Iterator
 from functools import partial
 
 import torch
-
-from gridworld.benchmark import peers
-from gridworld.benchmark.end_to_end import run, train
-from gridworld.benchmark.measure import Comparison, Workload
-from gridworld.benchmark.training import PPO_LARGE, steps_per_second
+from benchmarks import peers
+from benchmarks.end_to_end import run, train
+from benchmarks.measure import Comparison, Workload
+from benchmarks.training import PPO_LARGE, steps_per_second
 
 _LARGE_ENVS, _LARGE_ROLLOUTS = 1024, 16
 

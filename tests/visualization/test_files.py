@@ -14,9 +14,8 @@ from PIL import Image
 from gridworld.envs.rendering import draw_frame, pack
 from gridworld.errors import InputError, failure
 from gridworld.storage.atomic_write import replacing, replacing_folder, write_array, write_json
-from gridworld.visualization import files as record
+from gridworld.visualization import files
 from gridworld.visualization.animation import animation_of_frames, animation_of_states, automatic_cell_size
-from gridworld.visualization.files import encode_png
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
 
@@ -24,18 +23,18 @@ CLASSIC = compile_mdp(load("classic"))
 WALK = np.array([0, 1, 1, 2, 3, 4, 5, 11, 17, 16])
 
 
-def frames_of(image: Image.Image) -> list[tuple[np.ndarray, float]]:
-    shown = []
+def frames_of(content: bytes) -> list[tuple[np.ndarray, float]]:
+    image, shown = Image.open(io.BytesIO(content)), []
     for index in range(image.n_frames):
         image.seek(index)
         shown.append((np.array(image.convert("RGB")), float(image.info["duration"])))
     return shown
 
 
-@pytest.mark.parametrize("encode", [record.encode_gif, record.encode_apng])
+@pytest.mark.parametrize("encode", [files.encode_gif, files.encode_apng])
 @pytest.mark.parametrize("fps", [1, 4, 25])
 def test_animations_are_exact_and_last_as_long_as_they_should(encode, fps: int) -> None:
-    shown = frames_of(Image.open(io.BytesIO(encode(animation_of_states(CLASSIC, WALK, cell_size=20), fps))))
+    shown = frames_of(encode(animation_of_states(CLASSIC, WALK, cell_size=20), fps))
     distinct = [state for state, before in zip(WALK, [None, *WALK], strict=False) if state != before]
     assert len(shown) == len(distinct)  # a repeated frame is shown for longer
     for (got, _), state in zip(shown, distinct, strict=True):
@@ -52,33 +51,27 @@ def test_a_gif_holds_any_film_exactly() -> None:
     for _ in range(12):
         frame = frames[-1].copy()
         top, left = chance.integers(23), chance.integers(31)
-        frame[top : top + chance.integers(5), left : left + chance.integers(9)] = palette[
-            chance.integers(200)
-        ]
+        box = slice(top, top + chance.integers(5)), slice(left, left + chance.integers(9))
+        frame[box] = palette[chance.integers(200)]
         frames.append(frame)
-    gif = record.encode_gif(animation_of_frames(frames, [frames[0][0, 0], (0, 0, 0)]), 20)
-    assert record.encode_gif(animation_of_frames(map(pack, frames), [frames[0][0, 0], (0, 0, 0)]), 20) == gif
-    shown = frames_of(Image.open(io.BytesIO(gif)))
+    gif = files.encode_gif(animation_of_frames(frames, [frames[0][0, 0], (0, 0, 0)]), 20)
+    assert files.encode_gif(animation_of_frames(map(pack, frames), [frames[0][0, 0], (0, 0, 0)]), 20) == gif
+    shown = frames_of(gif)
     assert len(shown) == len(frames)
     assert all(np.array_equal(got, frame) for (got, _), frame in zip(shown, frames, strict=True))
     assert sum(duration for _, duration in shown) == (len(frames) + 4) * 50
-
     still = animation_of_states(CLASSIC, np.zeros(1500, dtype=int), cell_size=4)
-    lasting = Image.open(io.BytesIO(record.encode_gif(still, 1)))
-    assert sum(duration for _, duration in frames_of(lasting)) == 1504 * 1000
-
-
-def test_a_film_has_one_palette() -> None:
-    noise = np.random.default_rng(0).integers(256, size=(40, 40, 3), dtype=np.uint8)
+    assert sum(duration for _, duration in frames_of(files.encode_gif(still, 1))) == 1504 * 1000
+    noise = chance.integers(256, size=(40, 40, 3), dtype=np.uint8)
     with pytest.raises(InputError, match="more than 256 colours"):
         animation_of_frames([noise])
 
 
 def test_png_is_exact() -> None:
     noise = np.random.default_rng(0).integers(256, size=(13, 17, 3), dtype=np.uint8)
-    half = np.concatenate([np.zeros_like(noise), noise, np.tile(noise[-1:], (9, 1, 1))])  # with empty rows
-    for frame in (noise, draw_frame(CLASSIC, 0, 20), half, half[:20], noise[:1, :1]):
-        image = Image.open(io.BytesIO(encode_png(frame)))
+    half = np.concatenate([np.zeros_like(noise), noise, np.tile(noise[-1:], (9, 1, 1))])
+    for frame in (noise, draw_frame(CLASSIC, 0, 20), half, noise[:1, :1]):
+        image = Image.open(io.BytesIO(files.encode_png(frame)))
         image.load()  # checks the sums
         assert image.mode == "RGB"
         assert np.array_equal(np.array(image), frame)
@@ -86,29 +79,33 @@ def test_png_is_exact() -> None:
 
 def test_pngs_are_numbered_exact_and_replace_what_was_there(tmp_path: Path) -> None:
     folder = tmp_path / "frames"
-    record.save_pngs(animation_of_states(CLASSIC, WALK, 20), folder)
-    record.save_pngs(animation_of_states(CLASSIC, WALK[:3], 20), folder)
+    files.save_pngs(animation_of_states(CLASSIC, WALK, 20), folder)
+    files.save_pngs(animation_of_states(CLASSIC, WALK[:3], 20), folder)
     assert sorted(path.name for path in folder.iterdir()) == ["0000.png", "0001.png", "0002.png"]
     assert [path.name for path in tmp_path.iterdir()] == ["frames"]
     for path, state in zip(sorted(folder.iterdir()), WALK[:3], strict=True):
         assert np.array_equal(np.array(Image.open(path).convert("RGB")), draw_frame(CLASSIC, int(state), 20))
 
 
-def test_films_that_memory_or_a_player_could_not_hold_are_refused() -> None:
+def test_films_that_memory_or_a_player_could_not_hold_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     large = animation_of_states(CLASSIC, WALK, 500)
-    record.check_size(large, ["png", "gif", "apng"])
+    files.check_size(large, ["png", "gif", "apng"])
     with pytest.raises(InputError, match="mp4: 4000 x 3500 pixels are too many for a video"):
-        record.check_size(large, ["mp4"])
+        files.check_size(large, ["mp4"])
     long = animation_of_states(CLASSIC, np.tile(WALK, 5), 500)
     with pytest.raises(InputError, match="apng: 50 pictures of 4000 x 3500 pixels are too many"):
-        record.check_size(long, ["apng"])
+        files.check_size(long, ["apng"])
+    assert automatic_cell_size(CLASSIC) == 100
+    assert automatic_cell_size(compile_mdp(parse("S" + "." * 98 + "G", "wide"))) == 9
+    monkeypatch.setattr(files, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install 'gridworld-sb3\[video\]'"):
+        files.require_video()
 
 
 def test_mp4_has_even_sides_and_every_frame(tmp_path: Path) -> None:
     av = pytest.importorskip("av", reason="PyAV is not installed (extra `video`)")
-    layout = parse("S.\n.G\n.T", "odd")
-    mdp = compile_mdp(layout)
-    record.save(animation_of_states(mdp, np.array([0, 1, 3]), cell_size=13), tmp_path / "episode.mp4", 5)
+    mdp = compile_mdp(parse("S.\n.G\n.T", "odd"))
+    files.save(animation_of_states(mdp, np.array([0, 1, 3]), cell_size=13), tmp_path / "episode.mp4", 5)
     with av.open(str(tmp_path / "episode.mp4")) as video:
         stream = video.streams.video[0]
         assert (stream.width, stream.height) == (52, 66)
@@ -119,10 +116,7 @@ def test_mp4_has_even_sides_and_every_frame(tmp_path: Path) -> None:
     assert np.abs(pictures[0][:65].astype(int) - draw_frame(mdp, 0, 13)).mean() < 3
 
 
-def test_large_maps_get_smaller_cells() -> None:
-    assert automatic_cell_size(CLASSIC) == 100
-    wide = compile_mdp(parse("S" + "." * 98 + "G", "wide"))
-    assert automatic_cell_size(wide) == 9
+# ---- what is written, is written whole -----------------------------------------------------------------
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
@@ -149,13 +143,11 @@ def test_a_failed_folder_leaves_the_old_one(keep: bool, tmp_path: Path) -> None:
             (part / "new").touch()
             raise OSError(errno.ENOSPC, "no space", str(part / "new"))
 
-    with pytest.raises(OSError, match="no space") as told:
+    with pytest.raises(OSError, match="no space") as error:
         fill()
-    assert told.value.filename == str(folder / "new")
-    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == [
-        "frames",
-        "frames/old",
-    ] * keep
+    assert error.value.filename == str(folder / "new")
+    left = [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")]
+    assert left == ["frames", "frames/old"] * keep
 
 
 def test_a_folder_takes_the_place_of_a_link_and_not_of_what_it_leads_to(tmp_path: Path) -> None:
@@ -163,79 +155,48 @@ def test_a_folder_takes_the_place_of_a_link_and_not_of_what_it_leads_to(tmp_path
     (tmp_path / "outside" / "file").touch()
     for name in ("frames", f".frames.{os.getpid()}.part", f".frames.{os.getpid()}.old.part"):
         (tmp_path / name).symlink_to("outside")
-    record.save_pngs(animation_of_states(CLASSIC, WALK[:1], 20), tmp_path / "frames")
+    files.save_pngs(animation_of_states(CLASSIC, WALK[:1], 20), tmp_path / "frames")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["frames", "outside"]
     assert [path.name for path in (tmp_path / "frames").iterdir()] == ["0000.png"]
     assert [path.name for path in (tmp_path / "outside").iterdir()] == ["file"]
 
 
-def in_the_way(folder: Path, name: str) -> Path:
-    (folder / name / "full").mkdir(parents=True)
-    return folder / name
+WRITERS = {
+    "json": lambda path: write_json(path, {}),
+    "array": lambda path: write_array(path, np.zeros(2)),
+    "png": lambda path: files.save_png(draw_frame(CLASSIC, 0, 20), path),
+    "pngs": lambda path: files.save_pngs(animation_of_states(CLASSIC, WALK[:1], 20), path),
+}
 
 
-def under_a_file(folder: Path, name: str) -> Path:
-    (folder / "file").touch()
-    return folder / "file" / name
-
-
-def in_no_folder(folder: Path, name: str) -> Path:
-    return folder / "nowhere" / name
-
-
-@pytest.mark.parametrize("place", [in_the_way, under_a_file, in_no_folder])
-@pytest.mark.parametrize(
-    "write",
-    [
-        lambda path: write_json(path, {}),
-        lambda path: write_array(path, np.zeros(2)),
-        lambda path: record.save_png(draw_frame(CLASSIC, 0, 20), path),
-    ],
-    ids=["json", "array", "png"],
-)
-def test_what_cannot_be_written_is_named_and_not_what_stands_beside_it(
-    write: Callable[[Path], None], place: Callable[[Path, str], Path], tmp_path: Path
+@pytest.mark.parametrize("place", ["thing", "file/thing", "nowhere/thing"])
+@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+def test_what_cannot_be_written_is_named_and_nothing_else_is_touched(
+    write: Callable[[Path], None], place: str, tmp_path: Path
 ) -> None:
-    path = place(tmp_path, "thing")
+    if write is WRITERS["pngs"] and place != "file/thing":
+        return  # a folder is replaced, and its parents are made
+    (tmp_path / "thing" / "full").mkdir(parents=True)
+    (tmp_path / "file").touch()
+    path = tmp_path / place
     before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(OSError, match=r".") as told:
+    with pytest.raises(OSError, match=r".") as error:
         write(path)
-    assert told.value.filename == str(path)
+    assert error.value.filename in (str(path), str(path.parent))
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_pictures_that_cannot_be_written_are_named(tmp_path: Path) -> None:
-    path = under_a_file(tmp_path, "frames")
-    with pytest.raises(OSError, match=r".") as told:
-        record.save_pngs(animation_of_states(CLASSIC, WALK[:1], 20), path)
-    assert told.value.filename in (str(path), str(path.parent))
+FAILURES = [
+    (errno.EACCES, "a/b.gif", "a/b.gif: Permission denied; choose another folder than a, or get the right"),
+    (errno.EROFS, "b.gif", "b.gif: Read-only file system; choose another folder than ., or get the right"),
+    (errno.ENOSPC, "a/b.gif", "a/b.gif: No space left on device; make room there"),
+    (errno.EISDIR, "a/b.gif", "a/b.gif: Is a directory"),
+    (errno.EIO, None, "Input/output error"),
+    (None, None, "cannot write mode P as PNG"),
+]
 
 
-@pytest.mark.parametrize(
-    ("code", "where", "sentence"),
-    [
-        (
-            errno.EACCES,
-            "a/b.gif",
-            "a/b.gif: Permission denied; choose another folder than a, or get the right",
-        ),
-        (
-            errno.EROFS,
-            "b.gif",
-            "b.gif: Read-only file system; choose another folder than ., or get the right",
-        ),
-        (errno.ENOSPC, "a/b.gif", "a/b.gif: No space left on device; make room there"),
-        (errno.EISDIR, "a/b.gif", "a/b.gif: Is a directory"),
-        (errno.EIO, None, "Input/output error"),
-        (None, None, "cannot write mode P as PNG"),
-    ],
-)
+@pytest.mark.parametrize(("code", "where", "sentence"), FAILURES)
 def test_a_failed_write_says_what_would_be_right(code: int | None, where: str | None, sentence: str) -> None:
     error = OSError("cannot write mode P as PNG") if code is None else OSError(code, os.strerror(code), where)
     assert failure(error).startswith(sentence)
-
-
-def test_a_missing_video_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(record, "find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"pip install 'gridworld-sb3\[video\]'"):
-        record.require_video()
