@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gridworld.config.agents import MISSING, AgentConfig, agent_schemas
-from gridworld.config.composition.setting_names import settings_of_a_run
+from gridworld.config.composition.words import settings_of_a_run
 from gridworld.config.effects import Effect
 from gridworld.config.settings_by_effect import effect_of, is_newer
 from gridworld.config.texts import LIBRARIES, Text

@@ -13,6 +13,7 @@ from typing import Any
 
 import optuna
 
+from gridworld.config.composition.compose import search_path
 from gridworld.config.composition.recipe_file import TRUST, overrides
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
@@ -41,7 +42,7 @@ from gridworld.tune.search.storage import StudyStorage, count_trials
 from gridworld.tune.search.worker import StudyContext, run_trials
 from gridworld.tune.search.worker_pool import SearchError, run_workers
 from gridworld.tune.study_folder import at_work_in, check_study_folder, claim, is_claimed, write_study
-from gridworld.tune.study_spec import ConfFolders, StudySpec, search_path
+from gridworld.tune.study_spec import ConfFolders, StudySpec
 
 
 def tune(spec: StudySpec) -> None:

@@ -8,7 +8,7 @@ import pytest
 from helpers.support import configure
 
 from gridworld.config.composition.recipe_file import with_recipe
-from gridworld.config.composition.setting_names import settings_of_a_run
+from gridworld.config.composition.words import settings_of_a_run
 from gridworld.config.plain_settings import foreign, texts_in
 from gridworld.config.texts import Text
 from gridworld.errors import InputError

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
 from gridworld.process.parallel.forks import LostError, can_fork, run_in_forks
+
 from gridworld.storage.file_lock import is_locked, locked
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks are used on Linux only")

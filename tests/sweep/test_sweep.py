@@ -16,6 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
+from gridworld.sweep.progress import sweep_line
 from helpers.pages import NO_PICTURES
 from helpers.support import ROOT, configure, script, start, train_on_full_disk
 from hypothesis import given
@@ -30,7 +31,6 @@ from gridworld.storage.append_log import AppendLog
 from gridworld.storage.file_lock import is_locked, locked
 from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.job_table import JobRow, JobTable
-from gridworld.sweep.progress import sweep_line
 from gridworld.sweep.results import results_lines
 from gridworld.training.together import run_alone
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gridworld.sweep.population import populations
 from helpers.hostile import manifest
 from helpers.pages import NO_PICTURES
 from helpers.resuming import differences, go_on, left_behind, stopped_after
@@ -32,7 +33,6 @@ from gridworld.restore.repeat import population
 from gridworld.run.reader import read_run
 from gridworld.sweep.folder import JobEntry
 from gridworld.sweep.plan import Job
-from gridworld.sweep.population import populations
 from gridworld.training.setup import check_settings, make_context
 
 SMALL = (
