@@ -18,7 +18,7 @@ from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from gridworld.commands.shell.console import COMMANDS
+from gridworld.commands.console import COMMANDS
 from gridworld.config.agents import AgentConfig, agent_schemas
 from gridworld.config.composition.conf_folder import conf_folder
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig

@@ -1,4 +1,4 @@
-"""The console command `gridworld`, also `python -m gridworld`; see `gridworld.commands.shell.console`."""
+"""The console command `gridworld`, also `python -m gridworld`; see `gridworld.commands.console`."""
 
 from gridworld.process.early_signals import listen
 
@@ -6,7 +6,7 @@ from gridworld.process.early_signals import listen
 def main() -> None:
     """Run the command line in `sys.argv`."""
     listen()  # before what takes time to import
-    from gridworld.commands.shell.console import main
+    from gridworld.commands.console import main
 
     main()
 

@@ -1,8 +1,9 @@
-"""Bounds of settings: a value outside raises `InputError` with a sentence that names key, value and bound."""
+"""Bounds of settings: a number outside raises `InputError` with a sentence on key, number and bounds."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 from gridworld.errors import InputError
 
@@ -11,39 +12,36 @@ MOST_STEPS = 100_000  # of an episode; an evaluation goes through all of them
 NEAREST_GAMMA = 1 - 1e-11  # to 1, but for 1 itself
 
 
-def at_least(key: str, value: float, bound: float) -> None:
-    """Refuse a value that is below the bound, infinite or NaN."""
-    if not bound <= value < math.inf:
-        raise InputError(f"{key}={value}: must be at least {bound}")
+@dataclass(frozen=True)
+class Bounds:
+    """A finite number from `low` to `high`; where `above`, not `low` itself."""
 
+    low: float = -math.inf
+    high: float = math.inf
+    above: bool = False
+    least: float = 0.0  # size of a number other than 0
 
-def at_most(key: str, value: float, bound: float) -> None:
-    """Refuse a value that is above the bound, or NaN."""
-    if not value <= bound:
-        raise InputError(f"{key}={value}: must be at most {bound}")
+    def check(self, key: str, number: float, written: object = None) -> None:
+        """Refuse a number outside; `written` is how the setting has it."""
+        is_high_enough = self.low < number if self.above else self.low <= number
+        is_large_enough = number == 0 or abs(number) >= self.least
+        if not (is_high_enough and is_large_enough and number <= self.high and abs(number) < math.inf):
+            raise InputError(f"{key}={number if written is None else written}: must be {self}")
 
-
-def above_zero(key: str, value: float) -> None:
-    """Refuse a value that is not positive, infinite or NaN."""
-    if not 0 < value < math.inf:
-        raise InputError(f"{key}={value}: must be a positive number")
-
-
-def within(key: str, value: float, low: float, high: float) -> None:
-    """Refuse a value outside [low, high], or NaN."""
-    if not low <= value <= high:
-        raise InputError(f"{key}={value}: must be from {low} to {high}")
-
-
-def within_size(key: str, value: float, least: float, most: float, why: str = "") -> None:
-    """Refuse a value that is neither 0 nor of a size in [least, most], or NaN."""
-    if value != 0 and not least <= abs(value) <= most:
-        raise InputError(f"{key}={value}: must be 0 or of a size from {least:g} to {most:g}{why}")
+    def __str__(self) -> str:
+        low = f"above {self.low}" if self.above else f"at least {self.low}"
+        if self.least:
+            return f"0 or of a size from {self.least:g} to {self.high:g}"
+        if self.low == -math.inf:
+            return "a finite number" if self.high == math.inf else f"at most {self.high}"
+        if self.high == math.inf:
+            return low
+        return f"{low} and at most {self.high}" if self.above else f"from {self.low} to {self.high}"
 
 
 def discount(key: str, value: float) -> None:
     """Refuse a value outside [0, 1], or one so near to 1 that double precision loses the cost of a step."""
-    within(key, value, 0, 1)
+    Bounds(0, 1).check(key, value)
     if NEAREST_GAMMA < value < 1:
         raise InputError(
             f"{key}={value}: is so near to 1 that rounding hides what a step costs; must be 1, or at most "

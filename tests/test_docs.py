@@ -12,7 +12,7 @@ from helpers.pages import PAGES, Reader, blocks, check
 from helpers.support import ROOT, configure
 
 import gridworld
-from gridworld.config.flatten import flat
+from gridworld.config.settings import flat
 
 CLAIMS: dict[str, tuple[str, list[str]]] = {  # by a part of a command: what it prints, and words to add
     "classic_ppo_sb3_defaults": ("not optimal", []),

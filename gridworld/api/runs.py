@@ -24,10 +24,12 @@ from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError, failure
 from gridworld.process.memory_budget import limited, unlimited
 from gridworld.process.signals import Interrupted
-from gridworld.report.evidence.curve_reader import read_columns
-from gridworld.restore.resume import train_or_resume
+from gridworld.report.evidence import read_columns
+from gridworld.restore.resume import unfinished_of
 from gridworld.restore.saved_run import SavedRun, read_visits
 from gridworld.run.claim import check_free, claimed
+from gridworld.run.recovery import is_started
+from gridworld.training.train import train as train_in
 from gridworld.world.exact.evaluation import Evaluator
 
 Curve = dict[str, NDArray[Any]]
@@ -202,7 +204,10 @@ def _train_without_files(config: TrainConfig, given: list[str]) -> RunResult:
 
 def _finished(place: Path, config: TrainConfig, given: list[str], folder: Path | None) -> RunResult:
     agents: list[Agent] = []
-    train_or_resume(config, place, given, agents.append)
+    if is_started(place):
+        unfinished_of(place, config).resume(on_built=agents.append)
+    else:
+        train_in(config, place, given, on_built=agents.append)
     with unlimited():
         result = RunResult(SavedRun(place, trust=True), folder, agents.pop)
         _ = result.policy, result.evaluator  # before the model is trained further, or the folder is gone

@@ -18,7 +18,7 @@ from gridworld.config.composition import compose as composition
 from gridworld.config.composition.conf_folder import conf_folder
 from gridworld.config.composition.hydra_errors import sentence
 from gridworld.config.composition.recipe_file import literal, with_recipe
-from gridworld.config.flatten import flat
+from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 

@@ -9,9 +9,9 @@ from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 
-from gridworld.benchmark.measure import FULL, QUICK, ComparisonResult, Workload, lines
+from gridworld.benchmark.measure import FULL, QUICK, ComparisonResult, lines
+from gridworld.commands import parser_of
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import program
 from gridworld.run.claim import check_inside, check_writable
 from gridworld.storage.atomic_write import write_json
 
@@ -31,31 +31,24 @@ def main(arguments: Sequence[str]) -> None:
     check_writable(options.out.parent, "--out")
     workload = QUICK if options.quick else FULL
     results: list[ComparisonResult] = []
-    print(
-        f"medians of {workload.repetitions}, one torch thread, {platform.machine()}, {os.cpu_count()} cores"
-    )
-    for line in lines(_kept(_measured(workload, options.only), results)):
+
+    def measured() -> Iterator[ComparisonResult]:
+        for table in (known for known in _TABLES if known in options.only):
+            for comparison in import_module(f"gridworld.benchmark.{_TABLES[table]}").comparisons(workload):
+                results.append(comparison.measure(workload.repetitions))
+                yield results[-1]
+
+    machine = f"{platform.machine()}, {os.cpu_count()} cores"
+    print(f"medians of {workload.repetitions}, one torch thread, {machine}")
+    for line in lines(measured()):
         print(line, flush=True)
     write_json(options.out, {"scale": vars(workload), "results": [vars(result) for result in results]})
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog=program("benchmark"), description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="minutes: one short repetition of everything")
-    parser.add_argument(
-        "--only", choices=list(_TABLES), nargs="+", default=list(_TABLES), help="some of the tables"
-    )
-    parser.add_argument("--out", type=Path, default=Path("runs/benchmark.json"), help="where the JSON goes")
+    parser = parser_of("benchmark", __doc__)
+    option = parser.add_argument
+    option("--quick", action="store_true", help="minutes: one short repetition of everything")
+    option("--only", choices=list(_TABLES), nargs="+", default=list(_TABLES), help="some of the tables")
+    option("--out", type=Path, default=Path("runs/benchmark.json"), help="where the JSON goes")
     return parser
-
-
-def _measured(workload: Workload, tables: Sequence[str]) -> Iterator[ComparisonResult]:
-    for table in (known for known in _TABLES if known in tables):
-        for comparison in import_module(f"gridworld.benchmark.{_TABLES[table]}").comparisons(workload):
-            yield comparison.measure(workload.repetitions)
-
-
-def _kept(results: Iterator[ComparisonResult], where: list[ComparisonResult]) -> Iterator[ComparisonResult]:
-    for result in results:
-        where.append(result)
-        yield result

@@ -5,15 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
+from gridworld.commands import parser_of
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.picture import draw_diagnosis
 from gridworld.diagnosis.trials import beside, check_trusted, try_offers
 from gridworld.diagnosis.verdict import Diagnosis, diagnose
 from gridworld.errors import InputError
 from gridworld.process.console.columns import aligned
-from gridworld.process.console.command_line import program
 from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.console.terminal import printable, tell
 from gridworld.process.memory_budget import limited
@@ -21,7 +20,7 @@ from gridworld.process.signals import Interrupted
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.folder import shown
 from gridworld.storage.safe_read import check_no_link
-from gridworld.visualization.video import save_png
+from gridworld.visualization.files import save_png
 
 PICTURE = "diagnosis.png"
 _MOST_ROWS = 8
@@ -30,12 +29,7 @@ _NONE = 1  # the exit code
 
 @limited()
 def main(arguments: Sequence[str]) -> None:
-    """Print the diagnosis, and draw it in the run's folder.
-
-    Raises:
-        InputError: The run cannot be read.
-        SystemExit: With code 1 where nothing that was tried is certified.
-    """
+    """Print the diagnosis, and draw it in the run's folder; code 1 where nothing tried is certified."""
     options = _parser().parse_args(arguments)
     with telling_if_slow(f"diagnosing {options.run}"):
         saved = SavedRun(options.run, options.trust)
@@ -46,9 +40,14 @@ def main(arguments: Sequence[str]) -> None:
     print(printable(found.sentence()))
     if found.commands:
         print("Try, one at a time:")
-        for line in found.commands:
-            print(printable(f"  {line}"))
-        _draw(found, options.run)
+        print(*(printable(f"  {line}") for line in found.commands), sep="\n")
+        path = options.run / PICTURE
+        try:
+            check_no_link(path)
+            save_png(draw_diagnosis(found), path)
+            print(f"{shown(path)} shows where the regret comes from")
+        except (InputError, OSError) as error:  # the diagnosis is of use without it
+            tell(f"{path}: not drawn ({error})")
     if options.try_offers and found.findings:
         check_trusted(saved, found, options.trust)
         try:
@@ -61,7 +60,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _is_any_certified(saved: SavedRun, found: Diagnosis, options: argparse.Namespace) -> bool:
-    """Train what there is to try, and say what became of it."""
+    """Train what there is to try, and print the results."""
     print("Trying:")
     certified = False
     for trial in try_offers(saved, found, beside(options.run), options.trust):
@@ -75,16 +74,12 @@ def _is_any_certified(saved: SavedRun, found: Diagnosis, options: argparse.Names
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog=program("diagnose"), description=__doc__)
-    parser.add_argument("run", type=Path, help="the run's folder, e.g. runs/2026-...")
+    parser = parser_of("diagnose", __doc__, "run", "--trust")
     parser.add_argument(
         "--try",
         dest="try_offers",
         action="store_true",
         help="train what there is to try, in RUN-tried, until one is certified; exit code 1 if none is",
-    )
-    parser.add_argument(
-        "--trust", action="store_true", help="import the classes that the run names, wherever they are from"
     )
     return parser
 
@@ -103,14 +98,3 @@ def _table(found: Diagnosis) -> str:
         rest = float(split.cost[costly[_MOST_ROWS:]].sum())
         rows.append([f"and {len(costly) - _MOST_ROWS:,} more", "", "", "", f"{rest:.3g}", ""])
     return "\n".join(printable(f"  {line}") for line in aligned(rows, ("<14", "<8", ">9", ">9", ">9", "<14")))
-
-
-def _draw(found: Diagnosis, folder: Path) -> None:
-    path = folder / PICTURE
-    try:
-        check_no_link(path)
-        save_png(draw_diagnosis(found), path)
-    except (InputError, OSError) as error:  # the diagnosis stands without it
-        tell(f"{path}: not drawn ({error})")
-        return
-    print(f"{shown(path)} shows where the regret comes from")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from gridworld.commands import parser_for_a_run, whole_number
+from gridworld.commands import parser_of, whole
 from gridworld.envs.env import GridWorldEnv
-from gridworld.envs.frames.rendering import has_display
+from gridworld.envs.rendering import has_display
 from gridworld.envs.rollout import SampledScores, play, sample_episodes
 from gridworld.errors import InputError
 from gridworld.process.console.columns import aligned
@@ -28,10 +28,6 @@ _MOST_EPISODES = 1_000_000
 def main(arguments: Sequence[str]) -> None:
     """Print the scores."""
     options = _parser().parse_args(arguments)
-    if not 1 <= options.episodes <= _MOST_EPISODES:
-        raise InputError(f"--episodes {options.episodes}: must be from 1 to {_MOST_EPISODES}")
-    if options.seed < 0:
-        raise InputError(f"--seed {options.seed}: must be at least 0")
     if options.render == "human" and not has_display():
         raise InputError(
             "--render human: there is no display to open a window on; set DISPLAY, or use "
@@ -46,21 +42,27 @@ def main(arguments: Sequence[str]) -> None:
     with telling_if_slow(f"evaluating {options.run}"):
         score = evaluator.score(policy)
         sampled = sample_episodes(evaluator, policy, options.episodes, options.seed)
-        table, verdict = _table(evaluator, policy, score, sampled), _verdict(evaluator, policy, score)
+        table, verdict = _table(evaluator, policy, score, sampled), "certified optimal"
+        if not score.certified:
+            states = evaluator.endless_states(policy)
+            names = [evaluator.mdp.state_name(state) for state in states[:MOST_NAMED]]
+            circles = circles_text(len(states), names, score.outcome.timeout)
+            verdict = f"not optimal: regret {score.regret:.3g}{circles}"
     of = f"{options.run} at its best, step {saved.steps():,}," if options.best else options.run
     print(printable(f"{options.policy} policy of {of} on {evaluator.mdp.name}"))
     print(table)
-    print(verdict)
+    print(f"  {verdict}")
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_for_a_run(program("evaluate"), __doc__)
-    parser.add_argument("--layout", help="score it on another map of the same size: a name or a file")
-    parser.add_argument(
-        "--episodes", type=whole_number, default=1000, help="episodes to sample (default 1000)"
+    parser = parser_of("evaluate", __doc__, "run", "--policy", "--best", "--trust")
+    option = parser.add_argument
+    option("--layout", help="score it on another map of the same size: a name or a file")
+    option(
+        "--episodes", type=whole(1, _MOST_EPISODES), default=1000, help="episodes to sample (default 1000)"
     )
-    parser.add_argument("--seed", type=whole_number, default=0, help="of the sampled episodes (default 0)")
-    parser.add_argument("--render", choices=("human",), help="first show one episode in a window")
+    option("--seed", type=whole(0), default=0, help="of the sampled episodes (default 0)")
+    option("--render", choices=("human",), help="first show one episode in a window")
     return parser
 
 
@@ -76,17 +78,13 @@ def _table(evaluator: Evaluator, policy: FloatArray, score: Score, sampled: Samp
     }
     discounted = evaluator.discounted_return(policy)
     best_discounted = evaluator.discounted_return(evaluator.optimal_policy())
+    estimate = f" {sampled.discounted_return}"
     rows = [
         ["", "exact", f" {sampled.episodes:,} episodes [95 %]", "optimum"],
         ["without a step limit:", "", "", ""],
         ["value", f"{score.value:.4g}", "", f"{evaluator.optimal_value:.4g}"],
         [f"within {evaluator.max_episode_steps:,} steps:", "", "", ""],
-        [
-            "discounted return",
-            f"{discounted:.4g}",
-            f" {sampled.discounted_return}",
-            f"{best_discounted:.4g}",
-        ],
+        ["discounted return", f"{discounted:.4g}", estimate, f"{best_discounted:.4g}"],
     ]
     for metric in METRICS:
         if metric.within_limit:
@@ -95,21 +93,11 @@ def _table(evaluator: Evaluator, policy: FloatArray, score: Score, sampled: Samp
     return "\n".join(f"  {line}" for line in aligned(rows, ("<22", ">9", "<27", ">9")))
 
 
-def _verdict(evaluator: Evaluator, policy: FloatArray, score: Score) -> str:
-    if score.certified:
-        return "  certified optimal"
-    states = evaluator.endless_states(policy)
-    names = [evaluator.mdp.state_name(state) for state in states[:MOST_NAMED]]
-    circles = circles_text(len(states), names, score.outcome.timeout)
-    return f"  not optimal: regret {score.regret:.3g}{circles}"
-
-
 def _show(evaluator: Evaluator, policy: FloatArray, seed: int) -> None:
     """Play one episode in a window."""
-    states = play(evaluator.mdp, policy, evaluator.max_episode_steps, seed).states
     env = GridWorldEnv(render_mode="human", mdp=evaluator.mdp)
     try:
-        for state in states:
+        for state in play(evaluator.mdp, policy, evaluator.max_episode_steps, seed).states:
             env.state = state
             env.render()
     finally:

@@ -14,15 +14,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from gridworld.commands import parser_for_runs
+from gridworld.commands import parser_of
 from gridworld.errors import InputError, reason
 from gridworld.export.exported_run import read
 from gridworld.export.targets import TARGETS, check_installed
-from gridworld.process.console.command_line import program
 from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
-from gridworld.report.evidence.discovery import find_runs
+from gridworld.report.evidence import find_runs
 from gridworld.run.claim import check_inside, check_writable
 from gridworld.storage.safe_read import check_no_link
 
@@ -37,10 +36,10 @@ def main(arguments: Sequence[str]) -> None:
     check_installed(options.to)
     check_no_link(out)
     check_writable(out, "--out")
-    found = find_runs(options.runs)
-    problems, place = list(found.problems), None
+    folders, problems = find_runs(options.runs)
+    place = None
     with telling_if_slow("exporting the runs"):
-        for folder in found.folders:
+        for folder in folders:
             try:
                 place = _export(folder, options.to, out, options.project)
                 print(printable(f"{folder}: {place}"), flush=True)
@@ -66,24 +65,14 @@ def _export(folder: Path, to: str, out: Path, project: str) -> str:
         except (InputError, OSError):
             raise
         except Exception as error:  # of packages that are not ours
-            told = " ".join(reason(error).split())[:500]
-            raise InputError(f"{folder}: --to {to} failed: {told}") from error
+            why = " ".join(reason(error).split())[:500]
+            raise InputError(f"{folder}: --to {to} failed: {why}") from error
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_for_runs(program("export"), __doc__)
-    parser.add_argument(
-        "--to",
-        choices=tuple(TARGETS),
-        required=True,
-        help="all but hub need the extra of that name",
-    )
-    parser.add_argument(
-        "--out", type=Path, help="the folder to write to (default: runs/export/ and the target)"
-    )
-    parser.add_argument(
-        "--project",
-        default="gridworld",
-        help="W&B's project, MLflow's experiment (default: gridworld)",
-    )
+    parser = parser_of("export", __doc__, "runs")
+    option = parser.add_argument
+    option("--to", choices=tuple(TARGETS), required=True, help="all but hub need the extra of that name")
+    option("--out", type=Path, help="the folder to write to (default: runs/export/ and the target)")
+    option("--project", default="gridworld", help="W&B's project, MLflow's experiment (default: gridworld)")
     return parser

@@ -1,19 +1,18 @@
 """The game that a person plays with the arrow keys, perhaps beside a trained agent, without its window.
 
 `Game` is a state machine driven by key presses and ticks; `draw` is a function of it. The agent takes a step
-whenever the person does, and goes on alone when the person's episode is over.
+whenever the person does, and continues alone when the person's episode is over.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from enum import Enum
 
 import numpy as np
 
+from gridworld.envs import rendering as drawing
 from gridworld.envs.env import GridWorldEnv
-from gridworld.envs.frames import rendering as drawing
-from gridworld.envs.frames.rendering import Frame
+from gridworld.envs.rendering import Frame
 from gridworld.storage.rng_state import independent_generator
 from gridworld.visualization.canvas import Canvas
 from gridworld.world.exact.evaluation import Evaluator
@@ -34,22 +33,14 @@ class Key(Enum):
 
 
 class Player:
-    """An episode in progress, and its return so far.
-
-    Args:
-        evaluator: Of the world.
-        name: Who plays, for the caption.
-        limit: The most steps of an episode; None: no limit.
-    """
+    """An episode in progress, of at most `limit` steps, and its return so far."""
 
     def __init__(self, evaluator: Evaluator, name: str, limit: int | None = None) -> None:
-        self.name = name
-        self.evaluator = evaluator
+        self.evaluator, self.name, self._limit = evaluator, name, limit
+        self._env = GridWorldEnv(mdp=evaluator.mdp)
         self.state = self.steps = 0
         self.value = self.optimum = 0.0  # discounted return so far, and the best expected from the start
         self.over = False
-        self._limit = limit
-        self._env = GridWorldEnv(mdp=evaluator.mdp)
 
     def restart(self, seed: int) -> None:
         """Start an episode; players with the same seed start in the same cell."""
@@ -68,33 +59,34 @@ class Player:
 
     def standing(self) -> str:
         """The player's name, steps and return, and the optimum."""
-        return (
-            f"{self.name}: {_count(self.steps, 'step')}, return {self.value:.4g}, optimum {self.optimum:.4g}"
-        )
+        return f"{self.name}: {self._taken()}, return {self.value:.4g}, optimum {self.optimum:.4g}"
 
     def verdict(self) -> str:
         """How the finished episode compares with the optimum."""
-        mdp = self.evaluator.mdp
+        mdp, missing = self.evaluator.mdp, self.optimum - self.value
         where = "goal" if mdp.goal[self.state] else "trap" if mdp.trap[self.state] else "no end"
-        result = f"{where} after {_count(self.steps, 'step')}: "
-        missing = self.optimum - self.value
         if mdp.next_state.shape[2] > 1:
             luck = "more" if missing < 0 else "less"
-            return result + f"{abs(missing):.4g} {luck} than the best policy gets on average"
-        if missing <= _SAME * max(1.0, abs(self.optimum)):
-            return result + "nobody could do better"
-        return result + f"{missing:.4g} less than the optimum"
+            result = f"{abs(missing):.4g} {luck} than the best policy gets on average"
+        elif missing <= _SAME * max(1.0, abs(self.optimum)):
+            result = "nobody could do better"
+        else:
+            result = f"{missing:.4g} less than the optimum"
+        return f"{where} after {self._taken()}: {result}"
+
+    def _taken(self) -> str:
+        return "1 step" if self.steps == 1 else f"{self.steps} steps"
 
 
 class Game:
     """A person's board and perhaps an agent's.
 
     Args:
-        evaluator: Of the world.
-        seed: Of the start and the slips; a restart adds 1.
-        policy: The agent's, (S, A); None: there is no agent.
-        agent: The agent's name.
-        limit: The most steps of an agent's episode.
+        evaluator: of the world.
+        seed: of the start and the slips; a restart adds 1.
+        policy: the agent's, (S, A); None: there is no agent.
+        agent: the agent's name.
+        limit: the most steps of an agent's episode.
     """
 
     def __init__(
@@ -108,14 +100,9 @@ class Game:
         self.quit = False
         self.person = Player(evaluator, "you")
         self.agent = None if policy is None else Player(evaluator, agent, limit)
-        self._policy = policy
-        self._seed = seed
+        self.players = [self.person] if self.agent is None else [self.person, self.agent]
+        self._policy, self._seed = policy, seed
         self._restart()
-
-    @property
-    def players(self) -> Sequence[Player]:
-        """The person, then the agent if there is one."""
-        return [self.person] if self.agent is None else [self.person, self.agent]
 
     @property
     def over(self) -> bool:
@@ -150,15 +137,7 @@ class Game:
 
 
 def draw(game: Game, cell_size: int) -> Frame:
-    """Draw the boards side by side, each with its standing above and the verdict or the keys below.
-
-    Args:
-        game: The game.
-        cell_size: In pixels.
-
-    Returns:
-        An image, uint8 (height, width, 3).
-    """
+    """Draw the boards side by side, uint8 (height, width, 3), with their standings, and verdicts or keys."""
     boards = []
     for player in game.players:
         canvas = Canvas(player.evaluator.mdp, cell_size)
@@ -168,7 +147,3 @@ def draw(game: Game, cell_size: int) -> Frame:
         canvas.footer(player.verdict() if player.over else keys)
         boards.append(canvas.frame())
     return np.concatenate(boards, axis=1)
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gridworld.commands import add_best, whole_number
+from gridworld.commands import parser_of, whole
 from gridworld.commands.game import Game, Key, draw
 from gridworld.config.train import EvaluationConfig
 from gridworld.config.worlds import MapConfig
-from gridworld.envs.frames import rendering as drawing
+from gridworld.envs import rendering as drawing
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import program
 from gridworld.process.console.progress import telling_if_slow
@@ -24,15 +24,23 @@ from gridworld.world.grid import GridMdp
 
 _WIDEST_BOARD = 800  # pixels; two boards share twice 640
 _FPS = 30
-_TICKS = 5  # frames between two steps of an agent that goes on alone
-_WORLD = ("num_rows", "num_cols", "slip", "step_reward", "goal_reward", "trap_reward")
+_TICKS = 5  # frames between two steps of an agent that continues alone
+_WORLD: dict[str, tuple[Any, str]] = {  # a setting of the world: its type, and what it is
+    "num_rows": (whole(), "of the layout classic (default 5)"),
+    "num_cols": (whole(), "of the layout classic (default 6)"),
+    "slip": (float, "probability of slipping aside (default 0)"),
+    "step_reward": (float, "paid for every step (default 0)"),
+    "goal_reward": (float, "paid for entering a goal (default 1)"),
+    "trap_reward": (float, "paid for entering a trap (default -1)"),
+}
 
 
 @limited()
 def main(arguments: Sequence[str]) -> None:
     """Open the window and play until it is closed."""
     options = _parser().parse_args(arguments)
-    _check(options)
+    if options.best and options.agent is None:
+        raise InputError("--best: chooses between the models of a run; add --agent RUN")
     with telling_if_slow("solving the world"):
         game = _game(options)
     mdp, boards = game.person.evaluator.mdp, len(game.players)
@@ -44,25 +52,13 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def play(game: Game, cell_size: int) -> None:
-    """Show a game and pass it the keys until the person quits; prints the verdict on every episode.
-
-    Args:
-        game: The game.
-        cell_size: In pixels.
-    """
+    """Show a game and pass it the keys until the person quits; print the verdict on every episode."""
     pygame = drawing.import_pygame()
-    keys = {
-        pygame.K_UP: Key.UP,
-        pygame.K_RIGHT: Key.RIGHT,
-        pygame.K_DOWN: Key.DOWN,
-        pygame.K_LEFT: Key.LEFT,
-        pygame.K_r: Key.RESTART,
-        pygame.K_q: Key.QUIT,
-        pygame.K_ESCAPE: Key.QUIT,
-    }
+    keys = {getattr(pygame, f"K_{key.name}"): key for key in (Key.UP, Key.RIGHT, Key.DOWN, Key.LEFT)}
+    keys |= {pygame.K_r: Key.RESTART, pygame.K_q: Key.QUIT, pygame.K_ESCAPE: Key.QUIT}
     pygame.display.init()
     window: Any = None
-    clock, passed, told = pygame.time.Clock(), 0, False
+    clock, frames, is_told = pygame.time.Clock(), 0, False
     try:
         while not game.quit:
             frame = draw(game, cell_size)
@@ -78,54 +74,39 @@ def play(game: Game, cell_size: int) -> None:
                     game.press(Key.QUIT)
                 elif event.type == pygame.KEYDOWN and event.key in keys:
                     game.press(keys[event.key])
-            passed += 1
-            if passed % _TICKS == 0:
+            frames += 1
+            if frames % _TICKS == 0:
                 game.tick()
-            if game.over and not told:
+            if game.over and not is_told:
                 for player in game.players:
                     print(printable(f"{player.standing()}; {player.verdict()}"), flush=True)
-            told = game.over
+            is_told = game.over
     finally:
         pygame.quit()
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog=program("play"), description=__doc__)
-    parser.add_argument("--layout", help="a shipped map's name or a map file (default classic)")
-    parser.add_argument("--num-rows", type=whole_number, help="of the layout classic (default 5)")
-    parser.add_argument("--num-cols", type=whole_number, help="of the layout classic (default 6)")
-    parser.add_argument("--slip", type=float, help="probability of slipping aside (default 0)")
-    parser.add_argument("--step-reward", type=float, help="paid for every step (default 0)")
-    parser.add_argument("--goal-reward", type=float, help="paid for entering a goal (default 1)")
-    parser.add_argument("--trap-reward", type=float, help="paid for entering a trap (default -1)")
-    parser.add_argument("--gamma", type=float, help="discount of returns, 0 to 1 (default 0.99)")
-    parser.add_argument("--seed", type=whole_number, default=0, help="of starts and slips (default 0)")
-    parser.add_argument("--cell-size", type=whole_number, help="pixels (default 100, less on large maps)")
-    parser.add_argument(
+    parser = parser_of("play", __doc__, "--best")
+    option = parser.add_argument
+    option("--layout", help="a shipped map's name or a map file (default classic)")
+    for name, (kind, meaning) in _WORLD.items():
+        option(f"--{name.replace('_', '-')}", type=kind, help=meaning)
+    option("--gamma", type=float, help="discount of returns, 0 to 1 (default 0.99)")
+    option("--seed", type=whole(0), default=0, help="of starts and slips (default 0)")
+    option("--cell-size", type=whole(8), help="pixels (default 100, less on large maps)")
+    option(
         "--agent", type=Path, metavar="RUN", help="a finished run: its agent plays beside you, in its world"
     )
-    add_best(parser)
     return parser
-
-
-def _check(options: argparse.Namespace) -> None:
-    if options.seed < 0:
-        raise InputError(f"--seed {options.seed}: must be at least 0")
-    if options.best and options.agent is None:
-        raise InputError("--best: chooses between the models of a run; add --agent RUN")
-    if options.cell_size is not None and options.cell_size < 8:
-        raise InputError(f"--cell-size {options.cell_size}: must be at least 8 pixels")
 
 
 def _game(options: argparse.Namespace) -> Game:
     """A game in the world of the options; with an agent, its run's settings are the defaults."""
     given = {name: getattr(options, name) for name in _WORLD if getattr(options, name) is not None}
     if options.agent is None:
-        if options.layout is not None:
-            given["layout"] = options.layout
-        gamma = EvaluationConfig().gamma if options.gamma is None else options.gamma
-        env = MapConfig(**given)
+        env = MapConfig(**given, **({} if options.layout is None else {"layout": options.layout}))
         mdp = env.compile()
+        gamma = EvaluationConfig().gamma if options.gamma is None else options.gamma
         return Game(Evaluator(mdp, gamma, env.step_limit(mdp)), options.seed)
     if "num_rows" in given or "num_cols" in given:
         raise InputError("--num-rows, --num-cols: with --agent, the world has the size it was trained on")
@@ -133,9 +114,7 @@ def _game(options: argparse.Namespace) -> Game:
     config, world = saved.config, saved.evaluator(options.layout).mdp
     if not isinstance(config.env, MapConfig) or not isinstance(world, GridMdp):
         raise InputError(f"--agent {options.agent}: was trained on {config.env.name}, which is no map")
-    env = dataclasses.replace(config.env, **given)
-    mdp = env.compile_on(world.layout)
+    mdp = dataclasses.replace(config.env, **given).compile_on(world.layout)
     gamma = config.evaluation.gamma if options.gamma is None else options.gamma
-    policy = saved.snapshot().greedy_policy()
-    evaluator = Evaluator(mdp, gamma, env.step_limit(mdp))
+    evaluator, policy = Evaluator(mdp, gamma, config.env.step_limit(mdp)), saved.snapshot().greedy_policy()
     return Game(evaluator, options.seed, policy, config.agent.name, evaluator.max_episode_steps)

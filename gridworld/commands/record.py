@@ -10,12 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.commands import parser_for_a_run, whole_number
+from gridworld.commands import parser_of, whole
 from gridworld.config.pictures import PICTURES
-from gridworld.envs.frames.rendering import frame_size
+from gridworld.envs.rendering import frame_size
 from gridworld.envs.rollout import play
-from gridworld.errors import InputError
-from gridworld.process.console.command_line import program
 from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
@@ -23,12 +21,10 @@ from gridworld.restore.saved_run import SavedRun, choose_policy, read_visits
 from gridworld.run.claim import check_inside, check_writable
 from gridworld.storage.safe_read import check_no_link
 from gridworld.storage.symlinks import make_inside
-from gridworld.visualization import video
-from gridworld.visualization.animation import Animation
+from gridworld.visualization import files
 from gridworld.visualization.episode import film
-from gridworld.visualization.picture import Subject, drawer, save
+from gridworld.visualization.picture import drawer
 from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.mdp import Mdp
 
 MAPS = {picture.name: picture.drawer for picture in PICTURES if picture.is_map}
 
@@ -37,7 +33,10 @@ MAPS = {picture.name: picture.drawer for picture in PICTURES if picture.is_map}
 def main(arguments: Sequence[str]) -> None:
     """Write the files and print their paths."""
     options = _parser().parse_args(arguments)
-    _check(options)
+    if options.out is not None:
+        check_inside(options.out, "--out")
+    if "mp4" in options.format:
+        files.require_video()
     with telling_if_slow(f"recording {options.run}"):
         _record(options)
 
@@ -73,61 +72,38 @@ def _record(options: argparse.Namespace) -> None:
     if options.cell_size is not None:
         frame_size(saved.mdp, options.cell_size)
     formats = list(dict.fromkeys(options.format))
-    subject = _SavedSubject(saved, options.trust)
+    subject, mdp = _SavedSubject(saved, options.trust), saved.mdp
     drawn = {kind: drawer(MAPS[kind]).draw(subject)(options.cell_size) for kind in formats if kind in MAPS}
-    episodes = _film(saved.mdp, subject, options)
-    video.check_size(episodes, formats)
+    policy, limit = choose_policy(subject.snapshot, options.policy), subject.evaluator.max_episode_steps
+    episodes = [play(mdp, policy, limit, options.seed + index) for index in range(options.episodes)]
+    animation = film(saved.config.env, mdp, episodes, options.trust)(options.cell_size)
+    files.check_size(animation, formats)
     if options.out is None:
         make_inside(options.run, folder.name)
     else:
         folder.mkdir(parents=True, exist_ok=True)
     for kind in formats:
+        path = folder / ("frames" if kind == "png" else f"{kind}.png" if kind in MAPS else f"episode.{kind}")
         if kind == "png":
-            path = folder / "frames"
             check_no_link(path)
-        else:
-            path = folder / (f"{kind}.png" if kind in MAPS else f"episode.{kind}")
-        save(drawn.get(kind, episodes), path, options.fps)
+        files.save(drawn.get(kind, animation), path, options.fps)
         print(printable(str(path)))
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_for_a_run(program("record"), __doc__)
-    parser.add_argument(
+    parser = parser_of("record", __doc__, "run", "--policy", "--best", "--trust")
+    option = parser.add_argument
+    option(
         "--format",
         nargs="+",
-        choices=(*video.FORMATS, *MAPS),
+        choices=(*files.FORMATS, *MAPS),
         default=["png", "gif"],
-        help=f"one or more of {' '.join(video.FORMATS)} for episodes, {' '.join(MAPS)} for maps "
+        help=f"one or more of {' '.join(files.FORMATS)} for episodes, {' '.join(MAPS)} for maps "
         "(default png gif; mp4 needs the extra `video`)",
     )
-    parser.add_argument(
-        "--cell-size", type=whole_number, help="pixels (default 100, 80 in maps, less on large worlds)"
-    )
-    parser.add_argument("--fps", type=whole_number, default=4, help="frames a second, 1 to 100 (default 4)")
-    parser.add_argument("--episodes", type=whole_number, default=1, help="one after the other (default 1)")
-    parser.add_argument("--seed", type=whole_number, default=0, help="of the first episode (default 0)")
-    parser.add_argument("--out", type=Path, help="the folder to write to (default RUN/recording)")
+    option("--cell-size", type=whole(2), help="pixels (default 100, 80 in maps, less on large worlds)")
+    option("--fps", type=whole(1, 100), default=4, help="frames a second, 1 to 100 (default 4)")
+    option("--episodes", type=whole(1, 1000), default=1, help="one after the other (default 1)")
+    option("--seed", type=whole(0), default=0, help="of the first episode (default 0)")
+    option("--out", type=Path, help="the folder to write to (default RUN/recording)")
     return parser
-
-
-def _check(options: argparse.Namespace) -> None:
-    if not 1 <= options.fps <= 100:
-        raise InputError(f"--fps {options.fps}: must be from 1 to 100")
-    if not 1 <= options.episodes <= 1000:
-        raise InputError(f"--episodes {options.episodes}: must be from 1 to 1000")
-    if options.seed < 0:
-        raise InputError(f"--seed {options.seed}: must be at least 0")
-    if options.cell_size is not None and options.cell_size < 2:
-        raise InputError(f"--cell-size {options.cell_size}: must be at least 2 pixels")
-    if options.out is not None:
-        check_inside(options.out, "--out")
-    if "mp4" in options.format:
-        video.require_video()
-
-
-def _film(mdp: Mdp, subject: Subject, options: argparse.Namespace) -> Animation:
-    policy = choose_policy(subject.snapshot, options.policy)
-    limit = subject.evaluator.max_episode_steps
-    episodes = [play(mdp, policy, limit, options.seed + index) for index in range(options.episodes)]
-    return film(subject.config.env, mdp, episodes, subject.is_trusted)(options.cell_size)

@@ -14,13 +14,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from gridworld.commands import parser_for_runs, whole_number
-from gridworld.errors import InputError
-from gridworld.process.console.command_line import program
+from gridworld.commands import parser_of, whole
 from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
-from gridworld.report.build import MOST_TOLD, Reason, Report, gather, reasons
+from gridworld.report.build import MOST_SHOWN, Reason, gather, reasons
 from gridworld.report.writer import FORMATS, MARKERS, check_markers, check_out, write_readme, write_report
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.claim import check_inside
@@ -32,25 +30,29 @@ _MOST_DIAGNOSED = 10
 def main(arguments: Sequence[str]) -> None:
     """Write the report and print its path."""
     options = _parser().parse_args(arguments)
-    for name in ("seed", "diagnose"):
-        if getattr(options, name) < 0:
-            raise InputError(f"--{name} {getattr(options, name)}: must be at least 0")
     if options.out is not None:
         check_inside(options.out, "--out")
-    out = options.out or _usual_out(options.runs)
+    is_one = len(options.runs) == 1 and options.runs[0].is_dir()
+    out = options.out or (options.runs[0] / "report" if is_one else Path("runs/report"))
     check_out(out)
     if options.readme is not None:
         check_markers(options.readme)
     with telling_if_slow("reading the runs"):
         report = gather(options.runs, options.seed, options.log_steps)
     with telling_if_slow("diagnosing runs that are not certified"):
-        found, untold = reasons(report.study.groups, _reason, options.diagnose)
-        report = replace(report, reasons=found, notes=(*report.notes, *untold))
+        found, left_out = reasons(report.study.groups, _reason, options.diagnose)
+        report = replace(report, reasons=found, notes=(*report.notes, *left_out))
     with telling_if_slow("writing the report"):
         page = write_report(report, out, options.formats)
     if options.readme is not None:
         write_readme(report, options.readme)
-    _tell(report)
+    sentences = report.sentences()
+    lines = [f"warning: {printable(sentence)}" for sentence in sentences[:MOST_SHOWN]]
+    if len(sentences) > MOST_SHOWN:
+        lines.append(f"warning: and {len(sentences) - MOST_SHOWN} more, all in the report")
+    lines += [f"note: {printable(note)}" for note in (*report.study.notes, *report.notes)]
+    for line in lines:
+        print(line, file=sys.stderr)
     print(printable(str(page)))
     if options.open and not webbrowser.open(page.absolute().as_uri()):
         print(printable(f"--open: there is no browser here; open {page} in yours"), file=sys.stderr)
@@ -59,19 +61,20 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = parser_for_runs(program("report"), __doc__)
-    parser.add_argument(
+    parser = parser_of("report", __doc__, "runs")
+    option = parser.add_argument
+    option(
         "--out",
         type=Path,
         help="the report's folder (default: report/ in the one folder given, else runs/report)",
     )
-    parser.add_argument("--open", action="store_true", help="show the page in the browser")
-    parser.add_argument(
+    option("--open", action="store_true", help="show the page in the browser")
+    option(
         "--readme",
         type=Path,
         help=f"also put the results into this Markdown file, between its lines {' and '.join(MARKERS)}",
     )
-    parser.add_argument(
+    option(
         "--formats",
         nargs="*",
         choices=FORMATS,
@@ -79,20 +82,20 @@ def _parser() -> argparse.ArgumentParser:
         metavar="FORMAT",
         help=f"of the figures' files, any of {' '.join(FORMATS)}; with no word, none (default: all of them)",
     )
-    parser.add_argument(
+    option(
         "--log-steps",
         action="store_true",
         help="curves against the logarithm of the steps (without it, where an agent is ten times slower)",
     )
-    parser.add_argument(
+    option(
         "--diagnose",
-        type=whole_number,
+        type=whole(0),
         default=_MOST_DIAGNOSED,
         metavar="COUNT",
         help="say of so many runs at most why they are not certified, each in a second or some "
         f"(default {_MOST_DIAGNOSED}; 0: of none)",
     )
-    parser.add_argument("--seed", type=whole_number, default=0, help="of the bootstrap (default 0)")
+    option("--seed", type=whole(0), default=0, help="of the bootstrap (default 0)")
     return parser
 
 
@@ -103,17 +106,3 @@ def _reason(folder: Path) -> Reason | None:
 
     found = diagnose(Evidence.of(SavedRun(folder)))
     return None if found.phrase is None else Reason(found.phrase, found.first_change)
-
-
-def _usual_out(runs: Sequence[Path]) -> Path:
-    return runs[0] / "report" if len(runs) == 1 and runs[0].is_dir() else Path("runs/report")
-
-
-def _tell(report: Report) -> None:
-    sentences = report.sentences()
-    for sentence in sentences[:MOST_TOLD]:
-        print(f"warning: {printable(sentence)}", file=sys.stderr)
-    if len(sentences) > MOST_TOLD:
-        print(f"warning: and {len(sentences) - MOST_TOLD} more, all in the report", file=sys.stderr)
-    for note in (*report.study.notes, *report.notes):
-        print(f"note: {printable(note)}", file=sys.stderr)

@@ -13,26 +13,23 @@ import argparse
 import importlib
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
-from gridworld.config.train import TrainConfig
+from gridworld.commands import parser_of
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import program
 from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
 from gridworld.process.signals import Interrupted
-from gridworld.restore.comparison import Finding, check_whole, compare
-from gridworld.restore.repeat import lengths, population, repeat, without_pictures
+from gridworld.restore.reproduce import check_whole, compare, lengths, population, repeat
 from gridworld.restore.saved_run import settings_of
 from gridworld.run.claim import check_free, check_inside
 from gridworld.run.folder import MANIFEST
 from gridworld.run.identity.provenance import describe, differences, source_differences
 from gridworld.run.identity.stored_world import stored_world
 from gridworld.run.reader import RunReader, open_run, read_run
-from gridworld.world.mdp import Mdp
+from gridworld.training.setup import without_pictures
 
 DIFFERENT = 1  # exit code
 
@@ -52,25 +49,33 @@ def main(arguments: Sequence[str]) -> None:
         check_inside(options.keep, "--keep")
         check_free(options.keep, "--keep")
     print(printable(f"{options.run}: {config.agent.name} on {config.env.name}, seed {config.seed}"))
-    _tell_environment(list(differences(then.manifest, _here(then.manifest))))
-    _tell_resumed(then)
+    for line in _circumstances(then):
+        print(f"  {printable(line)}", flush=True)
     if shorter:
-        told = ", ".join(f"{length:,}" for length in shorter)
-        print(f"  made longer: to {told} steps first, then on to {config.total_timesteps:,}", flush=True)
+        steps = ", ".join(f"{length:,}" for length in shorter)
+        print(f"  made longer: to {steps} steps first, then on to {config.total_timesteps:,}", flush=True)
     if members:
-        told = ", ".join(run.folder.name for run in members)
-        print(f"  its numbers depend on all runs of its population, which train again: {told}", flush=True)
-    try:
-        if options.keep is not None:
-            options.keep.mkdir(parents=True, exist_ok=True)
-            same = _again(then, options.keep, config, mdp, options.trust, members)
-        else:
-            with tempfile.TemporaryDirectory(prefix="gridworld-") as folder:
-                plain = without_pictures(config)
-                same = _again(then, Path(folder), plain, mdp, options.trust, members)
-    except Interrupted as interruption:
-        print(str(interruption), file=sys.stderr)
-        sys.exit(interruption.exit_code)
+        names = ", ".join(run.folder.name for run in members)
+        print(f"  its numbers depend on all runs of its population, which train again: {names}", flush=True)
+
+    def same_in(folder: Path) -> bool | None:
+        again = config if options.keep is not None else without_pictures(config)
+        try:
+            repeat(then, folder, again, mdp, options.trust, members)
+        except InputError as error:
+            if not (folder / MANIFEST).exists():  # these settings cannot be run here at all
+                raise
+            print(f"  it did not come to its end this time: {printable(str(error))}")
+            return False
+        with telling_if_slow("comparing"):
+            findings = list(compare(then, read_run(folder), again, mdp))
+        for finding in findings:
+            verdict = {True: "identical", False: "DIFFERENT", None: "UNKNOWN"}[finding.same]
+            print(f"  {finding.part:<20}{verdict:<9}  {printable(finding.detail)}")
+        verdicts = {finding.same for finding in findings}
+        return next((verdict for verdict in (False, None) if verdict in verdicts), True)
+
+    same = _in_folder(options.keep, same_in)
     if same is None:
         raise InputError(
             f"{options.run}: all that could be compared is identical, but not all of the run is there; put "
@@ -81,71 +86,39 @@ def main(arguments: Sequence[str]) -> None:
         sys.exit(DIFFERENT)
 
 
+def _in_folder(keep: Path | None, same_in: Callable[[Path], bool | None]) -> bool | None:
+    """Compare in the folder that is kept, or in a temporary one."""
+    try:
+        if keep is not None:
+            keep.mkdir(parents=True, exist_ok=True)
+            return same_in(keep)
+        with tempfile.TemporaryDirectory(prefix="gridworld-") as folder:
+            return same_in(Path(folder))
+    except Interrupted as interruption:
+        print(str(interruption), file=sys.stderr)
+        sys.exit(interruption.exit_code)
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=program("reproduce"), description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("run", type=Path, help="the run's folder, e.g. runs/2026-...")
+    parser = parser_of("reproduce", __doc__, "run", "--trust")
     parser.add_argument(
         "--keep", type=Path, metavar="FOLDER", help="write the new run there, with its pictures, and keep it"
-    )
-    parser.add_argument(
-        "--trust", action="store_true", help="import the classes that the run names, wherever they are from"
     )
     return parser
 
 
-def _again(
-    then: RunReader,
-    folder: Path,
-    config: TrainConfig,
-    mdp: Mdp,
-    trust: bool,
-    members: Sequence[RunReader],
-) -> bool | None:
-    """Train again and compare: whether all is identical; None: all that can be compared is."""
-    try:
-        repeat(then, folder, config, mdp, trust, members)
-    except InputError as error:
-        if not (folder / MANIFEST).exists():  # these settings cannot be run here at all
-            raise
-        print(f"  it did not come to its end this time: {printable(str(error))}")
-        return False
-    with telling_if_slow("comparing"):
-        findings = list(compare(then, read_run(folder), config, mdp))
-    for finding in findings:
-        _tell(finding)
-    verdicts = {finding.same for finding in findings}
-    return next((verdict for verdict in (False, None) if verdict in verdicts), True)
-
-
-def _here(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """This environment, with torch's view of the processor if the run has it."""
-    processor = manifest.get("processor")
+def _circumstances(run: RunReader) -> Iterator[str]:
+    """What differs between then and now, and what differed each time that the run was resumed."""
+    processor = run.manifest.get("processor")
     if isinstance(processor, dict) and processor.get("torch") is not None:
-        importlib.import_module("torch")
-    return describe()
-
-
-def _tell_environment(differences: Sequence[str]) -> None:
-    print(f"  {'environment':<20}{'differs' if differences else 'the same'}", flush=True)
-    for line in differences:
-        print(f"    {printable(line)}")
-
-
-def _tell_resumed(run: RunReader) -> None:
-    """Print what differed each time that the run was resumed."""
+        importlib.import_module("torch")  # whose view of the processor is compared too
+    found = list(differences(run.manifest, describe()))
+    yield f"{'environment':<20}{'differs' if found else 'the same'}"
+    yield from (f"  {line}" for line in found)
     before = run.manifest.get("git")
     for again in run.resumptions:
         differs = again.get("differs")
         lines = [f"{line} (anyway=true)" for line in differs] if isinstance(differs, list) else []
         if "git" in again:
             lines += source_differences(before, before := again["git"])
-        for line in lines:
-            where = f"went on after step {again.get('step')}"
-            print(f"    {printable(f'{where}: {line}')}", flush=True)
-
-
-def _tell(finding: Finding) -> None:
-    verdict = {True: "identical", False: "DIFFERENT", None: "UNKNOWN"}[finding.same]
-    print(f"  {finding.part:<20}{verdict:<9}  {printable(finding.told)}")
+        yield from (f"  went on after step {again.get('step')}: {line}" for line in lines)

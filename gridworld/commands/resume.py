@@ -6,11 +6,9 @@ classes that the run names wherever they are from, `anyway=true` accepts other v
 
 from __future__ import annotations
 
-import contextlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from gridworld.config.composition.words import digits
 from gridworld.errors import InputError
@@ -19,7 +17,8 @@ from gridworld.process.memory_budget import limited
 from gridworld.run.claim import alone_in, check_inside
 from gridworld.run.reader import check_is_run
 
-KEY = "resume"
+KEY, STEPS = "resume", "total_timesteps"
+_SWITCHES = {"logging.progress": "true", "trust": "false", "anyway": "false"}  # with their defaults
 
 
 @limited()
@@ -27,6 +26,8 @@ def main(arguments: Sequence[str]) -> None:
     """Resume, and print the result as a new run does."""
     result_is_in_files()
     words = _parse(arguments)
+    total_timesteps = _step_count(words[STEPS]) if STEPS in words else None
+    progress, trust, anyway = ((words.get(name) or usual) == "true" for name, usual in _SWITCHES.items())
     folder = Path(words[KEY])
     check_inside(folder, KEY)
     check_is_run(folder)  # before anything is written there
@@ -38,50 +39,34 @@ def main(arguments: Sequence[str]) -> None:
     from gridworld.run.summary import train_and_tell
 
     with alone_in(folder):
-        unfinished = open_unfinished(folder, words.get("trust", False))
-        total_timesteps, anyway = words.get("total_timesteps"), words.get("anyway", False)
-        progress = words.get("logging.progress", True)
+        unfinished = open_unfinished(folder, trust)
         train_and_tell(folder, lambda: unfinished.resume(total_timesteps, anyway, progress), advice)
 
 
-def _parse(arguments: Sequence[str]) -> dict[str, Any]:
-    kinds: dict[str, Callable[[str], Any]] = {
-        KEY: _folder,
-        "total_timesteps": _step_count,
-        **dict.fromkeys(("logging.progress", "trust", "anyway"), _boolean),
-    }
-    words: dict[str, Any] = {}
+def _parse(arguments: Sequence[str]) -> dict[str, str]:
+    words: dict[str, str] = {}
     for argument in arguments:
         key, _, text = argument.partition("=")
-        if key not in kinds:
+        if key not in (KEY, STEPS, *_SWITCHES):
             raise InputError(
                 f"{argument}: a run goes on with the settings that it began with; beside {KEY}=RUN there are "
-                f"{', '.join(list(kinds)[1:])}"
+                f"{', '.join([STEPS, *_SWITCHES])}"
             )
         if key in words:
             raise InputError(f"{argument}: {key} is given already; give it once")
-        try:
-            words[key] = kinds[key](text)
-        except ValueError as error:
-            raise InputError(f"{argument}: must be {error}") from None
+        if key in _SWITCHES and text not in ("true", "false"):
+            raise InputError(f"{argument}: must be true or false")
+        if key == KEY and not text:
+            raise InputError(f"{argument}: must be the folder of a run, e.g. one in runs/")
+        words[key] = text
     return words
 
 
-def _folder(text: str) -> str:
-    if not text:
-        raise ValueError("the folder of a run, e.g. one in runs/")
-    return text
-
-
 def _step_count(text: str) -> int:
-    with contextlib.suppress(ValueError):
-        text = digits(text)  # 1e5
-    if not text.isascii() or not text.isdecimal() or len(text) > 18 or int(text) < 1:
-        raise ValueError("a number of environment steps")
-    return int(text)
-
-
-def _boolean(text: str) -> bool:
-    if text not in ("true", "false"):
-        raise ValueError("true or false")
-    return text == "true"
+    try:
+        count = int(digits(text))  # 1e5
+        if 1 <= count < 10**18:
+            return count
+    except ValueError:
+        pass
+    raise InputError(f"{STEPS}={text}: must be a number of environment steps")

@@ -20,8 +20,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.commands import run
-from gridworld.commands.shell.help import manual
-from gridworld.commands.shell.output_folder import check_settings_of, check_sweep_folder, run_folder
+from gridworld.commands.manual import manual
+from gridworld.commands.output_folder import check_settings_of, check_sweep_folder, run_folder
 from gridworld.config.composition.compose import VERSION_BASE, completed, register_schemas, to_config
 from gridworld.config.composition.conf_folder import conf_folder, own_conf_folders
 from gridworld.config.composition.hydra_errors import sentence, unreadable_file
@@ -140,12 +140,22 @@ def run_job(settings: DictConfig) -> float:
 
 def _run_alone(config: TrainConfig, folder: Path, overrides: list[str]) -> float:
     """Train, or resume the run, in a folder that this process holds; returns the final regret."""
-    from gridworld.restore.advice import advice
-    from gridworld.restore.resume import train_or_resume
-    from gridworld.run.summary import train_and_tell
+    from gridworld.run.recovery import is_started
+    from gridworld.run.summary import Summary, train_and_tell
+    from gridworld.training.train import train
 
-    summary = train_and_tell(folder, lambda: train_or_resume(config, folder, overrides), advice)
-    return float(summary["regret"])
+    run: Callable[[], Summary] = partial(train, config, folder, overrides)
+    if is_started(folder):
+        from gridworld.restore.resume import unfinished_of
+
+        run = unfinished_of(folder, config).resume
+    return float(train_and_tell(folder, run, _advice)["regret"])
+
+
+def _advice(folder: Path) -> list[str]:
+    from gridworld.restore.advice import advice  # here, since most runs are certified
+
+    return advice(folder)
 
 
 def _tell(error: Exception) -> int:

@@ -14,11 +14,12 @@ import importlib.util
 import os
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gridworld.commands.shell.help import choices
+from gridworld.commands import parser_of
+from gridworld.commands.manual import choices
 from gridworld.config.composition.conf_folder import conf_folder
 from gridworld.config.composition.words import refuse_dashes
 from gridworld.errors import InputError, install_command
@@ -31,23 +32,17 @@ if TYPE_CHECKING:
 
 _KINDS = ("job", "all")  # of --cfg
 _EPILOG = """\
-keys, beside all of train.py's (defaults in conf/tune.yaml):
+keys, beside all of train.py's (with their defaults: --cfg all):
   tune=NAME            another file of conf/tune, or of --config-dir's tune/
-  tune.trials          how many, those of earlier calls included (100)
-  tune.seeds           of a trial: seed, seed + 1, ... (3)
-  tune.finalists       trials that go on (5) to more seeds, tune.final_seeds (10)
-  tune.confirm_seeds   still others, for the winner and what the search began from (20)
-  tune.study           its name, by which it is gone on with; tune.folder, its folder (runs/STUDY)
+  tune.trials          how many, those of earlier calls included; tune.seeds of each: seed, seed + 1, ...
+  tune.finalists       trials that are run on more seeds, tune.final_seeds; tune.confirm_seeds for the winner
+  tune.study           its name, by which it is resumed; tune.folder, its folder (runs/STUDY)
   tune.storage         any database URL of Optuna's (an SQLite file in the folder)
-  tune.workers         processes (one on each core); tune.timeout, seconds
-  tune.sampler         tpe, random; tune.pruner: median, hyperband, none
 
 examples:
   python scripts/tune.py agent=ppo env=four_rooms
       a hundred trials of three seeds; then
   python scripts/train.py recipe=runs/tune_ppo_four_rooms
-  python scripts/tune.py agent=ppo env=maze tune.trials=300 tune.study=maze
-      begins from a recipe
   python scripts/tune.py agent=ppo tune=mine --config-dir my_conf
       a search space of your own, my_conf/tune/mine.yaml
   python scripts/report.py runs/tune_ppo_four_rooms
@@ -59,16 +54,22 @@ def main(arguments: Sequence[str]) -> None:
     """Search, confirm the winner, and print the verdict."""
     conf = conf_folder()
     refuse_dashes(arguments)
-    options = _parser(conf).parse_intermixed_args(_with_kind(arguments))
+    parser = _parser(conf)
+    options = parser.parse_intermixed_args(arguments)
+    if options.cfg not in (None, *_KINDS):
+        if "=" not in options.cfg:
+            parser.error(f"argument --cfg/-c: invalid choice: {options.cfg!r} (choose from job, all)")
+        options.overrides.append(options.cfg)  # a setting
+        options.cfg = _KINDS[-1]
     if options.package is not None and not options.cfg:
         raise InputError(
             f"--package {options.package}: shows a part of the configuration; it goes with --cfg"
         )
     if importlib.util.find_spec("optuna") is None:
         raise InputError(f"{program('tune')}: optuna is not installed; {install_command('tune')}")
-    if options.config_dir is not None and not options.config_dir.is_dir():
-        raise InputError(f"--config-dir {options.config_dir}: no such folder")
     if options.config_dir is not None:
+        if not options.config_dir.is_dir():
+            raise InputError(f"--config-dir {options.config_dir}: no such folder")
         check_yaml(options.config_dir)
     from gridworld.tune.study_spec import ConfFolders, compose_study
 
@@ -95,40 +96,21 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _parser(conf: Path) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=program("tune"),
-        description=as_called(__doc__ or "").format(spaces="\n".join(choices(conf / "tune"))),
-        epilog=as_called(_EPILOG),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help=as_called("train.py's and tune.*"))
-    parser.add_argument("--config-dir", type=Path, help="a folder of your own yaml files, beside conf/")
-    parser.add_argument(
+    about = as_called(__doc__ or "").format(spaces="\n".join(choices(conf / "tune")))
+    parser = parser_of("tune", about, epilog=as_called(_EPILOG))
+    option = parser.add_argument
+    option("overrides", nargs="*", metavar="key=value", help=as_called("train.py's and tune.*"))
+    option("--config-dir", type=Path, help="a folder of your own yaml files, beside conf/")
+    option(
         *("--cfg", "-c"),
-        choices=_KINDS,
+        nargs="?",
+        const=_KINDS[-1],
+        metavar="{job,all}",
         help="print the configuration and do nothing: what the search begins from (job), or that and how to "
         "search (all, also without a word)",
     )
-    parser.add_argument("--package", "-p", help="with --cfg: only this part, such as agent or tune.space")
+    option("--package", "-p", help="with --cfg: only this part, such as agent or tune.space")
     return parser
-
-
-def _with_kind(words: Sequence[str]) -> Iterator[str]:
-    """The words with the kind of `--cfg` as a part of it, since what follows may also be a setting."""
-    kind_is_next = False
-    for word in words:
-        if kind_is_next:
-            kind_is_next = False
-            if word in (*_KINDS, "hydra"):  # the last is train.py's
-                yield f"--cfg={word}"
-                continue
-            yield f"--cfg={_KINDS[-1]}"
-        if word in ("--cfg", "-c"):
-            kind_is_next = True
-        else:
-            yield word
-    if kind_is_next:
-        yield f"--cfg={_KINDS[-1]}"
 
 
 def _show(spec: StudySpec, kind: str, package: str | None) -> None:

@@ -1,8 +1,7 @@
 """Settings that all agents share, and the place where the agents' own schemas are found.
 
-An agent's schema stands beside the agent, in its family's package in `gridworld/agents`. `agent_schemas`
-collects them at run time. This is the plug-in point, and the only place where this room reaches a room above
-it: by a package's name, not by an import statement.
+An agent's schema is in its family's package in `gridworld/agents`. `agent_schemas` collects them at run time:
+the only place where this room reaches a room above it, by a package's name, not by an import statement.
 """
 
 from __future__ import annotations
@@ -12,11 +11,9 @@ import importlib
 import math
 import pkgutil
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Protocol, Union
+from typing import Annotated, Any, Union
 
-from gridworld.bounds import above_zero, within
-from gridworld.config.effects import Effect, affects
-from gridworld.config.texts import ClassPath, Text, Word
+from gridworld.config.fields import ClassPath, Effect, Text, Word, affects
 from gridworld.errors import InputError
 
 MISSING = "???"  # OmegaConf's sign for a value that has to be given
@@ -33,7 +30,7 @@ WholeNumbers = Annotated[Any, Text.WORD, "a whole number, or lists and dicts of 
 
 @dataclass
 class AgentConfig:
-    """The settings of any agent. `family` is the package in `gridworld.agents` that has the algorithm."""
+    """The settings of any agent."""
 
     name: Word = field(default=MISSING, metadata=affects(Effect.LABELS))  # in tables and folders
     family: Word = MISSING  # the package in `gridworld.agents`
@@ -60,21 +57,12 @@ class AgentConfig:
 
 @functools.cache
 def agent_schemas() -> dict[str, type[AgentConfig]]:
-    """Collect the schemas of all agents, which imports the agents' families.
-
-    Returns:
-        The schemas by the names that Hydra has for them in its group `agent/schema`.
-    """
+    """The schemas of all agents by their names in Hydra's group `agent/schema`."""
     agents = importlib.import_module("gridworld.agents")
     found: dict[str, type[AgentConfig]] = {}
     for family in pkgutil.iter_modules(agents.__path__):
         found |= importlib.import_module(f"{agents.__name__}.{family.name}").schemas()
     return found
-
-
-def falls(value: object) -> bool:
-    """Whether a setting's value is written as a rate that falls, as `lin_NUMBER` is."""
-    return isinstance(value, str) and value.startswith(tuple(_POWERS))
 
 
 @dataclass(frozen=True)
@@ -94,6 +82,11 @@ class Decay:
         return float(self.initial * (1 - progress) ** self.power)
 
 
+def falls(value: object) -> bool:
+    """Whether a setting's value is written as a rate that falls, as `lin_NUMBER` is."""
+    return isinstance(value, str) and value.startswith(tuple(_POWERS))
+
+
 def parse_schedule(key: str, value: Schedule, linear_only: bool = False) -> Decay:
     """Read a rate that may fall over training.
 
@@ -102,33 +95,17 @@ def parse_schedule(key: str, value: Schedule, linear_only: bool = False) -> Deca
         value: a number, or one of `lin_NUMBER`, `sqrt_NUMBER` and `quad_NUMBER`.
         linear_only: whether the last two are refused.
     """
-    powers = {LINEAR: 1.0} if linear_only else _POWERS
-    text = value if isinstance(value, str) else None
-    form = next((form for form in powers if text is not None and text.startswith(form)), "")
+    form, digits = "", value
+    if isinstance(value, str):
+        form = next((form for form in _POWERS if value.startswith(form)), "")
+        digits = value.removeprefix(form) if form and "_" not in value.removeprefix(form) else "nan"
     try:
-        number = float(value if text is None else text.removeprefix(form))
+        number = float(digits)
     except (ValueError, OverflowError):
         number = math.nan
-    is_written_so = text is None or (form and "_" not in text.removeprefix(form))  # Python reads 0_3 as 3
-    if not (0 <= number < math.inf and is_written_so):
+    if not 0 <= number < math.inf or (linear_only and form not in ("", LINEAR)):
         others = "" if linear_only else " (sqrt_, quad_: for one by a root or a square)"
         raise InputError(
             f"{key}={value}: must be a number of at least 0, or {LINEAR}NUMBER for a linear decay{others}"
         )
-    return Decay(number, powers.get(form, 0.0))
-
-
-class EpsilonSchedule(Protocol):
-    """The settings of an epsilon that falls linearly over a fraction of training."""
-
-    exploration_fraction: float
-    exploration_initial_eps: float
-    exploration_final_eps: float
-
-
-def check_exploration(agent: EpsilonSchedule) -> None:
-    """Check that epsilon goes from one probability to another within training."""
-    above_zero("agent.exploration_fraction", agent.exploration_fraction)
-    within("agent.exploration_fraction", agent.exploration_fraction, 0, 1)
-    within("agent.exploration_initial_eps", agent.exploration_initial_eps, 0, 1)
-    within("agent.exploration_final_eps", agent.exploration_final_eps, 0, 1)
+    return Decay(number, _POWERS.get(form, 0.0))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Optional
 
-# OmegaConf reads the annotations at run time and knows no `X | None`.
+from gridworld.config.fields import bounds
 
 _PICTURE = "picture"  # in a field's metadata
 
@@ -60,16 +60,12 @@ class RecordingConfig:
 
     # values and greedy actions
     policy_map: bool = field(
-        default=True, metadata=picture("policy.png", "maps.policy_map", "policy", while_training=True)
+        default=True, metadata=picture("policy.png", "policy_map", "policy", while_training=True)
     )
     # how far the values are from the true ones
-    q_error: bool = field(
-        default=True, metadata=picture("q_error.png", "maps.q_error_map", "error of its values")
-    )
+    q_error: bool = field(default=True, metadata=picture("q_error.png", "q_error_map", "error of its values"))
     # where training has been
-    visits: bool = field(
-        default=True, metadata=picture("visits.png", "maps.visit_map", "visits while it learnt")
-    )
+    visits: bool = field(default=True, metadata=picture("visits.png", "visit_map", "visits while it learnt"))
     # the policy over training
     learning: bool = field(
         default=True, metadata=picture("learning.gif", "policy_history", "policy while it learnt")
@@ -78,8 +74,9 @@ class RecordingConfig:
     frames: bool = field(default=True, metadata=picture("frames", "episode"))
     gif: bool = field(default=True, metadata=picture("episode.gif", "episode"))
     mp4: bool = field(default=False, metadata=picture("episode.mp4", "episode"))
-    cell_size: Optional[int] = None  # noqa: UP045  # pixels of the episode's; null: 100, less on large maps
-    fps: int = 4  # frames a second
+    # pixels of the episode's; null: 100, less on large maps
+    cell_size: Optional[int] = field(default=None, metadata=bounds(2))  # noqa: UP045
+    fps: int = field(default=4, metadata=bounds(1, 100))  # frames a second
 
 
 PICTURES: tuple[Picture, ...] = tuple(

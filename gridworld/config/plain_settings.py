@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import os
 import re
 import types
@@ -17,9 +16,8 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gridworld.config.agents import MISSING, AgentConfig, agent_schemas
 from gridworld.config.composition.words import settings_of_a_run
-from gridworld.config.effects import Effect
-from gridworld.config.settings_by_effect import effect_of, is_newer
-from gridworld.config.texts import LIBRARIES, Text
+from gridworld.config.fields import LIBRARIES, Effect, Text
+from gridworld.config.settings import NEWER, effect_of
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, schema_of
 from gridworld.errors import InputError
@@ -28,47 +26,35 @@ from gridworld.process.console.terminal import printable
 
 _LARGEST_KWARG = 1000  # of an environment: sizes, and what it pays
 
-# A run that was made before there was such a setting is read with the setting's default.
-_WITHOUT_RESULT = (Effect.FILES, Effect.NOTHING)
-
 
 def check_foreign(settings: Mapping[str, Any], where: str, allow: str) -> None:
     """Refuse settings by which a stranger would run code, or have a file read, on the reader's machine.
 
     Args:
         settings: of a run, or a part of them, as plain values.
-        where: they stand, for the message.
+        where: they were read, for the message.
         allow: the word that would allow it, for the message.
     """
     for name, value, harm in foreign(settings):
-        told = printable(f"{name[:200]}={str(value)[:80]}")
-        raise InputError(f"{where}: {told} {harm}; add {allow} if you trust whoever made this")
+        setting = printable(f"{name[:200]}={str(value)[:80]}")
+        raise InputError(f"{where}: {setting} {harm}; add {allow} if you trust whoever made this")
 
 
 def foreign(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any, str]]:
-    """Find what does harm if a stranger wrote it, however deep it stands.
-
-    Args:
-        settings: as for `check_foreign`.
-
-    Yields:
-        Its dotted name, the value, and what it does.
-    """
+    """Find what does harm if a stranger wrote it, however deep: (dotted name, value, what it does)."""
     for name, value in _leaves(settings, ""):
         for kind in sorted(_kinds(name), key=lambda kind: kind.name):
-            if isinstance(value, str) and not _is_harmless(value, kind):
-                yield name, value, kind.harm
+            pattern, harm = kind.value
+            if isinstance(value, str):
+                if re.fullmatch(pattern, value) is None or (kind is Text.FILE and not _is_inside(value)):
+                    yield name, value, harm
             elif kind is Text.KWARGS and isinstance(value, int | float) and abs(value) > _LARGEST_KWARG:
                 yield name, value, f"is beyond {_LARGEST_KWARG:,}, and may make a world of any size"
 
 
-def _is_harmless(text: str, kind: Text) -> bool:
-    if re.fullmatch(kind.pattern, text) is None:
-        return False
-    if kind is not Text.FILE:
-        return True
+def _is_inside(path: str) -> bool:
     here = os.path.realpath(users_folder())
-    return Path(os.path.realpath(os.path.join(here, text))).is_relative_to(here)
+    return Path(os.path.realpath(os.path.join(here, path))).is_relative_to(here)
 
 
 def has_own_code(callbacks: Any) -> bool:
@@ -92,21 +78,17 @@ def _leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
 
 
 def _kinds(name: str) -> frozenset[Text]:
-    """What the schemas declare a text to be: at the setting of this name, or at the one that it is in.
-
-    What no schema knows, or has no text, may be anything.
-    """
-    while name and name not in declared_texts():
+    """What the schemas declare a text to be, at this setting or around it; what none knows may be code."""
+    while name and name not in _declared_texts():
         name = name.rpartition(".")[0]
-    return declared_texts().get(name) or frozenset([Text.CODE])
+    return _declared_texts().get(name) or frozenset([Text.CODE])
 
 
 @functools.cache
-def declared_texts() -> dict[str, frozenset[Text]]:
+def _declared_texts() -> dict[str, frozenset[Text]]:
     """What a text in each setting of a run is; several where the schemas of agents or worlds differ."""
-    return {
-        name: frozenset(itertools.chain(*map(texts_in, hints))) for name, hints in settings_of_a_run().items()
-    }
+    found = settings_of_a_run().items()
+    return {name: frozenset(text for hint in hints for text in texts_in(hint)) for name, hints in found}
 
 
 def texts_in(hint: Any) -> Iterator[Text]:
@@ -118,12 +100,7 @@ def texts_in(hint: Any) -> Iterator[Text]:
 
 
 def read_config(content: Any, where: str) -> TrainConfig:
-    """Read the settings of a run from a manifest.
-
-    Args:
-        content: the manifest's JSON.
-        where: it stands, for the message.
-    """
+    """Read the settings of a run from a manifest's JSON; `where` names it in the message."""
     agent = content.get("agent") if isinstance(content, dict) else None
     agent = agent if isinstance(agent, dict) else {}
     algorithm, schemas = agent.get("algorithm"), agent_schemas().values()
@@ -142,15 +119,19 @@ def _read(schema: type, content: Any, where: str, stand_in: dict[type, type], se
     hints = get_type_hints(schema)
     if not isinstance(content, dict):
         raise InputError(f"{where}: must be settings, is {shown(content)}")
-    newer = {n for n in hints if effect_of(section + n) in _WITHOUT_RESULT or is_newer(section + n)}
-    if odd := sorted((content.keys() ^ hints.keys()) - newer):
+    # A run from before there was a setting is read with its default, where the result does not depend on it.
+    optional = {
+        name
+        for name in hints
+        if section + name in NEWER or effect_of(section + name) in (Effect.FILES, Effect.NOTHING)
+    }
+    if odd := sorted((content.keys() ^ hints.keys()) - optional):
         fault = "lacks" if odd[0] in hints else "has an unknown key"
         raise InputError(f"{where}: {fault} {odd[0][:80]}; was the run written by another version?")
     values = {}
     for name in hints.keys() & content.keys():
         kind, value = stand_in.get(hints[name], hints[name]), content[name]
-        if dataclasses.is_dataclass(kind):
-            assert isinstance(kind, type)
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
             values[name] = _read(kind, value, f"{where}.{name}", stand_in, f"{section}{name}.")
         elif fits(value, kind):
             values[name] = value

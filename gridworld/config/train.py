@@ -1,22 +1,31 @@
 """Every setting of a training run, typed: the schema that the files in `conf/` fill in.
 
 Plain dataclasses. Hydra merges the yaml files and the command line into them and refuses a misspelt key or
-a wrong type by name; `check` refuses values that make no sense together. A field's metadata says what the
-setting affects (`gridworld.config.effects`). Nothing heavy is imported here.
+a wrong type by name; `check` refuses numbers outside of the bounds that their fields declare
+(`gridworld.config.fields`). Nothing heavy is imported here.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from typing import Any, Optional, Union
 
-from gridworld.bounds import at_least, at_most, discount, within
-from gridworld.config.agents import AgentConfig
-from gridworld.config.effects import Effect, affects
+from gridworld.bounds import discount
+from gridworld.config.agents import AgentConfig, parse_schedule
+from gridworld.config.fields import (
+    BOUNDS,
+    RATE,
+    Callback,
+    ClassPath,
+    Effect,
+    Word,
+    affects,
+    bounds,
+    declared,
+    privilege,
+)
 from gridworld.config.pictures import RecordingConfig
-from gridworld.config.privileges import privilege
-from gridworld.config.texts import Callback, ClassPath, Word
-from gridworld.config.worlds import EnvConfig, MapConfig
+from gridworld.config.worlds import SOURCES, EnvConfig, MapConfig
 from gridworld.errors import InputError
 
 # OmegaConf reads the annotations at run time and knows no `X | None`.
@@ -32,7 +41,7 @@ class ObservationConfig:
     """What the agent sees of a state."""
 
     kind: Word = "one_hot"  # or coordinates, image, own, none (the state's number)
-    cell_size: int = 8  # pixels, for images
+    cell_size: int = field(default=8, metadata=bounds(1))  # pixels, for images
     # features extractor of an `MlpPolicy` whose settings name none; null: Stable-Baselines3's own
     features: Optional[ClassPath] = None  # noqa: UP045
 
@@ -48,10 +57,11 @@ class ObservationConfig:
 class EvaluationConfig:
     """The exact evaluation."""
 
-    every: int = 1000  # environment steps
+    every: int = field(default=1000, metadata=bounds(1))  # environment steps
     # discount of value and regret, whatever discount the agent learns with
     gamma: float = field(default=0.99, metadata=affects(Effect.TASK))
-    stop_after: Optional[int] = None  # noqa: UP045  # end training at this many certificates in a row
+    # end training at this many certificates in a row
+    stop_after: Optional[int] = field(default=None, metadata=bounds(1))  # noqa: UP045
 
 
 @dataclass
@@ -59,7 +69,8 @@ class LoggingConfig:
     """What is logged while training."""
 
     tensorboard: bool = True  # write an event file
-    policy_map_every: int = 5  # evaluations between two pictures of the policy; 0 for none
+    # evaluations between two pictures of the policy; 0 for none
+    policy_map_every: int = field(default=5, metadata=bounds(0))
     progress: bool = field(default=True, metadata=affects(Effect.NOTHING))
 
 
@@ -80,17 +91,19 @@ class TrainConfig:
     preset: Word = field(default="none", metadata=affects(Effect.NOTHING))
     # what came of these settings when they were tried, where they do not solve the task
     known_failure: Optional[Word] = field(default=None, metadata=affects(Effect.NOTHING))  # noqa: UP045
-    seed: int = field(default=0, metadata=affects(Effect.SEED))  # of all random numbers
-    total_timesteps: int = field(default=20_000, metadata=affects(Effect.LENGTH))  # environment steps
-    n_envs: int = 64  # environments that step together
+    # of all random numbers
+    seed: int = field(default=0, metadata=affects(Effect.SEED) | bounds(0, 2**32 - 1))
+    # environment steps
+    total_timesteps: int = field(default=20_000, metadata=affects(Effect.LENGTH) | bounds(1))
+    n_envs: int = field(default=64, metadata=bounds(1, MOST_ENVS))  # environments that step together
     # b of b / sqrt(N), added to a reward of training for an action that was taken there N times; 0 for none
-    exploration_bonus: float = 0.0
+    exploration_bonus: float = field(default=0.0, metadata=bounds(0, MOST_BONUS))
     # share of training episodes that begin in a state drawn uniformly
-    exploring_starts: float = field(default=0.0, metadata=privilege("starts anywhere"))
+    exploring_starts: float = field(default=0.0, metadata=privilege("starts anywhere") | bounds(0, 1))
     # whether environments in one state share out an action's outcomes evenly, see `gridworld.envs.vector_env`
     stratified_draws: bool = field(default=False, metadata=privilege("stratified draws"))
     device: Word = field(default="cpu", metadata=affects(Effect.MACHINE))
-    threads: int = field(default=1, metadata=affects(Effect.MACHINE))  # of torch
+    threads: int = field(default=1, metadata=affects(Effect.MACHINE) | bounds(1, MOST_THREADS))  # of torch
     # of SB3: each a mapping of `_target_`, the import path of a class, and its arguments
     callbacks: list[Callback] = field(default_factory=list)
     agent: AgentConfig = field(default_factory=AgentConfig)  # the chosen agent's own schema in its place
@@ -106,29 +119,27 @@ class TrainConfig:
 
 
 def check(config: TrainConfig) -> None:
-    """Check the values that no schema can. Maps, rewards and agents are checked elsewhere."""
-    at_least("seed", config.seed, 0)
-    if config.seed >= 2**32:
-        raise InputError(f"seed={config.seed}: must be below 2**32")
-    at_least("total_timesteps", config.total_timesteps, 1)
-    at_least("n_envs", config.n_envs, 1)
-    at_most("n_envs", config.n_envs, MOST_ENVS)
-    within("exploration_bonus", config.exploration_bonus, 0, MOST_BONUS)
-    within("exploring_starts", config.exploring_starts, 0, 1)
-    at_least("threads", config.threads, 1)
-    at_most("threads", config.threads, MOST_THREADS)
-    config.env.check()
-    at_least("observation.cell_size", config.observation.cell_size, 1)
-    at_least("evaluation.every", config.evaluation.every, 1)
+    """Check the values that no type can. Maps, rewards and what is the agents' own are checked elsewhere."""
+    check_bounds(config)
     discount("evaluation.gamma", config.evaluation.gamma)
-    if config.evaluation.stop_after is not None:
-        at_least("evaluation.stop_after", config.evaluation.stop_after, 1)
-    at_least("logging.policy_map_every", config.logging.policy_map_every, 0)
-    if config.recording.cell_size is not None:
-        at_least("recording.cell_size", config.recording.cell_size, 2)
+    source = getattr(config.env, "source", None)
+    if source is not None and SOURCES.get(source) is not type(config.env):
+        raise InputError(f"env.source={source}: is no setting of its own; choose a source by env=...")
     every = config.checkpoint.every
     if not (every is None or every == AUTO or (type(every) is int and every >= 1)):
         raise InputError(
             f"checkpoint.every={every}: must be a number of steps, {AUTO}, or null for no checkpoints"
         )
-    within("recording.fps", config.recording.fps, 1, 100)
+
+
+def check_bounds(section: Any, prefix: str = "") -> None:
+    """Check the numbers of a section of the settings, and of those in it, against their fields' bounds."""
+    schema: type = type(section)
+    for name, metadata in declared(schema).items():
+        key, value = prefix + name, getattr(section, name)
+        if is_dataclass(value):
+            check_bounds(value, f"{key}.")
+        elif BOUNDS in metadata and value is not None:
+            is_rate = RATE in metadata
+            number = parse_schedule(key, value, metadata[RATE]).initial if is_rate else value
+            metadata[BOUNDS].check(key, number, value)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Optional
 
 from gridworld.config.agents import MISSING
+from gridworld.config.fields import bounds
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
 
@@ -26,24 +27,31 @@ class DimensionConfig:
 class TuneConfig:
     """How `scripts/tune.py` searches; `tune` on the command line."""
 
-    trials: int = 100  # the search ends after so many
-    seeds: int = 3  # a trial's: seed, seed + 1, ...
-    finalists: int = 5  # trials that go on to more seeds, beside what the search began from
-    final_seeds: int = 10  # the next ones, for the finalists
-    confirm_seeds: int = 20  # the next ones, for the winner and for what the search began from
+    trials: int = field(default=100, metadata=bounds(1))  # the search ends after so many
+    seeds: int = field(default=3, metadata=bounds(1))  # a trial's: seed, seed + 1, ...
+    # trials that go on to more seeds, beside what the search began from
+    finalists: int = field(default=5, metadata=bounds(1))
+    final_seeds: int = field(default=10, metadata=bounds(0))  # the next ones, for the finalists
+    # the next ones, for the winner and for what the search began from
+    confirm_seeds: int = field(default=20, metadata=bounds(2))
     study: Optional[str] = None  # noqa: UP045  # its name; null: of agent and world
     folder: Optional[str] = None  # noqa: UP045  # null: runs/STUDY
     storage: Optional[str] = None  # noqa: UP045  # any URL that Optuna takes; null: study.db in the folder
-    workers: int = -1  # processes; -1 for one on each core
-    together: Optional[int] = None  # noqa: UP045  # trials of a worker at once; null: 8 of all, 1 of one
-    timeout: Optional[float] = None  # noqa: UP045  # seconds; no trial begins after that
+    workers: int = field(default=-1, metadata=bounds(-1))  # processes; -1 for one on each core
+    # trials of a worker at once; null: 8 of all, 1 of one
+    together: Optional[int] = field(default=None, metadata=bounds(1))  # noqa: UP045
+    # seconds; no trial begins after that
+    timeout: Optional[float] = field(default=None, metadata=bounds(0, above=True))  # noqa: UP045
     sampler: str = "tpe"  # or random
-    sampler_seed: int = 0  # of the search itself
+    sampler_seed: int = field(default=0, metadata=bounds(0))  # of the search itself
     pruner: str = "median"  # or hyperband, none
-    evaluations: int = 50  # of a seed, at least, so that who is certified sooner shows
-    reports: int = 10  # looks of the pruner at a seed's curve
-    stop_after: Optional[int] = 3  # noqa: UP045  # a trial's seed ends at this many certificates in a row
-    heartbeat: int = 5  # seconds; a worker that gives no sign for three times as long loses its trial
+    # of a seed, at least, so that who is certified sooner shows
+    evaluations: int = field(default=50, metadata=bounds(1))
+    reports: int = field(default=10, metadata=bounds(1))  # looks of the pruner at a seed's curve
+    # a trial's seed ends at this many certificates in a row
+    stop_after: Optional[int] = field(default=3, metadata=bounds(1))  # noqa: UP045
+    # seconds; a worker that gives no sign for three times as long loses its trial
+    heartbeat: int = field(default=5, metadata=bounds(1))
     space: dict[str, DimensionConfig] = field(default_factory=dict)  # conf/tune/*.yaml
 
 

@@ -1,8 +1,7 @@
 """Where a world comes from: a schema for each source, which compiles its world.
 
-A schema is the section `env` of a run's settings. `SOURCES` has them by the names that the files in
-`conf/env` choose them by. To add a source, add a schema here, a yaml, and a module in
-`gridworld.world.sources`.
+A schema is the section `env` of a run's settings. To add a source, add a schema to `SOURCES`, a yaml to
+`conf/env`, and a module to `gridworld.world.sources`.
 """
 
 from __future__ import annotations
@@ -13,9 +12,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Optional
 
-from gridworld.bounds import MOST_STEPS, STEP_LIMIT, at_least, at_most
+from gridworld.bounds import MOST_STEPS, STEP_LIMIT
 from gridworld.config.agents import MISSING
-from gridworld.config.texts import CodePath, EnvId, FilePath, Kwargs, Word
+from gridworld.config.fields import CodePath, EnvId, FilePath, Kwargs, Word, bounds
 from gridworld.errors import InputError
 
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
@@ -30,7 +29,8 @@ if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
 class EnvConfig:
     """A world of any source."""
 
-    max_episode_steps: Optional[int] = None  # noqa: UP045  # the step limit; null: the world's own, or 100
+    # the step limit; null: the world's own, or 100
+    max_episode_steps: Optional[int] = field(default=None, metadata=bounds(1, MOST_STEPS))  # noqa: UP045
 
     @property
     def name(self) -> str:
@@ -56,15 +56,6 @@ class EnvConfig:
             )
         return limit
 
-    def check(self) -> None:
-        """Check the step limit: one that can be, and that an exact evaluation comes to the end of."""
-        source = getattr(self, "source", None)
-        if source is not None and SOURCES.get(source) is not type(self):
-            raise InputError(f"env.source={source}: is no setting of its own; choose a source by env=...")
-        if self.max_episode_steps is not None:
-            at_least("env.max_episode_steps", self.max_episode_steps, 1)
-            at_most("env.max_episode_steps", self.max_episode_steps, MOST_STEPS)
-
 
 @dataclass
 class MapConfig(EnvConfig):
@@ -81,17 +72,15 @@ class MapConfig(EnvConfig):
 
     @property
     def name(self) -> str:
-        """See `EnvConfig.name`."""
         return self.layout
 
     def compile(self) -> GridMdp:
-        """See `EnvConfig.compile`."""
         from gridworld.world.layout import load
 
         return self.compile_on(load(self.layout, self.num_rows, self.num_cols))
 
     def compile_on(self, layout: Layout) -> GridMdp:
-        """Compile the world with another map in place of the configured one."""
+        """Compile the world with this map in place of the configured one."""
         return _compiled(layout, self.slip, self.step_reward, self.goal_reward, self.trap_reward)
 
 
@@ -105,16 +94,13 @@ class GymnasiumConfig(EnvConfig):
 
     @property
     def compiles_quickly(self) -> bool:
-        """See `EnvConfig.compiles_quickly`; an id with a colon imports a module."""
-        return ":" not in self.id
+        return ":" not in self.id  # which would import a module
 
     @property
     def name(self) -> str:
-        """See `EnvConfig.name`."""
         return self.id
 
     def compile(self) -> Mdp:
-        """See `EnvConfig.compile`."""
         from gridworld.world.sources.gymnasium_table import compile_gymnasium
 
         return compile_gymnasium(self.id, self.kwargs)
@@ -129,17 +115,15 @@ class EnumeratedConfig(GymnasiumConfig):
 
     @property
     def compiles_quickly(self) -> bool:
-        """See `EnvConfig.compiles_quickly`."""
         return False
 
     def compile(self) -> Mdp:
-        """See `EnvConfig.compile`."""
         from gridworld.world.sources.enumerated import enumerate_env
 
         return enumerate_env(self.id, self.kwargs, ignore=self.ignore)
 
     def step_limit(self, mdp: Mdp) -> int:
-        """See `EnvConfig.step_limit`; the environment itself ends its episodes at its own limit."""
+        # the environment itself ends its episodes at its own limit
         limit, own = super().step_limit(mdp), mdp.max_episode_steps
         if own is not None and limit > own:
             raise InputError(
@@ -158,11 +142,9 @@ class ArraysConfig(EnvConfig):
 
     @property
     def name(self) -> str:
-        """See `EnvConfig.name`."""
         return Path(self.path).stem
 
     def compile(self) -> Mdp:
-        """See `EnvConfig.compile`."""
         from gridworld.world.sources.arrays import load_world
 
         return load_world(self.path)
@@ -178,16 +160,13 @@ class BuiltConfig(EnvConfig):
 
     @property
     def name(self) -> str:
-        """See `EnvConfig.name`."""
         return self.builder.rpartition(".")[2]
 
     @property
     def compiles_quickly(self) -> bool:
-        """See `EnvConfig.compiles_quickly`."""
         return False
 
     def compile(self) -> Mdp:
-        """See `EnvConfig.compile`."""
         from gridworld.world.sources.arrays import build
 
         return build(self.builder, self.kwargs)
@@ -201,11 +180,9 @@ class ClassicConfig(EnvConfig):
 
     @property
     def name(self) -> str:
-        """See `EnvConfig.name`."""
         return self.source
 
     def compile(self) -> Mdp:
-        """See `EnvConfig.compile`."""
         from gridworld.world.sources import classics
 
         sizes = asdict(self)
@@ -262,7 +239,7 @@ def _compiled(
 
 
 def compiled(env: EnvConfig) -> Mdp:
-    """The world of these settings; see `EnvConfig.compile`."""
+    """The world of these settings."""
     return env.compile()
 
 

@@ -17,7 +17,7 @@ from gridworld.config.agents import falls, parse_schedule
 from gridworld.config.train import TrainConfig
 from gridworld.diagnosis.split import RegretSplit, split_regret
 from gridworld.errors import InputError
-from gridworld.report.evidence.curve_reader import read_columns
+from gridworld.report.evidence import read_columns
 from gridworld.restore.saved_run import SavedRun, read_visits
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.exact.markov_chain import Chain

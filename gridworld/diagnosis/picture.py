@@ -5,15 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from gridworld.diagnosis.verdict import Diagnosis
-from gridworld.envs.frames.board import board_of
-from gridworld.envs.frames.rendering import AGENT, Frame
+from gridworld.envs.board import board_of
+from gridworld.envs.rendering import AGENT, Frame
 from gridworld.visualization.canvas import Canvas, shown
-from gridworld.visualization.colormaps import ORANGES, is_dark, linear
-from gridworld.visualization.maps.directions import directions
-from gridworld.visualization.maps.greedy_path import greedy_paths
-from gridworld.visualization.maps.policy_map import draw_paths
-from gridworld.visualization.maps.state_table import Numbers, StateTable, table_states
-from gridworld.visualization.sheet import INK, PAPER, UNREACHABLE, Swatch, short
+from gridworld.visualization.paths import directions, draw_paths, greedy_paths
+from gridworld.visualization.sheet import INK, ORANGES, PAPER, UNREACHABLE, Swatch, is_dark, linear, short
+from gridworld.visualization.state_table import Numbers, StateTable, table_states
 from gridworld.world.mdp import FloatArray
 
 

@@ -18,8 +18,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from gridworld.envs.frames import rendering as drawing
-from gridworld.envs.frames.rendering import CELL_SIZE, MARGIN, Colour, Frame, Point
+from gridworld.envs import rendering as drawing
+from gridworld.envs.rendering import CELL_SIZE, MARGIN, Colour, Frame, Point
 from gridworld.errors import InputError
 from gridworld.world.grid import ACTION_NAMES, NUM_ACTIONS, GridMdp, mdp_or_compiled
 from gridworld.world.layout import CLASSIC, NUM_COLS, NUM_ROWS, Cell, Layout, positive_int
@@ -154,14 +154,9 @@ class GridWorldEnv(gym.Env[int, int]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[int, dict[str, Any]]:
-        """Put the agent on a start. One number is drawn from `np_random` where there are several starts.
+        """Put the agent on a start; returns the state, a plain int, and an empty info.
 
-        Args:
-            seed: from which `np_random` begins anew; None: it goes on.
-            options: none are known.
-
-        Returns:
-            The state, a plain int, and an empty info.
+        One number is drawn from `np_random` where there are several starts. No `options` are known.
         """
         super().reset(seed=seed)
         starts = self.mdp.start_states
@@ -171,16 +166,9 @@ class GridWorldEnv(gym.Env[int, int]):
         return self._state, {}
 
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
-        """Move once. One number is drawn from `np_random` where the world slips.
+        """Move once by an action from 0 to 3. One number is drawn from `np_random` where the world slips.
 
-        Args:
-            action: a whole number from 0 to 3.
-
-        Returns:
-            The state, the reward, whether the episode terminated, False for truncated, and an empty info.
-
-        Raises:
-            InputError: another action.
+        Returns the state, the reward, whether the episode terminated, False for truncated, and an empty info.
         """
         try:
             move = -1 if isinstance(action, bool | np.bool_) else operator.index(action)

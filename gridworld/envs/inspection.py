@@ -2,8 +2,7 @@
 
 What is scored has to be what was given: wrappers included, in every copy of a batch. What is not known
 exactly is refused. `gridworld.world.sources.wrappers` says what the wrappers of an environment do; here are
-the environments below them and the batches above them. Libraries are recognised by the names of their
-classes, so that none of them need be imported for it.
+the environments below them and the batches above them, known by the names of their classes.
 """
 
 from __future__ import annotations
@@ -19,9 +18,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.bounds import MOST_STEPS, STEP_LIMIT, at_most
-from gridworld.envs.frames.rendering import frame_size
+from gridworld.bounds import MOST_STEPS, STEP_LIMIT, Bounds
 from gridworld.envs.observations import KINDS, ObservationTable, TableObservation, make_observation
+from gridworld.envs.rendering import frame_size
 from gridworld.errors import InputError
 from gridworld.world.grid import GridMdp, compile_mdp
 from gridworld.world.layout import Layout, load, positive_int
@@ -73,36 +72,24 @@ _BY_METHOD: dict[str, Callable[[Any, Any], Any]] = {  # what SB3's wrappers make
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What somebody trains on, or asks a score for.
+    """What somebody trains on, or asks a score for."""
 
-    Attributes:
-        mdp: the world, with what wrappers make of rewards and actions.
-        max_episode_steps: the step limit of an episode.
-        own_limit: the same where the environment has one.
-        is_transformed: whether wrappers transform it, so that a Discrete observation may be another number.
-        seen: the observations as they are now, or None where a world alone was given.
-        masks: which actions are allowed in each state, (S, A), or None where nothing is said of it.
-    """
-
-    mdp: Mdp
-    own_limit: int | None = None
+    mdp: Mdp  # the world, with what wrappers make of rewards and actions
+    own_limit: int | None = None  # the environment's own step limit, if any
     max_episode_steps: int = STEP_LIMIT
-    is_transformed: bool = False
-    seen: Callable[[], ObservationTable] | None = None
-    masks: Callable[[], NDArray[np.bool_] | None] = lambda: None
+    is_transformed: bool = False  # by wrappers, so that a Discrete observation may be another number
+    seen: Callable[[], ObservationTable] | None = None  # as it is now; None: a world alone was given
+    masks: Callable[[], NDArray[np.bool_] | None] = lambda: (
+        None
+    )  # allowed actions (S, A), if anything is said
 
 
 def task_of(env: Any, max_episode_steps: int | None = None) -> Task:
-    """Find out which task an environment is.
+    """Find out which task an environment is; refuses what has no world in it or may change it unseen.
 
-    Args:
-        env: an environment or a batch of Gymnasium or SB3, wrapped or not: a GridWorld, or one with a
-            transition table; a compiled world; or what `load` takes: the name of a map, its file, or a
-            `Layout`.
-        max_episode_steps: the step limit; None: the environment's own, or 100 where it has none.
-
-    Raises:
-        InputError: there is no world in it, or a wrapper may change the task in an unknown way.
+    `env` is an environment or a batch of Gymnasium or SB3, wrapped or not, of a GridWorld or with a
+    transition table; a compiled world; or what `load` takes. Without a limit it is the
+    environment's own, or else 100.
     """
     if isinstance(env, Mdp):
         task = Task(env, env.max_episode_steps)
@@ -112,17 +99,16 @@ def task_of(env: Any, max_episode_steps: int | None = None) -> Task:
         task = _task(env)
     limit = task.own_limit if max_episode_steps is None else max_episode_steps
     limit = STEP_LIMIT if limit is None else positive_int("max_episode_steps", limit)
-    at_most("max_episode_steps", limit, MOST_STEPS)
+    Bounds(high=MOST_STEPS).check("max_episode_steps", limit)
     return replace(task, max_episode_steps=limit)
 
 
 def world_of(env: Any) -> Mdp:
     """The world of an environment or a batch, with its step limit."""
     task = _task(env)
-    usual = STEP_LIMIT if isinstance(task.mdp, GridMdp) else task.mdp.max_episode_steps  # what a map's means
-    return (
-        task.mdp if task.own_limit in (None, usual) else replace(task.mdp, max_episode_steps=task.own_limit)
-    )
+    mdp, limit = task.mdp, task.own_limit
+    usual = STEP_LIMIT if isinstance(mdp, GridMdp) else mdp.max_episode_steps  # what a map's means
+    return mdp if limit in (None, usual) else replace(mdp, max_episode_steps=limit)
 
 
 def _task(env: Any) -> Task:
@@ -141,7 +127,6 @@ def _no_world(env: Any) -> InputError:
 
 
 def _single(env: gym.Env[Any, Any]) -> Task:
-    """The task of a single environment."""
     real, limit = env.unwrapped, step_limit(env)
     innermost = [env, *(wrapper.env for wrapper in wrappers_of(env))][-1]
     mdp = getattr(real, "mdp", None)
@@ -208,47 +193,42 @@ def _copies(batch: Any) -> Task:
             "step of the other; make one for each"
         )
     task = _single(first)
-    tasks = {}
-    for index, other in enumerate(others, start=1):
-        if not _is_copy(first, other):
-            tasks[index] = _single(other)
-            if Mdp.text(tasks[index].mdp) != Mdp.text(task.mdp) or tasks[index].own_limit != task.own_limit:
+    tasks = {index: _single(other) for index, other in enumerate(others, 1) if not _is_copy(first, other)}
+
+    def refuse_others(is_same: Callable[[Task], bool], mistake: str) -> None:
+        for index, other in tasks.items():
+            if not is_same(other):
                 raise InputError(
-                    f"env: environment {index} of the {type(batch).__name__} is another task than "
-                    "environment 0; give one of them, or a batch of one task"
+                    f"env: environment {index} of the {type(batch).__name__} {mistake} environment 0; give "
+                    "one of them, or a batch of one task"
                 )
 
-    def otherwise(index: int, what: str) -> InputError:
-        return InputError(
-            f"env: environment {index} of the {type(batch).__name__} {what} otherwise than environment 0; "
-            "give one of them, or a batch of one kind"
-        )
-
     def seen() -> ObservationTable:
-        assert task.seen is not None
-        table = task.seen()
-        for index, other in tasks.items():
-            theirs = None if other.seen is None else other.seen()
-            if theirs is None or table.space != theirs.space or not same(_rows(table), _rows(theirs)):
-                raise otherwise(index, "shows states")
+        table = task.seen()  # type: ignore[misc]
+
+        def shows_the_same(other: Task) -> bool:
+            theirs = other.seen()  # type: ignore[misc]
+            return table.space == theirs.space and same(_rows(table), _rows(theirs))
+
+        refuse_others(shows_the_same, "shows states otherwise than")
         return table
 
     def masks() -> NDArray[np.bool_] | None:
-        for index, other in tasks.items():
-            if not np.array_equal(task.masks(), other.masks()):  # type: ignore[arg-type]
-                raise otherwise(index, "masks actions")
-        return task.masks()
+        mine: Any = task.masks()
+        refuse_others(lambda other: np.array_equal(mine, other.masks()), "masks actions otherwise than")  # type: ignore[arg-type]
+        return mine  # type: ignore[no-any-return]
 
+    text, limit = Mdp.text(task.mdp), task.own_limit
+    refuse_others(
+        lambda other: (Mdp.text(other.mdp), other.own_limit) == (text, limit), "is another task than"
+    )
     return replace(task, seen=functools.cache(seen), masks=masks)
 
 
 def _is_copy(one: gym.Env[Any, Any], other: gym.Env[Any, Any]) -> bool:
     """Whether two environments are made alike, wrapper by wrapper, but for where they are."""
-    chains = [[*wrappers_of(each), each.unwrapped] for each in (one, other)]
-    if [type(each) for each in chains[0]] != [type(each) for each in chains[1]]:
-        return False
-    pairs = list(zip(*chains, strict=True))
-    return all(alike(mine, its, _OF_AN_EPISODE) for mine, its in pairs)
+    mine, its = ([*wrappers_of(each), each.unwrapped] for each in (one, other))
+    return len(mine) == len(its) and all(map(lambda a, b: alike(a, b, _OF_AN_EPISODE), mine, its))
 
 
 def _rows(table: ObservationTable) -> Any:
@@ -256,7 +236,6 @@ def _rows(table: ObservationTable) -> Any:
 
 
 def _batch(env: Any) -> Task:
-    """The task of a batch, or of a wrapper around one."""
     of_wrapper = ("observations",) if isinstance(env, gym.vector.VectorWrapper) else ()
     kind, name = known_class(env, _BATCHES, (*_DECISIVE, *of_wrapper)), type(env).__name__
     if kind is None:

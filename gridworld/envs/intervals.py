@@ -28,9 +28,8 @@ class Estimate:
 def wilson_interval(count: int, total: int) -> tuple[float, float]:
     """Wilson's score interval, from 0 to 1, for the share of `count` hits in `total` samples, one or more.
 
-    It is `scipy.stats.binomtest(count, total).proportion_ci(0.95, method="wilson")`. By hand, since
-    `scipy.stats` takes a second to import. References: E. B. Wilson, Journal of the American Statistical
-    Association 22, 1927; the form is method 3 of R. G. Newcombe, Statistics in Medicine 17, 1998.
+    It is `scipy.stats.binomtest(count, total).proportion_ci(0.95, method="wilson")`, without the second that
+    `scipy.stats` takes to import. Reference: method 3 of R. G. Newcombe, Statistics in Medicine 17, 1998.
     """
     share = count / total
     scale = 2 * (total + _Z**2)

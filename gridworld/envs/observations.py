@@ -27,7 +27,7 @@ from gymnasium.vector import VectorEnv, VectorObservationWrapper
 from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
-from gridworld.envs.frames import rendering as drawing
+from gridworld.envs import rendering as drawing
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import check_memory
 from gridworld.world.layout import positive_int
@@ -42,19 +42,12 @@ _SMALL_TABLE_BYTES = 2**24  # up to here a table is kept, beyond it one-hot rows
 
 @dataclass(frozen=True, eq=False)
 class ObservationTable:
-    """One observation per state.
-
-    Attributes:
-        kind: its name in `KINDS`.
-        space: of one observation.
-        num_states: S.
-        stored: (S, *shape), read-only; None: one-hot rows, written when they are asked for.
-    """
+    """One observation per state, of a kind of `KINDS`; `space` is of one observation."""
 
     kind: str
     space: gym.Space[Any]
     num_states: int
-    stored: NDArray[Any] | None
+    stored: NDArray[Any] | None  # (S, *shape), read-only; None: one-hot rows, written when they are asked for
 
     def rows(self, states: IntArray, out: NDArray[Any] | None = None) -> NDArray[Any]:
         """Look up the observations (..., *shape) of states (...), in `out` or a fresh array."""
@@ -144,15 +137,9 @@ KINDS: dict[str, Callable[[Mdp, int], Rows]] = {  # takes the world and `cell_si
 
 
 def make_observation(mdp: Mdp, kind: str, cell_size: int = IMAGE_CELL_SIZE) -> ObservationTable:
-    """Make the observations of all states of a world.
+    """Make the observations of all states of a world, of a kind of `KINDS`; `cell_size` is of images, pixels.
 
-    Args:
-        mdp: the world.
-        kind: a name in `KINDS`.
-        cell_size: pixels a cell, for images.
-
-    Raises:
-        InputError: no such kind; the world has nothing of it; or images that would not fit into memory.
+    Raises InputError if there is no such kind, the world has nothing of it, or images do not fit into memory.
     """
     if kind not in KINDS:
         *others, last = KINDS
@@ -177,6 +164,26 @@ class TableObservation(gym.ObservationWrapper[Any, int, int], gym.utils.RecordCo
         return self.table.rows(np.asarray(observation))
 
 
+class VectorTableObservation(VectorObservationWrapper[Any, Any, Any, Any]):
+    """A GridWorld batch with observations (num_envs, *shape) of a kind of `KINDS`; `cell_size` is of images.
+
+    `copy` says whether every step returns a fresh array; else all write to the same one, as in SyncVectorEnv.
+    """
+
+    def __init__(
+        self, env: VectorEnv[Any, Any, Any], kind: str, cell_size: int = IMAGE_CELL_SIZE, copy: bool = True
+    ) -> None:
+        super().__init__(env)
+        self.table = make_observation(_mdp(env), kind, cell_size)
+        self.single_observation_space = self.table.space
+        self.observation_space = batch_space(self.table.space, self.num_envs)
+        self._reused: Any = None if copy else create_empty_array(self.table.space, self.num_envs)
+
+    def observations(self, observations: IntArray) -> NDArray[Any]:
+        """The rows (num_envs, *shape) of states (num_envs,)."""
+        return self.table.rows(observations, out=self._reused)
+
+
 class OneHotObservation(TableObservation):
     """float32 (S,): 1 at the state's number."""
 
@@ -199,26 +206,6 @@ class ImageObservation(TableObservation):
     def __init__(self, env: gym.Env[int, int], cell_size: int = IMAGE_CELL_SIZE) -> None:
         gym.utils.RecordConstructorArgs.__init__(self, cell_size=cell_size)
         super().__init__(env, "image", cell_size)
-
-
-class VectorTableObservation(VectorObservationWrapper[Any, Any, Any, Any]):
-    """A GridWorld batch with observations (num_envs, *shape) of a kind of `KINDS`; `cell_size` is of images.
-
-    `copy` says whether every step returns a fresh array; else all write to the same one, as in SyncVectorEnv.
-    """
-
-    def __init__(
-        self, env: VectorEnv[Any, Any, Any], kind: str, cell_size: int = IMAGE_CELL_SIZE, copy: bool = True
-    ) -> None:
-        super().__init__(env)
-        self.table = make_observation(_mdp(env), kind, cell_size)
-        self.single_observation_space = self.table.space
-        self.observation_space = batch_space(self.table.space, self.num_envs)
-        self._reused: Any = None if copy else create_empty_array(self.table.space, self.num_envs)
-
-    def observations(self, observations: IntArray) -> NDArray[Any]:
-        """The rows (num_envs, *shape) of states (num_envs,)."""
-        return self.table.rows(observations, out=self._reused)
 
 
 class VectorOneHotObservation(VectorTableObservation):

@@ -31,10 +31,7 @@ class SampledScores:
 
 
 def sample_episodes(evaluator: Evaluator, policy: FloatArray, episodes: int, seed: int) -> SampledScores:
-    """Estimate the scores of a policy (S, A) from episodes that are played in one batch.
-
-    `seed` is of the environments; what the policy draws is independent of it.
-    """
+    """Estimate the scores of a policy (S, A) from episodes; its draws are independent of `seed`."""
     policy = check_policy(evaluator.mdp, policy)
     envs = GridWorldVectorEnv(
         episodes,

@@ -34,7 +34,7 @@ class Returns(NamedTuple):
         return self.total / self.episodes if self.episodes else None
 
     def merged(self, others: Returns) -> Returns:
-        """The returns of these and of `others`."""
+        """These and `others`."""
         return Returns(self.episodes + others.episodes, self.total + others.total)
 
 
@@ -66,12 +66,7 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
         return step
 
     def count(self, pairs: NDArray[Any], rewards: FloatArray) -> None:
-        """Count n steps of all environments, and add the exploration bonus to their rewards.
-
-        Args:
-            pairs: (n, num_envs), state * A + action.
-            rewards: (n, num_envs), changed in place.
-        """
+        """Count n steps, `pairs` (n, num_envs) of state * A + action, and add the bonus to their rewards."""
         if self.exploration_bonus:
             for each in zip(pairs, rewards, strict=True):
                 self._count(*each)

@@ -1,8 +1,7 @@
 """Many copies of a world at once: a batch of steps is a handful of array look-ups, whatever its size.
 
 With (state, action, outcome) flattened to one index, the next states, rewards and ends of a whole batch are
-three look-ups in the same frozen tables that the single environment uses. No environment has a Python
-object of its own.
+three look-ups in the same frozen tables that the single environment uses.
 """
 
 from __future__ import annotations
@@ -17,8 +16,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from gridworld.bounds import STEP_LIMIT
-from gridworld.envs.frames import rendering as drawing
-from gridworld.envs.frames.rendering import CELL_SIZE, Frame
+from gridworld.envs import rendering as drawing
+from gridworld.envs.rendering import CELL_SIZE, Frame
 from gridworld.errors import InputError
 from gridworld.storage.rng_state import generator_state, set_generator_state
 from gridworld.storage.serialization import State, StateError, fill
@@ -52,9 +51,8 @@ class Tables(NamedTuple):
 
     def of_pairs(self) -> FloatArray:
         """The thresholds as (K - 1, S * A)."""
-        pairs = len(self.reward) // (len(self.thresholds) + 1)
-        of_each = self.thresholds.reshape(len(self.thresholds), -1)
-        return np.broadcast_to(of_each, (len(self.thresholds), pairs))
+        count = len(self.thresholds)
+        return np.broadcast_to(self.thresholds.reshape(count, -1), (count, len(self.reward) // (count + 1)))
 
 
 Advance = tuple[StateArray, FloatArray, BoolArray, BoolArray, Ended | None]
@@ -81,9 +79,6 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
     With `stratified`, environments that take the same action in the same state at the same time share out its
     outcomes evenly, and those that start at the same time the starts (see `stratified_numbers`). The episodes
     of each have the same probabilities as without.
-
-    Raises:
-        InputError: a setting that makes no world or no batch.
     """
 
     metadata = {  # noqa: RUF012
@@ -141,9 +136,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         self._num_actions = self.mdp.num_actions
         self._num_outcomes = self.mdp.next_state.shape[2]
         next_state = self.mdp.next_state.ravel().astype(np.int64)
-        thresholds = self.mdp.thresholds.reshape(
-            -1 if self.mdp.thresholds.size else 1, self._num_outcomes - 1
-        )
+        thresholds = self.mdp.thresholds.reshape(self.mdp.num_states * self._num_actions, -1)
         alike = (thresholds == thresholds[:1]).all()
         thresholds = thresholds[0] if alike else np.ascontiguousarray(thresholds.T)
         terminated = self.mdp.terminal[next_state]
@@ -171,14 +164,11 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         """Start new episodes; those under way are given up.
 
         Args:
-            seed: one number, from which `np_random` begins anew; None: it goes on.
+            seed: one number, from which `np_random` begins anew; None: it continues.
             options: `reset_mask`, (num_envs,) booleans, says which environments; without it, all.
 
         Returns:
             (num_envs,) states, int64, and empty infos.
-
-        Raises:
-            InputError: another kind of seed or mask.
         """
         if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int | np.integer)):
             raise InputError(
@@ -209,28 +199,18 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
 
         Returns:
             (num_envs,) states (int64), rewards (float64), terminated and truncated (bool), and infos.
-
-        Raises:
-            InputError: other actions.
         """
         states, rewards, terminated, truncated, ended = self.advance(actions)
         infos: dict[str, Any] = {}
         if ended is not None:  # as `SyncVectorEnv` has them for environments without infos of their own
             final_obs = np.full(self.num_envs, None, dtype=object)
-            final_obs[ended.mask] = ended.states[
-                ended.mask
-            ].tolist()  # plain ints, as of a single environment
+            final_obs[ended.mask] = ended.states[ended.mask].tolist()  # plain ints, as of one environment
             infos = {"final_obs": final_obs, "_final_obs": ended.mask}
             infos |= {"final_info": {}, "_final_info": ended.mask.copy()}
         return states, rewards, terminated, truncated, infos
 
     def advance(self, actions: NDArray[Any]) -> Advance:
-        """`step` in arrays alone, for training: a step that ends episodes makes no object for each.
-
-        Returns:
-            (num_envs,) states (int64), rewards (float64), terminated and truncated (bool), as `step` does,
-            and of a batch that resets in the same step, the episodes that ended, or None.
-        """
+        """`step` in arrays alone, for training; where it resets in the same step, with what ended."""
         index = self._state * self._num_actions
         index += self._check_actions(actions)
         starting = np.flatnonzero(self._over) if self._any_over else None
@@ -281,18 +261,12 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
 
     def set_state(self, state: State) -> None:
         """Mirrors `get_state`, of a batch of the same size on the same world."""
-        states = state["states"]
-        if (
-            isinstance(states, np.ndarray)
-            and states.size
-            and not 0 <= states.min() <= states.max() < self.mdp.num_states
-        ):
+        if not np.isin(state["states"], np.arange(self.mdp.num_states)).all():
             raise StateError(f"states must be from 0 to {self.mdp.num_states - 1}")
         set_generator_state(self.np_random, state["random"])
-        fill(self._state, states, "states")
-        fill(self._elapsed, state["elapsed"], "elapsed")
-        fill(self._over, state["over"], "over")
-        fill(self._returns, state["returns"], "returns")
+        own = {"states": self._state, "elapsed": self._elapsed, "over": self._over, "returns": self._returns}
+        for key, array in own.items():
+            fill(array, state[key], key)
         self._any_over = bool(self._over.any())
 
     @property
@@ -312,11 +286,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         return starts[self.mdp.start_index(self.draw_numbers(np.zeros(count, dtype=np.int64)))]
 
     def draw_numbers(self, situations: StateArray) -> FloatArray:
-        """A number from [0, 1) for each of some environments, to draw what happens to it.
-
-        In a stratified batch, those of one of the `situations` (n,), in which the same may happen with the
-        same probabilities, are evenly spread.
-        """
+        """(n,) numbers from [0, 1); if stratified, evenly spread in each of the `situations` (n,)."""
         if self.stratified:
             return stratified_numbers(situations, self.np_random)
         return self.np_random.random(len(situations))
@@ -357,23 +327,15 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
 
 
 def stratified_numbers(groups: IntArray, rng: np.random.Generator) -> FloatArray:
-    """Random numbers that the members of a group share out evenly.
+    """Random numbers (n,) that the members of each of the `groups` (n,), integers, share out evenly.
 
-    Independent numbers leave the share of each outcome to chance: of n environments in the same situation, an
-    outcome of probability p meets np, give or take √(np(1-p)). Those of a group of m are 1/m apart, from a
-    random one on, so it meets np rounded down or up. Each number by itself is uniform in [0, 1), and
-    independent of all that came before; so each episode has the probabilities that it has anyway.
+    Those of a group of m are 1/m apart, from a random one on, so that an outcome of probability p meets np of
+    n environments, rounded down or up. Each number by itself is uniform in [0, 1), and independent of all
+    that came before; so each episode has the probabilities that it has anyway.
 
     References: R. Cranley and T. Patterson, Randomization of Number Theoretic Methods for Multiple
     Integration, 1976; P. L'Ecuyer, C. Lécot and B. Tuffin, A Randomized Quasi-Monte Carlo Simulation Method
     for Markov Chains, 2008.
-
-    Args:
-        groups: (n,), integers from 0 up to about n, the group of each.
-        rng: draws one number for each group that has members, in ascending order.
-
-    Returns:
-        (n,) numbers.
     """
     sizes = np.bincount(groups)
     shifts = np.zeros(len(sizes))

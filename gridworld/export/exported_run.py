@@ -15,16 +15,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gridworld.config.flatten import flat
 from gridworld.config.pictures import PICTURES
 from gridworld.config.plain_settings import read_config
+from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import MapConfig
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import plain, printable, tell
-from gridworld.report.evidence.curve_reader import ONLINE, read_columns
-from gridworld.report.evidence.run_reader import Evidence, Unusable
-from gridworld.report.evidence.run_reader import read as read_evidence
+from gridworld.report.evidence import ONLINE, Evidence, Unusable, read_columns
+from gridworld.report.evidence import read as read_evidence
 from gridworld.run.folder import WORLD
 from gridworld.run.identity.stored_world import stored_world
 from gridworld.run.reader import LARGEST_RESULT, RunReader, open_run

@@ -8,23 +8,22 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from gridworld.process.console.terminal import plain
-from gridworld.report.analysis.statistics import Interval, Share
+from gridworld.report.statistics import Interval, Share
 from gridworld.storage.csv_text import csv_text
 
 NOTHING = "\N{EN DASH}"
 _MINUS = "\N{MINUS SIGN}"
+# Signs with which a name out of a run's folder could be HTML, a link, a row, or the end of a marked place.
+_MARKS = re.compile(r"""[\\|<>&`\[\]*!\n\r]|:(?=//)|(?<=www)\.""")
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """An interval with the way its numbers are told."""
+    """An interval with the way its numbers are written."""
 
     interval: Interval
     form: Callable[[float], str]
 
-
-# Signs with which a name out of a run's folder could be HTML, a link, a row, or the end of a marked place.
-_MARKS = re.compile(r"""[\\|<>&`\[\]*!\n\r]|:(?=//)|(?<=www)\.""")
 
 Cell = str | float | int | None | Share | Estimate
 
@@ -91,7 +90,7 @@ def interval_text(cell: Cell) -> str:
 
 
 def is_text(table: Table, column: int) -> bool:
-    """Whether a column holds words, which stand to the left; numbers stand to the right."""
+    """Whether a column holds words, which are aligned to the left; numbers are aligned to the right."""
     return bool(table.rows) and all(isinstance(row[column], str) for row in table.rows)
 
 
@@ -102,18 +101,21 @@ def to_captioned_markdown(table: Table) -> str:
 
 def to_markdown(table: Table) -> str:
     """A Markdown pipe table; names in it are shown as they are."""
+
+    def text(cell: Cell) -> str:
+        if isinstance(cell, str):
+            return _plain_markdown(cell)
+        return f"{main_text(cell)} {interval_text(cell)}".strip()
+
     sides = ("---" if is_text(table, column) else "---:" for column in range(len(table.columns)))
-    lines = [_piped(map(_plain_markdown, table.columns)), _piped(sides)]
-    lines += [
-        _piped(
-            _plain_markdown(cell)
-            if isinstance(cell, str)
-            else f"{main_text(cell)} {interval_text(cell)}".strip()
-            for cell in row
-        )
-        for row in table.rows
-    ]
-    return "\n".join(lines) + "\n"
+    rows: list[Iterable[str]] = [map(_plain_markdown, table.columns), sides]
+    rows += [map(text, row) for row in table.rows]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def _plain_markdown(text: str) -> str:
+    """Text that may be anybody's, so that it is shown as it is."""
+    return _MARKS.sub(lambda found: f"&#{ord(found[0])};", text)
 
 
 def to_csv(table: Table) -> str:
@@ -145,12 +147,3 @@ def to_csv(table: Table) -> str:
 
 def _digits(value: float) -> str:
     return "" if math.isnan(value) else f"{value:.10g}"
-
-
-def _piped(cells: Iterable[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
-def _plain_markdown(text: str) -> str:
-    """Text that may be anybody's, such that it is shown as it stands."""
-    return _MARKS.sub(lambda found: f"&#{ord(found[0])};", text)

@@ -6,13 +6,12 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
-from gridworld.report.analysis.analyse import Comparison, Overall, Result, TaskAnalysis
-from gridworld.report.analysis.metrics import BY_KEY, METRICS
+from gridworld.report.analysis import BY_KEY, METRICS, Comparison, Overall, Result, TaskAnalysis
 from gridworld.report.build import Reasons, Report
-from gridworld.report.evidence.grouping import Group, Study, differing, learning_key, shortfall
-from gridworld.report.evidence.run_reader import Unusable
-from gridworld.report.evidence.tuning_study import TuningStudy
+from gridworld.report.evidence import Unusable
+from gridworld.report.grouping import Group, Study, differing, learning_key
 from gridworld.report.table import NOTHING, Cell, Estimate, Table, number, steps_up_to
+from gridworld.report.tuning_study import TuningStudy
 
 _SCORES = tuple(metric.key for metric in METRICS if metric.key not in ("regret", "steps"))
 _HEADINGS = {
@@ -36,9 +35,9 @@ def all_tables(report: Report) -> Iterator[Table]:
     for task in report.tasks:
         yield task_table(task)
         yield scores_table(task)
-        yield from improvement_tables(task.comparisons, task.task, task.groups)
+        yield from improvement_tables(task.comparisons, task.task)
     if report.overall is not None:
-        yield overall_table(report.overall, study.groups)
+        yield overall_table(report.overall)
     for tuning in report.tunings:
         yield winner_table(tuning)
         yield finalists_table(tuning)
@@ -63,7 +62,8 @@ def results_table(tasks: Sequence[TaskAnalysis], reasons: Reasons) -> Table:
     columns = ["task", "agent", "seeds certified", "ever certified", *(_HEADINGS[which] for which in shown)]
     columns += ["why not"] if reasons else []
     caption = "Certified seeds, exact regret and steps, with 95 % intervals"
-    return _counting([group for task in tasks for group in task.groups], "results", caption, columns, rows)
+    results = [result for task in tasks for result in task.results]
+    return _with_privileges(results, Table("results", caption, columns, rows))
 
 
 def _most_common(group: Group, reasons: Reasons) -> str:
@@ -72,17 +72,13 @@ def _most_common(group: Group, reasons: Reasons) -> str:
     return "".join(f"{cause} ({count} of {causes.total()})" for cause, count in causes.most_common(1))
 
 
-def _counting(
-    groups: Sequence[Group], name: str, caption: str, columns: list[str], rows: list[list[Cell]]
-) -> Table:
-    """A table with a row for each group, and what any of them asks for: its privileges, the runs counted."""
-    if any(group.privileges for group in groups):
-        columns = [*columns, "privileges"]
-        rows = [[*row, group.privileges] for row, group in zip(rows, groups, strict=True)]
-    if short := shortfall(groups):
-        columns = [*columns, "counted"]
-        rows = [[*row, group.shortfall or "all"] for row, group in zip(rows, groups, strict=True)]
-    return Table(name, caption + short, columns, rows)
+def _with_privileges(results: Iterable[Result], table: Table) -> Table:
+    """The table, with a row for each result, and a column of their privileges where any has some."""
+    privileges = [result.group.privileges for result in results]
+    if not any(privileges):
+        return table
+    rows = [[*row, each] for row, each in zip(table.rows, privileges, strict=True)]
+    return Table(table.name, table.caption, [*table.columns, "privileges"], rows)
 
 
 def task_table(task: TaskAnalysis) -> Table:
@@ -92,7 +88,7 @@ def task_table(task: TaskAnalysis) -> Table:
         for result in task.results
     ]
     columns = ["agent", "certified at the end", "ever certified", *_HEADINGS.values()]
-    return _counting(task.groups, task.task, f"Results on {task.task}", columns, rows)
+    return _with_privileges(task.results, Table(task.task, f"Results on {task.task}", columns, rows))
 
 
 def scores_table(task: TaskAnalysis) -> Table:
@@ -103,7 +99,7 @@ def scores_table(task: TaskAnalysis) -> Table:
     ]
     caption = f"Means over seeds on {task.task}, of the greedy policy where nothing else is said"
     columns = ["agent", *(BY_KEY[key].title for key in keys)]
-    return _counting(task.groups, f"{task.task} scores", caption, columns, rows)
+    return _with_privileges(task.results, Table(f"{task.task} scores", caption, columns, rows))
 
 
 def estimate(result: Result, key: str, statistic: str) -> Estimate | None:
@@ -114,11 +110,8 @@ def estimate(result: Result, key: str, statistic: str) -> Estimate | None:
     return Estimate(found, steps_up_to(result.shortest_uncertified) if key == "steps" else number)
 
 
-def improvement_tables(comparisons: Sequence[Comparison], name: str, groups: Sequence[Group]) -> list[Table]:
-    """The probabilities that the row's agent is better than the column's on the task `name`.
-
-    There is a table for each metric that is compared.
-    """
+def improvement_tables(comparisons: Sequence[Comparison], name: str) -> list[Table]:
+    """The probabilities that the row's agent is better than the column's on the task, by metric."""
     tables = []
     for metric in METRICS:
         cells = {
@@ -130,27 +123,24 @@ def improvement_tables(comparisons: Sequence[Comparison], name: str, groups: Seq
         caption = f"Probability that a run of the row's agent beats one of the column's in {metric.title}"
         rows = [[agent, *(cells.get((agent, other)) for other in agents)] for agent in agents]
         if cells:
-            title = f"{name} improvement in {metric.title}"
-            tables.append(Table(title, caption + shortfall(groups), ["agent", *agents], rows))
+            tables.append(Table(f"{name} improvement in {metric.title}", caption, ["agent", *agents], rows))
     return tables
 
 
-def overall_table(overall: Overall, groups: Iterable[Group]) -> Table:
+def overall_table(overall: Overall) -> Table:
     """One number an agent, over all its tasks."""
     rows: list[list[Cell]] = [
         [agent, f"{count} of {overall.tasks}", Estimate(interval, number)]
         for agent, (count, interval) in overall.optimality.items()
     ]
-    caption = f"Optimality over tasks{shortfall(groups)}"
-    return Table("all tasks", caption, ["agent", "tasks", "optimality, IQM"], rows)
+    return Table("all tasks", "Optimality over tasks", ["agent", "tasks", "optimality, IQM"], rows)
 
 
 def answer_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
     """Seeds certified at the end, agents down and tasks across."""
     found = {(result.group.agent, task.task): result.certified for task in tasks for result in task.results}
     rows = [[agent, *(found.get((agent, task)) for task in study.tasks)] for agent in study.agents]
-    caption = f"Seeds certified optimal at the end{shortfall(study.groups)}"
-    return Table("certified", caption, ["agent", *study.tasks], rows)
+    return Table("certified", "Seeds certified optimal at the end", ["agent", *study.tasks], rows)
 
 
 def runs_table(study: Study) -> Table:

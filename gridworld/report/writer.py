@@ -5,6 +5,7 @@ The event files have the curves over seeds, since TensorBoard cannot average run
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import re
@@ -16,9 +17,8 @@ import numpy as np
 from gridworld.errors import InputError, reason
 from gridworld.process.console.terminal import tell
 from gridworld.report import tables
-from gridworld.report.analysis.analyse import Result, TaskAnalysis
-from gridworld.report.analysis.curves import Band
-from gridworld.report.build import MOST_TOLD, NothingFinishedError, Report, gather
+from gridworld.report.analysis import Band, Result, TaskAnalysis
+from gridworld.report.build import MOST_SHOWN, NothingFinishedError, Report, gather
 from gridworld.report.table import to_captioned_markdown, to_csv, to_markdown
 from gridworld.run.claim import check_writable
 from gridworld.run.folder import EVENTS as EVENT_FILE
@@ -37,11 +37,8 @@ _LONGEST_NAME = 120
 FORMATS = ("png", "pdf", "svg")  # of the figures
 
 BANDS = {  # tags of a value, its lower and its upper end
-    name: (f"{name}/{point}", f"{name}/low", f"{name}/high")
-    for name, point in (
-        *(("regret", "iqm"), ("value", "iqm"), ("on-line return", "iqm")),
-        ("seeds certified", "mean"),
-    )
+    name: (f"{name}/{'mean' if name == 'seeds certified' else 'iqm'}", f"{name}/low", f"{name}/high")
+    for name in ("regret", "value", "on-line return", "seeds certified")
 }
 
 MARKERS = "<!-- results -->", "<!-- /results -->"
@@ -65,14 +62,16 @@ def check_out(folder: Path) -> None:
 
 
 def write_report(report: Report, folder: Path, formats: Sequence[str] = FORMATS) -> Path:
-    """Write the page, figures, tables and event files, in the place of an older report, whole or not at all.
-
-    Returns the page's path. Raises `InputError` where something other than a report is in the way.
-    """
+    """Write all in the place of an older report, whole or not at all; returns the page's path."""
     check_out(folder)
-    # matplotlib is imported only now, since it may refuse the user's settings.
-    from gridworld.report.page import charts, render
-
+    # It keeps what matplotlib says about its fonts and folders, also on import, off standard error.
+    logging.getLogger("matplotlib").addHandler(logging.NullHandler())
+    try:
+        from gridworld.report.page import charts, render
+    except (ValueError, OSError) as error:  # it reads the user's settings when it is imported
+        raise InputError(
+            f"matplotlib: its settings cannot be read ({error}); mend or remove matplotlibrc"
+        ) from None
     of_all = charts(report)
     with replacing_folder(folder) as new:
         write_text(new / PAGE, render(report, of_all))
@@ -80,8 +79,7 @@ def write_report(report: Report, folder: Path, formats: Sequence[str] = FORMATS)
         drawn = [chart for of_one in of_all.values() for chart in of_one]
         for name, chart in zip(_file_names(chart.name for chart in drawn), drawn, strict=True):
             for kind in formats:
-                content = chart.svg.encode() if kind == "svg" else chart.saved_as(kind)
-                (new / FIGURES / f"{name}.{kind}").write_bytes(content)
+                (new / FIGURES / f"{name}.{kind}").write_bytes(chart.saved_as(kind))
         (new / TABLES).mkdir()
         all_tables = list(tables.all_tables(report))
         for name, table in zip(_file_names(table.name for table in all_tables), all_tables, strict=True):
@@ -92,23 +90,20 @@ def write_report(report: Report, folder: Path, formats: Sequence[str] = FORMATS)
 
 
 def write_over_seeds(runs: Path, folder: Path) -> Path | None:
-    """Write the curves over seeds of a sweep or a study, for TensorBoard to show beside those of the runs.
+    """Write the curves over seeds of a sweep or a study, for TensorBoard to show next to those of the runs.
 
-    What is damaged, or keeps them from being written, is told on standard error.
-
-    Returns:
-        What was made in `folder`; None where no agent has two seeds, there are too many runs to read them
-        all, or none has curves for TensorBoard or can be used.
+    What is damaged is named on standard error. Returns what was made in `folder`; None where no agent has two
+    seeds, there are too many runs to read them all, or none has curves for TensorBoard or can be used.
     """
     count = sum(1 for _ in runs.glob(f"*/{MANIFEST}"))
     if count > _MOST_READ_UNASKED or not any(runs.glob(f"*/{EVENT_FILE}")):
         return None
     try:
         report = gather([runs])
-        for sentence in report.damage[:MOST_TOLD]:
+        for sentence in report.damage[:MOST_SHOWN]:
             tell(sentence)
-        if len(report.damage) > MOST_TOLD:
-            tell(f"{runs}: {len(report.damage) - MOST_TOLD} more files are damaged; the report has all")
+        if len(report.damage) > MOST_SHOWN:
+            tell(f"{runs}: {len(report.damage) - MOST_SHOWN} more files are damaged; the report has all")
         if all(len(result.group.runs) < 2 for task in report.tasks for result in task.results):
             return None
         with replacing_folder(folder / OVER_SEEDS) as new:
@@ -124,8 +119,7 @@ def write_over_seeds(runs: Path, folder: Path) -> Path | None:
 def _write_events(report: Report, folder: Path) -> None:
     results = [(task, result) for task in report.tasks for result in task.results]
     # TensorBoard shows these names, so they keep their blanks.
-    labels = [(f"{result.group.agent} on {task.task}", result.group.seeds) for task, result in results]
-    names = _file_names((", ".join(filter(None, label)) for label in labels), blank=" ")
+    names = _file_names((f"{result.group.agent} on {task.task}" for task, result in results), blank=" ")
     for name, (task, result) in zip(names, results, strict=True):
         (folder / name).mkdir(parents=True)
         events = EventWriter(folder / name)
@@ -157,10 +151,7 @@ def _curves(
 
 
 def check_markers(path: Path) -> None:
-    """Raise `InputError` unless the Markdown file has the two markers, once each and in order.
-
-    It must be possible to replace it, too.
-    """
+    """Raise `InputError` unless the Markdown file has the two markers, in order, and can be replaced."""
     _around_markers(path)
     check_writable(path.parent, "--readme")
 

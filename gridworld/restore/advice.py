@@ -21,9 +21,8 @@ from gridworld.restore.saved_run import SavedRun
 from gridworld.run.folder import SWEEP_JSON, RunFolder, shown
 from gridworld.run.reader import LARGEST_RESULT, RunReader
 
-_FALLS = 0.95  # the regret of the last quarter of a curve beside the quarter before it
+_FALLS = 0.95  # of the regret in the quarter of the curve before the last
 _FEWEST = 8  # evaluations
-_NO_PRESET = (AUTO, "none")
 _WHY = "what it costs, and why:"
 _REPLACED = ("total_timesteps", "n_envs", "preset", "tuned")
 
@@ -49,19 +48,13 @@ def _commands(saved: SavedRun, place: str) -> Iterator[list[str]]:
     if config.recipe is None and (env := _world_with_recipe(config)) is not None:
         own = [word for word in words if _key(word).partition(".")[0] not in ("env", "experiment", "agent")]
         yield ["its recipe:", _train([f"agent={config.agent.name}", f"env={env}", *own])]
-    elif (preset := _unused_preset(saved)) is not None and "experiment" not in map(_key, words):
-        yield [f"for {preset} worlds:", _train([*words, f"preset={preset}"])]
+    elif config.recipe is None and config.preset in (AUTO, "none") and "experiment" not in map(_key, words):
+        preset = fitting_preset(config, lambda: saved.mdp)
+        yield from [[f"for {preset} worlds:", _train([*words, f"preset={preset}"])]] if preset else []
     yield [_WHY, f"{command('diagnose')} {place}"]
     if not (run.folder.parent / SWEEP_JSON).exists() and _still_falls(run):  # a job's length is the sweep's
         resume = run.resume_command(dataclasses.asdict(config))
         yield ["its regret still falls:", f"{resume} total_timesteps={2 * config.total_timesteps}"]
-
-
-def _unused_preset(saved: SavedRun) -> str | None:
-    config = saved.config
-    if config.recipe is not None or config.preset not in _NO_PRESET:
-        return None
-    return fitting_preset(config, lambda: saved.mdp)
 
 
 def _train(words: Sequence[str]) -> str:
@@ -76,10 +69,8 @@ def _key(word: str) -> str:
 def _world_with_recipe(config: TrainConfig) -> str | None:
     """The name in `conf/env` of the run's world, if the agent has a recipe for it."""
     ending = f"_{config.agent.name}.yaml"
-    for recipe in sorted((conf_folder() / "tuned").glob(f"*{ending}")):
-        if is_world(config.env, env := recipe.name.removesuffix(ending)):
-            return env
-    return None
+    names = (recipe.name.removesuffix(ending) for recipe in (conf_folder() / "tuned").glob(f"*{ending}"))
+    return next((env for env in sorted(names) if is_world(config.env, env)), None)
 
 
 def _still_falls(run: RunReader) -> bool:

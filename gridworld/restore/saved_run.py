@@ -31,7 +31,7 @@ from gridworld.run.reader import RunReader, open_run
 from gridworld.training.setup import make_context
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.grid import GridMdp
-from gridworld.world.layout import CLASSIC, Layout, load
+from gridworld.world.layout import CLASSIC, load
 from gridworld.world.mdp import FloatArray, Mdp
 
 _LARGEST_HEADER = 2**12  # bytes before the numbers in NumPy's format
@@ -43,9 +43,9 @@ class SavedRun:
     """A finished run with its settings and its world.
 
     Args:
-        folder: The run's folder.
-        trust: Import the classes that the settings name, wherever they are from.
-        best: Take the agent with the lowest regret on the way, not the one at the end.
+        folder: the run's folder.
+        trust: import the classes that the settings name, wherever they are from.
+        best: take the agent with the lowest regret on the way, not the one at the end.
     """
 
     @limited()
@@ -64,9 +64,8 @@ class SavedRun:
 
         Of a run that is not trusted they are made of its settings, and what would run code is left out.
         """
-        from gridworld.config.composition.recipe_file import (
-            harmless_words,  # with Hydra, which takes its time
-        )
+        # here, with Hydra, which takes its time
+        from gridworld.config.composition.recipe_file import harmless_words
 
         words: list[str] = self.run.manifest.get("overrides") or []
         kept = list(words) if self._trust else list(harmless_words(words, self.config))
@@ -79,27 +78,20 @@ class SavedRun:
 
     @limited()
     def evaluator(self, layout: str | None = None) -> Evaluator:
-        """An evaluator of the run's world.
-
-        Args:
-            layout: The name or file of another map, of the same size, to take instead.
-        """
-        mdp = self.mdp
+        """An evaluator of the run's world, or of another map of the same size by its name or file."""
+        mdp, env = self.mdp, self.config.env
         if layout is not None:
-            env = self.config.env
             if not isinstance(env, MapConfig) or not isinstance(mdp, GridMdp):
-                raise InputError(
-                    f"layout {layout!r}: {self.run.folder} was trained on {env.name}, which is no map"
-                )
-            trained = mdp.layout
-            world = load(layout, *_size(trained)) if layout == CLASSIC else load(layout)
-            if _size(world) != _size(trained):
+                raise InputError(f"layout {layout!r}: {self.run.folder} was trained on {env.name}, not a map")
+            rows, columns = mdp.layout.num_rows, mdp.layout.num_cols
+            world = load(layout, rows, columns) if layout == CLASSIC else load(layout)
+            if (world.num_rows, world.num_cols) != (rows, columns):
                 raise InputError(
                     f"layout {world.name}: is {world.num_rows}x{world.num_cols}, the agent was trained on "
-                    f"{trained.num_rows}x{trained.num_cols}; take a map of that size"
+                    f"{rows}x{columns}; take a map of that size"
                 )
             mdp = env.compile_on(world)
-        return Evaluator(mdp, self.config.evaluation.gamma, self.config.env.step_limit(mdp))
+        return Evaluator(mdp, self.config.evaluation.gamma, env.step_limit(mdp))
 
     @limited()
     def snapshot(self) -> PolicySnapshot:
@@ -109,14 +101,12 @@ class SavedRun:
     @limited()
     def agent(self) -> Agent:
         """The trained agent, a new object at every call."""
-        observation = make_observation(
-            self.mdp, self.config.observation.kind, self.config.observation.cell_size
-        )
+        shows = self.config.observation
+        observation = make_observation(self.mdp, shows.kind, shows.cell_size)
         self.run.verify(self._model_file)
         few = dataclasses.replace(self.config, n_envs=min(self.config.n_envs, 2), callbacks=[])
-        agent = family(self.config.agent).build(
-            self.config.agent, dataclasses.replace(make_context(few, self.mdp, observation), only_asked=True)
-        )
+        context = dataclasses.replace(make_context(few, self.mdp, observation), only_asked=True)
+        agent = family(self.config.agent).build(self.config.agent, context)
         agent.load(self._model_file)
         return agent
 
@@ -136,10 +126,10 @@ def settings_of(
     """Read the settings in a run's manifest.
 
     Args:
-        run: The run.
-        trust: As for `SavedRun`.
-        trains: Whether it is to be trained, which calls its callbacks.
-        allow: The word by which the command's user says that the run is trusted.
+        run: the run.
+        trust: as for `SavedRun`.
+        trains: whether it is to be trained, which calls its callbacks.
+        allow: the word by which the command's user says that the run is trusted.
     """
     config = read_config(run.manifest["config"], str(run.manifest_file))
     for key, name in (("agent.name", config.agent.name), ("env", config.env.name)):
@@ -148,10 +138,8 @@ def settings_of(
     try:
         check(config)
         if not trust:
-            used = {
-                "agent": dataclasses.asdict(config.agent),
-                "callbacks": config.callbacks if trains else [],
-            }
+            callbacks = config.callbacks if trains else []
+            used = {"agent": dataclasses.asdict(config.agent), "callbacks": callbacks}
             check_foreign(used, str(run.manifest_file), allow)
         family(config.agent).check(config)
     except RecursionError:
@@ -160,24 +148,15 @@ def settings_of(
 
 
 def read_visits(run: RunReader, shape: tuple[int, ...]) -> NDArray[np.int64]:
-    """Read how often training took each action in each state.
-
-    Args:
-        run: The run.
-        shape: (S, A) of its world.
-
-    Returns:
-        Counts, int64 (S, A).
-    """
+    """Read how often training took each action in each state, int64 counts of this shape (S, A)."""
     path = run.visits_file
     content = run.read(path, _LARGEST_HEADER + 8 * math.prod(shape))
     try:
         visits = np.load(io.BytesIO(content), allow_pickle=False)
     except DAMAGED:
-        raise InputError(f"{path}: no counts of visits that can be read") from None
-    if not isinstance(visits, np.ndarray) or visits.shape != shape or visits.dtype.kind not in "iu":
-        raise InputError(f"{path}: must be counts for every cell and action of this run's world")
-    counts: NDArray[np.int64] = visits.astype(np.int64)
+        raise InputError(f"{path}: cannot be read as counts of visits") from None
+    is_whole = isinstance(visits, np.ndarray) and visits.shape == shape and visits.dtype.kind in "iu"
+    counts: NDArray[np.int64] = visits.astype(np.int64) if is_whole else np.array([-1])
     if (counts < 0).any():
         raise InputError(f"{path}: must be counts for every cell and action of this run's world")
     return counts
@@ -186,7 +165,3 @@ def read_visits(run: RunReader, shape: tuple[int, ...]) -> NDArray[np.int64]:
 def choose_policy(snapshot: PolicySnapshot, kind: str) -> FloatArray:
     """The probabilities (S, A) of a snapshot's policy of a `kind`, "greedy" or "sampled"."""
     return snapshot.greedy_policy() if kind == "greedy" else snapshot.sampled
-
-
-def _size(layout: Layout) -> tuple[int, int]:
-    return layout.num_rows, layout.num_cols

@@ -12,14 +12,15 @@ from pathlib import Path
 from gridworld.config.train import TrainConfig
 from gridworld.errors import FolderLostError, InputError, MachineError, reason
 from gridworld.process.signals import Interrupted
-from gridworld.restore.resume import training_or_resumption
+from gridworld.restore.resume import unfinished_of
 from gridworld.run.folder import ERROR_FILE, LOCK, MANIFEST
-from gridworld.run.recovery import find_run
+from gridworld.run.recovery import find_run, is_started
 from gridworld.run.writer import clear, record_failure
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.file_lock import locked
 from gridworld.sweep.job_table import one_line, run_status
 from gridworld.training.together import Training
+from gridworld.training.train import training
 
 _UNFINISHED = ("running", "interrupted")  # statuses of runs that were stopped from outside
 
@@ -63,7 +64,11 @@ def run_in_sweep(
                 clear(folder)
             # The sweep has a progress line of its own.
             quiet = replace(config, logging=replace(config.logging, progress=False))
-            return float((yield from training_or_resumption(quiet, folder, overrides))["regret"])
+            is_begun = is_started(folder)
+            run = (
+                unfinished_of(folder, quiet).resumption() if is_begun else training(quiet, folder, overrides)
+            )
+            return float((yield from run)["regret"])
     except Interrupted as interruption:
         sys.exit(interruption.exit_code)
     except (OSError, MachineError, FolderLostError) as error:  # the job itself is right, and goes on later

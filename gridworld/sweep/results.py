@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gridworld.config.effects import Effect
-from gridworld.config.flatten import flat
-from gridworld.config.settings_by_effect import ON_RESULT, effect_of, with_effects
+from gridworld.config.fields import Effect
+from gridworld.config.settings import ON_RESULT, effect_of, flat, with_effects
 from gridworld.envs.intervals import wilson_interval
 from gridworld.errors import InputError
 from gridworld.process.console.columns import aligned

@@ -1,27 +1,40 @@
-"""The learning curve: exact evaluations of an agent's policies while it learns, handed to sinks.
+"""The learning curve: exact evaluations of an agent's policies while it learns, and where they go.
 
-Two policies are scored side by side: the greedy one and the one that actions are sampled from. Beside them
-stands what the environments counted: the returns of the training episodes since the evaluation before. The
-sinks (`gridworld.training.sinks`) turn an evaluation into a row of a file, points in TensorBoard, a progress
-line and pictures.
+Two policies are scored side by side: the greedy one and the one that actions are sampled from. With them go
+the returns of the training episodes since the evaluation before, which the environments counted. A sink
+takes every evaluation: the curve's file, TensorBoard, the progress line, the pictures.
 """
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot
 from gridworld.config.train import TrainConfig
 from gridworld.envs.statistics_env import NO_EPISODES, Returns, StatisticsVectorEnv
 from gridworld.errors import InputError
 from gridworld.process.parallel.together import clock
+from gridworld.storage.append_log import AppendLog
+from gridworld.storage.csv_text import csv_text
 from gridworld.storage.serialization import State
 from gridworld.world.exact.evaluation import Evaluator, Score
+from gridworld.world.metrics import METRICS, TRAINING_METRICS, Metric, numbers, optimal_score
+
+if TYPE_CHECKING:
+    from gridworld.process.console.progress import Progress
+    from gridworld.training.tensorboard import EventWriter
+
+# TensorBoard sorts its groups by name and opens with the first: the greedy policy's learning curve. Behind it
+# are the greedy policy's other metrics, the sampled policy, and the optimum, which is a flat line.
+GREEDY, GREEDY_MORE, SAMPLED, OPTIMUM = "eval", "eval_more", "eval_sampled", "optimal"
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,24 +48,7 @@ class Evaluation:
     returns: Returns  # of the training episodes since the evaluation before
 
 
-class Sink(Protocol):
-    """What takes every evaluation, in order."""
-
-    def write(self, evaluation: Evaluation) -> None:
-        """Take one more."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Held:
-    """An evaluation that was due where training may be over; what it is of, as it was then."""
-
-    step: int
-    snapshot: PolicySnapshot
-    model: bytes  # the content of its file, if it was the best by then
-
-    def get_state(self) -> State:
-        model = np.frombuffer(self.model, np.uint8)
-        return {"step": self.step, "beliefs": vars(self.snapshot).copy(), "model": model}
+Sink = Callable[[Evaluation], None]
 
 
 @dataclass
@@ -64,14 +60,7 @@ class Certificate:
     certified_since_step: int | None = None  # of the streak that still holds
 
     def update(self, step: int, certified: bool, is_new_policy: bool) -> None:
-        """Take in an evaluation.
-
-        Args:
-            step: environment steps so far.
-            certified: whether the greedy policy is certified optimal.
-            is_new_policy: False if this policy was evaluated last time too. Between two updates the same one
-                may be met again; it earns one certificate, not several.
-        """
+        """Take in an evaluation; a policy that was evaluated last time too earns no second certificate."""
         if not certified:
             self.certified_since_step, self.streak = None, 0
             return
@@ -81,53 +70,21 @@ class Certificate:
         if self.first_certified_step is None:
             self.first_certified_step = step
 
-    def get_state(self) -> State:
-        """The three fields."""
-        return vars(self).copy()
 
-    def set_state(self, state: State) -> None:
-        """Continue from the three fields, which may stand among others."""
-        self.streak = int(state["streak"])
-        self.first_certified_step = state["first_certified_step"]
-        self.certified_since_step = state["certified_since_step"]
-
-
+@dataclass
 class BestModel:
-    """The model of the lowest exact regret, the earliest of equals; all certified policies are equals.
+    """The model of the lowest exact regret, the earliest of equals; all certified policies are equals."""
 
-    Attributes:
-        step: environment steps at its evaluation; -1: there was none yet.
-        regret: of its greedy policy.
-        content: of its model file.
-    """
-
-    def __init__(self) -> None:
-        self.step, self.regret, self.content = -1, float("inf"), b""
+    step: int = -1  # environment steps at its evaluation; -1: there was none yet
+    regret: float = float("inf")  # of its greedy policy
+    content: bytes = field(default=b"", repr=False)  # of its model file
 
     def is_beaten_by(self, score: Score) -> bool:
         """Whether a policy with this score is better."""
         return self.step < 0 or score.shortfall < self.regret
 
-    def offer(self, step: int, score: Score, model_file: Callable[[], bytes]) -> None:
-        """Take a model if it is better.
-
-        Args:
-            step: environment steps so far.
-            score: of its greedy policy.
-            model_file: gives the content of its file, which is only then asked for.
-        """
-        if self.is_beaten_by(score):
-            self.step, self.regret, self.content = step, score.shortfall, model_file()
-
     def get_state(self) -> State:
-        """The attributes."""
-        content = np.frombuffer(self.content, np.uint8)
-        return {"step": self.step, "regret": self.regret, "content": content}
-
-    def set_state(self, state: State) -> None:
-        """Mirrors `get_state`."""
-        self.step, self.regret = int(state["step"]), float(state["regret"])
-        self.content = state["content"].tobytes()
+        return {"step": self.step, "regret": self.regret, "content": np.frombuffer(self.content, np.uint8)}
 
 
 class LearningCurve:
@@ -135,6 +92,17 @@ class LearningCurve:
 
     The evaluation at the end may come soon after the one before, with few episodes of its own; it takes those
     of the one before too.
+
+    Args:
+        evaluator: scores policies exactly.
+        agent: the one that learns.
+        config: the run's settings; `evaluation` and `total_timesteps` say when an evaluation is due.
+        envs: those that the agent learns in, which count the returns of its episodes.
+
+    Attributes:
+        newest: the newest evaluation.
+        seconds: spent on evaluation.
+        sinks: take every evaluation, one after the other.
     """
 
     def __init__(
@@ -142,43 +110,36 @@ class LearningCurve:
         evaluator: Evaluator,
         agent: Agent,
         config: TrainConfig,
-        sinks: Sequence[Sink] = (),
         envs: StatisticsVectorEnv | None = None,
     ) -> None:
-        """A curve without a point.
-
-        Args:
-            evaluator: scores policies exactly.
-            agent: the one that learns.
-            config: the run's settings; `evaluation` and `total_timesteps` say when an evaluation is due.
-            sinks: take every evaluation, one after the other.
-            envs: those that the agent learns in, which count the returns of its episodes.
-        """
         self.evaluator = evaluator
         self.certificate = Certificate()
         self.best = BestModel()
         self.newest: Evaluation | None = None
-        self.seconds = 0.0  # spent on evaluation
-        self._agent = agent
-        self._envs = envs
-        self._sinks = sinks
-        self._every = config.evaluation.every
-        self._stop_after = config.evaluation.stop_after
+        self.seconds = 0.0
+        self.sinks: list[Sink] = []
+        self._agent, self._envs = agent, envs
+        self._every, self._stop_after = config.evaluation.every, config.evaluation.stop_after
         self._total = config.total_timesteps
         self._next = self._every
-        self._held: _Held | None = None
+        # The evaluation that was due where training may be over, see `on_step`: the step, the policy and,
+        # if it was the best by then, the model.
+        self._held: tuple[int, PolicySnapshot, bytes] | None = None
         self._due = NO_EPISODES  # those of the newest evaluation that was due, held or not
 
     def get_state(self) -> State:
         """The schedule, the certificate, the best model; the newest snapshot, which gives its scores."""
-        newest, held = self.newest, self._held
+        newest, held = self.newest, None
+        if self._held is not None:
+            step, snapshot, model = self._held
+            held = {"step": step, "snapshot": vars(snapshot).copy(), "model": np.frombuffer(model, np.uint8)}
         return {
             "step": -1 if newest is None else newest.step,
             "next": self._next,
-            **self.certificate.get_state(),
+            **vars(self.certificate),
             "seconds": self.seconds,
-            "beliefs": None if newest is None else vars(newest.snapshot).copy(),
-            "held": None if held is None else held.get_state(),
+            "snapshot": None if newest is None else vars(newest.snapshot).copy(),
+            "held": held,
             "best": self.best.get_state(),
             "due": self._due._asdict(),
         }
@@ -190,19 +151,22 @@ class LearningCurve:
             Exception: of any kind for a state that does not fit; see `storage.serialization.fitting`.
         """
         self._next = int(state["next"])
-        self.certificate.set_state(state)
+        self.certificate = Certificate(
+            int(state["streak"]), state["first_certified_step"], state["certified_since_step"]
+        )
         self.seconds = float(state["seconds"])
         if (held := state["held"]) is not None:
-            self._held = _Held(int(held["step"]), _snapshot(held["beliefs"]), held["model"].tobytes())
-        self.best.set_state(state["best"])
+            self._held = int(held["step"]), _snapshot(held["snapshot"]), held["model"].tobytes()
+        best = state["best"]
+        self.best = BestModel(int(best["step"]), float(best["regret"]), best["content"].tobytes())
         self._due = Returns(int(state["due"]["episodes"]), float(state["due"]["total"]))
-        if state["beliefs"] is not None:
-            snapshot = _snapshot(state["beliefs"])
+        if state["snapshot"] is not None:
+            snapshot = _snapshot(state["snapshot"])
             self.newest = Evaluation(int(state["step"]), snapshot, *self._scores(snapshot), NO_EPISODES)
 
-    def catch_up(self) -> None:
-        """Write what was held at the end of a shorter run, if that is not the end any more."""
-        if self._held is not None and self._held.step < self._total:
+    def write_held_of_shorter_run(self) -> None:
+        """Write what was held at the end of a shorter run, if that is no longer the end."""
+        if self._held is not None and self._held[0] < self._total:
             self._write_held()
 
     def on_step(self, step: int) -> int:
@@ -226,34 +190,25 @@ class LearningCurve:
             if step < self._total:
                 self._evaluate(step, self._agent.snapshot, self._agent.model_file, self._due)
             else:
-                self._held = self._hold(step, self._agent.snapshot())
+                snapshot = self._agent.snapshot()
+                is_best = self.best.is_beaten_by(self._greedy_score(snapshot))
+                self._held = step, snapshot, self._agent.model_file() if is_best else b""
         if self._stop_after is not None and self.certificate.streak >= self._stop_after:
             return 0
         return self._next if self._held is None else step + 1
 
     def evaluate(self, step: int) -> Evaluation:
-        """Evaluate both policies before the first or after the last step, once a step.
-
-        Args:
-            step: environment steps so far.
-
-        Returns:
-            The evaluation at this step, a new one or the one that there is.
-        """
+        """Evaluate both policies before the first or after the last step, once a step."""
         self._held = None  # of this step, as it was before the last update
         if self.newest is not None and step == self.newest.step:
             return self.newest
         returns = self._due.merged(self._take_returns())
         return self._evaluate(step, self._agent.snapshot, self._agent.model_file, returns)
 
-    def _hold(self, step: int, snapshot: PolicySnapshot) -> _Held:
-        is_best = self.best.is_beaten_by(self._greedy_score(snapshot))
-        return _Held(step, snapshot, self._agent.model_file() if is_best else b"")
-
     def _write_held(self) -> None:
-        held, self._held = self._held, None
-        if held is not None:
-            self._evaluate(held.step, lambda: held.snapshot, lambda: held.model, self._due)
+        if self._held is not None:
+            (step, snapshot, model), self._held = self._held, None
+            self._evaluate(step, lambda: snapshot, lambda: model, self._due)
 
     def _take_returns(self) -> Returns:
         return NO_EPISODES if self._envs is None else self._envs.take_returns()
@@ -261,28 +216,25 @@ class LearningCurve:
     def _evaluate(
         self,
         step: int,
-        snapshot: Callable[[], PolicySnapshot],
+        take_snapshot: Callable[[], PolicySnapshot],
         model_file: Callable[[], bytes],
         returns: Returns,
     ) -> Evaluation:
         started = clock()
-        evaluation = self._scored(step, snapshot(), returns)
-        self.best.offer(step, evaluation.greedy, model_file)
-        self.seconds += clock() - started
-        for sink in self._sinks:
-            sink.write(evaluation)
-        return evaluation
-
-    def _scored(self, step: int, snapshot: PolicySnapshot, returns: Returns) -> Evaluation:
+        snapshot, before = take_snapshot(), self.newest
         if not (np.isfinite(snapshot.values).all() and np.isfinite(snapshot.sampled).all()):
             raise InputError(
                 f"training diverged: the agent's values are no finite numbers after {step} steps; "
                 "try a smaller learning rate"
             )
-        before = self.newest
         is_new = before is None or not np.array_equal(before.snapshot.values, snapshot.values)
         self.newest = evaluation = Evaluation(step, snapshot, *self._scores(snapshot), returns)
         self.certificate.update(step, evaluation.greedy.certified, is_new)
+        if self.best.is_beaten_by(evaluation.greedy):
+            self.best = BestModel(step, evaluation.greedy.shortfall, model_file())
+        self.seconds += clock() - started
+        for take in self.sinks:
+            take(evaluation)
         return evaluation
 
     def _scores(self, snapshot: PolicySnapshot) -> tuple[Score, Score]:
@@ -301,4 +253,75 @@ class LearningCurve:
 
 def _snapshot(state: State) -> PolicySnapshot:
     """Mirrors `vars`; nothing is left to a default."""
-    return PolicySnapshot(*(state[field.name] for field in dataclasses.fields(PolicySnapshot)))
+    return PolicySnapshot(*(state[each.name] for each in dataclasses.fields(PolicySnapshot)))
+
+
+CURVE_COLUMNS = (
+    "step",
+    *(metric.name for metric in METRICS),
+    *(f"sampled_{metric.name}" for metric in METRICS),
+    *(metric.name for metric in TRAINING_METRICS),
+)
+
+
+def write_row(log: AppendLog, evaluation: Evaluation) -> None:
+    """Append a row to `curve.csv`; before the first one, the names of the columns."""
+    row: dict[str, Any] = {"step": evaluation.step, **numbers(evaluation.greedy)}
+    row |= {f"sampled_{name}": number for name, number in numbers(evaluation.sampled).items()}
+    row |= {metric.name: metric.of(evaluation.returns) for metric in TRAINING_METRICS}
+    head = [] if log.length else [CURVE_COLUMNS]
+    log.append(csv_text([*head, [row[name] for name in CURVE_COLUMNS]]).encode())
+
+
+def read_curve(log: AppendLog, columns: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+    """Read columns of the `curve.csv` of this process, (evaluations,) each, that have no empty field."""
+    rows = csv.DictReader(io.StringIO(log.content().decode(), newline=""))
+    found = np.array([[float(row[name]) for name in columns] for row in rows])
+    return dict(zip(columns, found.reshape(-1, len(columns)).T, strict=True))
+
+
+def show_progress(progress: Progress, evaluation: Evaluation) -> None:
+    """Show how good the greedy policy is, next to the progress bar."""
+    greedy = evaluation.greedy
+    note = f"regret {greedy.regret:.3g}, goal {greedy.outcome.goal:.0%}"
+    progress.update(evaluation.step, note + (", certified optimal" if greedy.certified else ""))
+
+
+def _greedy_tag(metric: Metric) -> str:
+    return f"{GREEDY if metric.in_front else GREEDY_MORE}/{metric.name}"
+
+
+def _charts() -> dict[str, list[str]]:
+    charts: dict[str, list[str]] = {metric.chart: [] for metric in METRICS if metric.chart is not None}
+    for training_metric in TRAINING_METRICS:
+        charts.setdefault(training_metric.chart, []).append(training_metric.tag)
+    for metric in METRICS:
+        if metric.chart is not None:
+            optimum = [f"{OPTIMUM}/{metric.name}"] if metric.has_optimum else []
+            charts[metric.chart] += [_greedy_tag(metric), f"{SAMPLED}/{metric.name}", *optimum]
+    return charts
+
+
+CHARTS = _charts()  # of TensorBoard's Custom Scalars tab, {title: tags}
+
+
+class CurveScalars:
+    """TensorBoard's scalars: a point per evaluation and metric, and the optimum with it."""
+
+    def __init__(self, events: EventWriter, evaluator: Evaluator) -> None:
+        self._events = events
+        best = optimal_score(evaluator)
+        self._optimum = {
+            f"{OPTIMUM}/{metric.name}": float(metric.of(best)) for metric in METRICS if metric.has_optimum
+        }
+
+    def write(self, evaluation: Evaluation) -> None:
+        """Write one event with a value for every tag; SB3's names for metrics are tags too."""
+        greedy = [(metric, float(metric.of(evaluation.greedy))) for metric in METRICS]
+        tags = self._optimum | {_greedy_tag(metric): number for metric, number in greedy}
+        tags |= {f"{GREEDY}/{metric.sb3_name}": number for metric, number in greedy if metric.sb3_name}
+        tags |= {f"{SAMPLED}/{name}": float(number) for name, number in numbers(evaluation.sampled).items()}
+        for metric in TRAINING_METRICS:
+            if (number := metric.of(evaluation.returns)) is not None:
+                tags[metric.tag] = number
+        self._events.scalars(tags, evaluation.step)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +17,15 @@ from numpy.typing import NDArray
 from gridworld.agents import PolicySnapshot
 from gridworld.config.pictures import PICTURES, Picture
 from gridworld.config.train import TrainConfig
-from gridworld.envs.frames.rendering import Frame, fitting_cell_size
+from gridworld.envs.rendering import Frame, fitting_cell_size
 from gridworld.errors import InputError
-from gridworld.run.writer import RunWriter
 from gridworld.storage.serialization import State
 from gridworld.training.learning_curve import Evaluation
 from gridworld.training.tensorboard import EventWriter
 from gridworld.visualization.animation import Animation
-from gridworld.visualization.picture import Draw, drawer, save
+from gridworld.visualization.files import encode_gif, save
+from gridworld.visualization.picture import Draw, drawer
 from gridworld.visualization.policy_history import PolicyHistory
-from gridworld.visualization.video import encode_gif
 from gridworld.world.exact.evaluation import Evaluator
 
 _GROUP = "pictures"  # of TensorBoard's tags: behind the learning curve
@@ -47,33 +47,28 @@ class _Subject:
 
 
 class Pictures:
-    """A sink of evaluations that draws."""
+    """Draws evaluations.
+
+    Args:
+        config: the run's settings; `recording` and `logging` say what is drawn.
+        folder: that the files go to.
+        evaluator: the evaluator of the run's world.
+        visits: (S, A), the environments' own counts, which grow.
+        events: where TensorBoard's pictures go, if anywhere.
+        is_trusted: see `visualization.picture.Subject`.
+    """
 
     def __init__(
         self,
         config: TrainConfig,
-        run: RunWriter,
+        folder: Path,
         evaluator: Evaluator,
         visits: NDArray[np.int64],
         events: EventWriter | None,
         is_trusted: bool,
     ) -> None:
-        """Nothing is drawn yet.
-
-        Args:
-            config: the run's settings; `recording` and `logging` say what is drawn.
-            run: the folder that the files go to.
-            evaluator: the evaluator of the run's world.
-            visits: (S, A), the environments' own counts, which grow.
-            events: where TensorBoard's pictures go, if anywhere.
-            is_trusted: see `visualization.picture.Subject`.
-        """
-        self._config = config
-        self._run = run
-        self._evaluator = evaluator
-        self._visits = visits
-        self._events = events
-        self._is_trusted = is_trusted
+        self._config, self._folder, self._evaluator = config, folder, evaluator
+        self._visits, self._events, self._is_trusted = visits, events, is_trusted
         self._history = PolicyHistory(evaluator.mdp.num_states) if config.recording.learning else None
         self._evaluations = 0
         self._shown_at: int | None = None  # the step of the newest policy in TensorBoard
@@ -113,21 +108,6 @@ class Pictures:
             if getattr(self._config.recording, picture.setting):
                 self._attempt(picture.label, self._keep, picture, subject, prepared)
 
-    def _subject(self, evaluation: Evaluation, visits: NDArray[np.int64]) -> _Subject:
-        snapshot, step = evaluation.snapshot, evaluation.step
-        return _Subject(
-            self._config, self._is_trusted, self._evaluator, snapshot, step, visits, self._history
-        )
-
-    def _attempt(self, label: str, function: Callable[..., None], *arguments: object) -> None:
-        """A picture that cannot be drawn is no reason to fail a run that is trained."""
-        try:
-            function(*arguments)
-        except InputError as error:
-            if label not in self._too_large:
-                self._too_large.add(label)
-                _log.warning("%s: %s is left out, %s", self._run.folder, label, error)
-
     def _show_development(self, evaluation: Evaluation) -> None:
         self._shown_at = evaluation.step
         if self._events is None:
@@ -138,18 +118,32 @@ class Pictures:
             if picture.while_training:
                 self._attempt(f"TensorBoard's {picture.name}", self._draw_and_show, picture, subject)
 
-    def _draw_and_show(self, picture: Picture, subject: _Subject) -> None:
-        self._show(
-            picture, self._for_tensorboard(picture, drawer(picture.drawer).draw(subject)), subject.steps
+    def _subject(self, evaluation: Evaluation, visits: NDArray[np.int64]) -> _Subject:
+        snapshot, step = evaluation.snapshot, evaluation.step
+        return _Subject(
+            self._config, self._is_trusted, self._evaluator, snapshot, step, visits, self._history
         )
+
+    def _attempt(self, label: str, function: Callable[..., None], *arguments: object) -> None:
+        """A picture that cannot be drawn does not fail a run that is trained."""
+        try:
+            function(*arguments)
+        except InputError as error:
+            if label not in self._too_large:
+                self._too_large.add(label)
+                _log.warning("%s: %s is left out, %s", self._folder, label, error)
+
+    def _draw_and_show(self, picture: Picture, subject: _Subject) -> None:
+        draw = drawer(picture.drawer).draw(subject)
+        self._show(picture, self._for_tensorboard(picture, draw), subject.steps)
 
     def _keep(self, picture: Picture, subject: _Subject, prepared: dict[str, Draw]) -> None:
         """Write the file, and show it in TensorBoard where it has not been shown while training."""
         if picture.drawer not in prepared:
             prepared[picture.drawer] = drawer(picture.drawer).draw(subject)
-        draw, fps = prepared[picture.drawer], self._config.recording.fps
+        draw = prepared[picture.drawer]
         drawn = draw(None)
-        content = save(drawn, self._run.folder / picture.file, fps)
+        content = save(drawn, self._folder / picture.file, self._config.recording.fps)
         if self._events is None or picture.while_training or not picture.is_in_tensorboard:
             return
         shown = self._for_tensorboard(picture, draw)

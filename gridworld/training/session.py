@@ -9,12 +9,17 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 from gridworld.agents import Agent, Learning, TrainingContext
-from gridworld.config.train import TrainConfig
+from gridworld.config.settings import privileges
+from gridworld.config.train import AUTO, TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console.progress import Progress
 from gridworld.process.console.terminal import tell
@@ -24,18 +29,28 @@ from gridworld.run.checkpoints import Checkpoints, Pace
 from gridworld.run.evaluations_file import NEEDED, write_evaluations
 from gridworld.run.folder import CURVE, EVENTS
 from gridworld.run.identity.fingerprint import environment, identity
-from gridworld.run.summary import Summary
+from gridworld.run.summary import MOST_NAMED, Summary
 from gridworld.run.writer import RunWriter
 from gridworld.storage.append_log import AppendLog
 from gridworld.storage.atomic_write import in_background, sync, write_array, write_bytes, write_json
 from gridworld.storage.serialization import State, fitting
-from gridworld.training.learning_curve import LearningCurve, Sink
+from gridworld.training.learning_curve import (
+    CHARTS,
+    CurveScalars,
+    Evaluation,
+    LearningCurve,
+    read_curve,
+    show_progress,
+    write_row,
+)
 from gridworld.training.pictures import Pictures
-from gridworld.training.sinks import CHARTS, CurveFile, CurveScalars, ProgressLine, read_curve
-from gridworld.training.summary import CLOCK, as_json, summarise
 from gridworld.training.tensorboard import EventWriter, as_markdown, hparams
 from gridworld.training.together import Training
 from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.mdp import EXACT
+from gridworld.world.metrics import numbers, optimal_numbers
+
+CLOCK = {"train_seconds", "evaluation_seconds"}  # the summary's times
 
 _log = logging.getLogger("gridworld")
 
@@ -45,22 +60,14 @@ class Learner:
 
     def __init__(self, agent: Agent) -> None:
         self.agent = agent
-        self._state: State | None = None
+        self.state: State | None = None
 
     def get_state(self) -> State:
         """The agent's, with its environments."""
         return self.agent.get_state()
 
     def set_state(self, state: State) -> None:
-        """Continue from a state."""
-        self._state = state
-
-    def learning(
-        self, total: int, on_step: Callable[[int], int], on_safe_point: Callable[[int], None] | None
-    ) -> Learning:
-        """What is to be learnt from here on."""
-        state, self._state = self._state, None  # it may be large
-        return Learning(self.agent, total, on_step, on_safe_point, state)
+        self.state = state
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,18 +84,19 @@ class Parts:
 
     def set_state(self, state: State) -> None:
         """Continue from the state of a whole checkpoint."""
-        for name in PARTS:
-            getattr(self, name).set_state(state[name])
+        with fitting():
+            for name in PARTS:
+                getattr(self, name).set_state(state[name])
 
 
 PARTS = tuple(field.name for field in dataclasses.fields(Parts))
 LOGS = {"curve": CURVE, "events": EVENTS}  # that a checkpoint has marks of, and the pattern of their names
-FORMAT = 4  # of a checkpoint; a number more where a part's state has other keys or another meaning
+FORMAT = 5  # of a checkpoint; a number more where a part's state has other keys or another meaning
 CONTENT = {  # the type of each key of a checkpoint
     "format": int,
     "identity": str,
     "environment": dict,
-    "manifest": str,  # as the run's was then; older ones have none
+    "manifest": str,  # as the run's was then
     "steps": int,
     "total_timesteps": int,
     "seconds": float,
@@ -98,12 +106,29 @@ CONTENT = {  # the type of each key of a checkpoint
 
 
 class Session:
-    """The training of one run, new or continued."""
+    """The training of one run, new or continued; nothing is written before `run`.
+
+    Args:
+        config: the run's settings.
+        folder: the run's.
+        evaluator: the evaluator of its world.
+        agent: ready to learn.
+        context: where the agent learns.
+        events: the event file, if there is to be one.
+        state: the content of a checkpoint to continue from; None: from the start.
+        is_trusted: whether the environment that the settings name may be made.
+
+    Attributes:
+        reached: environment steps.
+
+    Raises:
+        StateError: for a state that does not fit.
+    """
 
     def __init__(
         self,
         config: TrainConfig,
-        run: RunWriter,
+        folder: Path,
         evaluator: Evaluator,
         agent: Agent,
         context: TrainingContext,
@@ -111,39 +136,27 @@ class Session:
         state: State | None,
         is_trusted: bool,
     ) -> None:
-        """Open the run's files; those that grow are cut back to the state.
-
-        Args:
-            config: the run's settings.
-            run: its folder, with a manifest.
-            evaluator: the evaluator of its world.
-            agent: ready to learn.
-            context: where the agent learns.
-            events: the event file, if there is to be one.
-            state: the content of a checkpoint to continue from; None: from the start.
-            is_trusted: whether the environment that the settings name may be made.
-        """
-        self._config, self._run, self._events = config, run, events
-        self._visits = context.envs.visits
-        self._state = state
-        self._steps = 0 if state is None else int(state["steps"])
-        self.checkpoints = Checkpoints(run.folder)
-        self.checkpoints.newest = None if state is None else self._steps
+        self._config, self._events = config, events
+        self._evaluator, self._visits = evaluator, context.envs.visits
+        self._is_new = state is None
+        self._curve_mark = None if state is None else state["marks"]["curve"]
+        self.reached = 0 if state is None else int(state["steps"])
+        self.checkpoints = Checkpoints(folder)
+        self.checkpoints.newest = None if state is None else self.reached
         self._origin = {
             "identity": identity(config, evaluator.mdp.text()),
             "environment": environment(config.agent),
         }
-        self._pace = Pace(self._checkpoint_every(agent), self._steps)
+        self._pace = Pace(self._checkpoint_every(agent), self.reached)
         self._stop = StopRequest()
         self._started = clock() - (0.0 if state is None else float(state["seconds"]))
-        self._curve_log = AppendLog(run.curve_file, None if state is None else state["marks"]["curve"])
-        label = f"{config.agent.name} on {evaluator.mdp.name}"
-        self._progress = Progress(config.total_timesteps, label, config.logging.progress)
-        pictures = Pictures(config, run, evaluator, self._visits, events, is_trusted)
-        scalars = [] if events is None else [CurveScalars(events, evaluator)]
-        sinks: list[Sink] = [CurveFile(self._curve_log), *scalars, ProgressLine(self._progress), pictures]
-        curve = LearningCurve(evaluator, agent, config, sinks, context.envs)
-        self._parts = Parts(Learner(agent), curve, pictures)
+        self._parts = Parts(
+            Learner(agent),
+            LearningCurve(evaluator, agent, config, envs=context.envs),
+            Pictures(config, folder, evaluator, self._visits, events, is_trusted),
+        )
+        if state is not None:
+            self._parts.set_state(state)
 
     def _checkpoint_every(self, agent: Agent) -> int | str | None:
         every = self._config.checkpoint.every
@@ -153,17 +166,18 @@ class Session:
         tell(f"checkpoints: none, since {unknown} does not define get_state and set_state")
         return None
 
-    def run(self) -> Training[Summary]:
-        """Train, evaluate, record.
+    def progress(self) -> dict[str, int | None]:
+        """How many steps were made, and how many of them are saved."""
+        return {"reached": self.reached, "checkpoint": self.checkpoints.newest}
 
-        Returns:
-            The run's summary, which is written.
+    def run(self, run: RunWriter) -> Training[Summary]:
+        """Train, evaluate, record; the summary is written, too.
 
         Raises:
             InputError: where training diverges, or the folder is taken away.
-            StateError: for a state that does not fit.
             Interrupted: by a signal, after a checkpoint.
         """
+        self._open(run)
         succeeded = False
         try:
             with self._stop.listening():
@@ -178,17 +192,21 @@ class Session:
             self._close(succeeded)
         return summary
 
-    @property
-    def reached(self) -> int:
-        """Environment steps."""
-        return self._steps
+    def _open(self, run: RunWriter) -> None:
+        """Open the curve's file, cut back to the state, and the rest that takes evaluations."""
+        config, events, curve = self._config, self._events, self._parts.curve
+        self._run = run
+        self._curve_log = AppendLog(run.curve_file, self._curve_mark)
+        label = f"{config.agent.name} on {self._evaluator.mdp.name}"
+        self._progress = Progress(config.total_timesteps, label, config.logging.progress)
+        curve.sinks.append(partial(write_row, self._curve_log))
+        if events is not None:
+            curve.sinks.append(CurveScalars(events, self._evaluator).write)
+        curve.sinks += [partial(show_progress, self._progress), self._parts.pictures.write]
 
     def _begin(self) -> None:
-        state, self._state = self._state, None  # it may be large
-        if state is not None:
-            with fitting():
-                self._parts.set_state(state)
-            self._parts.curve.catch_up()
+        if not self._is_new:
+            self._parts.curve.write_held_of_shorter_run()
             return
         if self._events is not None:
             self._events.hparams(hparams(self._config))
@@ -198,11 +216,13 @@ class Session:
         self._parts.curve.evaluate(0)
 
     def _learning(self) -> Learning:
+        learner = self._parts.agent
+        state, learner.state = learner.state, None  # it may be large
         on_safe_point = None if self._pace.never else self._on_safe_point
-        return self._parts.agent.learning(self._config.total_timesteps, self._on_step, on_safe_point)
+        return Learning(learner.agent, self._config.total_timesteps, self._on_step, on_safe_point, state)
 
     def _on_step(self, steps: int) -> int:
-        self._steps = steps
+        self.reached = steps
         if self._pace.never:  # else a safe point will come
             self._stop.obey()
         return self._parts.curve.on_step(steps)
@@ -247,13 +267,13 @@ class Session:
     def _finish(self) -> Summary:
         seconds = clock() - self._started
         parts = self._parts
-        last = parts.curve.evaluate(self._steps)
+        last = parts.curve.evaluate(self.reached)
         write_bytes(self._run.model_file, parts.agent.agent.model_file())
         write_bytes(self._run.best_model_file, parts.curve.best.content)
         self._write_evaluations()
         write_array(self._run.visits_file, self._visits)
         summary = summarise(self._config, parts.curve, last, seconds)
-        write_json(self._run.summary_file, as_json(summary))
+        write_json(self._run.summary_file, _as_json(summary))
         if self._events is not None:
             timeless = {key: value for key, value in summary.items() if key not in CLOCK}
             self._events.text("run/summary", as_markdown(timeless), last.step)
@@ -287,3 +307,47 @@ class Session:
                 failures.append(error)
         if succeeded and failures:
             raise failures[0]
+
+
+def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, seconds: float) -> Summary:
+    """The fields of `summary.json`, where numbers may be infinite; `seconds` are those of training."""
+    evaluator, certificate = curve.evaluator, curve.certificate
+    mdp = evaluator.mdp
+    endless = evaluator.endless_states(last.snapshot.greedy_policy())
+    greedy, sampled = (
+        {name: number for name, number in numbers(score).items() if name != "certified"}
+        for score in (last.greedy, last.sampled)
+    )
+    return {
+        "agent": config.agent.name,
+        "env": mdp.name,
+        **({} if mdp.truth == EXACT else {"truth": mdp.truth}),
+        "observation": config.observation.kind,
+        "seed": config.seed,
+        "recipe": config.recipe,
+        "preset": config.preset if config.preset != AUTO else "none",
+        "privileges": privileges(dataclasses.asdict(config)),
+        "total_timesteps": config.total_timesteps,
+        "timesteps": last.step,
+        "gamma": config.evaluation.gamma,
+        "max_episode_steps": evaluator.max_episode_steps,
+        "certified": last.greedy.certified,
+        "first_certified_step": certificate.first_certified_step,
+        "certified_since_step": certificate.certified_since_step,
+        "best_step": curve.best.step,
+        "best_regret": curve.best.regret,
+        **optimal_numbers(evaluator),
+        **greedy,
+        "endless_cells": [mdp.coordinates(state) for state in endless],
+        "endless_states": [mdp.state_name(state) for state in endless[:MOST_NAMED]],
+        "sampled": sampled,
+        "train_seconds": round(seconds, 3),
+        "evaluation_seconds": round(curve.seconds, 3),
+    }
+
+
+def _as_json(content: Any) -> Any:
+    """The same with null for what JSON has no number for: an endless walk at γ = 1 is worth -inf."""
+    if isinstance(content, dict):
+        return {key: _as_json(value) for key, value in content.items()}
+    return None if isinstance(content, float) and not math.isfinite(content) else content

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 
@@ -10,16 +11,39 @@ from gridworld.config.composition.presets import LARGE, STOCHASTIC, fitting_pres
 from gridworld.config.pictures import PICTURES
 from gridworld.config.train import AUTO, TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
-from gridworld.envs.frames.rendering import frame_size
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
-from gridworld.visualization.picture import drawer
-from gridworld.visualization.video import require_video
 from gridworld.world.exact.evaluation import Evaluator, fitting_discounts, score_of_optimum
 from gridworld.world.mdp import Mdp
 
 _QUICKLY_SOLVED = 6000  # outcomes of all states and actions
+
+
+def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = compiled) -> Mdp:
+    """Check everything that can be checked without the agent's library.
+
+    Args:
+        config: the settings of a run.
+        world: makes the world, or returns one that several runs share.
+
+    Returns:
+        The run's world.
+    """
+    check(config)
+    family(config.agent).check(config)
+    mdp = world(config.env)
+    config.env.step_limit(mdp)
+    wanted = config.recording
+    if wanted.mp4:
+        from gridworld.visualization.files import require_video
+
+        require_video()
+    if wanted.cell_size is not None and (wanted.frames or wanted.gif or wanted.mp4):
+        from gridworld.envs.rendering import frame_size
+
+        frame_size(mdp, wanted.cell_size)
+    return mdp
 
 
 def make_context(
@@ -28,16 +52,9 @@ def make_context(
     observation: ObservationTable,
     write_scalars: WriteScalars | None = None,
 ) -> TrainingContext:
-    """Make the environments that an agent of this configuration learns in.
+    """Make `config.n_envs` fresh environments, and what else an agent is built from.
 
-    Args:
-        config: the settings of the run.
-        mdp: its world.
-        observation: what the agent sees of each state.
-        write_scalars: takes the agent's own training metrics.
-
-    Returns:
-        `config.n_envs` fresh environments and what else the agent's family builds it from.
+    `write_scalars` takes the agent's own training metrics.
     """
     share = config.exploring_starts
     envs = StatisticsVectorEnv(
@@ -59,35 +76,29 @@ def make_context(
     )
 
 
+@functools.lru_cache(maxsize=4)  # the runs of a population share a world
+def _with_exploring_starts(mdp: Mdp, share: float) -> Mdp:
+    return mdp.with_exploring_starts(share)
+
+
 def import_for(config: TrainConfig) -> None:
     """Import what a run of this configuration takes, for processes that are forked from this one."""
+    from gridworld.visualization.picture import drawer
+
     family(config.agent).import_for(config.agent)
     for picture in PICTURES:
         if getattr(config.recording, picture.setting):
             drawer(picture.drawer)
 
 
-@functools.lru_cache(maxsize=4)  # the runs of a population share a world
-def _with_exploring_starts(mdp: Mdp, share: float) -> Mdp:
-    return mdp.with_exploring_starts(share)
-
-
-def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = compiled) -> Mdp:
-    """Check everything that can be checked without the agent's library.
-
-    Args:
-        config: the settings of a run.
-        world: makes the world, or returns one that several runs share.
-
-    Returns:
-        The run's world.
-    """
-    check(config)
-    family(config.agent).check(config)
-    mdp = world(config.env)
-    config.env.step_limit(mdp)
-    check_recording(config, mdp)
-    return mdp
+def without_pictures(config: TrainConfig) -> TrainConfig:
+    """The same settings without pictures, which take time, or an extra that may be missing."""
+    none = dict.fromkeys((picture.setting for picture in PICTURES), False)
+    return dataclasses.replace(
+        config,
+        recording=dataclasses.replace(config.recording, **none),
+        logging=dataclasses.replace(config.logging, policy_map_every=0),
+    )
 
 
 def notes(config: TrainConfig, mdp: Mdp) -> list[str]:
@@ -112,14 +123,9 @@ def notes(config: TrainConfig, mdp: Mdp) -> list[str]:
 
 
 def objective_note(config: TrainConfig, mdp: Mdp) -> str | None:
-    """Say that no agent with this discount can be certified, if that is so.
+    """Say that no agent with this discount can be certified, if that is so, with what would be right.
 
-    Args:
-        config: the settings of a run.
-        mdp: its world; one that takes longer than some tens of milliseconds to solve is not looked at.
-
-    Returns:
-        The sentence, with what would be right; None: the agent has no discount, or its optimum is certified.
+    A world that takes longer than some tens of milliseconds to solve is not looked at.
     """
     gamma, judged = getattr(config.agent, "gamma", None), config.evaluation.gamma
     if gamma in (None, judged) or mdp.probability.size > _QUICKLY_SOLVED:
@@ -136,12 +142,3 @@ def objective_note(config: TrainConfig, mdp: Mdp) -> str | None:
         f"{key.lstrip('+')}={gamma:g}: what is optimal under it has a regret of {score.regret:.2g} under "
         f"evaluation.gamma={judged:g}, too much for a certificate; take {key}={right:g}"
     )
-
-
-def check_recording(config: TrainConfig, mdp: Mdp) -> None:
-    """Check that the episode can be drawn as the settings ask for."""
-    wanted = config.recording
-    if wanted.mp4:
-        require_video()
-    if (wanted.frames or wanted.gif or wanted.mp4) and wanted.cell_size is not None:
-        frame_size(mdp, wanted.cell_size)

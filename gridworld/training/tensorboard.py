@@ -12,22 +12,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tensorboard.compat.proto.summary_pb2 import Summary, SummaryMetadata
-from tensorboard.compat.proto.tensor_pb2 import TensorProto
-from tensorboard.compat.proto.tensor_shape_pb2 import TensorShapeProto
+from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.compat.proto.types_pb2 import DT_STRING
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.custom_scalar import metadata as layout_metadata
 from tensorboard.plugins.hparams import api_pb2, metadata, plugin_data_pb2
 from tensorboard.plugins.text import metadata as text_metadata
 
-from gridworld.config.flatten import flat
-from gridworld.config.settings_by_effect import ON_RESULT, with_effects
+from gridworld.config.settings import ON_RESULT, flat, with_effects
 from gridworld.config.train import TrainConfig
-from gridworld.envs.frames.rendering import Frame
+from gridworld.envs.rendering import Frame
 from gridworld.storage.append_log import AppendLog
 from gridworld.storage.event_file import EventFile
-from gridworld.visualization.png import encode_png
+from gridworld.visualization.files import encode_png
 
 HParamValue = bool | float | str | None
 
@@ -48,15 +45,14 @@ def as_markdown(content: Mapping[str, Any]) -> str:
 
 
 class EventWriter:
-    """Writes one event file, which is opened when it is first needed. Steps are environment steps."""
+    """Writes one event file, which is opened when it is first needed. Steps are environment steps.
+
+    Args:
+        folder: where the file is.
+        mark: where a file ended that is to be continued, see `storage.append_log`; None: a new one.
+    """
 
     def __init__(self, folder: Path, mark: dict[str, Any] | None = None) -> None:
-        """A new file, or with a mark the one that is there.
-
-        Args:
-            folder: where the file is.
-            mark: where a file ended that is to be continued, see `storage.append_log`.
-        """
         self._folder, self._mark = folder, mark
 
     @functools.cached_property
@@ -70,9 +66,7 @@ class EventWriter:
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
         """Write one event with a value for every tag."""
-        self._file.add(
-            Summary(value=[Summary.Value(tag=tag, simple_value=v) for tag, v in values.items()]), step
-        )
+        self._add([{"tag": tag, "simple_value": value} for tag, value in values.items()], step)
 
     def image(self, tag: str, frame: Frame, step: int) -> None:
         """Write a picture as PNG."""
@@ -97,75 +91,52 @@ class EventWriter:
             else:
                 # A name that the locale could not decode has characters that no protocol buffer takes.
                 start.hparams[name].string_value = str(value).encode("utf-8", "backslashreplace").decode()
-        self._session(
-            metadata.SESSION_START_INFO_TAG, plugin_data_pb2.HParamsPluginData(session_start_info=start)
-        )
+        self._session(metadata.SESSION_START_INFO_TAG, session_start_info=start)
 
     def end_session(self, succeeded: bool) -> None:
         """Write how the run ended, for the HParams table."""
         status = api_pb2.STATUS_SUCCESS if succeeded else api_pb2.STATUS_FAILURE
         end = plugin_data_pb2.SessionEndInfo(status=status, end_time_secs=time.time())
-        self._session(metadata.SESSION_END_INFO_TAG, plugin_data_pb2.HParamsPluginData(session_end_info=end))
+        self._session(metadata.SESSION_END_INFO_TAG, session_end_info=end)
 
     def text(self, tag: str, markdown: str, step: int) -> None:
         """Write a text for the Text tab."""
-        plugin = SummaryMetadata.PluginData(plugin_name=text_metadata.PLUGIN_NAME)
-        content = markdown.encode("utf-8", "backslashreplace")
-        value = Summary.Value(
-            tag=tag,
-            metadata=SummaryMetadata(plugin_data=plugin),
-            tensor=TensorProto(dtype=DT_STRING, string_val=[content], tensor_shape=TensorShapeProto()),
-        )
-        self._file.add(Summary(value=[value]), step)
+        self._tensor(tag, text_metadata.PLUGIN_NAME, markdown.encode("utf-8", "backslashreplace"), step)
 
     def charts(self, title: str, charts: Mapping[str, Sequence[str]]) -> None:
         """Write charts of several tags each, for the Custom Scalars tab: {chart title: tags}."""
-        self._layout(
-            title,
-            [
-                layout_pb2.Chart(title=name, multiline=layout_pb2.MultilineChartContent(tag=tags))
-                for name, tags in charts.items()
-            ],
-        )
+        self._layout(title, [{"title": name, "multiline": {"tag": tags}} for name, tags in charts.items()])
 
     def bands(self, title: str, bands: Mapping[str, tuple[str, str, str]]) -> None:
         """Write charts with a band around a line, for the same tab: {title: tags of value, low and high}."""
-        series = layout_pb2.MarginChartContent.Series
-        self._layout(
-            title,
-            [
-                layout_pb2.Chart(
-                    title=name,
-                    margin=layout_pb2.MarginChartContent(series=[series(value=value, lower=low, upper=high)]),
-                )
-                for name, (value, low, high) in bands.items()
-            ],
-        )
+        series = {
+            name: {"value": value, "lower": low, "upper": high} for name, (value, low, high) in bands.items()
+        }
+        self._layout(title, [{"title": name, "margin": {"series": [each]}} for name, each in series.items()])
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
-    def _layout(self, title: str, charts: Sequence[layout_pb2.Chart]) -> None:
-        category = layout_pb2.Category(title=title, chart=charts)
-        content = layout_pb2.Layout(category=[category]).SerializeToString()
-        plugin = SummaryMetadata.PluginData(plugin_name=layout_metadata.PLUGIN_NAME)
-        value = Summary.Value(
-            tag=layout_metadata.CONFIG_SUMMARY_TAG,
-            metadata=SummaryMetadata(plugin_data=plugin),
-            tensor=TensorProto(dtype=DT_STRING, string_val=[content], tensor_shape=TensorShapeProto()),
-        )
-        self._file.add(Summary(value=[value]), 0)
+    def _layout(self, title: str, charts: Sequence[dict[str, Any]]) -> None:
+        content = layout_pb2.Layout(category=[{"title": title, "chart": charts}]).SerializeToString()
+        self._tensor(layout_metadata.CONFIG_SUMMARY_TAG, layout_metadata.PLUGIN_NAME, content, 0)
+
+    def _tensor(self, tag: str, plugin: str, content: bytes, step: int) -> None:
+        """Write what TensorBoard's plugin of that name shows."""
+        tensor = {"dtype": DT_STRING, "string_val": [content], "tensor_shape": {}}
+        shown_by = {"plugin_data": {"plugin_name": plugin}}
+        self._add([{"tag": tag, "metadata": shown_by, "tensor": tensor}], step)
 
     def _image(self, tag: str, encoded: bytes, size: tuple[int, int], step: int) -> None:
         width, height = size
-        picture = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=encoded)
-        self._file.add(Summary(value=[Summary.Value(tag=tag, image=picture)]), step)
+        image = {"height": height, "width": width, "colorspace": 3, "encoded_image_string": encoded}
+        self._add([{"tag": tag, "image": image}], step)
 
-    def _session(self, tag: str, content: plugin_data_pb2.HParamsPluginData) -> None:
-        content.version = metadata.PLUGIN_DATA_VERSION
-        plugin = SummaryMetadata.PluginData(
-            plugin_name=metadata.PLUGIN_NAME, content=content.SerializeToString()
-        )
-        value = Summary.Value(tag=tag, metadata=SummaryMetadata(plugin_data=plugin))
-        self._file.add(Summary(value=[value]), 0)
+    def _session(self, tag: str, **content: Any) -> None:
+        data = plugin_data_pb2.HParamsPluginData(version=metadata.PLUGIN_DATA_VERSION, **content)
+        plugin = {"plugin_name": metadata.PLUGIN_NAME, "content": data.SerializeToString()}
+        self._add([{"tag": tag, "metadata": {"plugin_data": plugin}}], 0)
+
+    def _add(self, values: Sequence[dict[str, Any]], step: int) -> None:
+        self._file.add(Summary(value=values), step)

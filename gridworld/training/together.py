@@ -8,9 +8,9 @@ and end one after the other, and none can tell the difference. Each runs in a co
 from __future__ import annotations
 
 import contextvars
+import dataclasses
 import time
 from collections.abc import Callable, Generator, Sequence
-from functools import partial
 from typing import Any, Generic, TypeVar
 
 from gridworld.agents import Learning, learn_together
@@ -21,32 +21,21 @@ Training = Generator[Learning, None, T]
 
 
 def run_alone(training: Training[T]) -> T:
-    """Run a training.
-
-    Returns:
-        What it returns.
-
-    Raises:
-        BaseException: what it raises.
-    """
+    """Run a training; returns what it returns, and raises what it raises."""
     try:
         learning = next(training)
         while True:
-            error = _error(learning)
+            error: BaseException | None = None
+            try:
+                learning.agent.learn(
+                    learning.total_timesteps, learning.on_step, learning.on_safe_point, learning.state
+                )
+            except BaseException as failure:
+                error = failure
             learning = next(training) if error is None else training.throw(error)
     except StopIteration as end:
         result: T = end.value
         return result
-
-
-def _error(learning: Learning) -> BaseException | None:
-    try:
-        learning.agent.learn(
-            learning.total_timesteps, learning.on_step, learning.on_safe_point, learning.state
-        )
-    except BaseException as error:
-        return error
-    return None
 
 
 def run_together(trainings: Sequence[Callable[[], Training[T]]]) -> list[T | Exception]:
@@ -59,9 +48,9 @@ def run_together(trainings: Sequence[Callable[[], Training[T]]]) -> list[T | Exc
         What each returned, or the exception that it raised.
 
     Raises:
-        SystemExit: a training raised it. The others have gone on until they ended; those that had not begun
-            were left out.
-        BaseException: one of another kind that is no `Exception`. It was raised in the others too.
+        SystemExit: a training raised it. The others ran to their ends; those that had not begun were left
+            out.
+        BaseException: one of another kind that is not an `Exception`. It was raised in the others too.
     """
     together = _Together(len(trainings))
     runs = [_Run(begin, together) for begin in trainings]
@@ -140,39 +129,38 @@ class _Run(Generic[T]):
         try:
             if self._training is None:
                 self._training = self._call(self._begin)
-            step = partial(next, self._training) if error is None else partial(self._throw, error)
-            learning: Learning = self._call(step)
+            assert self._training is not None
+            learning = (
+                self._call(next, self._training) if error is None else self._call(self._training.throw, error)
+            )
         except StopIteration as end:
-            self.result, self.learning, self._training = end.value, None, None
+            self.result = end.value
         except Exception as failure:
-            self.result, self.learning, self._training = failure, None, None
+            self.result = failure
         except SystemExit as stop:
             self._together.exit = self._together.exit or stop
-            self.learning = self._training = None
         else:
-            self.learning = Learning(
-                learning.agent,
-                learning.total_timesteps,
-                partial(self._together.apart, partial(self._call, learning.on_step)),
-                None if learning.on_safe_point is None else partial(self._hook, learning.on_safe_point),
-                learning.state,
+            save = learning.on_safe_point
+            self.learning = dataclasses.replace(
+                learning,
+                on_step=self._own(learning.on_step),
+                on_safe_point=None if save is None else self._own(save),
             )
+            return
+        self.learning = self._training = None
 
     def end(self, stop: BaseException) -> None:
         """Raise something in it, if it has begun and not ended."""
         if self._training is not None:
             try:
-                self._call(partial(self._throw, self.error or stop))
+                self._call(self._training.throw, self.error or stop)
             except BaseException:  # it may raise another one on its way out
                 self._training = None
 
-    def _hook(self, call: Callable[[int], None], steps: int) -> None:
-        self._together.apart(partial(self._call, call), steps)
+    def _own(self, hook: Callable[[int], Any]) -> Callable[[int], Any]:
+        """A hook that is called in this run's context, on its own time."""
+        return lambda steps: self._together.apart(lambda at: self._call(hook, at), steps)
 
-    def _throw(self, error: BaseException) -> Learning:
-        assert self._training is not None
-        return self._training.throw(error)
-
-    def _call(self, function: Callable[..., Any], *arguments: int) -> Any:
+    def _call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         with self._clock.running():
             return self._context.run(function, *arguments)

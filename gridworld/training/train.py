@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
 import shlex
 import traceback
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from gridworld.agents import Agent, family
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import make_observation
-from gridworld.errors import FolderLostError, InputError, MachineError, reason
+from gridworld.errors import InputError, MachineError, reason
 from gridworld.process.console.command_line import recorded_command_line
 from gridworld.process.console.terminal import tell
 from gridworld.process.signals import Interrupted
-from gridworld.run.folder import RunFolder, shown
-from gridworld.run.reader import RunReader
+from gridworld.run.folder import MANIFEST, RunFolder, shown
+from gridworld.run.recovery import is_started
 from gridworld.run.summary import Summary, interruption_text
 from gridworld.run.train_log import TrainLog
-from gridworld.run.undo import FilesBefore
 from gridworld.run.writer import RunWriter
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.serialization import State, StateError
@@ -44,28 +45,23 @@ def train(
     folder: Path,
     overrides: list[str],
     world: Callable[[EnvConfig], Mdp] = compiled,
-    replace: bool = False,
     on_built: OnBuilt = ignore,
 ) -> Summary:
-    """Train, evaluate and record as configured; everything it writes goes to the run's folder.
+    """Train, evaluate and record as configured.
 
     Args:
         config: the run's settings.
         folder: the run's, which everything is written to.
         overrides: what the command line changed, for the manifest.
         world: makes the configured world, or returns one that there is.
-        replace: whether what the folder has of an earlier run is cleared away.
         on_built: takes the agent before it learns.
-
-    Returns:
-        The summary.
 
     Raises:
         InputError: for a mistake in the settings, before anything is written, or where training diverges.
         MachineError: where files cannot be written.
         Interrupted: by a signal, after a checkpoint.
     """
-    return run_alone(training(config, folder, overrides, world, replace, on_built))
+    return run_alone(training(config, folder, overrides, world, on_built))
 
 
 def training(
@@ -73,7 +69,6 @@ def training(
     folder: Path,
     overrides: list[str],
     world: Callable[[EnvConfig], Mdp] = compiled,
-    replace: bool = False,
     on_built: OnBuilt = ignore,
 ) -> Training[Summary]:
     """The same as a generator, for `run_together`."""
@@ -81,10 +76,11 @@ def training(
         mdp = check_settings(config, world)
         for note in notes(config, mdp) if config.logging.progress else ():
             tell(note)
-
-        def begin() -> RunWriter:
-            return RunWriter.start(folder, dataclasses.asdict(config), mdp, overrides, replace)
-
+        manifest = folder / MANIFEST
+        is_empty = os.path.lexists(manifest) and not is_started(folder)
+        if is_empty:
+            tell(f"{manifest}: is empty, and nothing of the run was saved; it begins anew")
+        begin = partial(RunWriter.start, folder, dataclasses.asdict(config), mdp, overrides, replace=is_empty)
         return (yield from carry_out(config, folder, mdp, begin, log, world is compiled, on_built=on_built))
 
 
@@ -95,99 +91,53 @@ def carry_out(
     begin: Callable[[], RunWriter],
     log: TrainLog,
     is_trusted: bool,
-    earlier: tuple[RunReader, State] | None = None,
+    state: State | None = None,
     on_built: OnBuilt = ignore,
 ) -> Training[Summary]:
-    """Train from the start or continue from a state, with settings that were checked.
+    """Train from the start or continue from a checkpoint's state, with settings that were checked.
 
-    Args:
-        config: the run's settings.
-        folder: the run's, which everything is written to.
-        mdp: the run's world.
-        begin: writes the manifest, once the agent is built.
-        log: takes what is warned about; its file is opened here.
-        is_trusted: whether the environment that the settings name may be made.
-        earlier: the run as its folder has it and the content of a checkpoint; None: from the start.
-        on_built: as for `train`.
-
-    Returns:
-        The summary.
-
-    Raises:
-        InputError, MachineError, Interrupted: as `train` does.
+    `begin` writes the manifest, once everything is built. `is_trusted`: the environment that the settings
+    name may be made, which runs its code.
     """
     observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
     evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
-    before = None if earlier is None else FilesBefore(*earlier)
-    state = None if earlier is None else earlier[1]
     events = None
     if config.logging.tensorboard:
         events = EventWriter(folder, None if state is None else state["marks"]["events"])
     context = make_context(config, mdp, observation, None if events is None else events.scalars)
     agent = family(config.agent).build(config.agent, context)
     on_built(agent)
-
+    run = None
     try:
+        session = Session(config, folder, evaluator, agent, context, events, state, is_trusted)
         run = begin()
-    except OSError as error:  # the manifest is the old one, or none: files are replaced whole
-        raise _unwritable(folder, config, error) from None
-    log.open(run.log_file)
-    if state is None:
-        log.add(f"begins: {shlex.join(recorded_command_line())}")
-    session = None
-    try:
-        session = Session(config, run, evaluator, agent, context, events, state, is_trusted)
-        if before is not None and before.has_result():
-            session.checkpoints.held = before.steps
-        summary = yield from session.run()
-    except Interrupted as interruption:
-        run.end("interrupted", str(interruption), **_progress(session))
-        log.add(interruption_text(interruption, run, run.manifest))
-        raise
+        log.open(run.log_file)
+        if state is None:
+            log.add(f"begins: {shlex.join(recorded_command_line())}")
+        summary = yield from session.run(run)
     except BaseException as error:
-        with contextlib.suppress(OSError):  # nothing can be written perhaps
-            if before is None or not _undo(before, run, log, error, session):
-                _note_failure(run, log, error, _progress(session))
+        if run is not None:
+            with contextlib.suppress(OSError):  # nothing can be written perhaps
+                _note_end(run, log, error, session.progress())
         if isinstance(error, StateError):
             raise InputError(f"{folder}: its checkpoint does not fit this run: {error}") from None
         if isinstance(error, OSError):
             raise _unwritable(folder, config, error) from None
         raise
     session.checkpoints.keep(1)
-    run.end("finished", None, **_progress(session))
+    run.end("finished", None, **session.progress())
     log.add(f"finished after {session.reached:,} steps")
     return summary
 
 
-def _undo(
-    before: FilesBefore, run: RunWriter, log: TrainLog, error: BaseException, session: Session | None
-) -> bool:
-    """Put a run back as it was, if it cannot be resumed at all, or was finished and cannot be made longer."""
-    has_gone_on = session is not None and session.reached != before.steps
-    if isinstance(error, InputError | StateError) and not has_gone_on:
-        before.put_back()
-        log.add(f"cannot be resumed: {reason(error)}", "ERROR")
-        return True
-    if not _is_failure(error) or isinstance(error, FolderLostError) or not before.has_result():
-        return False
-    before.put_back()
-    log.add(f"cannot be made longer: {reason(error)}", "ERROR")
-    if not isinstance(error, InputError | StateError):
-        write_text(run.error_file, traceback.format_exc())
-    tell(f"{shown(run.folder)}: stays as it was, finished after {before.steps:,} steps")
-    return True
-
-
-def _is_failure(error: BaseException) -> bool:
-    # What is no `Exception` is a signal's that came before the session takes them itself.
-    return isinstance(error, Exception) and not isinstance(error, OSError)
-
-
-def _note_failure(
-    run: RunWriter, log: TrainLog, error: BaseException, progress: dict[str, int | None]
-) -> None:
-    """Write to the manifest and the log why a run ended, and the traceback of what nobody has foreseen."""
-    failed = _is_failure(error)
+def _note_end(run: RunWriter, log: TrainLog, error: BaseException, progress: dict[str, int | None]) -> None:
+    """Record why a run ended before its end, and the traceback of what nobody has foreseen."""
+    if isinstance(error, Interrupted):
+        run.end("interrupted", str(error), **progress)
+        log.add(interruption_text(error, run, run.manifest))
+        return
+    # What is not an `Exception` is a signal's that came before the session takes them itself.
+    failed = isinstance(error, Exception) and not isinstance(error, OSError)
     status = "failed" if failed else "interrupted"
     log.add(f"{status}: {reason(error)}", "ERROR")
     if failed and not isinstance(error, InputError | StateError):
@@ -200,10 +150,3 @@ def _unwritable(folder: Path, config: TrainConfig, error: OSError) -> MachineErr
     resume = run.resume_command(dataclasses.asdict(config))
     how = f"go on with {resume}" if run.manifest_file.exists() else "give the command again"
     return MachineError(f"{shown(folder)}: {reason(error)}; put that right, then {how}")
-
-
-def _progress(session: Session | None) -> dict[str, int | None]:
-    """How many steps were made, and how many of them are saved."""
-    if session is None:
-        return {}
-    return {"reached": session.reached, "checkpoint": session.checkpoints.newest}

@@ -22,7 +22,7 @@ from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import printable, tell
 from gridworld.process.parallel.together import LARGEST
-from gridworld.report.analysis import statistics
+from gridworld.report import statistics
 from gridworld.report.table import number, steps_up_to
 from gridworld.run.damage import damage
 from gridworld.run.recovery import find_run

@@ -18,8 +18,8 @@ from omegaconf import OmegaConf
 
 from gridworld.config.composition.compose import without_hydra
 from gridworld.config.composition.recipe_file import IN_A_STUDY, overrides
-from gridworld.config.effects import Effect
-from gridworld.config.settings_by_effect import ON_RESULT, with_effects
+from gridworld.config.fields import Effect
+from gridworld.config.settings import ON_RESULT, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.symlinks import make_inside

@@ -27,7 +27,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import recorded_command_line
-from gridworld.report.evidence.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
+from gridworld.report.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
 from gridworld.run.claim import check_writable
 from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON
 from gridworld.run.identity.provenance import versions

@@ -21,7 +21,6 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from gridworld.bounds import above_zero, at_least
 from gridworld.config.composition.compose import (
     compose_whole,
     register_schemas,
@@ -31,7 +30,7 @@ from gridworld.config.composition.compose import (
 )
 from gridworld.config.composition.hydra_errors import sentence
 from gridworld.config.composition.recipe_file import CHOSEN, with_recipe
-from gridworld.config.train import AUTO, TrainConfig
+from gridworld.config.train import AUTO, TrainConfig, check_bounds
 from gridworld.config.tune import TuneConfig
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import program
@@ -163,23 +162,9 @@ def _parse(words: Sequence[str]) -> list[Override]:
 
 
 def _check(settings: TuneConfig) -> None:
-    at_least("tune.trials", settings.trials, 1)
-    at_least("tune.seeds", settings.seeds, 1)
-    at_least("tune.finalists", settings.finalists, 1)
-    at_least("tune.final_seeds", settings.final_seeds, 0)
-    at_least("tune.confirm_seeds", settings.confirm_seeds, 2)
-    at_least("tune.evaluations", settings.evaluations, 1)
-    at_least("tune.reports", settings.reports, 1)
-    at_least("tune.heartbeat", settings.heartbeat, 1)
-    at_least("tune.sampler_seed", settings.sampler_seed, 0)
-    if settings.stop_after is not None:
-        at_least("tune.stop_after", settings.stop_after, 1)
-    if settings.timeout is not None:
-        above_zero("tune.timeout", settings.timeout)
-    if settings.together is not None:
-        at_least("tune.together", settings.together, 1)
-    if settings.workers != -1:
-        at_least("tune.workers", settings.workers, 1)
+    check_bounds(settings, "tune.")
+    if settings.workers == 0:
+        raise InputError("tune.workers=0: must be at least 1, or -1 for one on each core")
     for key, value, known in (
         ("sampler", settings.sampler, _SAMPLERS),
         ("pruner", settings.pruner, _PRUNERS),

@@ -7,19 +7,16 @@ exact; what an environment of another library draws may have more than a palette
 from __future__ import annotations
 
 import functools
-import math
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from gridworld.envs.frames import rendering as drawing
-from gridworld.envs.frames.rendering import Frame, Packed
+from gridworld.envs import rendering as drawing
+from gridworld.envs.rendering import Frame, Packed
 from gridworld.envs.rollout import Episode
 from gridworld.errors import InputError
 from gridworld.world.layout import positive_int
@@ -27,16 +24,12 @@ from gridworld.world.mdp import IntArray, Mdp
 
 _MOST_COLOURS = 256
 _LONGEST_SIDE = 1000  # pixels, where no cell size is asked for
-_MOST_SIZES = 2  # of a world's boards that are kept: of the files, and of TensorBoard
-_MOST_ENCODED = 8_000_000  # bytes that are kept of each
+_MOST_ENCODED = 8_000_000  # bytes that are kept of a world's files
 _SAMPLED = 3_000_000  # bytes of all frames that a common palette is made from
 
+Picture = NDArray[np.uint8]  # (height, width), numbers of colours
 Palette = NDArray[np.uint8]  # (colours, 3), RGB
-Numbered = tuple[list[NDArray[np.uint8]], Palette]  # pictures, (height, width) each, and what they refer to
-
-
-# Parts of files, by the keys of the pictures that they depend on.
-Encoded = dict[tuple[object, ...], bytes]
+Encoded = dict[tuple[object, ...], bytes]  # parts of files, by the keys of the pictures that they depend on
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +38,7 @@ class Animation:
 
     keys: Sequence[int]  # one per picture; equal keys are equal pictures
     draw: Callable[[int], Image.Image]  # a fresh palette image for a key, all of one size and palette
-    encoded: Encoded = field(default_factory=dict)  # files' parts, by the keys that they depend on
+    encoded: Encoded = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -62,77 +55,39 @@ def automatic_cell_size(mdp: Mdp) -> int:
 
 
 def animation_of_states(mdp: Mdp, states: IntArray, cell_size: int | None = None) -> Animation:
-    """Show the agent in one state after the other.
-
-    Args:
-        mdp: the world.
-        states: (pictures,), the agent's states.
-        cell_size: pixels; None: see `automatic_cell_size`.
-
-    Returns:
-        A picture for each state.
-    """
+    """Show the agent in one state (pictures,) after the other; `cell_size` None: `automatic_cell_size`."""
     size = automatic_cell_size(mdp) if cell_size is None else positive_int("cell_size", cell_size)
-    empty = _empty_board(mdp, size)
+    empty, palette, encoded = _empty_board(mdp, size)
+    if sum(map(len, encoded.values())) > _MOST_ENCODED:
+        encoded.clear()
 
     def draw(state: int) -> Image.Image:
         left, top, width, height = drawing.agent_box(mdp, state, size)
-        picture = empty.picture.copy()
+        picture = empty.copy()
         picture[top : top + height, left : left + width] = 0  # the palette's first
-        return _image(picture, empty.palette)
+        return _image(picture, palette)
 
-    return Animation(states.tolist(), draw, empty.encoded)
+    return Animation(states.tolist(), draw, encoded)
 
 
-@dataclass(frozen=True, eq=False)
-class _EmptyBoard:
+@functools.lru_cache(maxsize=2)  # of the files, and of TensorBoard
+def _empty_board(mdp: Mdp, size: int) -> tuple[Picture, Palette, Encoded]:
     """What the episodes of all runs in a world have in common."""
-
-    picture: NDArray[np.uint8]
-    palette: Palette
-    encoded: Encoded = field(default_factory=dict)
-
-
-_boards: WeakKeyDictionary[Mdp, dict[int, _EmptyBoard]] = WeakKeyDictionary()
-
-
-def _empty_board(mdp: Mdp, size: int) -> _EmptyBoard:
-    """The board in cells of `size` pixels, drawn once per process; of a world the newest sizes are kept."""
-    boards = _boards.setdefault(mdp, {})
-    board = boards.pop(size, None)
-    if board is None:
-        empty = drawing.draw_frame(mdp, None, size)
-        numbered = _number([empty], first=[drawing.AGENT, drawing.BACKGROUND])
-        assert numbered is not None  # colours of walls, cliffs, ends, lines and the greys of letters
-        board = _EmptyBoard(numbered[0][0], numbered[1])
-    if sum(map(len, board.encoded.values())) > _MOST_ENCODED:
-        board.encoded.clear()
-    if board.picture.size <= _MOST_ENCODED:
-        boards[size] = board
-    for oldest in list(boards)[:-_MOST_SIZES]:
-        del boards[oldest]
-    return board
+    numbered = _number([drawing.draw_frame(mdp, None, size)], first=[drawing.AGENT, drawing.BACKGROUND])
+    assert numbered is not None  # colours of walls, cliffs, ends, lines and the greys of letters
+    return numbered[0][0], numbered[1], {}
 
 
 def animation_of_cards(mdp: Mdp, episodes: Sequence[Episode], cell_size: int | None = None) -> Animation:
-    """Tell episodes in text: each picture has a state, the action taken there, and the reward so far.
-
-    Args:
-        mdp: the world, of which only the names of states and actions are shown.
-        episodes: one after the other.
-        cell_size: pixels; None: see `automatic_cell_size`.
-
-    Returns:
-        A picture for each state of each episode.
-    """
+    """Show episodes in text: each picture has a state, the action taken there, and the reward so far."""
     size = automatic_cell_size(mdp) if cell_size is None else positive_int("cell_size", cell_size)
     frame_size = drawing.frame_size(mdp, size)
     cards = [lines for episode in episodes for lines in _cards(mdp, episode)]
+    greys = np.repeat(np.arange(_MOST_COLOURS, dtype=np.uint8)[:, None], 3, axis=1)
 
     def draw(index: int) -> Image.Image:
         surface = drawing.import_pygame().Surface(frame_size)
         drawing.draw_card(surface, cards[index])
-        greys = np.repeat(np.arange(_MOST_COLOURS, dtype=np.uint8)[:, None], 3, axis=1)
         return _image(np.ascontiguousarray(drawing.surface_to_frame(surface)[..., 0]), greys)
 
     return Animation(range(len(cards)), draw)
@@ -148,14 +103,9 @@ def _cards(mdp: Mdp, episode: Episode) -> Iterator[tuple[str, ...]]:
 
 
 def animation_of_frames(frames: Iterable[Frame | Packed], likely: Iterable[Sequence[int]] = ()) -> Animation:
-    """Show frames one after the other.
+    """Show frames one after the other: (height, width, 3) each, RGB, or (height, width), packed.
 
-    Args:
-        frames: (height, width, 3) each, RGB, or (height, width), see `envs.frames.rendering.Packed`.
-        likely: colours that the palette begins with; to know those of most pixels before saves time.
-
-    Returns:
-        A picture for each frame.
+    The palette begins with the `likely` colours; to know those of most pixels before saves time.
     """
     numbered = _number(frames, likely)
     if numbered is None:
@@ -167,15 +117,10 @@ def animation_of_frames(frames: Iterable[Frame | Packed], likely: Iterable[Seque
 def animation_of_rendered(
     frames: Sequence[Frame], keys: Sequence[int], longest_side: int | None = None
 ) -> Animation:
-    """Show frames of any number of colours in some order.
+    """Show the frame with the number of each key, scaled down to `longest_side` pixels where it is larger.
 
-    Args:
-        frames: (height, width, 3) each, RGB, all of one size.
-        keys: the number of the frame that each picture shows.
-        longest_side: pixels; larger frames are scaled down. None: they stay as they are.
-
-    Returns:
-        A picture for each key; quantised where the frames have more colours than a palette.
+    The frames (height, width, 3), RGB, are of one size. They are quantised where they have more colours than
+    a palette.
     """
     pictures = [_scaled_down(frame, longest_side) for frame in frames]
     if (numbered := _number(pictures)) is not None:
@@ -197,55 +142,37 @@ def _scaled_down(frame: Frame, longest_side: int | None) -> Frame:
     return np.asarray(Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS))
 
 
-def _image(picture: NDArray[np.uint8], palette: Palette) -> Image.Image:
+def _image(picture: Picture, palette: Palette) -> Image.Image:
     image = Image.fromarray(picture)
     image.putpalette(palette.tobytes())
     return image
 
 
-def _number(pictures: Iterable[Frame | Packed], first: Iterable[Sequence[int]] = ()) -> Numbered | None:
+def _number(
+    pictures: Iterable[NDArray[Any]], first: Iterable[Sequence[int]] = ()
+) -> tuple[list[Picture], Palette] | None:
     """The pictures as numbers into one palette, which begins with these colours; None: too many colours."""
+    numbers, numbered = _colour_numbers(), []
     palette = list(dict.fromkeys(red << 16 | green << 8 | blue for red, green, blue in first))
-    numbered = []
-    with _one_at_a_time:
-        numbers = _colour_numbers()
-        try:
-            numbers[palette] = range(1, 1 + len(palette))
-            for picture in pictures:
-                # Bands of about a million pixels need little memory beside a large picture.
-                bands: list[NDArray[Any]] = np.array_split(
-                    picture, 1 + math.prod(picture.shape[:2]) // 1_000_000
-                )
-                numbered.append(np.concatenate([_look_up(band, numbers, palette) for band in bands]))
-        except _TooManyColoursError:
-            return None
-        finally:
-            numbers[palette] = 0
+    try:
+        numbers[palette] = range(1, 1 + len(palette))
+        for picture in pictures:
+            packed = drawing.pack(picture) if picture.ndim == 3 else picture
+            found = numbers[packed]
+            if not found.all():
+                new = np.unique(packed[found == 0])
+                if len(palette) + len(new) > _MOST_COLOURS:
+                    return None
+                numbers[new] = range(1 + len(palette), 1 + len(palette) + len(new))
+                palette += new.tolist()
+                found = numbers[packed]
+            numbered.append(np.subtract(found, 1, dtype=np.uint8, casting="unsafe"))
+    finally:
+        numbers[palette] = 0
     return numbered, np.array(palette, dtype=">u4").view(np.uint8).reshape(-1, 4)[:, 1:]
-
-
-def _look_up(band: NDArray[Any], numbers: NDArray[np.uint16], palette: list[int]) -> NDArray[np.uint8]:
-    """The places of the band's colours in the palette, which gets those that are new."""
-    packed = drawing.pack(band) if band.ndim == 3 else band
-    found = numbers[packed]
-    if not found.all():
-        new = np.unique(packed[found == 0])
-        if len(palette) + len(new) > _MOST_COLOURS:
-            raise _TooManyColoursError
-        numbers[new] = range(1 + len(palette), 1 + len(palette) + len(new))
-        palette += new.tolist()
-        found = numbers[packed]
-    return np.subtract(found, 1, dtype=np.uint8, casting="unsafe")
-
-
-class _TooManyColoursError(Exception):
-    pass
-
-
-_one_at_a_time = threading.Lock()  # they use one table
 
 
 @functools.cache
 def _colour_numbers() -> NDArray[np.uint16]:
-    """Zeros for all RGB colours: 32 MB of which only the pages of used colours are ever touched."""
+    """The number of each RGB colour in a palette, from 1: of its 32 MB few pages are ever touched."""
     return np.zeros(1 << 24, dtype=np.uint16)

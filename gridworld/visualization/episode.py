@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from gridworld.config.worlds import EnvConfig, GymnasiumConfig
-from gridworld.envs.frames.board import board_of
-from gridworld.envs.frames.real_env import RealEnvFrames
-from gridworld.envs.frames.rendering import Frame, frame_size
+from gridworld.envs.board import board_of
+from gridworld.envs.real_env import RealEnvFrames
+from gridworld.envs.rendering import Frame, frame_size
 from gridworld.envs.rollout import Episode, play
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import printable, tell
@@ -45,17 +45,10 @@ def draw(subject: Subject) -> Draw:
 def film(
     env: EnvConfig, mdp: Mdp, episodes: Sequence[Episode], is_trusted: bool
 ) -> Callable[[int | None], Animation]:
-    """Prepare an animation of episodes, one after the other.
+    """Prepare an animation of episodes, one after the other, as a function of a cell size in pixels.
 
-    Args:
-        env: the settings of the world, which say whether it has an environment that draws frames.
-        mdp: the world.
-        episodes: at least one.
-        is_trusted: whether that environment may be made.
-
-    Returns:
-        A function of a cell size in pixels, None for its own. An environment's own frames are scaled down
-        where they are larger than the board would be with cells of that size.
+    The frames are those of the environment that `env` names, where `is_trusted` allows to make it; they are
+    scaled down where they are larger than the board would be with cells of that size.
     """
     frames = _by_the_environment(env, mdp, episodes, is_trusted)
     if frames is not None:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
@@ -20,10 +19,9 @@ from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
 from gridworld.config.train import TrainConfig
-from gridworld.envs.frames.rendering import Frame
-from gridworld.storage.atomic_write import write_bytes
+from gridworld.envs.rendering import Frame
+from gridworld.errors import InputError
 from gridworld.visualization.animation import Animation
-from gridworld.visualization.video import encode_gif, save_animation, save_png, save_pngs
 from gridworld.world.exact.evaluation import Evaluator
 
 if TYPE_CHECKING:
@@ -41,20 +39,17 @@ class Subject(Protocol):
     """What pictures are of: an agent after some training in its world."""
 
     @property
-    def config(self) -> TrainConfig:
-        """The run's settings."""
+    def config(self) -> TrainConfig: ...
 
     @property
     def is_trusted(self) -> bool:
         """Whether the environment that the settings name may be made, which runs its code."""
 
     @property
-    def evaluator(self) -> Evaluator:
-        """The evaluator of the run's world."""
+    def evaluator(self) -> Evaluator: ...
 
     @property
-    def snapshot(self) -> PolicySnapshot:
-        """What the agent holds of every state."""
+    def snapshot(self) -> PolicySnapshot: ...
 
     @property
     def steps(self) -> int:
@@ -74,6 +69,14 @@ def agents_gamma(subject: Subject) -> float:
     return float(getattr(subject.config.agent, "gamma", subject.evaluator.solution.gamma))
 
 
+def visits_of(subject: Subject) -> NDArray[np.int64] | None:
+    """The subject's visits; None where the run has none, for pictures that can be drawn without."""
+    try:
+        return subject.visits
+    except InputError:
+        return None
+
+
 class Drawer(Protocol):
     """The two names of a drawer's module."""
 
@@ -86,27 +89,3 @@ class Drawer(Protocol):
 def drawer(name: str) -> Drawer:
     """The module of that name in this package."""
     return cast("Drawer", importlib.import_module(f"{__package__}.{name}"))
-
-
-def save(drawn: Frame | Animation, path: Path, fps: int) -> bytes | None:
-    """Write a picture as what its path's ending says.
-
-    Args:
-        drawn: a frame, for a PNG, or an animation.
-        path: a file, or without an ending the folder of an animation's numbered PNGs.
-        fps: pictures per second of an animation.
-
-    Returns:
-        The content of a GIF.
-    """
-    gif = None
-    if not isinstance(drawn, Animation):
-        save_png(drawn, path)
-    elif path.suffix == ".gif":
-        gif = encode_gif(drawn, fps)
-        write_bytes(path, gif)
-    elif path.suffix:
-        save_animation(drawn, path, fps)
-    else:
-        save_pngs(drawn, path)
-    return gif

@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
-from gridworld.envs.frames.board import board_of
-from gridworld.envs.frames.rendering import fitting_cell_size
+from gridworld.envs.board import board_of
+from gridworld.envs.rendering import fitting_cell_size
 from gridworld.storage.serialization import State
 from gridworld.visualization.animation import Animation, animation_of_frames
 from gridworld.visualization.canvas import shown
-from gridworld.visualization.colormaps import VIRIDIS, linear
-from gridworld.visualization.maps.policy_map import caption_at, draw_policy_map, explored_by
-from gridworld.visualization.maps.state_table import Numbers, draw_policy_table, table_states
+from gridworld.visualization.paths import explored
 from gridworld.visualization.picture import Draw, Subject
-from gridworld.visualization.sheet import PAPER, Sheet
+from gridworld.visualization.policy_map import caption_at, draw_policy_map, draw_policy_table
+from gridworld.visualization.sheet import PAPER, VIRIDIS, Sheet, linear
+from gridworld.visualization.state_table import Numbers, table_states
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.mdp import BoolArray
 
@@ -33,8 +33,9 @@ _MOSAIC_SIDE = 640  # pixels, where there are several panels
 def draw(subject: Subject) -> Draw:
     """The animation of the subject's history, of one size."""
     assert subject.history is not None
+    known = explored(subject.evaluator.mdp, subject.visits)
     animation = subject.history.animation(
-        subject.evaluator, explored_by(subject), lambda step: caption_at(subject, step), subject.visits
+        subject.evaluator, known, lambda step: caption_at(subject, step), subject.visits
     )
     return lambda cell_size: animation
 
@@ -104,11 +105,8 @@ class PolicyHistory:
     ) -> Animation:
         """The policy map, or table, over training; one scale of colours for all of it.
 
-        Args:
-            evaluator: of the run's world.
-            known: (S,), the states that training acted in at any time.
-            caption: of a map after so many steps.
-            visits: (S, A), how often training took each action, by which a table's states are chosen.
+        `known` (S,) are the states that training acted in at any time; by `visits` (S, A) those of a table
+        are chosen. `caption` is of a map after so many steps.
         """
         mdp, optimal, moments = evaluator.mdp, evaluator.solution.optimal, self.moments()
         board = board_of(mdp)

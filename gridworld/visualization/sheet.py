@@ -1,15 +1,20 @@
-"""A picture with words: a caption above, in the middle whatever is drawn, a legend below."""
+"""A picture with words: a caption above, in the middle whatever is drawn, a legend below; and colour scales.
+
+Lightness rises or falls steadily along each scale, so that colour-blind readers see the order of numbers too,
+and a grey print keeps it. A scale has a limited number of colours, which keeps animations within the 256 of a
+GIF.
+"""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gridworld.envs.frames.rendering import (
+from gridworld.envs.rendering import (
     BACKGROUND,
     SMALLEST_TEXT,
     UNKNOWN,
@@ -20,17 +25,77 @@ from gridworld.envs.frames.rendering import (
     font,
     import_pygame,
     surface_to_frame,
+    text_size,
     text_width,
     write,
 )
-from gridworld.envs.frames.rendering import INK as INK
-from gridworld.visualization.colormaps import ColourArray, Scale
+from gridworld.envs.rendering import INK as INK
+from gridworld.world.mdp import BoolArray, FloatArray
+
+ColourArray = NDArray[np.uint8]  # (..., 3), RGB
 
 PAPER: Colour = BACKGROUND
 DISAGREES: Colour = (213, 60, 50)  # the colour of a greedy action that is not optimal
 UNKNOWN_INK: Colour = (170, 170, 170)
 
-Box = tuple[int, int, int, int]  # left, top, width, height
+_STEPS = 128  # colours of a scale
+_DECADES = 2.0  # a logarithmic scale from here on: below, a linear one still tells the cells apart
+
+
+def _ramp(*anchors: tuple[int, int, int]) -> ColourArray:
+    """(128, 3), in straight lines between the anchors."""
+    places, points = np.linspace(0, len(anchors) - 1, _STEPS), np.arange(len(anchors))
+    channels = [np.interp(places, points, channel) for channel in zip(*anchors, strict=True)]
+    return np.stack(channels, axis=1).round().astype(np.uint8)
+
+
+# matplotlib's viridis at five points, and two of C. Brewer's sequential schemes, https://colorbrewer2.org
+VIRIDIS = _ramp((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
+ORANGES = _ramp((255, 247, 236), (253, 212, 158), (252, 141, 89), (215, 48, 31), (127, 0, 0))
+BLUES = _ramp((222, 235, 247), (158, 202, 225), (66, 146, 198), (8, 81, 156), (8, 36, 88))
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """A range of numbers laid out over a ramp of colours (steps, 3)."""
+
+    ramp: ColourArray
+    low: float
+    high: float
+    logarithmic: bool = False
+
+    def colours(self, values: FloatArray) -> ColourArray:
+        """The colours (..., 3) of numbers (...,); those beyond the range get the colour of its end."""
+        low, high = self.low, self.high
+        if self.logarithmic:
+            values, low, high = np.log(np.maximum(values, low)), np.log(low), np.log(high)
+        level = (values - low) / (high - low) if high > low else np.zeros(np.shape(values))
+        steps = np.rint(np.clip(level, 0.0, 1.0) * (len(self.ramp) - 1))
+        colours: ColourArray = self.ramp[steps.astype(np.intp)]
+        return colours
+
+
+def linear(ramp: ColourArray, values: FloatArray, low: float | None = None) -> Scale:
+    """A scale from `low`, or the smallest finite value, to the largest; from 0 to 0 where none is finite."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return Scale(ramp, 0.0, 0.0)
+    return Scale(ramp, float(finite.min()) if low is None else low, float(finite.max()))
+
+
+def counting(ramp: ColourArray, counts: NDArray[Any]) -> Scale:
+    """A scale of the counts above zero, logarithmic where they span decades; from 0 to 0 without any."""
+    positive = counts[counts > 0]
+    if not positive.size:
+        return Scale(ramp, 0.0, 0.0)
+    low, high = float(positive.min()), float(positive.max())
+    return Scale(ramp, low, high, logarithmic=high >= low * 10**_DECADES)
+
+
+def is_dark(colours: ColourArray) -> BoolArray:
+    """Whether white is easier to read than black on colours (..., 3), as (...,)."""
+    dark: BoolArray = colours @ np.array([0.299, 0.587, 0.114]) < 140
+    return dark
 
 
 @dataclass(frozen=True)
@@ -58,45 +123,27 @@ class Sheet:
         names: the height of what is written into the upper border itself, in pixels.
 
     Attributes:
-        cell: see there.
-        text_size: of caption and legend, in pixels.
+        world: the surface of the middle and its border.
     """
 
     def __init__(self, width: int, height: int, cell: int, legend_rows: int = 1, names: int = 0) -> None:
         self.cell = cell
-        self.text_size = min(max(cell // 4, 15), 20)
-        self._legend_rows = legend_rows
+        self.text_size = min(max(cell // 4, 15), 20)  # of caption and legend, in pixels
+        self._legend_rows, self._names = legend_rows, names
         # The border of a cell is extended where words would not fit into it.
-        below = 1.1 + 1.5 * legend_rows
-        self._names = names
         top = names + max(0, round(2.2 * self.text_size) - cell)
-        bottom = max(0, round(below * self.text_size) - cell)
+        bottom = max(0, round((1.1 + 1.5 * legend_rows) * self.text_size) - cell)
         side = max(0, 21 * self.text_size - width + 1) // 2
         self._surface = import_pygame().Surface((width + 2 * side, top + height + bottom), 0, 32)
         self._surface.fill(PAPER)
-        self._world = self._surface.subsurface((side, top, width, height))
-
-    @property
-    def world(self) -> Any:
-        """The surface of the grid and its border of a cell."""
-        return self._world
+        self.world: Any = self._surface.subsurface((side, top, width, height))
 
     def number_size(self, room: float, texts: Collection[str]) -> int | None:
-        """Choose a font size for numbers in cells.
-
-        Args:
-            room: how wide a text may be, in cells.
-            texts: all that will be written.
-
-        Returns:
-            The font size in pixels; None where it would be too small to read.
-        """
+        """The font size at which numbers fit into `room` cells; None where they could not be read."""
         size = min(round(0.3 * self.cell), 20)
         if size < SMALLEST_TEXT or not texts:
             return None
-        widest = max(text_width(text, size) for text in set(texts))
-        fitting = int(size * min(1.0, room * self.cell / widest))
-        return fitting if fitting >= SMALLEST_TEXT else None
+        return text_size(max(texts, key=lambda text: text_width(text, size)), size, room * self.cell)
 
     def number(
         self, text: str, middle: Point, size: int, ink: Colour, plate: ColourArray | None = None
@@ -105,44 +152,46 @@ class Sheet:
         image = font(size).render(text, True, ink)
         box = image.get_rect(center=middle)
         if plate is not None:
-            self._world.fill(plate.tolist(), box)
-        self._world.blit(image, box)
+            self.world.fill(plate.tolist(), box)
+        self.world.blit(image, box)
 
     def caption(self, text: str) -> None:
         """Write one line above the grid, smaller where it is long."""
-        self._line(text, (self._world.get_offset()[1] + self.cell - self._names) // 2)
+        self._line(text, (self.world.get_offset()[1] + self.cell - self._names) // 2)
 
     def footer(self, text: str) -> None:
         """Write one line below the grid."""
-        bottom = self._world.get_offset()[1] + self._world.get_height() - self.cell
-        self._line(text, (bottom + self._surface.get_height()) // 2)
+        self._line(text, (self._bottom() + self._surface.get_height()) // 2)
+
+    def _bottom(self) -> int:
+        """The lower end of the grid, without its border."""
+        return int(self.world.get_offset()[1] + self.world.get_height() - self.cell)
 
     def _line(self, text: str, middle: int) -> None:
-        if not text:
-            return
-        width = self._surface.get_width()
-        size = self.text_size
-        left = min(self._world.get_offset()[0] + self.cell, max(6, (width - text_width(text, size)) // 2))
-        room = width - left - 6
-        size = max(SMALLEST_TEXT, int(size * min(1.0, room / max(1, text_width(text, size)))))
-        write(self._surface, text, left, middle, size)
+        if text:
+            width, size = self._surface.get_width(), self.text_size
+            centred = max(6, (width - text_width(text, size)) // 2)
+            left = min(self.world.get_offset()[0] + self.cell, centred)
+            size = text_size(text, size, width - left - 6) or SMALLEST_TEXT
+            write(self._surface, text, left, middle, size)
 
     def legend(self, scale: Scale, low: str, high: str, swatches: Sequence[Swatch] = ()) -> None:
-        """Draw the legend below the grid: the colour bar between the names of its ends, then the swatches.
+        """Draw the colour bar below the grid, between the names of its ends, and the swatches.
 
-        The swatches have a row of their own in a canvas with two rows of legend.
+        The swatches have a row of their own in a sheet with two rows of legend.
         """
-        total, offset = self._surface.get_width(), self._world.get_offset()
-        edge = offset[0] + self.cell
-        bottom = offset[1] + self._world.get_height() - self.cell
+        total, edge, bottom = (
+            self._surface.get_width(),
+            self.world.get_offset()[0] + self.cell,
+            self._bottom(),
+        )
         rows = (0.5,) if self._legend_rows == 1 else (0.32, 0.74)  # heights within what is below the grid
         middles = [bottom + round((self._surface.get_height() - bottom) * row) for row in rows]
         size, gap = self.text_size, self.text_size // 2
         beside = self._swatches_width(swatches, size) if len(rows) == 1 else 0
         ends = text_width(low, size) + text_width(high, size) + 2 * gap
         bar = max(3 * size, min(12 * size, total - 2 * gap - beside - ends))
-        left = max(4, min(edge, (total - bar - beside - ends) // 2))
-        middle = middles[0]
+        left, middle = max(4, min(edge, (total - bar - beside - ends) // 2)), middles[0]
         left = write(self._surface, low, left, middle, size) + gap
         self._draw_bar(scale, (left, middle - size // 2, bar, size))
         left = write(self._surface, high, left + bar + gap, middle, size) + 2 * gap
@@ -150,17 +199,21 @@ class Sheet:
             wide = self._swatches_width(swatches, size)
             size = max(SMALLEST_TEXT, int(size * min(1.0, (total - 8) / max(1, wide))))
             left = max(4, min(edge, (total - self._swatches_width(swatches, size)) // 2))
-        self._draw_swatches(swatches, left, middles[-1], size)
+        for swatch in swatches:
+            box = (left, middles[-1] - size // 2, size, size)
+            self._surface.fill(swatch.fill, box)
+            import_pygame().draw.rect(self._surface, swatch.frame, box, swatch.thick)
+            left = write(self._surface, swatch.label, left + size + size // 4, middles[-1], size) + size
 
     def _swatches_width(self, swatches: Sequence[Swatch], size: int) -> int:
         return sum(size + 3 * (size // 2) + text_width(swatch.label, size) for swatch in swatches)
 
-    def _draw_swatches(self, swatches: Sequence[Swatch], left: int, middle: int, size: int) -> None:
-        for swatch in swatches:
-            box = (left, middle - size // 2, size, size)
-            self._surface.fill(swatch.fill, box)
-            import_pygame().draw.rect(self._surface, swatch.frame, box, swatch.thick)
-            left = write(self._surface, swatch.label, left + size + size // 4, middle, size) + size
+    def _draw_bar(self, scale: Scale, box: tuple[int, int, int, int]) -> None:
+        left, top, width, height = box
+        steps = np.linspace(0, len(scale.ramp) - 1, width).round().astype(np.intp)
+        bar = np.tile(scale.ramp[steps], (height, 1, 1))
+        self._surface.blit(import_pygame().image.frombuffer(bar, (width, height), "RGB"), (left, top))
+        import_pygame().draw.rect(self._surface, INK, box, 1)
 
     def frame(self) -> Frame:
         """The picture's pixels."""
@@ -170,22 +223,6 @@ class Sheet:
         """The same with one number per pixel, a fresh array."""
         columns = np.asarray(self._surface.get_view("2"))
         return columns.T & np.uint32(0xFFFFFF)
-
-    def _draw_bar(self, scale: Scale, box: Box) -> None:
-        left, top, width, height = box
-        image = _bar(scale.ramp.tobytes(), width, height)
-        self._surface.blit(image, (left, top))
-        import_pygame().draw.rect(self._surface, INK, box, 1)
-
-
-@functools.lru_cache(maxsize=32)
-def _bar(ramp: bytes, width: int, height: int) -> Any:
-    """A ramp of colours, (steps, 3) bytes, from left to right."""
-    colours = np.frombuffer(ramp, dtype=np.uint8).reshape(-1, 3)
-    steps = np.linspace(0, len(colours) - 1, width).round().astype(np.intp)
-    row = np.full((width, 4), 255, dtype=np.uint8)
-    row[:, :3] = colours[steps]
-    return import_pygame().image.frombuffer(np.tile(row, (height, 1, 1)), (width, height), "RGBX")
 
 
 def short(number: float, largest: float | None = None) -> str:

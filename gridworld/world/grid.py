@@ -3,8 +3,8 @@
 A move succeeds with probability 1 - slip; otherwise one of the two perpendicular moves happens instead, with
 probability slip / 2 each. A move off the grid or into a wall leaves the agent where it is. The reward of a
 step is `step_reward` plus the reward of the cell entered (goal, trap, or nothing). A move into a cliff pays
-as one into a trap and leads to the start, so that no agent is ever on a cliff cell; as a state it is floor
-that no move leads to. Walls absorb as terminal cells do.
+as one into a trap and leads to the start, so that no agent is ever on a cliff cell. Walls absorb as terminal
+cells do.
 """
 
 from __future__ import annotations
@@ -26,11 +26,7 @@ NUM_ACTIONS = len(MOVES)
 class GridMdp(Mdp):
     """The tables of a map: a state is a cell, A = 4 actions, K outcomes (1 without slip, 3 with).
 
-    Attributes:
-        layout: the map; slip and the rewards are those of `compile_mdp`.
-        neighbour: (S, A), int32, where a move leads, geometry alone: borders and walls, no slip, fall or end.
-        wall: (S,), bool.
-        cliff: (S,), bool.
+    `neighbour` (S, A), int32, is where a move leads by borders and walls alone; `wall` and `cliff` are (S,).
     """
 
     layout: Layout
@@ -47,7 +43,7 @@ class GridMdp(Mdp):
         return self.layout.text()
 
     def rewards_text(self) -> tuple[str, str]:
-        """See `Mdp.rewards_text`."""
+        """See `Mdp`."""
         return f"step_reward={self.step_reward}", " or a step_reward of at most 0"
 
     def coordinates(self, state: int) -> tuple[int, ...]:
@@ -55,7 +51,7 @@ class GridMdp(Mdp):
         return divmod(state, self.layout.num_cols)
 
     def state_name(self, state: int) -> str:
-        """See `Mdp.state_name`."""
+        """See `Mdp`."""
         row, col = self.coordinates(state)
         return f"row {row + 1}, column {col + 1}"
 
@@ -82,10 +78,9 @@ def compile_mdp(
     slip = finite("slip", slip)
     if not 0 <= slip <= 1:
         raise InputError(f"slip={slip}: must be a probability, from 0 to 1")
-    step_reward = checked_reward("step_reward", step_reward)
-    goal_reward = checked_reward("goal_reward", goal_reward)
-    trap_reward = checked_reward("trap_reward", trap_reward)
-
+    rewards = {"step_reward": step_reward, "goal_reward": goal_reward, "trap_reward": trap_reward}
+    rewards = {key: checked_reward(key, value) for key, value in rewards.items()}
+    step_reward, goal_reward, trap_reward = rewards.values()
     if layout.cliffs and trap_reward > 0:
         raise InputError(
             f"trap_reward={trap_reward}: must be at most 0 where the map has a cliff, "
@@ -94,8 +89,7 @@ def compile_mdp(
     goal, trap, wall, cliff = (
         _mask(layout, cells) for cells in (layout.goals, layout.traps, layout.walls, layout.cliffs)
     )
-    terminal = goal | trap
-    absorbing = terminal | wall
+    absorbing = goal | trap | wall
     neighbour = _neighbours(layout, wall)
 
     # Outcome 0 is the move itself; with slip, 1 and 2 are the moves at right angles to it.
@@ -114,15 +108,13 @@ def compile_mdp(
         action_names=ACTION_NAMES,
         layout=layout,
         slip=slip,
-        step_reward=step_reward,
-        goal_reward=goal_reward,
-        trap_reward=trap_reward,
+        **rewards,
         neighbour=frozen(neighbour),
         next_state=frozen(next_state),
         probability=np.broadcast_to(np.array(chances), next_state.shape),
         thresholds=np.broadcast_to(np.array(thresholds), (*neighbour.shape, len(thresholds))),
         reward=frozen(reward),
-        terminal=frozen(terminal),
+        terminal=frozen(goal | trap),
         goal=frozen(goal),
         absorbing=frozen(absorbing),
         wall=frozen(wall),
@@ -169,11 +161,8 @@ def _mask(layout: Layout, cells: tuple[Cell, ...] | frozenset[Cell]) -> BoolArra
 
 def _neighbours(layout: Layout, wall: BoolArray) -> IntArray:
     states = np.arange(wall.size, dtype=np.int32)
-    rows, cols = np.divmod(states, layout.num_cols)
-    table = np.empty((wall.size, NUM_ACTIONS), dtype=np.int32)
-    for action, (down, right) in enumerate(MOVES):
-        row = np.clip(rows + down, 0, layout.num_rows - 1)
-        col = np.clip(cols + right, 0, layout.num_cols - 1)
-        target = row * layout.num_cols + col
-        table[:, action] = np.where(wall[target], states, target)
-    return table
+    row, col = np.divmod(states[:, None], layout.num_cols)
+    down, right = np.array(MOVES, dtype=np.int32).T
+    target = np.clip(row + down, 0, layout.num_rows - 1) * layout.num_cols
+    target += np.clip(col + right, 0, layout.num_cols - 1)
+    return np.where(wall[target], states[:, None], target).astype(np.int32)

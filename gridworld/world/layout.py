@@ -9,15 +9,14 @@ Maps are text, one line a row and one sign a cell:
     #  wall, cannot be entered
     .  floor
 
-`Layout` is the checked, immutable form. Whatever holds one can rely on it: there is a start and a goal, no
-cell is two things, every start can reach a goal without stepping on a trap or a cliff, and where there is a
-cliff, there is one start to be sent back to.
+`Layout` is the checked, immutable form: there is a start and a goal, no cell is two things, every start can
+reach a goal without stepping on a trap or a cliff, and where there is a cliff, there is one start to be sent
+back to.
 """
 
 from __future__ import annotations
 
 import operator
-from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -48,20 +47,9 @@ class MapError(InputError):
 
 @dataclass(frozen=True)
 class Layout:
-    """A checked map; the module says what the kinds of cells are.
+    """A checked map; the module says what the kinds of cells are. Raises InputError if it cannot be played.
 
-    Attributes:
-        name: what messages call it.
-        num_rows: its height in cells.
-        num_cols: its width in cells.
-        starts: the cells that episodes begin in.
-        goals: cells that end an episode with success.
-        traps: cells that end it without.
-        walls: cells that cannot be entered.
-        cliffs: cells that send back to the start.
-
-    Raises:
-        InputError: the map could not be played.
+    `name` is what messages call it; `num_rows` and `num_cols` are its height and width in cells.
     """
 
     name: str
@@ -111,8 +99,9 @@ def classic(num_rows: int = NUM_ROWS, num_cols: int = NUM_COLS) -> Layout:
         return Layout(CLASSIC, num_rows, num_cols, starts=((0, 0),), goals=((row, col),), traps=traps)
     except MapError as error:
         _, mistake, _ = error.args
-        size = f"layout classic of {num_rows} x {num_cols} cells"
-        raise InputError(f"{size}: {mistake}; give at least 4 rows and 3 columns") from None
+        raise InputError(
+            f"layout classic of {num_rows} x {num_cols} cells: {mistake}; give at least 4 rows and 3 columns"
+        ) from None
 
 
 def parse(text: str, name: str) -> Layout:
@@ -137,16 +126,8 @@ def parse(text: str, name: str) -> Layout:
                 f"{name}: row {row + 1} has {len(line)} columns, row 1 has {len(lines[0])}; "
                 "all rows must be equally long"
             )
-    return Layout(
-        name=name,
-        num_rows=len(lines),
-        num_cols=len(lines[0]),
-        starts=tuple(found["S"]),
-        goals=tuple(found["G"]),
-        traps=tuple(found["T"]),
-        walls=frozenset(found["#"]),
-        cliffs=tuple(found["C"]),
-    )
+    starts, goals, traps, cliffs = (tuple(found[tile]) for tile in "SGTC")
+    return Layout(name, len(lines), len(lines[0]), starts, goals, traps, frozenset(found["#"]), cliffs)
 
 
 def load(
@@ -165,10 +146,8 @@ def load(
     if isinstance(layout, str) and layout == CLASSIC:
         return classic(NUM_ROWS if num_rows is None else num_rows, NUM_COLS if num_cols is None else num_cols)
     loaded = layout if isinstance(layout, Layout) else _read(layout)
-    for what, asked, actual in (
-        ("num_rows", num_rows, loaded.num_rows),
-        ("num_cols", num_cols, loaded.num_cols),
-    ):
+    for what, asked in (("num_rows", num_rows), ("num_cols", num_cols)):
+        actual = getattr(loaded, what)
         if asked is not None and positive_int(what, asked) != actual:
             raise InputError(
                 f"{what}={asked}: the map {loaded.name} has {actual}; leave {what} out, "
@@ -206,8 +185,16 @@ def _read(layout: str | PathLike[str]) -> Layout:
     try:
         # A row may end in blanks or \r\n; far more than that is no map, and is not read.
         with open_users_file(given) as file:
-            is_ordinary = file is not None
-            raw = b"" if file is None else file.read(4 * MAX_CELLS + 1)
+            raw = None if file is None else file.read(4 * MAX_CELLS + 1)
+        if raw is None:
+            raise InputError(f"layout {given!r}: is no ordinary file; give a readable text file")
+        if len(raw) > 4 * MAX_CELLS:
+            raise InputError(f"{given}: the map is too large; at most {MAX_CELLS} cells fit")
+        return parse(raw.decode("utf-8-sig"), name=given)
+    except UnicodeDecodeError as error:
+        raise InputError(f"{given}: not a text file (byte {error.start + 1} is not UTF-8)") from None
+    except InputError:
+        raise
     except (FileNotFoundError, NotADirectoryError, ValueError):
         shipped = ", ".join(shipped_layouts())
         raise InputError(f"layout {given!r}: neither a shipped layout ({shipped}) nor a file") from None
@@ -215,14 +202,6 @@ def _read(layout: str | PathLike[str]) -> Layout:
         raise InputError(
             f"layout {given!r}: the map cannot be read ({error.strerror}); give a readable text file"
         ) from None
-    if not is_ordinary:
-        raise InputError(f"layout {given!r}: is no ordinary file; give a readable text file")
-    if len(raw) > 4 * MAX_CELLS:
-        raise InputError(f"{given}: the map is too large; at most {MAX_CELLS} cells fit")
-    try:
-        return parse(raw.decode("utf-8-sig"), name=given)
-    except UnicodeDecodeError as error:
-        raise InputError(f"{given}: not a text file (byte {error.start + 1} is not UTF-8)") from None
 
 
 def _check_size(name: str, num_rows: int, num_cols: int) -> None:
@@ -233,56 +212,46 @@ def _check_size(name: str, num_rows: int, num_cols: int) -> None:
 
 
 def _check(layout: Layout) -> None:
-    name = layout.name
+    def refused(mistake: str, remedy: str) -> MapError:
+        return MapError(layout.name, mistake, remedy)
+
     positive_int("num_rows", layout.num_rows)
     positive_int("num_cols", layout.num_cols)
-    _check_size(name, layout.num_rows, layout.num_cols)
-    if not layout.starts:
-        raise MapError(name, "there is no start", "mark at least one cell with 'S'")
-    if not layout.goals:
-        raise MapError(name, "there is no goal", "mark at least one cell with 'G'")
+    _check_size(layout.name, layout.num_rows, layout.num_cols)
+    for what in ("start", "goal"):
+        if not getattr(layout, f"{what}s"):
+            raise refused(f"there is no {what}", f"mark at least one cell with {what[0].upper()!r}")
     kind: dict[Cell, str] = {}
-    for what, cells in (
-        ("goal", layout.goals),
-        ("trap", layout.traps),
-        ("wall", layout.walls),
-        ("cliff", layout.cliffs),
-        ("start", layout.starts),
-    ):
-        for row, col in cells:
+    for what in ("goal", "trap", "wall", "cliff", "start"):
+        for row, col in getattr(layout, f"{what}s"):
             where = f"row {row + 1}, column {col + 1}"
             if not (0 <= row < layout.num_rows and 0 <= col < layout.num_cols):
-                raise MapError(name, f"{where}: this {what} lies outside the grid", "move it inside")
+                raise refused(f"{where}: this {what} lies outside the grid", "move it inside")
             if (row, col) in kind:
-                raise MapError(
-                    name, f"{where}: a {what} on a {kind[row, col]}", "a cell can be one thing only"
-                )
+                raise refused(f"{where}: a {what} on a {kind[row, col]}", "a cell can be one thing only")
             kind[row, col] = what
     if layout.cliffs and len(layout.starts) > 1:
-        raise MapError(
-            name, f"a cliff 'C' sends back to the start, and there are {len(layout.starts)}", "leave one 'S'"
+        raise refused(
+            f"a cliff 'C' sends back to the start, and there are {len(layout.starts)}", "leave one 'S'"
         )
     reaching = _cells_that_reach_a_goal(layout)
-    for row, col in layout.starts:
-        if (row, col) not in reaching:
-            raise MapError(
-                name,
-                f"no goal can be reached from the start in row {row + 1}, column {col + 1}",
-                "open a way past the walls, traps and cliffs",
-            )
+    for row, col in [cell for cell in layout.starts if cell not in reaching]:
+        raise refused(
+            f"no goal can be reached from the start in row {row + 1}, column {col + 1}",
+            "open a way past the walls, traps and cliffs",
+        )
 
 
 def _cells_that_reach_a_goal(layout: Layout) -> set[Cell]:
-    """Breadth-first from the goals backwards; moves are symmetric between floor cells."""
+    """From the goals backwards; moves are symmetric between floor cells."""
     closed = layout.walls.union(layout.traps, layout.cliffs)
-    seen = set(layout.goals)
-    queue = deque(layout.goals)
-    while queue:
-        row, col = queue.popleft()
+    seen, waiting = set(layout.goals), list(layout.goals)
+    while waiting:
+        row, col = waiting.pop()
         for down, right in MOVES:
             cell = row + down, col + right
             inside = 0 <= cell[0] < layout.num_rows and 0 <= cell[1] < layout.num_cols
             if inside and cell not in seen and cell not in closed:
                 seen.add(cell)
-                queue.append(cell)
+                waiting.append(cell)
     return seen

@@ -4,8 +4,6 @@ A world is a Markov decision process with S states, A actions and at most K outc
 state: where a source says that a transition ends the episode, it leads to a terminal state. Terminal states
 absorb: every action stays there and pays nothing.
 
-`gridworld.world.grid` makes the worlds of maps, `gridworld.world.sources` makes those of other descriptions.
-
 Reference: M. L. Puterman, Markov Decision Processes, 1994, chapter 2.
 """
 
@@ -14,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-from collections import deque
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
@@ -23,7 +20,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.bounds import within_size
+from gridworld.bounds import Bounds
 from gridworld.errors import InputError
 
 IntArray = NDArray[np.integer[Any]]
@@ -39,46 +36,27 @@ EXACT = "exact"  # the `truth` of tables that are given
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Mdp:
-    """Read-only tables of one world.
+    """Read-only tables of one world. Two states share a `number` where only one of them is an end."""
 
-    Attributes:
-        name: what messages and pictures call it.
-        action_names: A names.
-        next_state: (S, A, K), int32.
-        probability: (S, A, K), float64; sums to 1 over K.
-        reward: (S, A, K), float64.
-        terminal: (S,), bool, where an episode is over.
-        goal: (S,), bool, the terminal states that are a success.
-        start: (S,), float64, a distribution.
-        thresholds: (S, A, K - 1), float64: the outcome of a uniform draw is how many of them it reaches.
-        absorbing: (S,), bool: terminal, or a state that no action leaves and nothing is paid in.
-        number: (S,), int64, what the environment calls each state, its observation. Two states share a number
-            where a transition into it ends the episode and another one does not.
-        places: (S, 3), int64, or None: panel, row and column of each state in pictures, -1 where it has none.
-        panel_names: what pictures call each panel; none: they do not name them.
-        state_names: what messages call the state of each number; none: by its place or its number.
-        max_episode_steps: the step limit that belongs to the world; None: it has none of its own.
-        own_observation: (S, ...), or None: what the environment itself shows of each state.
-        truth: where the tables come from, as tables and pictures say it.
-    """
-
-    name: str
-    action_names: tuple[str, ...]
-    next_state: IntArray
-    probability: FloatArray
-    reward: FloatArray
-    terminal: BoolArray
-    goal: BoolArray
-    start: FloatArray
-    thresholds: FloatArray
-    absorbing: BoolArray
-    number: IntArray
-    places: IntArray | None = None
-    panel_names: tuple[str, ...] = ()
-    state_names: tuple[str, ...] = ()
-    max_episode_steps: int | None = None
-    own_observation: NDArray[Any] | None = field(default=None, repr=False)
-    truth: str = EXACT
+    name: str  # what messages and pictures call it
+    action_names: tuple[str, ...]  # A
+    next_state: IntArray  # (S, A, K), int32
+    probability: FloatArray  # (S, A, K); sums to 1 over K
+    reward: FloatArray  # (S, A, K)
+    terminal: BoolArray  # (S,), where an episode is over
+    goal: BoolArray  # (S,), the terminal states that are a success
+    start: FloatArray  # (S,), a distribution
+    thresholds: FloatArray  # (S, A, K - 1): the outcome of a uniform draw is how many of them it reaches
+    absorbing: BoolArray  # (S,), terminal, or a state that no action leaves and nothing is paid in
+    number: IntArray  # (S,), int64, what the environment calls each state, its observation
+    places: IntArray | None = None  # (S, 3), int64: panel, row and column in pictures, -1 where it has none
+    panel_names: tuple[str, ...] = ()  # what pictures call each panel, if anything
+    state_names: tuple[
+        str, ...
+    ] = ()  # what messages call the state of each number, if not by place or number
+    max_episode_steps: int | None = None  # the step limit that belongs to the world, if any
+    own_observation: NDArray[Any] | None = field(default=None, repr=False)  # (S, ...), the environment's own
+    truth: str = EXACT  # where the tables come from, as tables and pictures say it
 
     def __repr__(self) -> str:
         sizes = f"{self.num_states} states, {self.num_actions} actions"
@@ -152,9 +130,8 @@ class Mdp:
     def digest(self) -> str:
         """The sha256 of the tables, equal for worlds in which the same happens with the same chances."""
         digest = hashlib.sha256()
-        for table in (self.next_state, self.probability, self.reward, self.terminal, self.goal, self.start):
-            digest.update(np.ascontiguousarray(table).tobytes())
-        digest.update(np.ascontiguousarray(self.number).tobytes())
+        for name in ("next_state", "probability", "reward", "terminal", "goal", "start", "number"):
+            digest.update(np.ascontiguousarray(getattr(self, name)).tobytes())
         return digest.hexdigest()
 
     def text(self) -> str:
@@ -207,12 +184,11 @@ def steps_from(starts: IntArray, next_state: IntArray, taken: BoolArray) -> IntA
     size = len(next_state)
     themselves = np.arange(size)[:, None, None]
     following = np.where(taken, next_state, themselves).reshape(size, -1).tolist()
-    waiting = deque(starts.tolist())
+    waiting = starts.tolist()
     steps = [-1] * size
     for start in waiting:
         steps[start] = 0
-    while waiting:
-        origin = waiting.popleft()
+    for origin in waiting:  # which grows
         for state in following[origin]:
             if steps[state] < 0:
                 steps[state] = steps[origin] + 1
@@ -235,7 +211,7 @@ def frozen(table: Table) -> Table:
 def checked_reward(what: str, value: Any) -> float:
     """A finite number that is neither too large nor too small to be added up."""
     number = finite(what, value)
-    within_size(what, number, LEAST_REWARD, MOST_REWARD)
+    Bounds(-MOST_REWARD, MOST_REWARD, least=LEAST_REWARD).check(what, number)
     return number
 
 

@@ -1,7 +1,5 @@
-"""The metrics of a learning curve, a row each.
-
-A row is a column of `curve.csv`, a field of `summary.json`, a tag of TensorBoard, a line of its charts and of
-the tables on a terminal. To add a metric, add its row.
+"""The metrics of a learning curve: a row is a column of `curve.csv`, a field of `summary.json`, a tag of
+TensorBoard, a line of its charts and of the tables on a terminal. To add a metric, add its row.
 """
 
 from __future__ import annotations
@@ -66,23 +64,23 @@ METRICS = (
         "value",
         "value",
         lambda score: score.value,
-        in_front=True,
         chart="value",
-        is_headline=True,
         has_optimum=True,
-        within_limit=False,
         in_report=True,
+        in_front=True,
+        is_headline=True,
+        within_limit=False,
     ),
     Metric(
         "regret",
         "regret",
         lambda score: score.regret,
-        in_front=True,
         chart="regret",
-        is_headline=True,
         known_optimum=0.0,
-        within_limit=False,
         text=regret_text,
+        in_front=True,
+        is_headline=True,
+        within_limit=False,
     ),
     Metric(
         "certified",

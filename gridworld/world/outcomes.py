@@ -1,11 +1,9 @@
-"""A world from outcomes that end episodes.
+"""A world from outcomes that end episodes, and the checks of a world's tables.
 
 Sources of worlds say of an outcome that it ends the episode, and where it leads: a state with a number that
-agents see. Here such a transition leads to a terminal state. That is the state with this number, where
-nothing but ends leads there; otherwise a further state, which shows the same number.
-
-An end is a goal if it pays as much as the best of all ends that can be reached, unless the source says itself
-which are.
+agents see. Here such a transition leads to a terminal state: the state with this number, where nothing but
+ends leads there; otherwise a further state, which shows the same number. An end is a goal if it pays as much
+as the best of all ends that can be reached, unless the source says itself which are.
 """
 
 from __future__ import annotations
@@ -75,38 +73,23 @@ def mdp_from_outcomes(
     own_observation: NDArray[Any] | None = None,
     truth: str = "exact",
 ) -> Mdp:
-    """Compile what a source says into a world.
+    """Compile what a source says into a world, whose states 0 to N - 1 are the numbered ones.
 
-    Args:
-        name: of the world.
-        outcomes: its transitions and starts.
-        action_names: A names; None: their numbers.
-        places: (N, 3), see `Mdp`; None: pictures have no place for states.
-        panel_names: see `Mdp`.
-        max_episode_steps: see `Mdp`.
-        own_observation: (N, *shape), see `Mdp`.
-        truth: see `Mdp`.
-
-    Returns:
-        The world. States 0 to N - 1 are the numbered ones, whatever follows are further ends.
-
-    Raises:
-        InputError: shapes that do not fit, no probabilities, numbers of no state, or too many of them.
+    `action_names` None: their numbers; `places` (N, 3) and `own_observation` (N, *shape): see `Mdp`. Refuses
+    shapes that do not fit, no probabilities, numbers of no state, or too many of them.
     """
     outcomes = checked(name, outcomes)
     _check_extras(name, outcomes, action_names, places, max_episode_steps, own_observation)
-    ends = _Ends(outcomes)
-    extra = ends.number[len(outcomes.start) :]
-    size, actions, count = len(ends.number), *outcomes.next_state.shape[1:]
-    terminal = np.zeros(size, dtype=np.bool_)
-    terminal[ends.states] = True
-    goal = np.zeros(size, dtype=np.bool_)
-    goal[ends.states] = ends.success
+    ends, success, number, leads_to = _ends(outcomes)
+    size, actions, count = len(number), *outcomes.next_state.shape[1:]
+    numbered, further = slice(0, len(outcomes.start)), len(number) - len(outcomes.start)
+    terminal, goal = np.zeros(size, dtype=np.bool_), np.zeros(size, dtype=np.bool_)
+    terminal[ends] = True
+    goal[ends] = success
 
     next_state = np.empty((size, actions, count), dtype=np.int32)
     probability, reward = np.zeros(next_state.shape), np.zeros(next_state.shape)
-    numbered = slice(0, len(outcomes.start))
-    next_state[numbered], reward[numbered] = ends.leads_to, outcomes.reward
+    next_state[numbered], reward[numbered] = leads_to, outcomes.reward
     probability[numbered] = outcomes.probability
     next_state[terminal] = np.flatnonzero(terminal)[:, None, None]
     probability[terminal] = np.eye(count)[0]
@@ -122,53 +105,47 @@ def mdp_from_outcomes(
         reward=frozen(reward),
         terminal=frozen(terminal),
         goal=frozen(goal),
-        start=frozen(np.concatenate([outcomes.start, np.zeros(len(extra))])),
+        start=frozen(np.concatenate([outcomes.start, np.zeros(further)])),
         thresholds=frozen(thresholds_of(probability)),
         absorbing=frozen(terminal | (stays | (probability == 0)).all(axis=(1, 2))),
-        number=frozen(ends.number),
-        places=None if places is None else frozen(places[ends.number].astype(np.int64)),
+        number=frozen(number),
+        places=None if places is None else frozen(places[number].astype(np.int64)),
         panel_names=tuple(panel_names),
         max_episode_steps=None if max_episode_steps is None else int(max_episode_steps),
-        own_observation=None if own_observation is None else frozen(own_observation[ends.number]),
+        own_observation=None if own_observation is None else frozen(own_observation[number]),
         truth=truth,
     )
 
 
-class _Ends:
+def _ends(outcomes: Outcomes) -> tuple[IntArray, BoolArray, IntArray, IntArray]:
     """The terminal states that outcomes need.
 
-    Attributes:
-        states: (E,), the terminal states.
-        success: (E,), which of them are goals.
-        number: (S,), the number of every state: of the N numbered ones, then of further ends.
-        leads_to: (N, A, K), the state that each outcome leads to.
+    Returns (E,), the terminal states, and which of them are goals; (S,), the number of every state: of the N
+    numbered ones, then of further ends; (N, A, K), the state that each outcome leads to.
     """
-
-    def __init__(self, outcomes: Outcomes) -> None:
-        size, possible = len(outcomes.start), outcomes.probability > 0
-        going_on = possible & ~outcomes.terminated
-        playing = steps_from(np.flatnonzero(outcomes.start), outcomes.next_state, going_on) >= 0
-        ending = possible & outcomes.terminated
-        first = ending & playing[:, None, None]
-        success = outcomes.success
-        if success is None:
-            success = outcomes.reward == outcomes.reward[first].max(initial=-np.inf)
-        # An end is told from others by its number and whether it is a success: the last bit of its key.
-        every = 2 * outcomes.next_state.astype(np.int64) + success
-        keys = np.unique(every[first])
-        others = np.unique(every[ending & ~first])  # what nobody reaches needs no end of its own
-        others = others[~np.isin(others // 2, keys // 2)]
-        others = others[~(np.isin(others ^ 1, others) & (others % 2 == 1))]
-        keys = np.sort(np.concatenate([keys, others]))
-        number, self.success = keys // 2, keys % 2 == 1
-        taken = playing[number]
-        taken[1:] |= number[1:] == number[:-1]
-        self.states: IntArray = np.where(taken, size - 1 + np.cumsum(taken), number)
-        self.number: IntArray = np.concatenate([np.arange(size, dtype=np.int64), number[taken]])
-        self.leads_to: IntArray = outcomes.next_state.astype(np.int64)
-        key = every[ending]
-        key = np.where(np.isin(key, keys), key, key ^ 1)
-        self.leads_to[ending] = self.states[np.searchsorted(keys, key)]
+    size, possible = len(outcomes.start), outcomes.probability > 0
+    going_on = possible & ~outcomes.terminated
+    playing = steps_from(np.flatnonzero(outcomes.start), outcomes.next_state, going_on) >= 0
+    ending = possible & outcomes.terminated
+    first = ending & playing[:, None, None]
+    success = outcomes.success
+    if success is None:
+        success = outcomes.reward == outcomes.reward[first].max(initial=-np.inf)
+    # An end is known by its number and whether it is a success: the last bit of its key.
+    every = 2 * outcomes.next_state.astype(np.int64) + success
+    keys = np.unique(every[first])
+    others = np.unique(every[ending & ~first])  # what nobody reaches needs no end of its own
+    others = others[~np.isin(others // 2, keys // 2)]
+    others = others[~(np.isin(others ^ 1, others) & (others % 2 == 1))]
+    keys = np.sort(np.concatenate([keys, others]))
+    number = keys // 2
+    taken = playing[number]
+    taken[1:] |= number[1:] == number[:-1]
+    states: IntArray = np.where(taken, size - 1 + np.cumsum(taken), number)
+    leads_to = outcomes.next_state.astype(np.int64)
+    key = every[ending]
+    leads_to[ending] = states[np.searchsorted(keys, np.where(np.isin(key, keys), key, key ^ 1))]
+    return states, keys % 2 == 1, np.concatenate([np.arange(size), number[taken]]), leads_to
 
 
 def thresholds_of(probability: FloatArray) -> FloatArray:
@@ -211,56 +188,60 @@ def checked(name: str, outcomes: Outcomes) -> Outcomes:
     What is impossible may lead anywhere and pay anything. Less precise probabilities are made to sum to 1.
     """
     _check_kinds(name, outcomes)
-    least = outcomes.probability.dtype, outcomes.start.dtype
-    probability, start = (
-        np.asarray(table, dtype=np.float64) for table in (outcomes.probability, outcomes.start)
-    )
-    _check_distribution(name, "start", start[None], least[1])
-    _check_distribution(name, "probability", probability, least[0])
+    start = _distribution(name, "start", outcomes.start[None])[0]
+    probability = _distribution(name, "probability", outcomes.probability)
     possible = probability > 0
     here = np.arange(len(start))[:, None, None]
     leads_to = outcomes.next_state.astype(np.int64)
     exists = (leads_to >= 0) & (leads_to < len(start))
-    found = replace(
-        outcomes,
-        next_state=np.where(possible | exists, leads_to, here),
-        probability=_summing_to_one(probability, least[0]),
-        start=_summing_to_one(start, least[1]),
-        reward=np.where(possible, outcomes.reward.astype(np.float64), 0.0),
-    )
-    wrong = (found.next_state < 0) | (found.next_state >= len(start))
-    for row in np.argwhere(wrong)[:1]:
+    reward = np.where(possible, outcomes.reward.astype(np.float64), 0.0)
+    for row in np.argwhere(possible & ~exists)[:1]:
         raise InputError(
-            f"{name}: next_state of state {row[0]}, action {row[1]} is {found.next_state[tuple(row)]}, "
+            f"{name}: next_state of state {row[0]}, action {row[1]} is {leads_to[tuple(row)]}, "
             f"must be from 0 to {len(start) - 1}"
         )
-    size = np.abs(found.reward)
-    wrong = (found.reward != 0) & ~((size >= LEAST_REWARD) & (size <= MOST_REWARD))
-    for row in np.argwhere(wrong)[:1]:
-        where = f"{name}: reward of state {row[0]}, action {row[1]}"
-        checked_reward(where, float(found.reward[tuple(row)]))
-    return found
+    size = np.abs(reward)
+    for row in np.argwhere((reward != 0) & ~((size >= LEAST_REWARD) & (size <= MOST_REWARD)))[:1]:
+        checked_reward(f"{name}: reward of state {row[0]}, action {row[1]}", float(reward[tuple(row)]))
+    return replace(
+        outcomes,
+        next_state=np.where(exists, leads_to, here),
+        probability=probability,
+        start=start,
+        reward=reward,
+    )
 
 
-def _summing_to_one(table: FloatArray, given: np.dtype[Any]) -> FloatArray:
-    precise = given.kind != "f" or given.itemsize >= _DOUBLE
-    return table if precise else table / table.sum(axis=-1, keepdims=True)
+def _distribution(name: str, what: str, given: NDArray[Any]) -> FloatArray:
+    """Probabilities along the last axis as float64; less precise ones are made to sum to 1."""
+    table: FloatArray = np.asarray(given, dtype=np.float64)
+    inexact = given.dtype.kind == "f" and given.dtype.itemsize < _DOUBLE
+    most = max(_SUM, table.shape[-1] * float(np.finfo(given.dtype).eps)) if inexact else _SUM
+    wrong = ~((table >= 0).all(axis=-1) & (np.abs(table.sum(axis=-1) - 1) <= most))
+    for where in np.argwhere(wrong)[:1]:
+        row = table[tuple(where)]
+        place = "" if what == "start" else f" of state {where[0]}, action {where[1]}"
+        shown = ", ".join([f"{each:.6g}" for each in row[:8]] + ["..."] * (len(row) > 8))
+        raise InputError(
+            f"{name}: {what}{place} is [{shown}], with sum {row.sum():.12g}; must be probabilities with sum 1"
+        )
+    return table / table.sum(axis=-1, keepdims=True) if inexact else table
 
 
 def _check_kinds(name: str, outcomes: Outcomes) -> None:
-    for what, (kinds, words) in _KINDS.items():
-        table = getattr(outcomes, what)
-        if what == "success" and table is None:
-            continue
+    given = {what: getattr(outcomes, what) for what in _KINDS}
+    if outcomes.success is None:
+        del given["success"]
+    for what, table in given.items():
+        kinds, words = _KINDS[what]
         if not isinstance(table, np.ndarray) or table.dtype.kind not in kinds:
             found = table.dtype if isinstance(table, np.ndarray) else type(table).__name__
             raise InputError(f"{name}: {what} is {found}, must be an array of {words}")
     shape = outcomes.next_state.shape
     if len(shape) != 3 or 0 in shape:
         raise InputError(f"{name}: next_state has shape {shape}, must be (states, actions, outcomes)")
-    for what in ("probability", "reward", "terminated", "success"):
-        table = getattr(outcomes, what)
-        if table is not None and table.shape != shape:
+    for what, table in given.items():
+        if what != "start" and table.shape != shape:
             raise InputError(
                 f"{name}: {what} has shape {table.shape}, next_state has {shape}; give one shape"
             )
@@ -286,21 +267,6 @@ def _check_extras(
         positive_int(f"{name}: max_episode_steps", limit)
 
 
-def _check_distribution(name: str, what: str, table: FloatArray, given: np.dtype[Any]) -> None:
-    inexact = given.kind == "f" and given.itemsize < _DOUBLE
-    most = max(_SUM, table.shape[-1] * float(np.finfo(given).eps)) if inexact else _SUM
-    wrong = ~((table >= 0).all(axis=-1) & (np.abs(table.sum(axis=-1) - 1) <= most))
-    if wrong.any():
-        where = np.argwhere(wrong)[0]
-        place = "" if what == "start" else f" of state {where[0]}, action {where[1]}"
-        shown = ", ".join(f"{each:.6g}" for each in table[tuple(where)][:8])
-        more = ", ..." if table.shape[-1] > 8 else ""
-        raise InputError(
-            f"{name}: {what}{place} is [{shown}{more}], with sum "
-            f"{table[tuple(where)].sum():.12g}; must be probabilities with sum 1"
-        )
-
-
 def checked_text(where: str, key: str, value: Any) -> str:
     """A short text on one line; refuses anything else."""
     text = value.item() if isinstance(value, np.ndarray) and value.ndim == 0 else value
@@ -311,25 +277,16 @@ def checked_text(where: str, key: str, value: Any) -> str:
 
 def verified(mdp: Mdp, where: str) -> Mdp:
     """The same world, if all of its tables are what `Mdp` says; `where` is what messages call it."""
-    for key in ("name", "truth"):
-        checked_text(where, key, getattr(mdp, key))
     if not isinstance(mdp.action_names, tuple) or not mdp.action_names:
         raise InputError(f"{where}: action_names is {str(mdp.action_names)[:50]}, must be a tuple of strings")
-    for name in mdp.action_names:
-        checked_text(where, "action_names", name)
+    texts = [("name", mdp.name), ("truth", mdp.truth), *(("action_names", each) for each in mdp.action_names)]
+    for key, text in texts:
+        checked_text(where, key, text)
     if mdp.max_episode_steps is not None:
         positive_int(f"{where}: max_episode_steps", mdp.max_episode_steps)
     _check_shapes(mdp, where)
-    found = checked(
-        where,
-        Outcomes(
-            next_state=mdp.next_state,
-            probability=mdp.probability,
-            reward=mdp.reward,
-            terminated=np.zeros(mdp.next_state.shape, dtype=np.bool_),
-            start=mdp.start,
-        ),
-    )
+    tables = {key: getattr(mdp, key) for key in ("next_state", "probability", "reward", "start")}
+    found = checked(where, Outcomes(terminated=np.zeros(mdp.next_state.shape, dtype=np.bool_), **tables))
     for key in ("next_state", "reward"):
         if not np.array_equal(getattr(found, key), getattr(mdp, key)):
             raise InputError(f"{where}: {key} of an outcome of probability 0 must be 0 or a state")
@@ -342,26 +299,23 @@ def verified(mdp: Mdp, where: str) -> Mdp:
 def _check_shapes(mdp: Mdp, where: str) -> None:
     shape = np.shape(mdp.next_state)
     size, actions, outcomes = shape if len(shape) == 3 else (0, 0, 0)
-    per_state = {"terminal": np.bool_, "goal": np.bool_, "absorbing": np.bool_, "number": np.int64}
     expected: dict[str, tuple[Any, tuple[int, ...]]] = {
         "next_state": (np.int32, (size, len(mdp.action_names), outcomes)),
         "probability": (np.float64, shape),
         "reward": (np.float64, shape),
         "thresholds": (np.float64, (size, actions, max(outcomes - 1, 0))),
         "start": (np.float64, (size,)),
-        **{name: (dtype, (size,)) for name, dtype in per_state.items()},
+        "number": (np.int64, (size,)),
+        **dict.fromkeys(("terminal", "goal", "absorbing"), (np.bool_, (size,))),
+        **({} if mdp.places is None else {"places": (np.int64, (size, 3))}),
     }
-    if mdp.places is not None:
-        expected["places"] = (np.int64, (size, 3))
     for name, (dtype, wanted) in expected.items():
         table = getattr(mdp, name)
         if not isinstance(table, np.ndarray) or table.dtype != dtype or table.shape != wanted:
-            told = f"{table.dtype} {table.shape}" if isinstance(table, np.ndarray) else type(table).__name__
-            raise InputError(f"{where}: {name} is {told}, must be {np.dtype(dtype)} {wanted}")
-    shown = mdp.own_observation
-    if shown is not None and (
-        not isinstance(shown, np.ndarray) or shown.dtype.kind not in "biuf" or shown.shape[:1] != (size,)
-    ):
+            found = f"{table.dtype} {table.shape}" if isinstance(table, np.ndarray) else type(table).__name__
+            raise InputError(f"{where}: {name} is {found}, must be {np.dtype(dtype)} {wanted}")
+    shown = np.zeros(size) if mdp.own_observation is None else mdp.own_observation
+    if not isinstance(shown, np.ndarray) or shown.dtype.kind not in "biuf" or shown.shape[:1] != (size,):
         raise InputError(f"{where}: own_observation must be numbers, the first of its axes {size} states")
 
 

@@ -26,7 +26,7 @@ from gridworld.benchmark import peers, population, training, worlds
 from gridworld.benchmark.measure import QUICK, Comparison
 from gridworld.commands import benchmark, evaluate, run
 from gridworld.commands import record as record_command
-from gridworld.commands.shell.help import manual
+from gridworld.commands.manual import manual
 from gridworld.errors import InputError
 
 TRAINED_WITHOUT_NEEDLESS_IMPORTS = f"""

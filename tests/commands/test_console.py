@@ -13,7 +13,7 @@ import pytest
 from helpers.support import CONF, ROOT, SHORT, script
 
 from gridworld import __version__
-from gridworld.commands.shell.console import COMMANDS
+from gridworld.commands.console import COMMANDS
 from gridworld.config.composition.conf_folder import conf_folder
 from gridworld.errors import DISTRIBUTION
 from gridworld.process.console import command_line
@@ -40,7 +40,8 @@ def test_help_has_a_line_for_each_command(words: list[str], tmp_path: Path) -> N
         assert re.search(rf"^  {name} +{re.escape(about)}$", done.stdout, re.MULTILINE)
 
 
-def test_version(tmp_path: Path) -> None:
+def test_version_and_checkout(tmp_path: Path) -> None:
+    assert conf_folder() == CONF
     assert gridworld("--version", cwd=tmp_path).stdout == f"gridworld {__version__}\n"
 
 
@@ -64,7 +65,7 @@ def test_asking_imports_nothing_heavy(tmp_path: Path) -> None:
     command = [sys.executable, "-X", "importtime", "-m", "gridworld", "--help"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     loaded = {line.split("|")[-1].strip() for line in done.stderr.splitlines()}
-    assert "gridworld.commands.shell.console" in loaded
+    assert "gridworld.commands.console" in loaded
     assert not loaded & {"numpy", "hydra", "torch", "gymnasium", "scipy"}
     ours = (ROOT / "gridworld" / "__main__.py").read_text()
     assert ours.index("listen()  # before") < ours.index("from gridworld.commands")
@@ -175,7 +176,3 @@ def test_it_trains_from_the_wheel(wheel: Path, tmp_path: Path) -> None:
         *("hydra.sweep.dir=sweep", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),
     )
     assert "sweep sweep: 2 jobs: 2 done" in told
-
-
-def test_the_checkout_has_its_own_conf() -> None:
-    assert conf_folder() == CONF

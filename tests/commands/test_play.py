@@ -13,7 +13,7 @@ from helpers.support import ROOT, SHORT, train_in
 
 from gridworld.commands import play as command
 from gridworld.commands.game import Game, Key, draw
-from gridworld.envs.frames.rendering import AGENT, draw_frame
+from gridworld.envs.rendering import AGENT, draw_frame
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
@@ -43,10 +43,7 @@ def test_keys_are_the_actions_and_returns_are_discounted() -> None:
     assert game.person.verdict() == "goal after 9 steps: 0.009321 less than the optimum"
     game = pressed(Game(CLASSIC), *[RIGHT] * 4, DOWN)
     assert game.person.verdict().startswith("trap after 5 steps: 1.893 less than the optimum")
-
-
-def test_restart_begins_anew_and_quit_ends() -> None:
-    game = pressed(Game(CLASSIC), *SHORTEST, Key.RESTART)
+    pressed(game, Key.RESTART)
     assert (game.person.state, game.person.steps, game.person.value, game.over) == (0, 0, 0, False)
     assert not game.quit
     assert pressed(game, Key.QUIT).quit
@@ -139,12 +136,6 @@ def test_the_window_obeys_the_keyboard(
     agent = [(frame == AGENT).all(axis=2) for frame in shown]
     assert np.array_equal(agent[0], agent[-1])  # back at the start
     assert len({mask.tobytes() for mask in agent}) == 9  # a picture per cell on the way
-    assert not pygame.display.get_init()
-
-
-def test_closing_the_window_ends_the_game(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pygame.event, "get", lambda: [pygame.event.Event(pygame.QUIT)])
-    command.main(["--layout", "cliff", "--cell-size", "20"])
     assert not pygame.display.get_init()
 
 

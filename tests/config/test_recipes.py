@@ -15,7 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from gridworld.agents import family
 from gridworld.agents.sb3.settings.constructor_arguments import algorithm_and_arguments
-from gridworld.commands.shell.help import manual
+from gridworld.commands.manual import manual
 from gridworld.config.composition.words import pairs
 from gridworld.config.train import check
 

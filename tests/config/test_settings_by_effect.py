@@ -12,14 +12,13 @@ from helpers.runs_folder import Maker
 from helpers.support import CONF, configure
 
 from gridworld.config.agents import agent_schemas
-from gridworld.config.effects import Effect
-from gridworld.config.flatten import flat
-from gridworld.config.settings_by_effect import effect_of, with_effects
+from gridworld.config.fields import Effect
+from gridworld.config.settings import effect_of, flat, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.config.tune import DimensionConfig
 from gridworld.errors import InputError
-from gridworld.report.evidence.grouping import arrange, learning_key, task_key
-from gridworld.report.evidence.run_reader import Evidence, read
+from gridworld.report.evidence import Evidence, read
+from gridworld.report.grouping import arrange, learning_key, task_key
 from gridworld.run.identity.fingerprint import identity, settings_hash
 from gridworld.training.tensorboard import hparams
 from gridworld.tune.recipe import _relevant, write_recipe

@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from gridworld.envs.frames.real_env import RealEnvFrames
+from gridworld.envs.real_env import RealEnvFrames
 from gridworld.errors import InputError
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 from gridworld.world.sources.enumerated import enumerate_env

@@ -24,11 +24,11 @@ from gridworld.config.composition.compose import to_config
 from gridworld.config.train import TrainConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
-from gridworld.report.charts.tuning_charts import tuning_charts
-from gridworld.report.evidence.run_reader import read
-from gridworld.report.evidence.tuning_study import TRIALS_SUM, find_tunings
+from gridworld.report.evidence import read
+from gridworld.report.setting_charts import tuning_charts
 from gridworld.report.table import to_captioned_markdown, to_csv
 from gridworld.report.tables import finalists_table, trials_table, winner_table
+from gridworld.report.tuning_study import TRIALS_SUM, find_tunings
 from gridworld.restore.saved_run import SavedRun
 from gridworld.storage.sealed_json import sealed
 from gridworld.training.setup import check_settings, make_context
@@ -205,7 +205,7 @@ def fuzz_study(random: random.Random, folder: Path) -> None:
         for table in (winner_table(each), finalists_table(each), trials_table(each)):
             to_csv(table), to_captioned_markdown(table)
         for chart in tuning_charts(each):
-            places = "".join(re.findall(r'\b(?:d|x|y|transform)="[^"]*"', chart.svg))
+            places = "".join(re.findall(r'\b(?:d|x|y|transform)="[^"]*"', chart.saved_as("svg").decode()))
             assert not re.search(r"\b(nan|inf)\b", places)
     if problems:
         raise InputError(problems[0])

@@ -33,7 +33,6 @@ from gridworld.run.identity.fingerprint import identity
 from gridworld.storage.event_file import _checksum
 from gridworld.storage.sealed_json import sealed
 from gridworld.storage.serialization import MAGIC, decode, encode
-from gridworld.visualization.png import _chunk
 
 SECRET = "the-secret-7f3a"
 Spoil = Callable[[Path, Path], None]
@@ -185,7 +184,12 @@ def png(width: int, height: int) -> bytes:
     packer = zlib.compressobj(9)
     rows = b"".join(packer.compress(bytes(1 + 3 * width)) for _ in range(height)) + packer.flush()
     size = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes([8, 2, 0, 0, 0])
-    return b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", size) + _chunk(b"IDAT", rows) + _chunk(b"IEND", b"")
+
+    def chunk(name: bytes, content: bytes) -> bytes:
+        parts = len(content).to_bytes(4, "big"), name, content, zlib.crc32(name + content).to_bytes(4, "big")
+        return b"".join(parts)
+
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", size) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 
 
 # ---- the model of a network --------------------------------------------------------------------------------

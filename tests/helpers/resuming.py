@@ -14,8 +14,9 @@ from helpers.support import configure
 from tensorboard.compat.proto.event_pb2 import Event
 
 from gridworld.agents import sb3, tabular
-from gridworld.restore.resume import open_unfinished
+from gridworld.restore.resume import open_unfinished, unfinished_of
 from gridworld.run.checkpoints import Checkpoints
+from gridworld.run.recovery import is_started
 from gridworld.storage.serialization import decode
 from gridworld.training.together import run_together
 from gridworld.training.train import train, training
@@ -43,6 +44,14 @@ def begin_all(runs: Sequence[tuple[Path, Sequence[str]]]) -> list[Any]:
 
 def go_on(folder: Path, total_timesteps: int | None = None) -> None:
     open_unfinished(folder, trust=True).resume(total_timesteps)
+
+
+def begin_or_go_on(folder: Path, *overrides: str) -> None:
+    """As the same command does in a folder that may hold an unfinished run."""
+    if is_started(folder):
+        unfinished_of(folder, configure(*overrides)).resume()
+    else:
+        begin(folder, *overrides)
 
 
 def stopped_after(number: int, folder: Path, *overrides: str) -> None:
@@ -131,8 +140,7 @@ def last_state(folder: Path) -> dict[str, Any] | None:
     if not files:
         return None
     state = decode(files[0].read_bytes())
-    state.pop("manifest", None)  # has the time of the start; older ones have none
-    for key in ("seconds", "marks"):
+    for key in ("seconds", "marks", "manifest"):  # which has the time of the start
         del state[key]
     curve = state["curve"]
     del curve["seconds"]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from helpers.support import configure
 
-from gridworld.report.evidence import tuning_study as tuning
+from gridworld.report import tuning_study as tuning
 from gridworld.run.identity.fingerprint import settings_hash
 from gridworld.run.reader import read_run
 from gridworld.storage.safe_read import sha256

@@ -47,7 +47,7 @@ from omegaconf import OmegaConf
 
 import gridworld
 from gridworld.config.composition.compose import compose
-from gridworld.envs.frames.rendering import import_pygame
+from gridworld.envs.rendering import import_pygame
 from gridworld.process.console import progress
 from gridworld.process.garbage import collect_less_often
 from gridworld.report import page

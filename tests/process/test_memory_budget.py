@@ -14,7 +14,7 @@ from gridworld.errors import InputError
 from gridworld.process.console import progress
 from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.memory_budget import VARIABLE, BudgetError, check_memory, is_limited, limited
-from gridworld.report.evidence.tuning_study import find_tunings
+from gridworld.report.tuning_study import find_tunings
 from gridworld.restore.saved_run import SavedRun
 from gridworld.storage.safe_read import as_object, as_table, check_yaml, sha256
 from gridworld.storage.sealed_json import sealed

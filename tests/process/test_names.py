@@ -16,8 +16,8 @@ from gridworld.commands import evaluate, jobs, record, report, reproduce, run
 from gridworld.commands import resume as resume_command
 from gridworld.process.console.terminal import prepare
 from gridworld.process.signals import Interrupted
-from gridworld.report.evidence.tuning_study import find_tunings
 from gridworld.report.table import Table, to_captioned_markdown, to_csv, to_markdown
+from gridworld.report.tuning_study import find_tunings
 from gridworld.run.folder import RunFolder, shown
 from gridworld.run.summary import interruption_text
 from gridworld.storage.sealed_json import sealed

@@ -27,10 +27,10 @@ from gridworld.commands import jobs as jobs_command
 from gridworld.commands import record as record_command
 from gridworld.config.pictures import PICTURES
 from gridworld.errors import InputError
+from gridworld.report import tuning_study as tuning
 from gridworld.report.build import gather
-from gridworld.report.evidence import tuning_study as tuning
 from gridworld.report.page import charts, render
-from gridworld.restore.comparison import check_whole
+from gridworld.restore.reproduce import check_whole
 from gridworld.restore.resume import open_unfinished
 from gridworld.restore.saved_run import SavedRun, read_visits
 from gridworld.run.reader import read_run

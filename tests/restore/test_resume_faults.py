@@ -61,36 +61,6 @@ def test_the_last_good_state_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert differences(left_behind(tmp_path / "run"), left_behind(tmp_path / "calm")) == []
 
 
-def test_a_finished_run_that_fails_while_it_is_made_longer_stays_as_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = tmp_path / "run"
-    begin(run, *SHORT["dqn"], *LESS, "checkpoint.every=100")
-    before = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-    targets, errors = DQN._targets, {"error.txt": RuntimeError("a bug"), "": InputError("diverged")}
-
-    def spoilt(self: DQN, *arguments: Any) -> Any:
-        if self.num_timesteps > 4000:  # the finished run's checkpoint is kept beside the newest two
-            assert len(list(run.glob("checkpoints/*.state"))) == 3
-            raise error
-        return targets(self, *arguments)
-
-    monkeypatch.setattr(DQN, "_targets", spoilt)
-    for trace, error in errors.items():
-        with pytest.raises(type(error), match=str(error)):
-            go_on(run, 5000)
-        assert "stays as it was, finished after 2,048 steps" in capsys.readouterr().err
-        after = {path: path.read_bytes() for path in run.rglob("*") if path.is_file()}
-        assert str(error).encode() in after.pop(run / "train.log").splitlines()[-2]
-        if trace:
-            assert b"RuntimeError: a bug" in after.pop(run / trace)
-            (run / trace).unlink()
-        assert after == {path: content for path, content in before.items() if path.name != "train.log"}
-    monkeypatch.undo()
-    go_on(run, 5000)
-    assert len(list(run.glob("checkpoints/*.state"))) == 1
-
-
 @pytest.mark.parametrize("name", ["events.out.tfevents.*", "curve.csv"])
 def test_a_file_deleted_under_us_is_put_back(
     name: str, calm: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any

@@ -29,7 +29,7 @@ from gridworld.sweep.job_table import JobTable
 from gridworld.training.pictures import Pictures
 from gridworld.training.together import run_alone
 from gridworld.visualization.animation import animation_of_states
-from gridworld.visualization.video import save_pngs
+from gridworld.visualization.files import save_pngs
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load
 

@@ -17,11 +17,10 @@ from typing import Any
 
 import pytest
 from helpers.disk import Disk, Left, put_back
-from helpers.resuming import begin, differences, go_on, left_behind, stopped_after
+from helpers.resuming import begin, begin_or_go_on, differences, go_on, left_behind, stopped_after
 from helpers.support import ROOT, SHORT, configure, script
 
 from gridworld.errors import InputError
-from gridworld.restore.resume import train_or_resume
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.reader import read_run
 from gridworld.storage.serialization import decode, encode
@@ -77,7 +76,7 @@ def check_goes_on(folder: Path, words: list[str], calm: dict[str, Any]) -> None:
         go_on(folder)
     else:
         folder.mkdir(exist_ok=True)
-        train_or_resume(configure(*words), folder, words)
+        begin_or_go_on(folder, *words)
     assert is_whole(folder)
     assert differences(left_behind(folder), calm) == []
 
@@ -214,7 +213,7 @@ def test_of_a_run_without_a_word_nothing_is_taken_away_that_could_be_a_result(tm
     (tmp_path / "manifest.json").write_bytes(b"")
     model = (tmp_path / "model.zip").read_bytes()
     with pytest.raises(InputError, match="no checkpoint has one"):
-        train_or_resume(configure(*SAVED), tmp_path, SAVED)
+        begin_or_go_on(tmp_path, *SAVED)
     assert (tmp_path / "model.zip").read_bytes() == model
 
 

@@ -40,7 +40,7 @@ def sweep(loader: ConfigLoader, *words: str) -> DictConfig:
         (["agent=ppo,q_learning", "env.slip=0,0.1", "seed=0,1"], 2),
         (["env=maze", "agent=q_learning", "agent.learning_rate=lin_0.5,0.25", "seed=1,2"], 1),
         (["agent=a2c", "+agent.arguments.max_grad_norm=0.5", "seed=0,1", "observation=coordinates"], 1),
-        (["seed=0,1", "agent.policy_kwargs.net_arch=[8,8]", "agent=dqn", "++n_envs=4"], 2),
+        (["agent.gamma=0.1,0.2", "agent.policy_kwargs.net_arch=[8,8]", "agent=dqn", "++n_envs=4"], 2),
         (["agent.gamma=0.1,0.2", "agent={gamma: 0.5}", "env.layout='my map.txt'"], 2),
         (["n_envs=${seed}", "seed=1,2,3"], 1),  # it follows from the seed
         (["seed=${n_envs}", "n_envs=1,2"], 1),
@@ -80,7 +80,7 @@ def test_what_all_jobs_have_in_common_is_not_some_jobs_own(loader: ConfigLoader,
     text = "# @package _global_\nhydra: {sweep: {dir: mine}}\n"
     (tmp_path / "experiment" / "dir.yaml").write_text(text)
     master = sweep(loader, f"hydra.searchpath=[file://{tmp_path}]")
-    with pytest.raises(InputError, match=r"^hydra\.sweep: is set in a file that only some of the jobs choose"):
+    with pytest.raises(InputError, match=r"^hydra\.sweep: is set in a file that only some of the jobs"):
         Configurations(loader, master)(["experiment=dir"])
     with pytest.raises(InputError, match=r"^hydra\.sweep\.subdir=\$\{seed\}: a sweep names the folders"):
         Configurations(loader, sweep(loader, "hydra.sweep.subdir=${seed}"))

@@ -29,7 +29,7 @@ from gridworld.config.sweep import SweepConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.process.parallel.together import mixing
-from gridworld.restore.repeat import population
+from gridworld.restore.reproduce import population
 from gridworld.run.reader import read_run
 from gridworld.sweep.folder import JobEntry
 from gridworld.sweep.plan import Job
@@ -142,7 +142,7 @@ def made_longer_later(run: Path) -> None:
     [
         (missing, r"is not in .*/asked any more; put its folder back"),
         (other_settings, r"has other settings now; put back the one that was trained with it"),
-        (went_on, r"went on from a checkpoint meanwhile; that cannot be repeated"),
+        (went_on, r"was resumed from a checkpoint meanwhile; that cannot be repeated"),
     ],
 )
 def test_what_became_of_another_run_is_told_before_training(
@@ -192,7 +192,8 @@ def test_a_run_that_went_on_says_with_whom_and_cannot_be_repeated(tmp_path: Path
         content = manifest_of(folder)
         assert content["numbers_depend_on"] == runs
         assert content["resumed"][0].get("numbers_depend_on") == (None if how == "alone" else runs)
-        with pytest.raises(InputError, match=rf"it went on after step 512 {how}, which cannot be repeated"):
+        sentence = rf"it was resumed after step 512 {how}, which cannot be repeated"
+        with pytest.raises(InputError, match=sentence):
             population(read_run(folder))
 
 

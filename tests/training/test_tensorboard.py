@@ -14,7 +14,7 @@ import pytest
 from helpers.browser import chromium
 from helpers.support import SHORT, script, train_in
 
-from gridworld.training.sinks import CHARTS
+from gridworld.training.learning_curve import CHARTS
 
 # Walks through the shadow roots that TensorBoard's components hide behind.
 PAGE_TEXT = """

@@ -172,7 +172,7 @@ def test_the_model_of_an_evaluation_at_the_end_is_kept_for_a_longer_run() -> Non
     agent: Any = Scripted(np.zeros(30), [])  # has learnt on meanwhile
     longer = LearningCurve(curve.evaluator, agent, configure("total_timesteps=40"))
     longer.set_state(curve.get_state())
-    longer.catch_up()
+    longer.write_held_of_shorter_run()
     assert (longer.best.step, longer.best.content) == (20, b"after snapshot 2")
 
 
@@ -238,7 +238,7 @@ def test_a_signal_while_the_runs_files_are_opened_interrupts_it(
         raise stop
 
     with monkeypatch.context() as patched:
-        patched.setattr("gridworld.training.train.Session", opening)
+        patched.setattr("gridworld.training.session.AppendLog", opening)
         with pytest.raises(type(stop)):
             train_in(tmp_path, *SHORT["q_learning"])
     assert json.loads((tmp_path / "manifest.json").read_text())["status"] == "interrupted"

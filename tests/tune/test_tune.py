@@ -116,7 +116,7 @@ def test_the_report_shows_the_study(studied: Path, tmp_path: Path) -> None:
 
 
 def test_a_changed_study_is_reported_as_damaged(studied: Path, tmp_path: Path) -> None:
-    from gridworld.report.evidence.tuning_study import find_tunings
+    from gridworld.report.tuning_study import find_tunings
 
     study = json.loads((studied / "study" / "study.json").read_text())
     study["space"]["agent.learning_rate"]["low"] = "<b>"

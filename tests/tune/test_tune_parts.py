@@ -27,7 +27,7 @@ from optuna.trial import create_trial
 
 from gridworld.config.tune import DimensionConfig, TuneConfig
 from gridworld.errors import InputError
-from gridworld.report.analysis import statistics
+from gridworld.report import statistics
 from gridworld.storage.sealed_json import sealed
 from gridworld.training.setup import check_settings
 from gridworld.training.together import run_alone

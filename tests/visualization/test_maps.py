@@ -10,16 +10,15 @@ from PIL import Image
 
 from gridworld.agents import PolicySnapshot
 from gridworld.config.pictures import PICTURES
-from gridworld.envs.frames.rendering import AGENT, CLIFF, GOAL, TRAP, WALL, Frame
+from gridworld.envs.rendering import AGENT, CLIFF, GOAL, TRAP, WALL, Frame
 from gridworld.visualization.canvas import Canvas
-from gridworld.visualization.colormaps import BLUES, ORANGES, VIRIDIS, Scale, counting, linear
-from gridworld.visualization.maps.greedy_path import explored, greedy_paths
-from gridworld.visualization.maps.policy_map import DISAGREES, UNKNOWN, draw_policy_map
-from gridworld.visualization.maps.q_error_map import draw_error_map, value_error
-from gridworld.visualization.maps.visit_map import draw_visit_map
+from gridworld.visualization.paths import explored, greedy_paths
 from gridworld.visualization.picture import drawer
 from gridworld.visualization.policy_history import PolicyHistory
-from gridworld.visualization.sheet import short
+from gridworld.visualization.policy_map import DISAGREES, UNKNOWN, draw_policy_map
+from gridworld.visualization.q_error_map import draw_error_map, value_error
+from gridworld.visualization.sheet import BLUES, ORANGES, VIRIDIS, Scale, counting, linear, short
+from gridworld.visualization.visit_map import draw_visit_map
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.exact.solver import value_iteration
 from gridworld.world.grid import compile_mdp

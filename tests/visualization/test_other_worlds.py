@@ -14,9 +14,9 @@ from gridworld.agents import PolicySnapshot
 from gridworld.config.pictures import PICTURES
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, GymnasiumConfig
-from gridworld.envs.frames.board import Kind, Panel, board_of
-from gridworld.envs.frames.real_env import RealEnvFrames
-from gridworld.envs.frames.rendering import (
+from gridworld.envs.board import Kind, Panel, board_of
+from gridworld.envs.real_env import RealEnvFrames
+from gridworld.envs.rendering import (
     AGENT,
     GOAL,
     TRAP,
@@ -29,21 +29,15 @@ from gridworld.envs.frames.rendering import (
 from gridworld.envs.rollout import Episode, play
 from gridworld.visualization.animation import Animation, animation_of_rendered
 from gridworld.visualization.canvas import Canvas, shown
-from gridworld.visualization.colormaps import BLUES, ORANGES, linear
 from gridworld.visualization.episode import film
-from gridworld.visualization.maps.directions import directions, moving_actions
-from gridworld.visualization.maps.policy_map import draw_policy_map
-from gridworld.visualization.maps.q_error_map import draw_error_map
-from gridworld.visualization.maps.state_table import (
-    StateTable,
-    draw_policy_table,
-    draw_visit_table,
-    held,
-    table_states,
-)
-from gridworld.visualization.picture import Subject, drawer, save
+from gridworld.visualization.files import save
+from gridworld.visualization.paths import directions, moving_actions
+from gridworld.visualization.picture import Subject, drawer
 from gridworld.visualization.policy_history import PolicyHistory
-from gridworld.visualization.sheet import DISAGREES
+from gridworld.visualization.policy_map import action_numbers, draw_policy_map, draw_policy_table
+from gridworld.visualization.q_error_map import draw_error_map
+from gridworld.visualization.sheet import BLUES, DISAGREES, ORANGES, linear
+from gridworld.visualization.state_table import StateTable, table_states
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.exact.solver import value_iteration
 from gridworld.world.grid import compile_mdp
@@ -253,7 +247,7 @@ def test_a_table_has_the_most_visited_states_in_the_order_in_which_they_are_met(
 
 
 def table_cell(table: StateTable, frame: Frame, row: int, column: int) -> Frame:
-    left, top, width, height = table._box(row, column)
+    left, top, width, height = table.box(row, column)
     x, y = table.world.get_offset()
     return frame[y + top : y + top + height, x + left : x + left + width]
 
@@ -266,7 +260,9 @@ def test_a_policy_table_frames_the_greedy_action() -> None:
     snapshot = PolicySnapshot(q.argmax(axis=1), np.full(q.shape, 0.5), q.max(axis=1), q)
     states, known = table_states(world), np.arange(6) < 4
     for each in (snapshot, dataclasses.replace(snapshot, q=None)):
-        frame = draw_policy_table(world, states, held(each, states), each.greedy, best.optimal, known).frame()
+        frame = draw_policy_table(
+            world, states, action_numbers(each, states), each.greedy, best.optimal, known
+        ).frame()
         table = StateTable(world, states, world.action_names, legend_rows=2)
         for row in range(5):
             cells = [table_cell(table, frame, row, column) for column in range(2)]
@@ -278,7 +274,7 @@ def test_a_policy_table_frames_the_greedy_action() -> None:
 def test_a_visit_table_leaves_actions_never_taken_white() -> None:
     world = chain(3)
     visits = np.array([[1, 50], [0, 25], [0, 0], [0, 0]])
-    frame = draw_visit_table(world, table_states(world), visits)
+    frame = drawer("visit_map").draw(subject(world, np.zeros((4, 2)), visits))(None)
     table = StateTable(world, table_states(world), world.action_names)
     corners = [[tuple(table_cell(table, frame, row, col)[3, 3]) for col in range(2)] for row in range(3)]
     white = (255, 255, 255)

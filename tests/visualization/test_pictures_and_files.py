@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gridworld.envs.frames.rendering import draw_frame, pack
+from gridworld.envs.rendering import draw_frame, pack
 from gridworld.errors import InputError, failure
 from gridworld.storage.atomic_write import replacing, replacing_folder, write_array, write_json
-from gridworld.visualization import video as record
+from gridworld.visualization import files as record
 from gridworld.visualization.animation import animation_of_frames, animation_of_states, automatic_cell_size
-from gridworld.visualization.png import encode_png
+from gridworld.visualization.files import encode_png
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
 
@@ -108,9 +108,7 @@ def test_mp4_has_even_sides_and_every_frame(tmp_path: Path) -> None:
     av = pytest.importorskip("av", reason="PyAV is not installed (extra `video`)")
     layout = parse("S.\n.G\n.T", "odd")
     mdp = compile_mdp(layout)
-    record.save_animation(
-        animation_of_states(mdp, np.array([0, 1, 3]), cell_size=13), tmp_path / "episode.mp4", 5
-    )
+    record.save(animation_of_states(mdp, np.array([0, 1, 3]), cell_size=13), tmp_path / "episode.mp4", 5)
     with av.open(str(tmp_path / "episode.mp4")) as video:
         stream = video.streams.video[0]
         assert (stream.width, stream.height) == (52, 66)

@@ -24,7 +24,7 @@ from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters
 from gridworld.agents.sb3.policy_outputs import Reading, epsilon_greedy, read, read_states, why_no_table
 from gridworld.agents.sb3.settings.schemas import SB3Config, reward_scale
 from gridworld.agents.sb3.state import class_without_state
-from gridworld.bounds import within
+from gridworld.bounds import Bounds
 from gridworld.config.agents import AgentConfig
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State, StateError
@@ -171,7 +171,7 @@ class SB3Agent:
             ) from None
         self._loaded = True
         if rate is not None:
-            within(f"{path}: exploration_rate", rate, 0, 1)
+            Bounds(0, 1).check(f"{path}: exploration_rate", rate)
             self._model.exploration_rate = rate  # type: ignore[attr-defined]
 
 

@@ -47,7 +47,6 @@ def check(config: TrainConfig) -> None:
         )
     if config.device not in ("cpu", "auto"):
         raise InputError(f"device={config.device}: agent={agent.name} runs on the processor; must be cpu")
-    agent.check()
 
 
 def import_for(config: AgentConfig) -> None:

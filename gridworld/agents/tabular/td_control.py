@@ -13,7 +13,6 @@ Reference: R. Sutton and A. Barto, Reinforcement Learning, 2nd ed., 2018, chapte
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -28,9 +27,8 @@ from gridworld.agents.tabular.epsilon_greedy import draw_actions, epsilon_greedy
 from gridworld.agents.tabular.model_file import model_bytes, read_model
 from gridworld.agents.tabular.settings import TabularConfig
 from gridworld.agents.tabular.training_log import TrainingLog
-from gridworld.bounds import at_least, within, within_size
-from gridworld.config.agents import MOST_KEPT, Schedule, check_exploration, parse_schedule
-from gridworld.config.effects import Effect, affects
+from gridworld.config.agents import MOST_KEPT, Schedule, parse_schedule
+from gridworld.config.fields import Effect, affects, bounds, rate
 from gridworld.errors import InputError
 from gridworld.storage.rng_state import generator_state, independent_generator, set_generator_state
 from gridworld.storage.serialization import State, fill, fitting
@@ -44,33 +42,21 @@ if TYPE_CHECKING:
 class TabularControlConfig(TabularConfig):
     """Temporal-difference control. Where Stable-Baselines3 has the same setting, it has the same name."""
 
-    learning_rate: Schedule = 0.1  # step size; a number; lin_NUMBER, sqrt_NUMBER and quad_NUMBER fall to 0
-    learning_rate_power: float = 0.0  # times (visits of the state and action) ** -power
-    initial_value: float = 0.0  # of every action in every state that is no end
-    exploration_fraction: float = 1.0  # of training, in which epsilon falls linearly
-    exploration_initial_eps: float = 1.0  # epsilon when training begins
-    exploration_final_eps: float = 0.05  # epsilon after that fraction
+    # step size; a number; lin_NUMBER, sqrt_NUMBER and quad_NUMBER fall to 0
+    learning_rate: Schedule = field(default=0.1, metadata=rate(1, above=True))
+    # times (visits of the state and action) ** -power
+    learning_rate_power: float = field(default=0.0, metadata=bounds(0, 1))
+    # of every action in every state that is no end
+    initial_value: float = field(default=0.0, metadata=bounds(-MOST_REWARD, MOST_REWARD, least=LEAST_REWARD))
+    # of training, in which epsilon falls linearly
+    exploration_fraction: float = field(default=1.0, metadata=bounds(0, 1, above=True))
+    # epsilon when training begins
+    exploration_initial_eps: float = field(default=1.0, metadata=bounds(0, 1))
+    exploration_final_eps: float = field(default=0.05, metadata=bounds(0, 1))  # epsilon after that fraction
     # episodes that the means in TensorBoard are taken over
-    stats_window_size: int = field(default=100, metadata=affects(Effect.LABELS))
+    stats_window_size: int = field(default=100, metadata=affects(Effect.LABELS) | bounds(1, MOST_KEPT))
     # episodes between two points there
-    log_interval: int = field(default=100, metadata=affects(Effect.LABELS))
-
-    def check(self) -> None:
-        """See `TabularConfig.check`."""
-        super().check()
-        size = parse_schedule("agent.learning_rate", self.learning_rate).initial
-        if not 0 < size <= 1:
-            raise InputError(
-                f"agent.learning_rate={self.learning_rate}: a step towards the target must be "
-                "above 0 and at most 1"
-            )
-        within("agent.learning_rate_power", self.learning_rate_power, 0, 1)
-        if not math.isfinite(self.initial_value):
-            raise InputError(f"agent.initial_value={self.initial_value}: must be a finite number")
-        within_size("agent.initial_value", self.initial_value, LEAST_REWARD, MOST_REWARD)
-        check_exploration(self)
-        within("agent.stats_window_size", self.stats_window_size, 1, MOST_KEPT)
-        at_least("agent.log_interval", self.log_interval, 1)
+    log_interval: int = field(default=100, metadata=affects(Effect.LABELS) | bounds(1))
 
 
 class TabularControl(ABC):

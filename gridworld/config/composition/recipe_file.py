@@ -18,10 +18,10 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import OmegaConf
 
 from gridworld.config.agents import MISSING
-from gridworld.config.alternatives import alternatives
 from gridworld.config.composition.conf_folder import is_override
 from gridworld.config.composition.words import as_whole
 from gridworld.config.plain_settings import check_foreign, fits, foreign, shown
+from gridworld.config.settings import alternatives
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.storage.safe_read import as_text, read_bytes

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gridworld.config.agents import MISSING, WholeNumbers
-from gridworld.config.alternatives import alternatives
 from gridworld.config.composition.conf_folder import conf_folder
+from gridworld.config.settings import alternatives
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.config.tune import TuneConfig

@@ -11,8 +11,8 @@ import json
 from typing import Any
 
 from gridworld.config.agents import AgentConfig
-from gridworld.config.effects import Effect
-from gridworld.config.settings_by_effect import ON_RESULT, with_effects
+from gridworld.config.fields import Effect
+from gridworld.config.settings import ON_RESULT, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.run.identity.provenance import code, processor, versions
 from gridworld.storage.safe_read import sha256

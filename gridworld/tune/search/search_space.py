@@ -22,8 +22,8 @@ from omegaconf import OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.config.composition.compose import to_config
-from gridworld.config.effects import Effect
-from gridworld.config.settings_by_effect import effect_of
+from gridworld.config.fields import Effect
+from gridworld.config.settings import effect_of
 from gridworld.config.train import TrainConfig
 from gridworld.config.tune import DimensionConfig
 from gridworld.errors import InputError

@@ -11,9 +11,8 @@ subtraction anywhere, every x_i has a small error relative to itself, however sm
 (W. Grassmann, M. Taksar and D. Heyman, Regenerative analysis and steady state distributions for Markov
 chains, Operations Research 33, 1985; C. O'Cinneide, Numerische Mathematik 65, 1993). This needs right >= 0.
 
-Large systems are factored sparsely by SuperLU, as far as that is accurate: with the leaks for a right-hand
-side, x is the probability of ever leaving, which is 1. Where it does not come out as 1, the elimination is
-used for them too, in a band around the diagonal.
+Large systems are factored sparsely by SuperLU, if that is accurate: with the leaks for a right-hand side, x
+is the probability of ever leaving, which is 1. Else it is eliminated in a band around the diagonal.
 """
 
 from __future__ import annotations
@@ -85,10 +84,7 @@ class BandedElimination:
 
 
 def factor(weights: Any, leak: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """A solver of the system, for right-hand sides (n, columns); it overwrites what it is given.
-
-    `weights` (n, n) is a numpy array or a scipy CSR array, `leak` is (n,).
-    """
+    """Solve for right-hand sides (n, columns); overwrites `weights` (n, n), numpy or CSR, and `leak` (n,)."""
     if isinstance(weights, np.ndarray):
         return Elimination(weights, leak, band=len(leak)).solve
     from scipy.sparse import diags_array

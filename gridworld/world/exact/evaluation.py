@@ -1,11 +1,8 @@
 """How good a policy is, exactly: by solving for its value.
 
 Value and regret are without a step limit, as in the theory that the certificate rests on. What becomes of an
-episode (goal, trap and time-out probability, return, length) is within the step limit, as training and
-sampling see it. The discounted return within the limit links the two: sampled episodes estimate it.
-
-Another discount may make another policy optimal: a shorter horizon takes a risk, or a detour, that a longer
-one does not. Then no agent that learns perfectly with it can be certified.
+episode is within the step limit, as training and sampling see it. Another discount may make another policy
+optimal; then no agent that learns perfectly with it can be certified.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
 """The Markov chain that a policy makes of the world, and what can be known of it exactly.
 
-The value of a policy π solves the linear system V = r_π + γ P_π V; what becomes of an episode follows from
-its distribution over states, step by step. A policy is a table (S, A) of action probabilities. Small worlds
-are dense matrices, large ones sparse.
-
-Without discount (γ = 1) the value is the expected total reward. A policy may then go on for ever. Where it
-comes to walk among states without earning anything, nothing is added any more; where it goes on earning, its
-gains or its losses are infinite.
+The value of a policy π, a table (S, A) of action probabilities, solves the linear system V = r_π + γ P_π V;
+what becomes of an episode follows from its distribution over states, step by step. Small worlds are dense
+matrices, large ones sparse. Without discount (γ = 1) the value is the expected total reward, which may be
+infinite where a policy never ends.
 
 Reference: M. L. Puterman, Markov Decision Processes, 1994, chapters 6 and 7 and appendix A.
 """
@@ -80,36 +77,27 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Of one policy under one discount.
+    """Of one policy under one discount."""
 
-    Attributes:
-        value: (S,), V_π = E Σ γ^t r_t.
-        scale: (S,), E Σ γ^t |r_t|, what a relative error is relative to.
-        slope: (S,), dV_π/dγ = E Σ t γ^(t-1) r_t: of equal values, the sooner has the smaller.
-        slope_scale: (S,), the same of |r_t|.
-    """
-
-    value: FloatArray
-    scale: FloatArray
-    slope: FloatArray | None = None
-    slope_scale: FloatArray | None = None
+    value: FloatArray  # (S,), V_π = E Σ γ^t r_t
+    scale: FloatArray  # (S,), E Σ γ^t |r_t|, what a relative error is relative to
+    slope: FloatArray | None = (
+        None  # (S,), dV_π/dγ = E Σ t γ^(t-1) r_t: of equal values, the sooner is smaller
+    )
+    slope_scale: FloatArray | None = None  # (S,), the same of |r_t|
 
 
 class Chain:
-    """States under one policy.
-
-    Attributes:
-        policy: (S, A), float64, rows sum to 1.
-        reward: (S,), r_π, the expected reward of a step.
-        transition: (S, S), P_π, a numpy array, or in large worlds a scipy CSR array.
-    """
+    """States under one policy."""
 
     def __init__(self, mdp: Mdp, policy: ArrayLike) -> None:
         self.mdp = mdp
-        self.policy = check_policy(mdp, policy)
+        self.policy = check_policy(mdp, policy)  # (S, A), rows sum to 1
         self._weight = self.policy[:, :, None] * mdp.probability  # (S, A, K)
-        self.reward: FloatArray = (self._weight * mdp.reward).sum(axis=(1, 2))
-        self.transition = self._transition()
+        self.reward: FloatArray = (self._weight * mdp.reward).sum(axis=(1, 2))  # (S,), r_π
+        self.transition = (
+            self._transition()
+        )  # (S, S), P_π, a numpy array, or in large worlds a scipy CSR array
 
     def _transition(self) -> Any:
         size, weight = self.mdp.num_states, self._weight
@@ -143,8 +131,8 @@ class Chain:
     def evaluation(self, gamma: float, with_slope: bool = False) -> Evaluation:
         """The value and what else policy iteration needs, in which tiny values are accurate too.
 
-        Gains and losses are solved for apart, as sums of non-negative numbers, whose error is small beside
-        each state's own scale, not only beside the largest one.
+        Gains and losses are solved for apart, as sums of non-negative numbers: their error is small beside
+        each state's own scale.
         """
         signs = (np.maximum(self.mdp.reward, 0), np.maximum(-self.mdp.reward, 0))
         paid = np.stack([(self._weight * part).sum(axis=(1, 2)) for part in signs], axis=1)

@@ -6,16 +6,15 @@ With V = 0 at the end of an episode, the optimum is the fixed point of
 
 found by value iteration and made exact by policy iteration.
 
-Without discount (γ = 1) this equation may have other fixed points than the optimum, and greedy actions may
-never end. There V* is the largest expected total reward that any policy has, one that goes on for ever
-included. Of the actions that keep it, those are optimal that bring gains sooner and losses later: with the
-smallest Σ_t t E[r_t], the slope of the value in γ. Both are what discounting prefers as γ goes to 1 (the
-first two orders of Blackwell's optimality). Policy iteration in this order, first V and then the slope,
-begins with a policy that is worth something everywhere: it rests where it can stay for ever without a reward,
-and elsewhere comes surely to such states or to an end if that is possible. So it cannot be caught in a fixed
-point that is not the optimum: where the optimum is better by the largest margin, it would have to stay among
-such states for ever, earn nothing there, and be no better than resting. Discounts just below 1 are treated in
-the same way, since the cost of a step gets lost in rounding beside the value.
+Without discount (γ = 1) this equation may have other fixed points, and greedy actions may never end. There V*
+is the largest expected total reward that any policy has, one that never ends included. Of the actions that
+keep it, those are optimal that bring gains sooner and losses later: with the smallest Σ_t t E[r_t], the slope
+of the value in γ. Both are what discounting prefers as γ goes to 1 (the first two orders of Blackwell's
+optimality). Policy iteration in this order begins with a policy that is worth something everywhere: it rests
+where it can stay for ever without a reward, and elsewhere surely comes to such states or to an end if that is
+possible. So no fixed point but the optimum can hold it: where the optimum is better by the largest margin, it
+would have to stay among such states for ever, earn nothing there, and be no better than resting. Discounts
+just below 1 are treated in the same way, since the cost of a step gets lost in rounding beside the value.
 
 References: M. L. Puterman, Markov Decision Processes, 1994, chapters 6, 7 and 10; R. Sutton and A. Barto,
 Reinforcement Learning, 2nd ed., 2018, chapter 4; A. Veinott, Discrete dynamic programming with sensitive
@@ -78,34 +77,20 @@ def pick(table: FloatArray, actions: IntArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The optimum of a world under one discount γ.
-
-    Attributes:
-        v: (S,), float64, V*.
-        q: (S, A), float64, Q*.
-        optimal: (S, A), True for every action as good as the best; all actions where it is over.
-        scale: (S,), float64, the expected discounted sum of |reward|: what "relative" is relative to.
-    """
+    """The optimum of a world under one discount γ."""
 
     gamma: float
-    v: FloatArray
-    q: FloatArray
-    optimal: BoolArray
-    scale: FloatArray
+    v: FloatArray  # (S,), V*
+    q: FloatArray  # (S, A), Q*
+    optimal: BoolArray  # (S, A), True for every action as good as the best; all actions where it is over
+    scale: FloatArray  # (S,), the expected discounted sum of |reward|: what "relative" is relative to
 
 
 def value_iteration(mdp: Mdp, gamma: float) -> Solution:
     """Find V*, Q* and all optimal actions, exact up to rounding.
 
     With γ = 1 and costs, a state from which every policy may go on paying for ever has V = -inf, and all its
-    actions are as good as each other.
-
-    Args:
-        mdp: the world.
-        gamma: the discount γ, from 0 to 1.
-
-    Raises:
-        InputError: another discount; or no finite optimum: γ = 1 and a way to go on earning for ever.
+    actions are as good as each other. A way to earn for ever has no finite optimum and is an InputError.
     """
     gamma = check_gamma(gamma)
     ordinary = min(gamma, ORDINARY_GAMMA)
@@ -181,12 +166,8 @@ def swept_values(mdp: Mdp, gamma: float) -> FloatArray:
 def _solve_by_value_and_slope(mdp: Mdp, gamma: float, greedy: IntArray) -> tuple[Evaluation, BoolArray]:
     """Policy iteration from `greedy` (S,): the larger value first, of equal values the smaller slope.
 
-    With γ = 1, `greedy` has a finite value wherever a policy has. Slopes are looked at once no value can be
-    improved. Values that look equal may differ by less than is visible: actions that turn out to be worse are
-    taken back, and are out of the choice from then on.
-
-    Returns:
-        The evaluation of an optimal policy; (S, A), True for every optimal action.
+    With γ = 1, `greedy` has a finite value wherever a policy has. Values that look equal may differ by less
+    than is visible: actions that turn out to be worse are taken back, and excluded from then on.
     """
     worse = np.zeros((mdp.num_states, mdp.num_actions), dtype=np.bool_)
     seen: set[bytes] = set()
@@ -211,10 +192,9 @@ def _solve_by_value_and_slope(mdp: Mdp, gamma: float, greedy: IntArray) -> tuple
 def _best_actions(
     mdp: Mdp, found: Evaluation, gamma: float, greedy: IntArray, worse: BoolArray
 ) -> tuple[BoolArray, IntArray]:
-    """The actions (S, A) that are best as one step before a policy, and the policy (S,) to go on with.
+    """The actions (S, A) that are best as one step before a policy, and the improved policy (S,).
 
-    `found` is of the policy `greedy` (S,), whose actions stay unless others are better by more than rounding;
-    `worse` (S, A) are known not to be.
+    The actions of `greedy` (S,) stay unless others are better by more than rounding; `worse` (S, A) are not.
     """
     assert found.slope is not None
     assert found.slope_scale is not None
@@ -256,10 +236,10 @@ def _advantage(
 ) -> tuple[FloatArray, FloatArray]:
     """Σ_k p_k [ r_k + γ x(next_k) - x(s) ] (S, A) for rewards r (S, A, K) and values x (S,); its size.
 
-    Summed up as differences of values, it is exact also where all but a tiny part stays where it is; of an
-    action without a finite value it is -inf. Its size is what its rounding is relative to. Outcomes that
-    change less than `negligible`, relative to their own size, change nothing: among them the rounding of a
-    likely one would hide what an unlikely one brings, and who has time waits for that.
+    Summed up as differences of values, it is exact also where all but a tiny part stays where it is; without
+    a finite value it is -inf. Its size is what its rounding is relative to. Outcomes that change less than
+    `negligible`, relative to their own size, change nothing: their rounding would hide what an unlikely one
+    brings.
     """
     here, there = values[:, None, None], values[mdp.next_state]
     moved = mdp.next_state != np.arange(mdp.num_states)[:, None, None]
@@ -272,9 +252,8 @@ def _advantage(
         sums = (np.where(mdp.probability > 0, mdp.probability * part, 0.0) for part in (change, size))
         gained, rounding = (part.sum(axis=2) for part in sums)
     unknown = ~np.isfinite(rounding)
-    over = mdp.absorbing
     gained[unknown], rounding[unknown] = -np.inf, 0.0
-    gained[over] = rounding[over] = 0.0
+    gained[mdp.absorbing] = rounding[mdp.absorbing] = 0.0
     return gained, rounding
 
 

@@ -52,19 +52,11 @@ _FORMAT = np.array("gridworld world 1")
 
 
 def load_world(path: str | PathLike[str]) -> Mdp:
-    """Read a world from a file: a custom one, or a run's `world.npz`. The module says what is in them.
+    """Read a world from an .npz file, a custom one or a run's `world.npz`; the module says what is in them.
 
-    Args:
-        path: an .npz file, relative to the folder that the program was started in.
-
-    Returns:
-        The world; without a `name`, its name is that of the file.
-
-    Raises:
-        InputError: no such file, another one, or arrays that make no world.
+    Without a `name` in it, the world is named after the file. Raises InputError if it is no such file.
     """
-    content = _read(path)
-    arrays = npz_arrays(path, content, "an .npz file of arrays", _MOST_BYTES)
+    arrays = npz_arrays(path, _read(path), "an .npz file of arrays", _MOST_BYTES)
     if "format" in arrays:
         return _from_fields(arrays, str(path))
     return mdp_from_arrays(Path(path).stem, arrays, str(path))
@@ -204,13 +196,13 @@ def _read(path: str | PathLike[str]) -> bytes:
                 )
             check_memory(given, 2 * size)
             return file.read(_MOST_BYTES)
+    except InputError:
+        raise
     except IsADirectoryError:
         raise InputError(f"env.path={given}: is a folder; give an .npz file") from None
     except (OSError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        told = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"env.path={given}: cannot be read ({told}); give an .npz file") from None
+        reason = getattr(error, "strerror", error)
+        raise InputError(f"env.path={given}: cannot be read ({reason}); give an .npz file") from None
 
 
 def world_bytes(mdp: Mdp) -> bytes:

@@ -35,9 +35,6 @@ def river_swim(length: int = 6) -> Mdp:
     Sources: A. L. Strehl and M. L. Littman, An analysis of model-based interval estimation for Markov
     decision processes, 2008; the numbers are those of I. Osband, D. Russo and B. Van Roy, (More) efficient
     reinforcement learning via posterior sampling, 2013, whose published code has the step limit.
-
-    Args:
-        length: number of states, at least 2.
     """
     _check_whole("length", length, 2, MOST_STATES)
     state = np.arange(length)
@@ -51,15 +48,10 @@ def river_swim(length: int = 6) -> Mdp:
     probability[-1, RIGHT] = 0.4, 0.6, 0.0
     reward = np.zeros(next_state.shape)
     reward[0, LEFT], reward[-1, RIGHT] = 0.005, 1.0
-    return mdp_from_outcomes(
+    return _world(
         f"RiverSwim {length}",
-        Outcomes(
-            next_state=next_state,
-            probability=probability,
-            reward=reward,
-            terminated=np.zeros(next_state.shape, dtype=np.bool_),
-            start=np.eye(1, length)[0],
-        ),
+        (next_state, reward, np.zeros(next_state.shape, dtype=np.bool_)),
+        probability=probability,
         action_names=_LEFT_RIGHT,
         places=grid_places(1, length),
         max_episode_steps=-(-20 * length // 6),
@@ -75,13 +67,10 @@ def deep_sea(size: int = 10, seed: int | None = None) -> Mdp:
     row ends the episode, in a state without a place, with or without the treasure; only with it, it is a
     success. The best return is 0.99, by `right` all the way, that of never moving right is 0.
 
-    Source: I. Osband et al., Behaviour suite for reinforcement learning, 2020, and its deterministic
-    `deep_sea`. The step limit is `size`, which is when the episode ends.
+    With a `seed`, which action is right is drawn for each cell, as bsuite draws it for the same
+    `mapping_seed`; without one it is action 1 everywhere. The step limit is `size`.
 
-    Args:
-        size: rows, and columns; at least 2.
-        seed: None: action 1 is right in every cell. A number: which action is right is drawn for each cell,
-            as bsuite draws it for the same `mapping_seed`, so that no generalisation over cells helps.
+    Source: I. Osband et al., Behaviour suite for reinforcement learning, 2020: its deterministic `deep_sea`.
     """
     _check_whole("size", size, 2, 500)
     cells = size * size
@@ -102,9 +91,10 @@ def deep_sea(size: int = 10, seed: int | None = None) -> Mdp:
     success = np.zeros((cells + 1, 2), np.bool_)
     success[:cells] = treasure
     places = np.stack([np.zeros(cells, np.int64), row, col], axis=1)
-    return mdp_from_outcomes(
+    return _world(
         f"DeepSea {size}",
-        _deterministic(next_state, reward, terminated, success, start=0),
+        (next_state, reward, terminated),
+        success=success,
         action_names=_LEFT_RIGHT if seed is None else None,
         places=np.concatenate([places, [[-1, -1, -1]]]),
         max_episode_steps=size,
@@ -119,13 +109,10 @@ def combination_lock(length: int = 10, num_actions: int = 2, seed: int | None = 
     episode ends in the open lock, state `length`. A random policy needs about num_actions ** length steps.
     The step limit is 10 * length: of an attempt with each of ten random actions.
 
+    With a `seed` the right actions are drawn; without one it is the last action of every state.
+
     Sources: S. D. Whitehead, Complexity and cooperation in Q-learning, 1991; S. Koenig and R. G. Simmons,
     Complexity analysis of real-time reinforcement learning, 1993 (the "reset state space").
-
-    Args:
-        length: number of actions that open it, at least 1.
-        num_actions: at least 2.
-        seed: None: the last action is the right one of every state. A number: the right ones are drawn.
     """
     _check_whole("length", length, 1, MOST_STATES - 1)
     _check_whole("num_actions", num_actions, 2, MOST_ACTIONS)
@@ -139,9 +126,9 @@ def combination_lock(length: int = 10, num_actions: int = 2, seed: int | None = 
     reward, terminated = np.zeros(next_state.shape), np.zeros(next_state.shape, dtype=np.bool_)
     reward[length - 1, right[-1]], terminated[length - 1, right[-1]] = 1.0, True
     next_state[length], terminated[length] = length, True
-    return mdp_from_outcomes(
+    return _world(
         f"combination lock {length}",
-        _deterministic(next_state, reward, terminated, None, start=0),
+        (next_state, reward, terminated),
         places=grid_places(1, length + 1),
         max_episode_steps=10 * length,
     )
@@ -159,9 +146,6 @@ def random_walk(length: int = 5) -> Mdp:
     has something to find. Its value is `Chain(mdp, uniform).value(1.0)`. The walk has no step limit.
 
     Source: R. Sutton and A. Barto, Reinforcement Learning, 2nd ed., 2018, example 6.2.
-
-    Args:
-        length: number of states without the ends, odd, so that there is a middle.
     """
     _check_whole("length", length, 1, MOST_STATES - 2)
     if length % 2 == 0:
@@ -171,32 +155,30 @@ def random_walk(length: int = 5) -> Mdp:
     reward = np.zeros(next_state.shape)
     reward[length, RIGHT] = 1.0
     terminated = (next_state == 0) | (next_state == length + 1)
-    return mdp_from_outcomes(
+    return _world(
         f"random walk {length}",
-        _deterministic(next_state, reward, terminated, None, start=(length + 1) // 2),
+        (next_state, reward, terminated),
+        start=(length + 1) // 2,
         action_names=_LEFT_RIGHT,
         places=grid_places(1, length + 2),
     )
 
 
-def _deterministic(
-    next_state: NDArray[Any],
-    reward: NDArray[np.float64],
-    terminated: NDArray[np.bool_],
-    success: NDArray[np.bool_] | None,
-    start: int,
-) -> Outcomes:
-    """Outcomes of tables (N, A)."""
-    starts = np.zeros(len(next_state))
-    starts[start] = 1.0
-    return Outcomes(
-        next_state=next_state[:, :, None],
-        probability=np.ones((*next_state.shape, 1)),
-        reward=reward[:, :, None],
-        terminated=terminated[:, :, None],
-        success=None if success is None else success[:, :, None],
-        start=starts,
-    )
+def _world(
+    name: str,
+    tables: tuple[NDArray[Any], NDArray[np.float64], NDArray[np.bool_]],
+    start: int = 0,
+    success: NDArray[np.bool_] | None = None,
+    probability: NDArray[np.float64] | None = None,
+    **settings: Any,
+) -> Mdp:
+    """The world of next states, rewards and ends, (N, A) or with `probability` (N, A, K)."""
+    given = {"next_state": tables[0], "reward": tables[1], "terminated": tables[2], "success": success}
+    if probability is None:
+        given = {key: None if table is None else table[:, :, None] for key, table in given.items()}
+        probability = np.ones((*tables[0].shape, 1))
+    first = (np.arange(len(probability)) == start).astype(np.float64)
+    return mdp_from_outcomes(name, Outcomes(probability=probability, start=first, **given), **settings)
 
 
 def _check_whole(key: str, value: Any, least: int, most: int) -> None:

@@ -35,12 +35,7 @@ _WALKED: dict[tuple[type, str] | None, str] = {}
 def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> Mdp:
     """Make an environment of Gymnasium and compile its transition table.
 
-    Args:
-        env_id: a registered id, e.g. `FrozenLake-v1`.
-        kwargs: arguments of `gymnasium.make`, e.g. `{"is_slippery": False}`.
-
-    Returns:
-        The world, with the id as its name and the step limit of the registered id.
+    `kwargs` are arguments of `gymnasium.make`. The world has the id as its name, and its step limit.
     """
     arguments = dict(kwargs or {})
     env = make_env(env_id, arguments)
@@ -93,8 +88,11 @@ def _compiled(real: gym.Env[Any, Any], name: str, limit: int | None) -> tuple[Md
         panel_names=known.panel_names if known is not None else (),
         max_episode_steps=limit,
     )
-    if known is not None and (reason := known.refused(real)):
-        raise InputError(f"{name}: {reason}")
+    if known and getattr(real, "fickle_passenger", False) and getattr(real, "fickle_probability", 1) > 0:
+        raise InputError(
+            f"{name}: fickle_passenger=True changes the destination in a way that its table P does not have, "
+            "so no exact truth is known; leave it out"
+        )
     return mdp, table
 
 
@@ -117,6 +115,15 @@ def _table(name: str, real: Any) -> Outcomes:
     longest = int(counts.max())
     check_size(name, states, actions, longest)
 
+    try:
+        start = np.array(getattr(real, "initial_state_distrib", None), dtype=np.float64)
+    except (TypeError, ValueError):
+        start = np.zeros(0)
+    if start.shape != (states,):
+        raise InputError(
+            f"{name}: initial_state_distrib must be the {states} probabilities of starting in each state"
+        )
+
     ends = np.cumsum(counts)
     pair = np.repeat(np.arange(states * actions), counts)
     column = np.arange(len(rows)) - np.repeat(ends - counts, counts)
@@ -130,70 +137,47 @@ def _table(name: str, real: Any) -> Outcomes:
         probability=padded[..., 0].copy(),
         reward=padded[..., 2].copy(),
         terminated=padded[..., 3] == 1,
-        start=_start(name, real, states),
+        start=start,
     )
-
-
-def _start(name: str, real: Any, states: int) -> NDArray[np.float64]:
-    try:
-        start = np.array(getattr(real, "initial_state_distrib", None), dtype=np.float64)
-    except (TypeError, ValueError):
-        start = np.zeros(0)
-    if start.shape != (states,):
-        raise InputError(
-            f"{name}: initial_state_distrib must be the {states} probabilities of starting in each state"
-        )
-    return start
 
 
 def _rows(name: str, table: Any, states: int, actions: int) -> tuple[NDArray[np.float64], IntArray]:
     """All outcomes (M, 4) in the order of states and actions, and how many each of these has (S * A,)."""
-    found: list[Any] = []
-    counts = np.empty(states * actions, dtype=np.int64)
+    pairs = list(itertools.product(range(states), range(actions)))
     try:
-        for state in range(states):
-            of_state = table[state]
-            for action in range(actions):
-                row = of_state[action]
-                counts[state * actions + action] = len(row)
-                found.extend(row)
-        rows = np.array(found, dtype=np.float64)
-        good = rows.shape == (len(found), 4) and bool((counts > 0).all())
-        if good and _are_outcomes(rows, states):
+        of_pairs = [table[state][action] for state, action in pairs]
+        rows = np.array([outcome for row in of_pairs for outcome in row], dtype=np.float64)
+        counts = np.array([len(row) for row in of_pairs])
+        if (counts > 0).all() and _are_outcomes(rows, states):
             return rows, counts
     except (KeyError, IndexError, TypeError, ValueError, OverflowError):
         pass
-    raise _mistake(name, table, states, actions)
+    for state, action in pairs:  # the first row that is no row
+        try:
+            row = table[state][action]
+        except (KeyError, IndexError, TypeError):
+            raise InputError(
+                f"{name}: P has no state {state} with action {action}, must have {states} states with "
+                f"{actions} actions each"
+            ) from None
+        try:
+            good = _are_outcomes(np.array(list(row), dtype=np.float64), states)
+        except (TypeError, ValueError, OverflowError):
+            good = False
+        if not good:
+            raise InputError(
+                f"{name}: P[{state}][{action}] is {str(row)[:100]}, must be a list of (probability, next "
+                f"state from 0 to {states - 1}, reward, terminated)"
+            )
+    raise InputError(f"{name}: P is no table of {states} states and {actions} actions")
 
 
 def _are_outcomes(rows: NDArray[np.float64], states: int) -> bool:
     """Whether all rows (M, 4) lead to states and end, or not."""
-    following = rows[:, 1]
-    are_states = (following >= 0) & (following < states) & (np.floor(following) == following)
+    if rows.ndim != 2 or rows.shape[1] != 4:
+        return False
+    are_states = (rows[:, 1] >= 0) & (rows[:, 1] < states) & (np.floor(rows[:, 1]) == rows[:, 1])
     return bool(are_states.all() and np.isin(rows[:, 3], (0, 1)).all())
-
-
-def _mistake(name: str, table: Any, states: int, actions: int) -> InputError:
-    """The first row that is no row."""
-    for state, action in itertools.product(range(states), range(actions)):
-        try:
-            row = table[state][action]
-        except (KeyError, IndexError, TypeError):
-            return InputError(
-                f"{name}: P has no state {state} with action {action}, must have {states} states with "
-                f"{actions} actions each"
-            )
-        try:
-            numbers = np.array(list(row), dtype=np.float64)
-            good = numbers.ndim == 2 and numbers.shape[1] == 4 and _are_outcomes(numbers, states)
-        except (TypeError, ValueError, OverflowError):
-            good = False
-        if not good:
-            return InputError(
-                f"{name}: P[{state}][{action}] is {str(row)[:100]}, must be a list of (probability, next "
-                f"state from 0 to {states - 1}, reward, terminated)"
-            )
-    return InputError(f"{name}: P is no table of {states} states and {actions} actions")
 
 
 def _differ(table: Outcomes, other: Outcomes) -> bool:
@@ -222,27 +206,17 @@ def _check_steps(mdp: Mdp, table: Outcomes, env: gym.Env[Any, Any]) -> str:
 
 @dataclass(frozen=True)
 class _KnownEnv:
-    """What is known of a class of environments beside its table."""
+    """What is known of a class of environments beside its table; see `Mdp`."""
 
     action_names: tuple[str, ...]
-    places: Callable[[Any], NDArray[np.int64]]  # (N, 3), see `Mdp`
-    panel_names: tuple[str, ...] = ()  # see `Mdp`
-    refused: Callable[[Any], str] = lambda env: ""  # why its table is not true, if that can be seen
+    places: Callable[[Any], NDArray[np.int64]]
+    panel_names: tuple[str, ...] = ()
 
 
 def _taxi_places(env: Any) -> NDArray[np.int64]:
     """One panel for each passenger and destination: passenger * 4 + destination."""
     cell, panel = np.divmod(np.arange(500), 20)
     return np.stack([panel, cell // 5, cell % 5], axis=1).astype(np.int64)
-
-
-def _is_fickle(env: Any) -> str:
-    if not (getattr(env, "fickle_passenger", False) and getattr(env, "fickle_probability", 1) > 0):
-        return ""
-    return (
-        "fickle_passenger=True changes the destination in a way that its table P does not have, so no exact "
-        "truth is known; leave it out"
-    )
 
 
 _KNOWN = {
@@ -252,7 +226,6 @@ _KNOWN = {
         ("south", "north", "east", "west", "pickup", "dropoff"),
         _taxi_places,
         tuple(f"{passenger} to {destination}" for passenger in (*"RGYB", "taxi") for destination in "RGYB"),
-        refused=_is_fickle,
     ),
 }
 

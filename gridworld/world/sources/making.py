@@ -18,11 +18,7 @@ _PACKAGES = {"MiniGrid-": "minigrid", "BabyAI-": "minigrid"}  # which register i
 def make_env(
     env_id: str, kwargs: Mapping[str, Any] | None = None, render_mode: str | None = None
 ) -> gym.Env[Any, Any]:
-    """Make an environment of Gymnasium.
-
-    `env_id` is a registered id, in which "module:id" imports the module first; `kwargs` are the arguments of
-    `gymnasium.make`.
-    """
+    """Make an environment by its registered id; "module:id" imports the module first."""
     arguments = dict(kwargs or {})
     if arguments.get("render_mode") is not None:
         raise InputError(

@@ -1,14 +1,14 @@
-"""Copies of an environment's state, and keys that are equal where states are.
+"""What Python objects hold: copies of an environment's state, and digests that are equal where states are.
 
-A state is what the attributes of the environment hold, everything that they refer to included. Left out are
-its random generators: whoever enumerates an environment refuses a step that draws from them.
-
-Attributes are copied by pickle, which is four times as fast as `copy.deepcopy`. What cannot change or cannot
-be copied (spaces, functions, modules) is kept as it is.
+A state is what the attributes of the environment hold, everything that they refer to included, but for its
+random generators. Attributes are copied by pickle, which is four times as fast as `copy.deepcopy`. What
+cannot change or cannot be copied (spaces, functions, modules) is kept as it is.
 """
 
 from __future__ import annotations
 
+import dis
+import functools
 import hashlib
 import io
 import marshal
@@ -16,27 +16,33 @@ import pickle
 import random
 import sys
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator
 from enum import Enum
-from types import BuiltinFunctionType, FunctionType, ModuleType
+from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
-_KEPT = (
-    gym.Space,
-    gym.envs.registration.EnvSpec,
-    FunctionType,
-    BuiltinFunctionType,
-    ModuleType,
-    *GENERATORS,
-)
-_PLAIN = frozenset({int, float, str, bool, bytes, type(None)})
-_CONTAINERS = (list, tuple, dict, set, frozenset, deque, bytearray)
+_SPEC = gym.envs.registration.EnvSpec
+_KEPT = (gym.Space, _SPEC, FunctionType, BuiltinFunctionType, ModuleType, *GENERATORS)
+_PLAIN = frozenset({int, float, complex, str, bool, bytes, type(None)})
+_REDUCED = (*_PLAIN - {type(None)}, list, tuple, dict, set, frozenset, deque, bytearray, functools.partial)
 _OF_ITS_RANDOMNESS = ("_np_random", "_np_random_seed")
 _SHORT = 16  # numbers; a position is the same whether it is a tuple or an array
+_MOST_READ = 20_000  # objects that a deep reader follows
+_LIBRARIES = {
+    *sys.stdlib_module_names,
+    *("gymnasium", "gridworld", "minigrid", "numpy", "sb3_contrib", "scipy", "stable_baselines3", "torch"),
+} - {"__main__"}
+_REFERENCES = {  # that a deep reader follows
+    MethodType: ("__self__", "__func__"),
+    BuiltinFunctionType: ("__self__",),
+    staticmethod: ("__func__",),
+    classmethod: ("__func__",),
+    property: ("fget", "fset"),
+}
 
 
 class Snapshots:
@@ -54,19 +60,17 @@ class Snapshots:
 
     def put_back(self, snapshot: bytes) -> None:
         """Make a copy, or rather a copy of it, the environment's state."""
-        unpickler = _Unpickler(io.BytesIO(snapshot), self._kept)
         attributes = vars(self._env)
         attributes.clear()
-        attributes.update(unpickler.load())
+        attributes.update(_Unpickler(io.BytesIO(snapshot), self._kept).load())
 
     def key(self, without: Collection[str] = ()) -> bytes:
         """A digest of the state, 16 bytes, but for some attributes; TypeError where it cannot be compared."""
-        attributes = {name: value for name, value in self._attributes() if name not in without}
-        return _digest(_Reader(self._env).read(attributes))
+        return Reader([self._env]).digest({k: v for k, v in self._attributes() if k not in without})
 
     def keys(self) -> dict[str, bytes]:
         """A digest of each attribute."""
-        return {name: _digest(_Reader(self._env).read(value)) for name, value in self._attributes()}
+        return {name: Reader([self._env]).digest(value) for name, value in self._attributes()}
 
     def _attributes(self) -> list[tuple[str, Any]]:
         return [each for each in vars(self._env).items() if each[0] not in _OF_ITS_RANDOMNESS]
@@ -74,7 +78,7 @@ class Snapshots:
 
 def key_of(value: Any) -> bytes:
     """A digest, 16 bytes, of an observation."""
-    return _digest(_Reader(None).read(value))
+    return Reader().digest(value)
 
 
 def random_states(env: gym.Env[Any, Any] | None = None) -> list[Any]:
@@ -97,11 +101,6 @@ def generator_state(generator: Any) -> Any:
         return repr(generator.bit_generator.state)
     state = generator.get_state(legacy=False)["state"]
     return state["key"].tobytes(), state["pos"]
-
-
-def _digest(value: Any) -> bytes:
-    # Version 2 of the format writes equal values alike; later ones refer back to the same object.
-    return hashlib.blake2b(marshal.dumps(value, 2), digest_size=16).digest()
 
 
 def _kept(number: int) -> Any:
@@ -132,49 +131,123 @@ class _Unpickler(pickle.Unpickler):
         return self._kept_by_id.__getitem__ if ours else super().find_class(module, name)
 
 
-class _Reader:
-    """Reads a value into nested tuples of plain ones; an object met again is its place in the order."""
+class AnotherEnvError(Exception):
+    """An environment is referred to that is not one of those known."""
 
-    def __init__(self, env: Any) -> None:
-        self._met: dict[int, tuple[int, Any]] = {} if env is None else {id(env): (0, env)}
 
-    def read(self, value: Any) -> Any:
-        kind = type(value)
-        if kind in _PLAIN:
-            return value
-        if kind is tuple:
-            return tuple([self.read(each) for each in value])
-        if isinstance(value, np.generic):
-            return self.read(value.item())
-        if isinstance(value, Enum):
-            return kind.__qualname__, value.name
+class Reader:
+    """Reads values into a list of plain ones; an object met again is its place in the order.
+
+    `known` are objects that are not read. A `deep` reader also follows what functions, classes, modules and
+    generators could remember by, libraries excepted; other environments are an `AnotherEnvError`, or skipped.
+    """
+
+    def __init__(self, known: Iterable[Any] = (), deep: bool = False, skips_envs: bool = False) -> None:
+        self.is_complete = True
+        self._found: list[Any] = []
+        self._deep, self._skips_envs = deep, skips_envs
+        # Objects are kept, so that ids stay apart.
+        self._met: dict[int, tuple[int, Any]] = {id(each): (n, each) for n, each in enumerate(known)}
+
+    def digest(self, *values: Any) -> bytes:
+        """16 bytes, equal for equal values."""
+        self._read(values)
+        # Version 2 of the format writes equal values alike; later ones refer back to the same object.
+        return hashlib.blake2b(marshal.dumps(self._found, 2), digest_size=16).digest()
+
+    def _read(self, waiting: Iterable[Any]) -> None:
+        waiting = list(waiting)
+        while waiting:
+            value = waiting.pop()
+            kind = type(value)
+            if kind in _PLAIN:
+                self._found.append(value)
+            elif kind is tuple:
+                self._found.append((None, len(value)))
+                waiting.extend(value)
+            elif id(value) in self._met:
+                self._found.append(("again", self._met[id(value)][0]))
+            elif isinstance(value, np.generic):
+                plain = value.item()
+                waiting.append(repr(plain) if isinstance(plain, np.generic) else plain)
+            elif self._deep:
+                if len(self._met) >= _MOST_READ:
+                    self.is_complete = False
+                    return
+                self._met[id(value)] = len(self._met), value
+                self._add(*self._followed(value, kind), waiting)
+            elif (label := _label(value, kind)) is not None:
+                self._found.append(label)
+            elif isinstance(value, np.ndarray):
+                waiting.append(tuple(value.tolist()))
+            else:
+                self._met[id(value)] = len(self._met), value
+                self._add(*_parts(value, kind), waiting)
+
+    def _add(self, label: Any, parts: Collection[Any], waiting: list[Any]) -> None:
+        self._found.append((label, len(parts)))
+        waiting.extend(parts)
+
+    def _followed(self, value: Any, kind: type) -> tuple[Any, Collection[Any]]:
+        """What a deep reader reads of a value, and follows."""
+        name = kind.__qualname__
+        if isinstance(value, gym.Env):
+            if self._skips_envs:
+                return "environment", ()
+            raise AnotherEnvError
+        if isinstance(value, GENERATORS):
+            return repr(generator_state(value)), ()
+        if isinstance(value, gym.Space):
+            return repr(value), () if self._skips_envs else (value._np_random,)
         if isinstance(value, np.ndarray):
-            return self._read_array(value)
-        if isinstance(value, type):
-            return value.__module__, value.__qualname__
-        if isinstance(value, _KEPT):
-            return type(value).__qualname__, getattr(value, "__qualname__", "")
-        return self._read_mutable(value, kind)
+            objects = value.dtype.hasobject
+            label = value.dtype.str, value.shape, b"" if objects else value.tobytes()
+            return label, (value.tolist(),) if objects else ()
+        if isinstance(value, FunctionType | ModuleType | type):
+            of_kind = {FunctionType: _of_function, ModuleType: _of_module}.get(
+                kind, lambda each: vars(each).values()
+            )
+            return value.__name__, () if _is_library(value) else list(of_kind(value))
+        if kind in (dict, set, frozenset):  # in their own order, which may be a memory too
+            return name, [part for each in value.items() for part in each] if kind is dict else list(value)
+        for kinds, references in _REFERENCES.items():
+            if isinstance(value, kinds):
+                return name, [getattr(value, each, None) for each in references]
+        try:
+            _, parts = _parts(value, kind)
+        except Exception:  # what cannot be read is known by its text
+            return repr(value), ()
+        return name, [*parts, *(() if kind is list or _is_library(kind) else (kind,))]
 
-    def _read_array(self, value: np.ndarray[Any, Any]) -> Any:
-        if value.dtype.hasobject or (value.ndim == 1 and value.size <= _SHORT):
-            return self.read(tuple(value.tolist()))
+
+def _label(value: Any, kind: type) -> Any:
+    """What stands for a value whose parts are no state; None: they are."""
+    if isinstance(value, Enum):
+        return kind.__qualname__, value.name
+    if isinstance(value, type):
+        return value.__module__, value.__qualname__
+    if isinstance(value, _KEPT):
+        return kind.__qualname__, getattr(value, "__qualname__", "")
+    if isinstance(value, np.ndarray) and not (
+        value.dtype.hasobject or (value.ndim == 1 and value.size <= _SHORT)
+    ):
         return value.dtype.str, value.shape, value.tobytes()
+    return None
 
-    def _read_mutable(self, value: Any, kind: type) -> Any:
-        if id(value) in self._met:
-            return "again", self._met[id(value)][0]
-        self._met[id(value)] = len(self._met), value  # which keeps it, so that ids stay apart
-        if kind is list:
-            return tuple([self.read(each) for each in value])
-        if kind is dict:
-            return tuple([(self.read(name), self.read(value[name])) for name in _in_order(value)])
-        if kind in (set, frozenset):
-            return tuple(sorted((self.read(each) for each in value), key=repr))
-        if hasattr(value, "__dict__") and not isinstance(value, _CONTAINERS):
-            return kind.__qualname__, self.read(object.__getstate__(value))
-        made_by = value.__reduce_ex__(4)
-        return made_by if isinstance(made_by, str) else self.read(tuple(map(_listed, made_by)))
+
+def _parts(value: Any, kind: type) -> tuple[Any, Collection[Any]]:
+    """The parts of an object, and what tells it from others with the same; a list is read like a tuple."""
+    if kind is list:
+        return None, value
+    if kind is dict:
+        return "dict", [part for name in _in_order(value) for part in (name, value[name])]
+    if kind in (set, frozenset):
+        return "set", sorted(value, key=key_of)
+    if hasattr(value, "__dict__") and not isinstance(value, _REDUCED):
+        return kind.__qualname__, (object.__getstate__(value),)
+    made_by = value.__reduce_ex__(4)
+    items = (made_by,) if isinstance(made_by, str) else made_by
+    return kind.__qualname__, [list(each) if hasattr(each, "__next__") else each for each in items]
 
 
 def _in_order(names: dict[Any, Any]) -> list[Any]:
@@ -185,6 +258,29 @@ def _in_order(names: dict[Any, Any]) -> list[Any]:
         return list(names)
 
 
-def _listed(part: Any) -> Any:
-    """The items that `__reduce_ex__` gives as an iterator."""
-    return list(part) if hasattr(part, "__next__") else part
+def _is_library(value: Any) -> bool:
+    name = value.__name__ if isinstance(value, ModuleType) else value.__module__
+    return str(name or "").partition(".")[0] in _LIBRARIES
+
+
+def _of_function(function: FunctionType) -> Iterator[Any]:
+    yield from (function.__defaults__, function.__kwdefaults__, vars(function), function.__code__.co_code)
+    for cell in function.__closure__ or ():
+        try:
+            yield cell.cell_contents
+        except ValueError:  # it has no value yet
+            yield None
+    for name in sorted(_globals_of(function.__code__)):
+        yield function.__globals__.get(name)
+
+
+def _globals_of(code: CodeType) -> set[str]:
+    names = {str(each.argval) for each in dis.get_instructions(code) if each.opname == "LOAD_GLOBAL"}
+    return names.union(*(_globals_of(each) for each in code.co_consts if isinstance(each, CodeType)))
+
+
+def _of_module(module: ModuleType) -> Iterator[Any]:
+    """Its data: what it imports and defines may be anything."""
+    for value in list(vars(module).values()):
+        if isinstance(value, int | float | str | list | dict | set | np.ndarray | GENERATORS):
+            yield value if not isinstance(value, dict) or "__name__" not in value else None

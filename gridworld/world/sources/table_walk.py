@@ -41,7 +41,6 @@ _RESETS = 1_500  # at least
 _SEEDED = 11  # so often with a seed
 _BLOCKS = 8  # of starts that follow each other
 _MOST_KINDS = 10_000  # numbers in different rows, up to which what came before an outcome is counted too
-_JUDGED = 5  # sorts of counts
 _PROBES = 12
 _WATCHED = 5  # episodes after which it is seen which attributes change
 
@@ -59,7 +58,7 @@ def walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any], is_known: bool) -> 
         walker.along_rows()
     else:
         walker.along_policies(_LONG_WALK)
-    return walker.told()
+    return walker.summary()
 
 
 class _Walker:
@@ -156,10 +155,10 @@ class _Walker:
         return np.where(self.mdp.absorbing[:, None], 0.0, found)
 
     def is_settable(self) -> bool:
-        """Whether the attribute `s` is its state, so that setting it leads there.
+        """Whether the attribute `s` is its state: it is what is shown, and setting it leads there.
 
-        It must be what is shown; nothing else may change, but in Gymnasium's own classes; and steps that only
-        the state set can make, not the one it is in, must be made.
+        Nothing else may change, but in Gymnasium's own classes; and steps that only the state set can make,
+        not the one it is in, must be made.
         """
         if not (self._shows_state and len(self._open) and (self._is_known or self._changed <= {"s"})):
             return False
@@ -215,31 +214,27 @@ class _Walker:
         contexts, columns = self._after.shape[1:]
         start = self.table.start
         block = (_BLOCKS * (np.cumsum(start) - start / 2)).astype(np.int64).clip(0, _BLOCKS - 1)
-        parts = [np.bincount(block, each, _BLOCKS).astype(np.float64) for each in (self._started, start)]
-        self._judge(self._started[None], start[None], lambda row: "the start in state")
-        self._judge(parts[0][None], parts[1][None], lambda row: f"of {_BLOCKS} parts of the starts, part")
-        self._judge(self._counts[seen], self._chance[seen], lambda row: f"{self._name(seen[row])}, outcome")
-        self._judge(
-            self._after.sum(axis=1),
-            self._chances,
-            lambda row: f"all rows like {self._name(self._like(row))}, outcome",
-        )
-        self._judge(
-            self._after.reshape(-1, columns),
-            np.repeat(self._chances, contexts, axis=0),
-            lambda row: (
-                f"all rows like {self._name(self._like(row // contexts))} after outcome "
-                f"{row % contexts - 1}, outcome"
-            ),
-        )
+        in_blocks = [np.bincount(block, each, _BLOCKS).astype(np.float64) for each in (self._started, start)]
+        each_context = np.repeat(self._chances, contexts, axis=0)
 
-    def _like(self, kind: int) -> int:
-        return int(np.flatnonzero(self._kind == kind)[0])
+        def like(kind: int) -> str:
+            return f"all rows like {self._name(np.flatnonzero(self._kind == kind)[0])}"
 
-    def _judge(self, counts: NDArray[Any], chance: FloatArray, name: Callable[[int], str]) -> None:
-        evidence = _evidence(counts, chance)
-        row = int(evidence.argmax()) if len(evidence) else 0
-        if evidence.max(initial=0) > np.log(_JUDGED * len(evidence) / _FALSE_ALARM):
+        def in_context(row: int) -> str:
+            return f"{like(row // contexts)} after outcome {row % contexts - 1}, outcome"
+
+        judged: list[tuple[NDArray[Any], FloatArray, Callable[[int], str]]] = [
+            (self._started[None], start[None], lambda row: "the start in state"),
+            (in_blocks[0][None], in_blocks[1][None], lambda row: f"of {_BLOCKS} parts of the starts, part"),
+            (self._counts[seen], self._chance[seen], lambda row: f"{self._name(seen[row])}, outcome"),
+            (self._after.sum(axis=1), self._chances, lambda row: f"{like(row)}, outcome"),
+            (self._after.reshape(-1, columns), each_context, in_context),
+        ]
+        for counts, chance, name in judged:
+            evidence = _evidence(counts, chance)
+            if evidence.max(initial=0) <= np.log(len(judged) * max(1, len(evidence)) / _FALSE_ALARM):
+                continue
+            row = int(evidence.argmax())
             size = int(counts[row].sum())
             which = int(np.abs(counts[row] - size * chance[row]).argmax())
             raise InputError(
@@ -257,11 +252,10 @@ class _Walker:
         row, following, reward, terminated = (np.array(each) for each in zip(*met, strict=True))
         state, action = np.divmod(row, self.mdp.num_actions)
         table = self.table
-        same = (table.probability[state, action] > 0) & (
-            table.next_state[state, action] == following[:, None]
-        )
-        same &= table.reward[state, action] == reward[:, None]
-        same &= table.terminated[state, action] == terminated[:, None]
+        same = table.probability[state, action] > 0
+        found = (table.next_state, following), (table.reward, reward), (table.terminated, terminated)
+        for given, seen in found:
+            same &= given[state, action] == seen[:, None]
         if not same.any(axis=1).all():
             wrong = int(np.argmin(same.any(axis=1)))
             place = f"{state[wrong]}, action {action[wrong]} led to state {following[wrong]}"
@@ -276,21 +270,21 @@ class _Walker:
         self._before = int(before[-1])
         np.add.at(self._after, (self._kind[row], before[:-1] % self._after.shape[1], column), 1)
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """What the counts say."""
         visits = self._counts.sum(axis=1)
         stepped = self._open[visits[self._open] > 0]
         off = _resolved(visits[stepped], self._chance[stepped])
         rows = f"{len(stepped):,} of {len(self._open):,}" if len(stepped) < len(self._open) else "all"
         starts = _resolved(self._started.sum(keepdims=True), self.table.start[None])
-        told = [
+        precise = [
             f"{what} to {100 * worst:.2g} %"
             for what, worst in (("probabilities", off.max(initial=0)), ("starts", starts[0]))
             if worst < _VAGUE
         ]
         return (
             f"table P, checked by {visits.sum():,} steps in {self.episodes:,} episodes: "
-            f"{', '.join([f'support of {rows} rows', *told])}"
+            f"{', '.join([f'support of {rows} rows', *precise])}"
         )
 
 
@@ -340,13 +334,11 @@ def _keys(snapshots: Snapshots) -> dict[str, bytes]:
 def _number(mdp: Mdp, observation: Any) -> int:
     try:
         number = int(observation)
-        is_number = bool(number == observation)
+        if number == observation and 0 <= number < mdp.num_numbers:
+            return number
     except (TypeError, ValueError, OverflowError):
-        is_number = False
-    if not is_number:
-        raise InputError(
-            f"{mdp.name}: shows {str(observation)[:80]!r}, must show the number of a state of its table"
-        )
-    if not 0 <= number < mdp.num_numbers:
-        raise InputError(f"{mdp.name}: shows state {number}, its table has states 0 to {mdp.num_numbers - 1}")
-    return number
+        pass
+    raise InputError(
+        f"{mdp.name}: shows {str(observation)[:80]!r}, must show the number of a state of its table, 0 to "
+        f"{mdp.num_numbers - 1}"
+    )

@@ -1,7 +1,6 @@
 """What the wrappers of an environment make of its world.
 
-A certificate is about the environment that a user holds, wrappers included. So every wrapper is looked at,
-and recognised by whose `step` and `reset` it runs:
+Every wrapper is looked at, and recognised by whose `step` and `reset` it runs:
 
     neutral      leaves the task as it is: it records, checks or renders
     time limit   its limit is the world's
@@ -10,8 +9,8 @@ and recognised by whose `step` and `reset` it runs:
     action       `action(a)`, compiled into the transitions
     memory       shows more than the state's number; the task is the same, but a policy behind it has no table
 
-Anything else is refused. The three methods must be functions of their argument and of nothing else: they are
-asked on a copy, see `pure_functions`, and the copy is stepped beside the tables.
+Anything else is refused. The three methods must be functions of their argument alone: they are asked on a
+copy, see `pure_functions`, and the copy is stepped beside the tables.
 """
 
 from __future__ import annotations
@@ -41,29 +40,22 @@ _GAMMA = 0.99
 _ROWS = 20_000  # pairs of state and action that are tried one by one, if states can be set
 _SEED = 20_261_123
 
-_WRAPPERS = "gymnasium.wrappers"
 _ROLES = {
     "gymnasium.core:Wrapper": NEUTRAL,  # of a wrapper that changes neither steps nor resets
-    f"{_WRAPPERS}.common:Autoreset": NEUTRAL,
-    f"{_WRAPPERS}.common:OrderEnforcing": NEUTRAL,
-    f"{_WRAPPERS}.common:PassiveEnvChecker": NEUTRAL,
-    f"{_WRAPPERS}.common:RecordEpisodeStatistics": NEUTRAL,
-    f"{_WRAPPERS}.rendering:AddWhiteNoise": NEUTRAL,
-    f"{_WRAPPERS}.rendering:HumanRendering": NEUTRAL,
-    f"{_WRAPPERS}.rendering:ObstructView": NEUTRAL,
-    f"{_WRAPPERS}.rendering:RecordVideo": NEUTRAL,
-    f"{_WRAPPERS}.rendering:RenderCollection": NEUTRAL,
-    "stable_baselines3.common.monitor:Monitor": NEUTRAL,
-    f"{_WRAPPERS}.common:TimeLimit": LIMIT,
     "gymnasium.core:ObservationWrapper": "observation",
     "gymnasium.core:RewardWrapper": "reward",
     "gymnasium.core:ActionWrapper": "action",
-    f"{_WRAPPERS}.transform_observation:AddRenderObservation": MEMORY,
-    f"{_WRAPPERS}.stateful_observation:DelayObservation": MEMORY,
-    f"{_WRAPPERS}.stateful_observation:FrameStackObservation": MEMORY,
-    f"{_WRAPPERS}.stateful_observation:NormalizeObservation": MEMORY,
-    f"{_WRAPPERS}.stateful_observation:TimeAwareObservation": MEMORY,
+    "stable_baselines3.common.monitor:Monitor": NEUTRAL,
+    "gymnasium.wrappers.common:TimeLimit": LIMIT,
 }
+for _module, _names, _role in (
+    ("common", "Autoreset OrderEnforcing PassiveEnvChecker RecordEpisodeStatistics", NEUTRAL),
+    ("rendering", "AddWhiteNoise HumanRendering ObstructView RecordVideo RenderCollection", NEUTRAL),
+    ("transform_observation", "AddRenderObservation", MEMORY),
+    ("stateful_observation", "DelayObservation FrameStackObservation", MEMORY),
+    ("stateful_observation", "NormalizeObservation TimeAwareObservation", MEMORY),
+):
+    _ROLES |= {f"gymnasium.wrappers.{_module}:{_name}": _role for _name in _names.split()}
 # What a transform may look at, so that it is copied too.
 _COPIED = {"Monitor", "OrderEnforcing", "RecordEpisodeStatistics", "TimeLimit"}
 # Environments whose state can be set, by the class whose steps they run.
@@ -83,17 +75,15 @@ def wrappers_of(env: Any) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
 
 
 def known_class(thing: Any, table: dict[str, str], methods: Sequence[str]) -> str | None:
-    """What a table by "module:class" says of the class whose `methods` an object runs.
+    """What a table by "module:class" says of the first known ancestor of an object, whose `methods` it runs.
 
-    It is the entry of its first known ancestor; None if there is none, or a method is its own.
+    None if there is none, or a method is its own.
     """
-    kind = type(thing)
+    kind, held = type(thing), getattr(thing, "__dict__", ())
     for base in kind.__mro__:
-        entry = table.get(f"{base.__module__}:{base.__qualname__}")
-        if entry is not None:
-            inherits = (getattr(kind, name, None) is getattr(base, name, None) for name in methods)
-            own = any(name in getattr(thing, "__dict__", ()) for name in methods)
-            return entry if all(inherits) and not own else None
+        if entry := table.get(f"{base.__module__}:{base.__qualname__}"):
+            inherited = all(getattr(kind, name, None) is getattr(base, name, None) for name in methods)
+            return entry if inherited and not any(name in held for name in methods) else None
     return None
 
 
@@ -106,17 +96,13 @@ def role_of(where: str, wrapper: gym.Wrapper[Any, Any, Any, Any]) -> str:
             "nothing exact is known of it; leave it out, or make it a gymnasium ObservationWrapper, "
             "RewardWrapper or ActionWrapper that defines only observation(), reward() or action()"
         )
-    seen_alike = wrapper.observation_space == wrapper.env.observation_space
-    if not seen_alike and role not in ("observation", MEMORY):
-        raise InputError(
-            f"{where}: its wrapper {name} changes the observation space and is no "
-            "gymnasium.ObservationWrapper, so what the agent sees of a state is not known; make it one"
-        )
-    if wrapper.action_space != wrapper.env.action_space and role != "action":
-        raise InputError(
-            f"{where}: its wrapper {name} changes the action space and is no gymnasium.ActionWrapper, so "
-            "what its actions do is not known; make it one"
-        )
+    for what, changing in (("observation", ("observation", MEMORY)), ("action", ("action",))):
+        inner, outer = (getattr(each, f"{what}_space") for each in (wrapper.env, wrapper))
+        if outer != inner and role not in changing:
+            raise InputError(
+                f"{where}: its wrapper {name} changes the {what} space and is no "
+                f"gymnasium.{what.title()}Wrapper, so what becomes of an {what} is not known; make it one"
+            )
     return role
 
 
@@ -133,12 +119,8 @@ def refuse_transformed(where: str, env: gym.Env[Any, Any]) -> None:
 
 def step_limit(env: gym.Env[Any, Any]) -> int | None:
     """The least step limit of an environment's wrappers; None: there is none."""
-    found = [
-        int(getattr(wrapper, "_max_episode_steps"))  # noqa: B009
-        for wrapper in wrappers_of(env)
-        if isinstance(wrapper, gym.wrappers.TimeLimit)
-    ]
-    return min(found, default=None)
+    found = [each for each in wrappers_of(env) if isinstance(each, gym.wrappers.TimeLimit)]
+    return min((int(vars(each)["_max_episode_steps"]) for each in found), default=None)
 
 
 class Wrapped:
@@ -260,13 +242,9 @@ class Wrapped:
     def _paid(self, mdp: Mdp, wrapper: Any) -> Mdp:
         """The world with a wrapper's rewards; an end pays nothing, nor does a state without a way to it."""
         counts = (mdp.probability > 0) & (~mdp.absorbing | mdp.reachable & ~mdp.terminal)[:, None, None]
-        given = np.unique(mdp.reward[counts])
-        made = np.array(
-            [
-                checked_reward(f"{self._where}: a reward of {type(wrapper).__name__}", _plain(reward))
-                for reward in self._asked(wrapper, "reward", given.tolist())
-            ]
-        )
+        given, what = np.unique(mdp.reward[counts]), f"{self._where}: a reward of {type(wrapper).__name__}"
+        paid = [_plain(reward) for reward in self._asked(wrapper, "reward", given.tolist())]
+        made = np.array([checked_reward(what, each) for each in paid])
         reward = np.zeros(mdp.reward.shape)
         reward[counts] = made[np.searchsorted(given, mdp.reward[counts])]
         return _changed(mdp, reward=reward)
@@ -283,14 +261,9 @@ class Wrapped:
                     f"{self._where}: {name} makes {str(inner)[:50]} of action {action}; must be "
                     f"{mdp.action_choices()}"
                 )
-        return _changed(
-            mdp,
-            action_names=tuple(mdp.action_names[inner] for inner in chosen),
-            **{
-                key: getattr(mdp, key)[:, np.array(chosen, dtype=int)]
-                for key in ("next_state", "probability", "reward")
-            },
-        )
+        tables = ("next_state", "probability", "reward")
+        chosen_tables = {key: getattr(mdp, key)[:, np.array(chosen, dtype=int)] for key in tables}
+        return _changed(mdp, action_names=tuple(mdp.action_names[each] for each in chosen), **chosen_tables)
 
     def _asked(self, wrapper: Any, method: str, arguments: list[Any]) -> list[Any]:
         chain = [self._copied.unwrapped, *wrappers_of(self._copied)]
@@ -299,8 +272,7 @@ class Wrapped:
     def _check_steps(self, rows: list[Any] | None, also: Callable[[int], None] = lambda state: None) -> None:
         """Step the copy beside the tables: from every state that can be set, then in whole episodes.
 
-        `rows` is what is seen of each state, None if it does not count; `also` compares something else in a
-        state.
+        `rows` is what is seen of each state, if that counts; `also` compares something else in a state.
         """
         env = self._copied
         probe, rng = self._probe, np.random.default_rng(_SEED)

@@ -14,7 +14,7 @@ from gridworld.errors import InputError
 from gridworld.process.console.progress import ProgressLine
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
-from gridworld.world.sources import exploring
+from gridworld.world.sources import enumerated
 from gridworld.world.sources.enumerated import enumerate_env
 
 CELLS = 5
@@ -310,7 +310,7 @@ def test_an_attribute_that_is_left_out_must_be_there() -> None:
 
 
 def test_states_too_far_away_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(exploring, "_DEEPEST", 100)
+    monkeypatch.setattr(enumerated, "_DEEPEST", 100)
     with pytest.raises(InputError, match="after 100 steps there are still new states, since its steps keeps"):
         enumerate_env("Corridor-v0")
 
@@ -376,8 +376,8 @@ def test_what_is_there_for_a_time_only(cells: int, first: int, last: int) -> Non
 
 
 def test_many_states_are_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(exploring, "_MANY_STATES", 100)
-    monkeypatch.setattr(exploring, "ProgressLine", partial(ProgressLine, seconds_between_lines=0))
+    monkeypatch.setattr(enumerated, "_MANY_STATES", 100)
+    monkeypatch.setattr(enumerated, "ProgressLine", partial(ProgressLine, seconds_between_lines=0))
     with pytest.raises(InputError, match="more than 1,200 states"):
         enumerate_env("Corridor-v0", {"variant": "endless"}, most_states=1200)
     assert "states so far, at most 1,200; Ctrl-C" in capsys.readouterr().err

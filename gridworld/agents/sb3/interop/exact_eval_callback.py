@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped, sync_envs_normalization
 
 from gridworld.agents.sb3.interop.foreign_model import ForeignPolicy
-from gridworld.bounds import at_least, discount
+from gridworld.bounds import Bounds, discount
 from gridworld.envs.inspection import Task, task_of
 from gridworld.run.evaluations_file import write_evaluations
 from gridworld.run.folder import BEST_MODEL, EVALUATIONS
@@ -74,10 +74,10 @@ class ExactEvalCallback(BaseCallback):
             InputError: an argument out of its bounds, or an environment that is no GridWorld.
         """
         super().__init__(verbose)
-        at_least("every", every, 1)
+        Bounds(1).check("every", every)
         discount("gamma", gamma)
         if stop_after is not None:
-            at_least("stop_after", stop_after, 1)
+            Bounds(1).check("stop_after", stop_after)
         self.evaluator: Evaluator | None = None
         self.best_regret = np.inf
         self.stopped_at: int | None = None

@@ -7,42 +7,24 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Optional
 
-from gridworld.config.agents import REPLAY_COUNTS, AgentConfig, Schedule, WholeNumbers
-from gridworld.config.effects import Effect, affects
-from gridworld.config.texts import Arguments, ClassPath, Word
+from gridworld.bounds import MOST_STEPS
+from gridworld.config.agents import MOST_KEPT, REPLAY_COUNTS, AgentConfig, Schedule, WholeNumbers
+from gridworld.config.fields import Arguments, ClassPath, Effect, Word, affects, bounds, rate
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
 
 
 # Arguments of SB3's classes that are a number to compute with: runs of one population may differ in them.
-_NUMBERS = frozenset(
-    [
-        "learning_rate",
-        "gamma",
-        "gae_lambda",
-        "ent_coef",
-        "vf_coef",
-        "max_grad_norm",
-        "clip_range",
-        "clip_range_vf",
-        "target_kl",
-        "exploration_fraction",
-        "exploration_initial_eps",
-        "exploration_final_eps",
-        "learning_starts",
-        "tau",
-        "target_update_interval",
-        "buffer_size",
-        "reward_scale",
-        "log_interval",
-        "stats_window_size",
-        "name",
-    ]
-)
-
-
+_NUMBERS = {
+    *("learning_rate", "gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm", "clip_range", "tau"),
+    *("clip_range_vf", "target_kl", "exploration_fraction", "exploration_initial_eps", "name", "buffer_size"),
+    *("exploration_final_eps", "learning_starts", "target_update_interval", "reward_scale", "log_interval"),
+    "stats_window_size",
+}
 _COPIES, _NUMBER = 6, 4  # of each weight: its gradient, the optimiser's, a model file; bytes
 _BYTES_OF_A_STEP = 64  # in a buffer, and while it is summed up
+MOST_RETURN = 1e15  # of an episode: its square must be a number of 32 bits
+_COUNT, _SHARE, _POSITIVE = bounds(1), bounds(0, 1), bounds(0, above=True)
 
 
 @dataclass
@@ -92,19 +74,18 @@ class SB3Config(AgentConfig):
 
     family: Word = "sb3"
     # of SB3's learn(): episodes for DQN, iterations for PPO
-    log_interval: int = field(default=1, metadata=affects(Effect.LABELS))
+    log_interval: int = field(default=1, metadata=affects(Effect.LABELS) | bounds(1))
     policy: ClassPath = "MlpPolicy"
     # the network runs once per state, where there is such a version; stock: SB3's own loop, once per sample
     engine: Word = "tabulated"
 
     @property
     def libraries(self) -> tuple[str, ...]:
-        """See `AgentConfig.libraries`."""
         return ("stable-baselines3", "sb3-contrib", "torch")
 
     @property
     def shape(self) -> str | None:
-        """See `AgentConfig.shape`: all that says how large arrays are, and what is done with them."""
+        # all that says how large arrays are, and what is done with them
         settings = asdict(self)
         settings |= settings.pop("arguments", {})
         if settings.get("engine") != "tabulated":
@@ -112,7 +93,7 @@ class SB3Config(AgentConfig):
         return repr({key: value for key, value in settings.items() if key not in _NUMBERS})
 
     def memory(self, num_states: int, num_envs: int, total_timesteps: int) -> int:
-        """See `AgentConfig.memory`: its networks with their copies, and what it keeps of its steps."""
+        # its networks with their copies, and what it keeps of its steps
         settings = vars(self) | vars(self).get("arguments", {})
         nets = as_dict(settings.get("policy_kwargs") or {}).get("net_arch") or [64, 64]
         widths = [num_states, *(nets if isinstance(nets, list) else max(nets.values(), key=sum)), 1]
@@ -137,7 +118,6 @@ class SB3ClassConfig(SB3Config):
         return float(self.arguments.get("gamma", 0.99))
 
     def key(self, name: str) -> str:
-        """See `AgentConfig.key`."""
         return f"{'' if name in self.arguments else '+'}agent.arguments.{name}"
 
 
@@ -145,10 +125,11 @@ class SB3ClassConfig(SB3Config):
 class SB3CheckedConfig(SB3Config):
     """A class of Stable-Baselines3 whose arguments are fields here, with their types."""
 
-    learning_rate: Schedule = 1e-3  # a number; lin_NUMBER, sqrt_NUMBER and quad_NUMBER fall to 0
-    batch_size: int = 64
-    gamma: float = 0.99
-    stats_window_size: int = field(default=100, metadata=affects(Effect.LABELS))
+    # a number; lin_NUMBER, sqrt_NUMBER and quad_NUMBER fall to 0
+    learning_rate: Schedule = field(default=1e-3, metadata=rate())
+    batch_size: int = field(default=64, metadata=_COUNT)
+    gamma: float = field(default=0.99, metadata=_SHARE)
+    stats_window_size: int = field(default=100, metadata=affects(Effect.LABELS) | bounds(1, MOST_KEPT))
     policy_kwargs: PolicyKwargs = field(default_factory=PolicyKwargs)
 
 
@@ -161,22 +142,22 @@ class DQNConfig(SB3CheckedConfig):
     log_interval: int = 4
     learning_rate: Schedule = 1e-4
     batch_size: int = 32
-    buffer_size: int = 1_000_000
-    learning_starts: int = 100
-    tau: float = 1.0
+    buffer_size: int = field(default=1_000_000, metadata=_COUNT)
+    learning_starts: int = field(default=100, metadata=bounds(0))
+    tau: float = field(default=1.0, metadata=_SHARE)
     train_freq: WholeNumbers = 4  # steps of the batch, or [n, step] or [n, episode]
-    gradient_steps: int = 1
+    gradient_steps: int = field(default=1, metadata=bounds(-1))
     replay_buffer_class: Optional[ClassPath] = None  # noqa: UP045
     replay_buffer_kwargs: Arguments = field(default_factory=dict)
     # rewards are multiplied by it on their way to DQN; null: they are as they are
     reward_scale: Optional[float] = None  # noqa: UP045
     optimize_memory_usage: bool = False
-    n_steps: int = 1
-    target_update_interval: int = 10_000
-    exploration_fraction: float = 0.1
-    exploration_initial_eps: float = 1.0
-    exploration_final_eps: float = 0.05
-    max_grad_norm: float = 10.0
+    n_steps: int = field(default=1, metadata=bounds(1, MOST_STEPS))
+    target_update_interval: int = field(default=10_000, metadata=_COUNT)
+    exploration_fraction: float = field(default=0.1, metadata=bounds(0, 1, above=True))
+    exploration_initial_eps: float = field(default=1.0, metadata=_SHARE)
+    exploration_final_eps: float = field(default=0.05, metadata=_SHARE)
+    max_grad_norm: float = field(default=10.0, metadata=_POSITIVE)
 
 
 def reward_scale(config: AgentConfig) -> float:
@@ -193,20 +174,20 @@ class PPOConfig(SB3CheckedConfig):
     algorithm: Word = "PPO"
     policy_kwargs: ActorCriticPolicyKwargs = field(default_factory=ActorCriticPolicyKwargs)
     learning_rate: Schedule = 3e-4
-    n_steps: int = 2048
-    n_epochs: int = 10
-    gae_lambda: Schedule = 0.95
-    clip_range: Schedule = 0.2
-    clip_range_vf: Optional[Schedule] = None  # noqa: UP045
+    n_steps: int = field(default=2048, metadata=_COUNT)
+    n_epochs: int = field(default=10, metadata=_COUNT)
+    gae_lambda: Schedule = field(default=0.95, metadata=rate(1))
+    clip_range: Schedule = field(default=0.2, metadata=rate(MOST_RETURN, linear_only=True))
+    clip_range_vf: Optional[Schedule] = field(default=None, metadata=rate(MOST_RETURN, linear_only=True))  # noqa: UP045
     normalize_advantage: bool = True
-    ent_coef: Schedule = 0.0
-    vf_coef: float = 0.5
-    max_grad_norm: float = 0.5
+    ent_coef: Schedule = field(default=0.0, metadata=rate())
+    vf_coef: float = field(default=0.5, metadata=bounds(0))
+    max_grad_norm: float = field(default=0.5, metadata=_POSITIVE)
     use_sde: bool = False
     sde_sample_freq: int = -1
     rollout_buffer_class: Optional[ClassPath] = None  # noqa: UP045
     rollout_buffer_kwargs: Arguments = field(default_factory=dict)
-    target_kl: Optional[float] = None  # noqa: UP045
+    target_kl: Optional[float] = field(default=None, metadata=_POSITIVE)  # noqa: UP045
 
 
 SCHEMAS: dict[str, type[AgentConfig]] = {"dqn": DQNConfig, "ppo": PPOConfig, "sb3": SB3ClassConfig}

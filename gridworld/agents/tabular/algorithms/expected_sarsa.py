@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from gridworld.agents.tabular.epsilon_greedy import expected_value
 from gridworld.agents.tabular.td_control import TabularControl, TabularControlConfig
-from gridworld.config.texts import Word
+from gridworld.config.fields import Word
 from gridworld.world.mdp import FloatArray
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gridworld.agents.tabular.td_control import TabularControl, TabularControlConfig
-from gridworld.config.texts import Word
+from gridworld.config.fields import Word
 from gridworld.world.mdp import FloatArray
 
 

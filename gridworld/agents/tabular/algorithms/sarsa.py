@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from gridworld.agents import TrainingContext
 from gridworld.agents.tabular.epsilon_greedy import expected_value
 from gridworld.agents.tabular.td_control import TabularControl, TabularControlConfig
-from gridworld.config.texts import Word
+from gridworld.config.fields import Word
 from gridworld.world.mdp import FloatArray, IntArray
 
 if TYPE_CHECKING:

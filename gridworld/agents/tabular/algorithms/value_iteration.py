@@ -15,8 +15,7 @@ import numpy as np
 from gridworld.agents import PolicySnapshot, TrainingContext
 from gridworld.agents.tabular.model_file import model_bytes, read_model
 from gridworld.agents.tabular.settings import TabularConfig
-from gridworld.config.privileges import privilege
-from gridworld.config.texts import Word
+from gridworld.config.fields import Word, privilege
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State
 from gridworld.world.exact.solver import value_iteration

@@ -1,1 +1,0 @@
-"""What commands share towards the shell: the command `gridworld`, completion, manual, output folder."""

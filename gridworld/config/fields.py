@@ -1,0 +1,101 @@
+"""What a schema declares at a field beside its default: its effect, its bounds, what its text is.
+
+`gridworld.config.settings` reads effects and privileges, `gridworld.config.train` bounds, and
+`gridworld.config.plain_settings` what texts are. A field that declares no effect has that of the section that
+it is in, and affects learning where that declares none either. A subclass with another default for a field
+need not repeat what its base class declares.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+from dataclasses import fields, is_dataclass
+from enum import Enum, auto
+from typing import Annotated, Any
+
+from gridworld.bounds import Bounds
+
+EFFECTS, PRIVILEGE, BOUNDS, RATE = "effects", "privilege", "bounds", "rate"  # keys of a field's metadata
+
+LIBRARIES = (  # of classes that an agent is made of
+    *("torch.nn.", "torch.optim.", "stable_baselines3.", "sb3_contrib."),
+    *("gridworld.agents.sb3.features.", "gridworld.agents.sb3.replay_counts."),
+)
+_OF_LIBRARIES = rf"({'|'.join(map(re.escape, LIBRARIES))})[\w.]+"
+_OF_KEYWORD = r"[\w+-]*"
+
+
+class Effect(Enum):
+    """On what a setting has an effect. Runs that differ in the last two alone have the same result."""
+
+    LEARNING = auto()  # what is learnt
+    LENGTH = auto()  # for how long
+    TASK = auto()  # what is to be learnt: the world, and the discount of the evaluation
+    EVALUATION = auto()  # when policies are evaluated, and at which result training ends
+    SEED = auto()  # the random numbers
+    MACHINE = auto()  # what it is computed on
+    LABELS = auto()  # what an agent is called, and what it logs while it learns
+    FILES = auto()  # what is kept beside the result
+    NOTHING = auto()  # once the run has come to its end
+
+
+def affects(effect: Effect, **entries: Effect) -> dict[str, Any]:
+    """Metadata: the setting's effect, and that of single entries where it is a mapping."""
+    return {EFFECTS: {"": effect, **{f".{name}": other for name, other in entries.items()}}}
+
+
+def privilege(name: str, value: Any = None) -> dict[str, Any]:
+    """Metadata: with `value` (None: any that is not empty or 0), the run has what a learner would not have.
+
+    Results show it by its name.
+    """
+    return {PRIVILEGE: (name, value)}
+
+
+def bounds(
+    low: float = -math.inf, high: float = math.inf, above: bool = False, least: float = 0.0
+) -> dict[str, Any]:
+    """Metadata: the setting is a number within these `Bounds`, or null."""
+    return {BOUNDS: Bounds(low, high, above, least)}
+
+
+def rate(high: float = math.inf, above: bool = False, linear_only: bool = False) -> dict[str, Any]:
+    """Metadata: the same from 0, of a number that may fall over training (`config.agents.parse_schedule`)."""
+    return bounds(0, high, above) | {RATE: linear_only}
+
+
+@functools.cache
+def declared(schema: type) -> dict[str, dict[str, Any]]:
+    """The metadata of each field, with what the base classes declare of it."""
+    found: dict[str, dict[str, Any]] = {}
+    for kind in reversed(schema.__mro__):
+        for each in fields(kind) if is_dataclass(kind) else ():
+            found[each.name] = found.get(each.name, {}) | dict(each.metadata)
+    return found
+
+
+class Text(Enum):
+    """What a text is: the pattern of those that do no harm, whoever wrote them, and what the others do."""
+
+    WORD = r"(?s).*", "is a word"  # compared, looked up among the program's own, or shown
+    FILE = r"[^\x00]*", "leads out of the current folder"  # nor if it is outside, by links or otherwise
+    CLASS = rf"[^.]*|{_OF_LIBRARIES}", f"is from none of {', '.join(LIBRARIES)}"
+    CODE = r"\?\?\?", "is called with the arguments beside it, and may write files"
+    ENV = r"[^:]*", "imports the module before the colon"
+    ARGUMENTS = (  # of a class of the libraries; a class may be among them, or a rate that falls
+        rf"{_OF_KEYWORD}|(lin|sqrt|quad)_[\d.e+-]+|{_OF_LIBRARIES}",
+        f"is no plain word, nor a class of {', '.join(LIBRARIES)}",
+    )
+    KWARGS = _OF_KEYWORD, "is for code that may take it for a file or a module"  # of code that is not ours
+
+
+Word = Annotated[str, Text.WORD]
+FilePath = Annotated[str, Text.FILE]
+ClassPath = Annotated[str, Text.CLASS]
+CodePath = Annotated[str, Text.CODE]
+EnvId = Annotated[str, Text.ENV]
+Callback = Annotated[Any, Text.CODE]
+Arguments = Annotated[dict[str, Any], Text.ARGUMENTS]
+Kwargs = Annotated[dict[str, Any], Text.KWARGS]

@@ -1,0 +1,306 @@
+"""The figures of agents: their curves and every seed's result on a task, and how they do over all tasks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+
+from gridworld.report import chart
+from gridworld.report.analysis import BY_KEY, METRICS, Band, Comparison, Overall, Result, TaskAnalysis
+from gridworld.report.chart import INK, LINE, MUTED, PAPER, Chart, Styles, house_style
+from gridworld.report.setting_charts import sweep_charts, sweeps
+from gridworld.report.statistics import INFINITE, Interval
+from gridworld.world.mdp import FloatArray
+
+_HEIGHT = 190.0  # points, of curves
+_NAME = 25  # characters, the width of a name at a row
+_BOOTSTRAP = "interquartile mean (IQM) with 95 % bootstrap bands"
+_MOST_DRAWN = len(chart.COLOURS)  # agents in one figure
+_MOST_PAIRS = 21  # those of seven agents
+_REFERENCES = {"optimum": (0, (5.0, 4.0)), "uniformly random": (0, (1.5, 3.0))}  # lines across
+
+Bounds = tuple[float, float]  # of an axis, the lower one first
+
+
+def task_charts(analysis: TaskAnalysis, styles: Styles) -> Iterator[Chart]:
+    """The figures of a task that its runs have the numbers for; none where every number is 0.
+
+    Curves and strips show as many agents as there are colours, the best ones where there are more.
+    """
+    for sweep in sweeps(analysis.results):
+        yield from sweep_charts(sweep, analysis.task)
+    shown = [result for result in analysis.results if result in analysis.ranked[:_MOST_DRAWN]]
+    drawn, count = replace(analysis, results=tuple(shown)), len(analysis.results)
+    more = f"; the {_MOST_DRAWN} best of {count}" if count > len(shown) else ""
+    yield from _curves(drawn, styles, more)
+    if count == 1 and len(shown[0].group.runs) == 1:
+        return  # a strip would have one dot
+    for key in ("regret", "steps", "online_return", "online_return_end"):
+        if any(result.samples[key].any() for result in shown):
+            yield _strip(drawn, key, styles, more)
+
+
+def _curves(analysis: TaskAnalysis, styles: Styles, more: str) -> Iterator[Chart]:
+    results, world, task = analysis.results, analysis.world, analysis.task
+    describe = partial(_description, results=results, more=more)
+    draw = partial(_draw_curves, styles=styles, log_steps=analysis.log_steps)
+    bands = {result.group.agent: result.regret for result in results}
+    if any(band.point.any() for band in bands.values()):
+        highest = [band.point if np.isnan(band.high).any() else band.high for band in bands.values()]
+        top = max((float(high) for high in np.concatenate(highest) if high < INFINITE), default=0.0)
+        yield draw(
+            f"{task} regret",
+            f"Regret on {task}",
+            describe("regret of the greedy policy, exact", _BOOTSTRAP) + "; 0 is optimal",
+            bands,
+            label="regret",
+            bounds=(0.0, 1.06 * top or 1.0),
+            references={"optimum": 0.0, "uniformly random": world.optimal_value - world.random_value},
+        )
+    if any(result.certificates.point.any() for result in results):
+        yield draw(
+            f"{task} certified",
+            f"Seeds certified optimal on {task}",
+            describe(
+                "share of seeds whose greedy policy is optimal from the start",
+                "bands are Wilson's 95 % intervals",
+            ),
+            {result.group.agent: _certificates(result) for result in results},
+            label="seeds certified",
+            bounds=(0.0, 1.0),
+            form=chart.percent,
+        )
+    bands = {result.group.agent: result.online for result in results if result.online is not None}
+    if any(band.point.any() for band in bands.values()):
+        yield draw(
+            f"{task} on-line return",
+            f"On-line return on {task}",
+            describe("mean return of the training episodes, exploration included", _BOOTSTRAP),
+            bands,
+            label="return",
+            bounds=_online_bounds(list(bands.values())),
+            references={"optimum": world.optimal_return},
+        )
+
+
+def _certificates(result: Result) -> Band:
+    """The share certified; without Wilson's interval for one seed, which would cover nearly everything."""
+    band = result.certificates
+    unknown = np.full(len(band.steps), math.nan)
+    return band if len(result.group.runs) > 1 else replace(band, low=unknown, high=unknown)
+
+
+def _description(what: str, statistic: str, results: Sequence[Result], more: str) -> str:
+    """What a figure shows, with the statistic and the number of seeds."""
+    counts = [len(result.group.runs) for result in results]
+    if set(counts) == {1}:
+        return f"{what}; one seed, so no interval{more}"
+    return f"{what}: {statistic}, {chart.seed_counts(counts)}{more}"
+
+
+def _online_bounds(bands: Sequence[Band]) -> Bounds:
+    """From the worst after the first tenth: what is learnt at the very start would flatten all the rest."""
+    late = np.concatenate([band.point[len(band.point) // 10 :] for band in bands])
+    late = late[np.abs(late) < INFINITE]
+    if not len(late):
+        return 0.0, 1.0
+    low, high = float(late.min()), float(late.max())
+    margin = 0.1 * (high - low) or 0.1 * abs(high) or 1.0
+    return low - margin, high + margin
+
+
+@house_style()
+def _draw_curves(
+    name: str,
+    title: str,
+    description: str,
+    bands: Mapping[str, Band],
+    styles: Styles,
+    label: str,
+    bounds: Bounds,
+    form: Callable[..., str] = chart.compact,
+    log_steps: bool = False,
+    levels: Bounds | None = None,
+    references: Mapping[str, float] = MappingProxyType({}),
+) -> Chart:
+    """Each agent's curve with its band against environment steps, or `levels` of optimality.
+
+    References are lines across. Curves are bold as far as all runs go, and dotted from where the first ended.
+    """
+    seen = {mark: level for mark, level in references.items() if bounds[0] <= level <= bounds[1]}
+    looks = [styles[agent] for agent in bands]
+    looks += [{"color": INK, "linestyle": _REFERENCES[mark]} for mark in seen]
+    names = [chart.wrapped(agent, 56) for agent in chart.without_shared(list(bands))]
+    handles = [Line2D([], [], linewidth=2.2, **look) for look in looks]
+    legend = list(zip(handles, [*names, *seen], strict=True))
+    figure, axes = chart.new_figure(title, _HEIGHT, "y", legend)
+    axes.set(ylim=bounds, ylabel=label)
+    axes.yaxis.set_major_formatter(form)
+    first = -math.inf
+    if levels is None:
+        first = _set_steps(axes, list(bands.values()), log_steps)
+    else:
+        axes.set(xlim=levels, xlabel="optimality: 0 is random, 1 is optimal")
+    for later, band, look in zip(range(len(bands))[::-1], bands.values(), looks, strict=False):
+        steps = np.maximum(band.steps, first)
+        values, low, high = (np.clip(numbers, *bounds) for numbers in (band.point, band.low, band.high))
+        if not np.isnan(low).any():  # one seed has no interval
+            axes.fill_between(steps, low, high, step="post", color=look["color"], alpha=0.18, linewidth=0)
+        line: dict[str, Any] = {"where": "post", "clip_on": False, "zorder": 3, **look}
+        whole = int((band.steps <= band.whole_until).sum())
+        # What is drawn first is wider, so that equal curves are all seen.
+        bold = {"linewidth": 2.2 + 0.6 * later, "markersize": 7, "marker": "o" if whole == 1 else ""}
+        axes.step(steps[:whole], values[:whole], **line | bold)
+        if whole < len(values):
+            rest, dotted = slice(max(0, whole - 1), None), {"linewidth": 1, "linestyle": (0, (2.0, 3.0))}
+            axes.step(steps[rest], values[rest], **line | dotted)
+    for level, look in zip(seen.values(), looks[len(bands) :], strict=True):
+        axes.axhline(level, linewidth=1, zorder=4, clip_on=False, **look)
+    return Chart(name, title, description, figure)
+
+
+def _set_steps(axes: Axes, bands: Sequence[Band], log_steps: bool) -> float:
+    """Lay out the axis of the steps; returns its first. A logarithmic one begins at the first after 0."""
+    end = max(1.0, *(float(band.steps[-1]) for band in bands))
+    first = min((float(step) for band in bands for step in band.steps[1:2]), default=end)
+    if not log_steps or first <= 0 or first >= end:
+        axes.set(xlim=(0, end), xlabel="environment steps")
+        return 0.0
+    axes.set_xscale("log")
+    factors = (1, 2, 5) if end < 60 * first else (1, 3) if end < 600 * first else (1,)
+    axes.xaxis.set_major_locator(LogLocator(10, factors))
+    axes.xaxis.set_major_formatter(chart.compact)
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set(xlim=(first, end), xlabel="environment steps, logarithmic")
+    return first
+
+
+@house_style()
+def _strip(analysis: TaskAnalysis, key: str, styles: Styles, more: str) -> Chart:
+    """A row for each agent: the estimate with its interval, and below it a dot for every seed."""
+    metric = BY_KEY[key]
+    results = [result for result in analysis.results if len(result.samples[key])]
+    samples = np.concatenate([result.samples[key] for result in results])
+    agents = [result.group.agent for result in results]
+    names = [chart.wrapped(agent, _NAME) for agent in chart.without_shared(agents)]
+    title = f"{metric.title} on {analysis.task}"
+    each = max(34.0, 12 + LINE * max(map(chart.line_count, names)))  # points, of a row
+    figure, axes = chart.new_figure(title[0].upper() + title[1:], each * len(results), "x")
+    chart.rows_on(axes, names)
+    low, high = end = _strip_bounds(samples[np.abs(samples) < INFINITE], key)
+    far = high + 0.1 * (high - low)
+    if not np.isfinite(samples).all():  # it has a place of its own at the end
+        end = low, far
+        marks = [mark for mark in MaxNLocator(4, steps=[1, 2, 5, 10]).tick_values(low, high) if mark <= high]
+        axes.set_xticks([*marks, far], [*map(chart.compact, marks), "never"])
+    axes.set(xlim=end, xlabel=key if key == "regret" else "environment steps" if key == "steps" else "return")
+
+    def place(numbers: FloatArray) -> FloatArray:
+        return np.where(np.isfinite(numbers), np.clip(numbers, low, high), far)
+
+    for row, result in enumerate(results):
+        colour, sample = styles[result.group.agent]["color"], result.samples[key]
+        finite, pale = np.isfinite(sample), to_rgba(colour, 0.55)
+        heights = row + (7 + 1.1 * (np.arange(len(sample)) % 5 - 2)) / each  # spread: equal ones are seen
+        axes.scatter(
+            place(sample),
+            heights,
+            s=np.where(finite, 27, 20),
+            facecolors=[pale if is_finite else "none" for is_finite in finite],
+            edgecolors=pale,
+            linewidths=np.where(finite, 0.0, 1.4).tolist(),
+            clip_on=False,
+        )
+        _draw_interval(axes, row - 4 / each, result.estimates[key, metric.statistics[0]], colour, place)
+    kind = "interquartile mean (IQM)" if metric.statistics[0] == "iqm" else "mean"
+    statistic = f"above them the {kind} with 95 % bootstrap interval"
+    description = _description("a dot for every seed", statistic, results, more)
+    return Chart(f"{analysis.task} {metric.title}", title, description, figure)
+
+
+def _strip_bounds(numbers: FloatArray, key: str) -> Bounds:
+    if not len(numbers):
+        return 0.0, 1.0
+    low, high = float(numbers.min()), float(numbers.max())
+    if key in ("regret", "steps"):
+        low = 0.0
+    margin = 0.04 * (high - low) or 0.05 * abs(high) or 0.1
+    return (low if low == 0 else low - margin), high + margin
+
+
+def _draw_interval(
+    axes: Axes,
+    row: float,
+    interval: Interval,
+    colour: str,
+    place: Callable[[FloatArray], FloatArray] = np.asarray,
+) -> None:
+    """A bar from end to end and a ring at the point."""
+    low, point, high = place(np.array([interval.low, interval.point, interval.high]))
+    if not math.isnan(interval.low):
+        axes.plot((low, high), (row, row), color=colour, linewidth=4, clip_on=False)
+    ring: dict[str, Any] = {"markeredgecolor": colour, "markeredgewidth": 3.0, "markersize": 7.0}
+    axes.plot([point], [row], "o", color=PAPER, clip_on=False, **ring)
+
+
+def overall_charts(overall: Overall, styles: Styles) -> Iterator[Chart]:
+    """A profile for each agent, and for each metric the pairs of agents, unless all of them are even.
+
+    They are as rliable has them.
+    """
+    ranked = sorted(overall.profiles, key=lambda agent: -overall.optimality[agent][1].point)
+    shown = ranked[:_MOST_DRAWN]
+    most = f"; the {len(shown)} best of {len(ranked)}" if len(ranked) > len(shown) else ""
+    levels, end = overall.levels, math.ceil(overall.levels[-1])
+    profiles = {agent: overall.profiles[agent] for agent in shown}
+    yield _draw_curves(
+        "all tasks profiles",
+        "Performance profiles over all tasks",
+        f"share of runs whose optimality is above each level, as the mean over tasks{most}; 95 % pointwise "
+        "intervals from the stratified bootstrap",
+        {agent: Band(levels, point, point, low, high, end) for agent, (point, low, high) in profiles.items()},
+        styles,
+        "runs above it",
+        (0.0, 1.0),
+        chart.percent,
+        levels=(float(levels[0]), 1.0),
+    )
+    for metric in METRICS:
+        pairs = [
+            each for each in overall.comparisons if each.metric == metric.key and each.agent < each.other
+        ]
+        if 0 < len(pairs) <= _MOST_PAIRS and any(each.probability.point != 0.5 for each in pairs):
+            yield _improvements(metric.title, pairs, styles)
+
+
+@house_style()
+def _improvements(metric: str, pairs: Sequence[Comparison], styles: Styles) -> Chart:
+    agents = sorted({agent for each in pairs for agent in (each.agent, each.other)})
+    names = [chart.wrapped(agent, _NAME) for agent in chart.without_shared(agents)]
+    short = dict(zip(agents, names, strict=True))
+    between = " >\n" if 2 * max(map(len, names)) + 3 > _NAME else " > "
+    rows = [f"{short[each.agent]}{between}{short[each.other]}" for each in pairs]
+    title = f"Improvement in {metric}"
+    height = max(26.0, 8 + LINE * max(map(chart.line_count, rows))) * len(pairs)
+    figure, axes = chart.new_figure(title, height, "x")
+    chart.rows_on(axes, rows)
+    axes.set(xlim=(0.0, 1.0), xlabel="probability that the first is better")
+    axes.axvline(0.5, color=MUTED, linewidth=1, linestyle=(0, (3, 3)), clip_on=False)
+    for row, pair in enumerate(pairs):
+        _draw_interval(axes, row, pair.probability, styles[pair.agent]["color"])
+    description = (
+        "probability that a run of the first agent is better than one of the second, ties half: the mean "
+        "over the tasks that both were run on, with 95 % intervals from the stratified bootstrap; at the "
+        "dashed line neither is better"
+    )
+    return Chart(f"all tasks improvement in {metric}", title, description, figure)

@@ -1,0 +1,336 @@
+"""Metrics, curves and comparisons of every agent on every task."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from gridworld.config.train import check_bounds
+from gridworld.config.worlds import schema_of
+from gridworld.report import statistics
+from gridworld.report.evidence import ONLINE, SAMPLED_RETURN, Evidence, reported
+from gridworld.report.grouping import Group, Study
+from gridworld.report.statistics import Interval, Share
+from gridworld.run.identity.stored_world import stored_world
+from gridworld.run.reader import read_run
+from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.mdp import FloatArray
+
+GRID_POINTS = 101  # from step 0 to the end of the task's longest run
+_MOST_CELLS = 100_000  # beyond, solving the world again would take longer than the report
+_TOLERANCE = 1e-6  # relative
+_SLOWER = 10  # times, from which on the steps of a task's agents need a logarithmic axis
+_LEVELS = 101
+_STATISTICS = {"mean": statistics.mean, "median": statistics.median, "iqm": statistics.iqm}
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Exact numbers of a task; NaN where its world cannot be built again."""
+
+    optimal_value: float
+    optimal_return: float = math.nan  # of the optimal policy, undiscounted, within the step limit
+    random_value: float = math.nan
+    random_return: float = math.nan
+    problem: str | None = None  # why they are missing, or in doubt
+
+
+def reference(run: Evidence) -> Reference:
+    """Solve the run's world again, from its manifest. Nothing is raised: `problem` says what is wrong."""
+    try:
+        schema = schema_of(run.world)
+        known = {field.name for field in dataclasses.fields(schema)}
+        if unknown := sorted(run.world.keys() - known):
+            raise ValueError(f"env.{unknown[0]} is not known to this version")
+        lines = run.layout.split("\n")
+        if len(lines) * max(map(len, lines)) > _MOST_CELLS:
+            raise ValueError(f"it has more than {_MOST_CELLS:,} cells")
+        env = schema(**run.world)
+        check_bounds(env, "env.")
+        mdp = stored_world(read_run(run.folder), env)
+        evaluator = Evaluator(mdp, run.gamma, env.step_limit(mdp))
+        random = evaluator.score(np.full(evaluator.mdp.probability.shape[:2], 1 / evaluator.mdp.num_actions))
+    except (ValueError, TypeError, ArithmeticError, np.linalg.LinAlgError) as error:
+        # Whatever is wrong with another version's world, the runs' own scores are as good as before.
+        return Reference(run.optimal_value, problem=f"its world cannot be built again here ({error})")
+    optimum, problem = evaluator.optimal_value, None
+    if not math.isclose(optimum, run.optimal_value, rel_tol=_TOLERANCE, abs_tol=_TOLERANCE):
+        problem = (
+            f"its optimal value is {optimum:.6g} here, and {run.optimal_value:.6g} according "
+            f"to {run.folder}; was it written by another version?"
+        )
+    returns = evaluator.optimum.expected_return, random.outcome.expected_return
+    return Reference(run.optimal_value, returns[0], random.value, returns[1], problem)
+
+
+@dataclass(frozen=True)
+class RunMetric:
+    """One number of a run."""
+
+    key: str
+    title: str
+    of: Callable[[Evidence, Reference], float]  # from its task's scale, too; NaN where it has none
+    statistics: tuple[str, ...] = ("mean",)  # over seeds; the first one is drawn
+    better: int = 1  # -1 where less is better
+    compared: bool = False  # between agents, as a probability of improvement
+
+
+def _optimality(run: Evidence, world: Reference) -> float:
+    """The final regret rescaled: 1 for the optimum, 0 for the uniformly random policy, below 0 for worse."""
+    span = world.optimal_value - world.random_value
+    return 1.0 - run.regret / span if math.isfinite(span) and span > 0 else math.nan
+
+
+def online_return(run: Evidence, last: float = 1.0) -> float:
+    """Mean return of the training episodes in the `last` part of training; NaN where there is none.
+
+    It is the mean over the curve's rows, weighted by their steps in that part.
+    """
+    if ONLINE not in run.curve:
+        return math.nan
+    begin = (1 - last) * run.steps
+    weights = np.diff(np.maximum(run.curve["step"], begin), prepend=begin)
+    counted = np.isfinite(run.curve[ONLINE]) & (weights > 0)
+    if not counted.any():
+        return math.nan
+    return float(run.curve[ONLINE][counted] @ (weights[counted] / weights[counted].sum()))
+
+
+def _last(column: str) -> Callable[[Evidence, Reference], float]:
+    return lambda run, _: float(run.curve[column][-1]) if column in run.curve else math.nan
+
+
+_CERTIFICATE = "steps to the first certificate"
+_ONLINE = "on-line return"
+METRICS = (
+    RunMetric("regret", "final regret", lambda run, _: run.regret, ("iqm", "median", "mean"), -1, True),
+    RunMetric("steps", _CERTIFICATE, lambda run, _: run.first_certified_step, ("iqm", "median"), -1, True),
+    RunMetric("optimality", "optimality", _optimality, ("iqm", "mean")),
+    *(RunMetric(metric.name, metric.label, _last(metric.name)) for metric in reported()),
+    RunMetric("sampled_return", "sampled policy's return", _last(SAMPLED_RETURN)),
+    RunMetric("online_return", f"{_ONLINE}, all of training", lambda run, _: online_return(run)),
+    RunMetric(
+        "online_return_end", f"{_ONLINE}, last tenth", lambda run, _: online_return(run, 0.1), compared=True
+    ),
+)
+BY_KEY = {metric.key: metric for metric in METRICS}
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """A curve over seeds, (points,) each."""
+
+    steps: FloatArray
+    point: FloatArray
+    mean: FloatArray
+    low: FloatArray
+    high: FloatArray
+    whole_until: int  # environment steps that all runs reach; later, ended runs keep their last value
+
+
+def grid_for(runs: Sequence[Evidence], logarithmic: bool = False) -> FloatArray:
+    """The steps (points,) of all of a task's curves, from 0 to the end of the longest run, evenly spread.
+
+    Where asked for, they are spread on a logarithmic axis too.
+    """
+    end = max(run.steps for run in runs)
+    points = np.linspace(0, end, GRID_POINTS)
+    first = min((run.curve["step"][1] for run in runs if run.steps > 0), default=0.0)
+    if logarithmic and first > 0:
+        points = np.concatenate([[0.0], points[points >= first], np.geomspace(first, end, GRID_POINTS)])
+    return np.unique(np.round(points))
+
+
+def on_grid(run: Evidence, column: str, grid: FloatArray) -> FloatArray:
+    """A column's newest value at each of the grid's steps, (points,): NaN before the first one."""
+    steps, values = run.curve["step"], run.curve[column]
+    steps, values = steps[~np.isnan(values)], values[~np.isnan(values)]
+    index = np.searchsorted(steps, grid, side="right") - 1
+    return np.where(index >= 0, values[np.maximum(index, 0)], math.nan) if len(values) else grid * math.nan
+
+
+def band(runs: Sequence[Evidence], column: str, grid: FloatArray, seed: int) -> Band:
+    """IQM and mean of a column over runs, with the IQM's 95 % bootstrap band.
+
+    It goes from the first step at which every run has a value to the end of the last run.
+    """
+    grid, whole_until = _until_the_end(runs, grid)
+    values = np.stack([on_grid(run, column, grid) for run in runs], axis=-1)
+    is_whole = ~np.isnan(values).any(axis=-1)
+    grid, values = grid[is_whole], values[is_whole]
+    point, low, high = statistics.bands(statistics.iqm, [values], seed)
+    return Band(grid, point, values.mean(axis=-1), low, high, whole_until)
+
+
+def certificates(runs: Sequence[Evidence], grid: FloatArray) -> Band:
+    """The share of runs that are certified at each step of the grid, with Wilson's 95 % interval."""
+    grid, whole_until = _until_the_end(runs, grid)
+    counts = np.sum([on_grid(run, "certified", grid) for run in runs], axis=0)
+    shares = [statistics.share(int(count), len(runs)) for count in counts]
+    low, high = np.array([s.low for s in shares]), np.array([s.high for s in shares])
+    return Band(grid, counts / len(runs), counts / len(runs), low, high, whole_until)
+
+
+def _until_the_end(runs: Sequence[Evidence], grid: FloatArray) -> tuple[FloatArray, int]:
+    ends = [run.steps for run in runs]
+    return np.union1d(grid[grid <= max(ends)], [float(max(ends))]), min(ends)
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """One agent on one task."""
+
+    group: Group
+    certified: Share  # at the end
+    ever: Share
+    samples: Mapping[str, FloatArray]  # by metric, (runs that have it,)
+    estimates: Mapping[tuple[str, str], Interval]  # by (metric, statistic)
+    regret: Band
+    certificates: Band  # share of seeds certified; its mean, with Wilson's interval
+    online: Band | None  # None unless all runs have it
+
+    @property
+    def shortest_uncertified(self) -> float:
+        """Steps that every run without a certificate was at least given."""
+        ends = [run.steps for run in self.group.runs if math.isinf(run.first_certified_step)]
+        return float(min(ends, default=0))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The probability that a run of `agent` is better than one of `other`."""
+
+    agent: str
+    other: str
+    metric: str
+    tasks: int  # over how many
+    probability: Interval
+
+
+@dataclass(frozen=True, eq=False)
+class TaskAnalysis:
+    """All agents on one task."""
+
+    task: str
+    world: Reference
+    results: tuple[Result, ...]
+    comparisons: tuple[Comparison, ...]
+    log_steps: bool = False  # whether curves are drawn against the logarithm of the steps
+
+    @property
+    def ranked(self) -> list[Result]:
+        """The results, best first: by the share certified, then by steps to it, then by regret."""
+
+        def rank(result: Result) -> tuple[float, ...]:
+            steps, regret = result.estimates["steps", "median"], result.estimates["regret", "iqm"]
+            return -result.certified.count / result.certified.total, steps.point, regret.point
+
+        return sorted(self.results, key=rank)
+
+
+@dataclass(frozen=True, eq=False)
+class Overall:
+    """Agents over all the tasks that they were run on, two or more."""
+
+    tasks: int
+    optimality: Mapping[str, tuple[int, Interval]]  # by agent: how many tasks, and the IQM over them
+    comparisons: tuple[Comparison, ...]
+    levels: FloatArray  # of optimality, (points,)
+    profiles: Mapping[str, tuple[FloatArray, ...]]  # by agent: share of runs above each level, low and high
+
+
+def analyse(
+    study: Study, seed: int = 0, log_steps: bool = False
+) -> tuple[tuple[TaskAnalysis, ...], Overall | None]:
+    """Compute all that the report shows: of each task, and over tasks where an agent was run on two.
+
+    `seed` is of the bootstrap. With `log_steps`, all curves are against the logarithm of the steps; those
+    of a task on which one agent is ten times slower than another always are.
+    """
+    tasks = tuple(_task(task, study.on(task), seed, log_steps) for task in study.tasks)
+    return tasks, _overall(tasks, seed)
+
+
+def _task(task: str, groups: list[Group], seed: int, log_steps: bool) -> TaskAnalysis:
+    runs = [run for group in groups for run in group.runs]
+    world = reference(next((run for run in runs if not run.damage), runs[0]))
+    ends = [max(run.steps for run in group.runs) for group in groups]
+    learnt = [float(np.median([run.first_certified_step for run in group.runs])) for group in groups]
+    for steps in (ends, learnt):  # whether one agent ran, or learnt, ten times as long as another
+        known = [step for step in steps if 0 < step < math.inf]
+        log_steps |= bool(known) and max(known) >= _SLOWER * min(known)
+    grid = grid_for(runs, log_steps)
+    results = tuple(_result(group, world, grid, seed) for group in groups)
+    comparisons = compare([{r.group.agent: r.samples for r in results}], seed)
+    return TaskAnalysis(task, world, results, comparisons, log_steps)
+
+
+def _result(group: Group, world: Reference, grid: FloatArray, seed: int) -> Result:
+    runs, samples, estimates = group.runs, {}, {}
+    for metric in METRICS:
+        values = np.array([metric.of(run, world) for run in runs])
+        samples[metric.key] = values = values[~np.isnan(values)]
+        for name in metric.statistics if len(values) else ():
+            estimates[metric.key, name] = statistics.interval(_STATISTICS[name], [values], seed)
+    has_online = all(ONLINE in run.curve and np.isfinite(run.curve[ONLINE]).any() for run in runs)
+    return Result(
+        group,
+        certified=statistics.share(sum(run.certified for run in runs), len(runs)),
+        ever=statistics.share(sum(math.isfinite(run.first_certified_step) for run in runs), len(runs)),
+        samples=samples,
+        estimates=estimates,
+        regret=band(runs, "regret", grid, seed),
+        certificates=certificates(runs, grid),
+        online=band(runs, ONLINE, grid, seed) if has_online else None,
+    )
+
+
+def compare(
+    tasks: Sequence[Mapping[str, Mapping[str, FloatArray]]], seed: int, least: int = 1
+) -> tuple[Comparison, ...]:
+    """Compare every agent with every other on the tasks that both were run on, `least` or more.
+
+    `tasks` has samples (runs,) by agent and metric for each task. Each pair is there twice, seen from either
+    side, for each metric that is compared.
+    """
+    agents = sorted({agent for task in tasks for agent in task})
+    out = []
+    for metric in METRICS:
+        for one, other in combinations(agents, 2) if metric.compared else ():
+            pairs = [
+                (metric.better * task[one][metric.key], metric.better * task[other][metric.key])
+                for task in tasks
+                if one in task and other in task
+            ]
+            pairs = [pair for pair in pairs if len(pair[0]) and len(pair[1])]
+            if len(pairs) >= least:
+                seen = statistics.improvement(pairs, seed)
+                mirrored = Interval(1 - seen.point, 1 - seen.high, 1 - seen.low)
+                out.append(Comparison(one, other, metric.key, len(pairs), seen))
+                out.append(Comparison(other, one, metric.key, len(pairs), mirrored))
+    return tuple(out)
+
+
+def _overall(tasks: Sequence[TaskAnalysis], seed: int) -> Overall | None:
+    """None where no agent was run on two tasks."""
+    samples = [{result.group.agent: result.samples for result in task.results} for task in tasks]
+    scores: dict[str, list[FloatArray]] = {}
+    for task in samples:
+        for agent, metrics in task.items():
+            if len(metrics["optimality"]):
+                scores.setdefault(agent, []).append(metrics["optimality"])
+    strata = {agent: each for agent, each in sorted(scores.items()) if len(each) > 1}
+    if not strata:
+        return None
+    optimality = {
+        agent: (len(each), statistics.interval(statistics.iqm, each, seed)) for agent, each in strata.items()
+    }
+    lowest = min(float(sample.min()) for each in strata.values() for sample in each)
+    levels = np.linspace(min(0.0, max(-1.0, lowest)), 1.0, _LEVELS)
+    profiles = {agent: statistics.profile(each, levels, seed) for agent, each in strata.items()}
+    return Overall(len(tasks), optimality, compare(samples, seed, least=2), levels, profiles)

@@ -1,0 +1,225 @@
+"""A figure of the report: its style, heading and legend, and what it is saved as (SVG, PDF, PNG).
+
+The agents' colours are those of M. Okabe and K. Ito, Color Universal Design, 2008, which people with any kind
+of colour vision can distinguish; from the eighth agent on, lines are dashed.
+"""
+
+from __future__ import annotations
+
+import io
+import textwrap
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from matplotlib import style
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.patheffects import Normal
+from matplotlib.text import Text
+from matplotlib.ticker import MaxNLocator
+
+from gridworld.process.console.terminal import plain
+
+INK, MUTED, GRID, PAPER = "#1c2430", "#5d6878", "#e3e7ed", "#ffffff"
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#b8578f", "#c98500", "#3a9bd9", "#4a4f57")  # of agents
+_DASHES = ((), (6.0, 3.0), (2.0, 2.5))
+
+WIDTH = 440.0  # points, of a figure; pixels in the page
+WIDE = 960.0
+SMALL, LABEL, HEADING = 11.0, 12.0, 14.0  # points, of fonts
+LINE = 14.5  # points, from one line of a text to the next
+_POINTS = 72  # an inch
+_MOST_LINES = 6  # of a name
+_LEGEND = 63  # characters that fit next to each other in a legend
+_HANDLE = 6  # characters that a name's line and the gaps take there
+
+_RC = {
+    "font.family": ["DejaVu Sans", "sans-serif"],  # the first comes with matplotlib
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": SMALL,
+    "text.parse_math": False,  # names may be anybody's: no formulas
+    "text.color": INK,
+    **{f"axes.spines.{side}": False for side in ("left", "right", "top", "bottom")},
+    **{f"{axis}tick.color": MUTED for axis in "xy"},
+    **{f"{axis}tick.major.size": 0.0 for axis in "xy"},
+    **{f"{axis}tick.major.pad": 6.0 for axis in "xy"},
+    **{f"{axis}tick.labelsize": SMALL for axis in "xy"},
+    "axes.axisbelow": True,
+    "axes.labelcolor": MUTED,
+    "axes.labelsize": SMALL,
+    "axes.labelpad": 3.0,
+    "xaxis.labellocation": "right",
+    "yaxis.labellocation": "top",
+    "grid.color": GRID,
+    "grid.linewidth": 1.0,
+    "lines.scale_dashes": False,
+    "lines.solid_capstyle": "butt",
+    "lines.markeredgewidth": 0.0,
+    "legend.frameon": False,
+    "legend.borderpad": 0.0,
+    "legend.handlelength": 1.6,
+    "legend.handletextpad": 0.5,
+    "legend.columnspacing": 1.1,
+    "legend.fontsize": SMALL,
+    "svg.fonttype": "none",  # text stays text
+}
+_CHANGING = {"svg": "Date", "pdf": "CreationDate", "png": "Software"}  # entries that are left out
+
+
+@contextmanager
+def house_style(salt: str = "") -> Iterator[None]:
+    """Draw and save in the report's style, whatever the user's matplotlib is set to.
+
+    `salt` makes the ids in a figure's SVG reproducible.
+    """
+    with warnings.catch_warnings(), style.context(["default", _RC | {"svg.hashsalt": salt}]):
+        warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
+        warnings.filterwarnings("ignore", "constrained_layout not applied", UserWarning)
+        yield
+
+
+Styles = Mapping[str, dict[str, Any]]  # by agent: arguments of matplotlib's lines, colour and dashes
+
+
+def styles(agents: Sequence[str]) -> Styles:
+    """How each agent is drawn in all figures."""
+    count = len(COLOURS)
+    dashes = [_DASHES[index // count % len(_DASHES)] for index in range(len(agents))]
+    return {
+        agent: {"color": COLOURS[index % count], "linestyle": (0, dash) if dash else "solid"}
+        for index, (agent, dash) in enumerate(zip(agents, dashes, strict=True))
+    }
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A figure, laid out."""
+
+    name: str  # of its files
+    title: str  # what it is called where it cannot be seen
+    description: str  # what is drawn, with which statistic of how many seeds; the caption in the page
+    figure: Figure
+
+    def __post_init__(self) -> None:
+        if (engine := self.figure.get_layout_engine()) is not None:
+            engine.execute(self.figure)
+        self.figure.set_layout_engine("none")  # what it found stays, whatever it is saved as
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether it takes the page's whole width."""
+        return bool(self.figure.get_figwidth() * _POINTS > WIDTH)
+
+    @property
+    def caption(self) -> str:
+        """The description as a sentence."""
+        return plain(f"{self.description[0].upper()}{self.description[1:]}.")
+
+    def saved_as(self, kind: str) -> bytes:
+        """A file, "png", "pdf" or "svg". A PDF's text is outlines: proper fonts take 0.4 s."""
+        texts = self.figure.findobj(Text) if kind == "pdf" else []
+        for text in texts:
+            text.set_path_effects([Normal()])
+        metadata = {"Title": plain(f"{self.title}: {self.description}"), _CHANGING[kind]: None}
+        buffer = io.BytesIO()
+        with house_style(plain(self.name)):
+            scale = 2 if kind == "png" else 1
+            self.figure.savefig(buffer, format=kind, dpi=scale * _POINTS, facecolor=PAPER, metadata=metadata)
+        for text in texts:
+            text.set_path_effects([])
+        return buffer.getvalue()
+
+
+def new_figure(
+    heading: str,
+    height: float,
+    grid: Literal["x", "y", None] = None,
+    legend: Sequence[tuple[Artist, str]] = (),
+    width: float = WIDTH,
+) -> tuple[Figure, Axes]:
+    """A figure with a heading and a legend above its axes, which are about `height` points high.
+
+    `grid` is the axis with lines across at its numbers, `legend` has handles with names of a line or more.
+    """
+    names = [name for _, name in legend]
+    columns, lines = 1, sum(map(line_count, names))
+    if names and lines == len(names):
+        fits = sum(len(name) + _HANDLE for name in names) <= _LEGEND
+        columns = len(names) if fits else max(1, _LEGEND // (max(map(len, names)) + _HANDLE))
+        lines = -(-len(names) // columns)
+    size = width / _POINTS, (height + 64 + LINE * lines) / _POINTS
+    layout = ConstrainedLayoutEngine(w_pad=8 / _POINTS, h_pad=4 / _POINTS)
+    figure = Figure(figsize=size, dpi=_POINTS, layout=layout)
+    axes = figure.add_subplot(facecolor="none")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+        axis.set_major_formatter(compact)
+    if grid is not None:
+        axes.grid(axis=grid, clip_on=False)
+    figure.legend(
+        [handle for handle, _ in legend],
+        names,
+        ncols=columns,
+        loc="outside upper left",
+        title=clipped(heading, int(width / 8.7)),
+        title_fontproperties={"size": HEADING, "weight": "bold"},
+        alignment="left",
+    )
+    return figure, axes
+
+
+def rows_on(axes: Axes, names: Sequence[str]) -> None:
+    """Give the vertical axis a row for each name, from the top."""
+    axes.set(ylim=(len(names) - 0.5, -0.5), yticks=range(len(names)))
+    axes.set_yticklabels(names, size=LABEL, color=INK)
+    axes.tick_params(axis="y", pad=10)
+
+
+def compact(number: float, _position: float = 0) -> str:
+    """Write 12000 as 12k. Matplotlib gives a tick's position, too."""
+    for size, sign in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(number) >= size:
+            return f"{number / size:.4g}{sign}"
+    return f"{number:.4g}"
+
+
+def percent(number: float, _position: float = 0) -> str:
+    """Write 0.5 as 50 %."""
+    return f"{100 * number:.0f} %"
+
+
+def clipped(text: str, most: int) -> str:
+    """Escape control characters, and shorten in the middle what is longer than `most` characters."""
+    text = plain(text)
+    half = max(1, (most - 1) // 2)
+    return text if len(text) <= most else f"{text[:half]}…{text[-half:]}"
+
+
+def wrapped(text: str, most: int) -> str:
+    """Escape control characters, and break into at most six lines of `most` characters."""
+    lines = textwrap.wrap(
+        plain(text)[:1000], most, break_on_hyphens=False, max_lines=_MOST_LINES, placeholder=" …"
+    )
+    return "\n".join(lines)
+
+
+def line_count(text: str) -> int:
+    """How many lines a text has."""
+    return text.count("\n") + 1
+
+
+def without_shared(names: Sequence[str]) -> list[str]:
+    """The labels of one agent's configurations without its name: "ppo (n_steps=8)" as n_steps=8."""
+    parts = [name.removesuffix(")").partition(" (") for name in names]
+    is_one_agent = len(names) > 1 and len({head for head, _, _ in parts}) == 1
+    return [tail for _, _, tail in parts] if is_one_agent and all(map(all, parts)) else list(names)
+
+
+def seed_counts(counts: Sequence[int]) -> str:
+    """Write numbers of seeds: "5 seeds", "3 to 5 seeds"."""
+    return f"{' to '.join(map(str, dict.fromkeys((min(counts), max(counts)))))} seeds"

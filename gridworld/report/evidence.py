@@ -1,0 +1,271 @@
+"""The runs of a report: found below the given folders, and read within bounds. Nothing in them is imported.
+
+The given folders may be links, since the user named them. A link in them may be a stranger's: it is not
+followed, so that a report covers what is in the folder, and the search ends.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gridworld.config.settings import NEWER, flat, privileges
+from gridworld.errors import InputError
+from gridworld.process.console.terminal import printable
+from gridworld.run.damage import damage
+from gridworld.run.folder import CURVE, MANIFEST, SUMMARY, VISITS
+from gridworld.run.reader import RunReader, read_run
+from gridworld.storage.safe_read import LARGEST_CSV, as_table
+from gridworld.world.mdp import FloatArray
+from gridworld.world.metrics import METRICS, Metric
+
+MOST_ENTRIES = 2_000_000  # files and folders below a given one: some seconds
+DAMAGED = "damaged"
+REQUIRED = ("step", "value", "regret", "certified", "goal_probability", "return")  # columns of a curve
+SAMPLED_RETURN = "sampled_return"
+ONLINE = "online_return"  # undiscounted, of training episodes (`training.learning_curve`); may be empty
+
+_FIRST = ("value", "return", "goal_probability")  # in the report's tables
+_MOST_COLUMNS = 100
+_LONGEST_NAME = 80  # characters
+_DIGITS = 9  # after the point: two ways to compute one regret differ later than that
+_KINDS = {str: "a name", int: "a whole number", float: "a number"}
+
+Settings = Mapping[str, str]  # flat: {"agent.gamma": "0.9"}
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """A finished run, as far as the statistics need it."""
+
+    folder: Path
+    agent: str  # its name in the settings
+    env: str  # the map's name
+    seed: int
+    settings: Settings  # all of them
+    world: Mapping[str, Any]  # env.* as the manifest has it
+    layout: str  # the map's text
+    gamma: float  # the evaluation's discount
+    optimal_value: float  # of the optimal policy at the start
+    seconds: float  # of training
+    started: str  # the date
+    version: str  # of this package; "?" where the manifest does not say
+    curve: Mapping[str, FloatArray]  # (evaluations,): the columns in `REQUIRED`, and what else the file has
+    pictures: Mapping[str, str | None]  # as `RunReader.pictures`
+    step_limit: Any = None  # of an episode, as the summary has it
+    privileges: Sequence[str] = ()  # as `config.settings.privileges` finds them in its settings
+    damage: tuple[str, ...] = ()  # a sentence for each of its other files that is not the one that it wrote
+
+    @property
+    def steps(self) -> int:
+        """Environment steps at the last evaluation."""
+        return int(self.curve["step"][-1])
+
+    @property
+    def certified(self) -> bool:
+        """Whether the final greedy policy is optimal."""
+        return bool(self.curve["certified"][-1])
+
+    @property
+    def regret(self) -> float:
+        """The final greedy policy's regret; exactly 0 for a certified one, so that two of them are a tie."""
+        return 0.0 if self.certified else round(float(self.curve["regret"][-1]), _DIGITS)
+
+    @property
+    def first_certified_step(self) -> float:
+        """Environment steps at the first certificate; infinite where there was none."""
+        hits = np.flatnonzero(self.curve["certified"])
+        return float(self.curve["step"][hits[0]]) if len(hits) else math.inf
+
+
+@dataclass(frozen=True)
+class Unusable:
+    """A run that is in no statistic, and why."""
+
+    folder: Path
+    reasons: tuple[str, ...]  # a sentence each, which begins with the folder
+    state: str = DAMAGED  # or the status of a run that is not finished
+    agent: str | None = None  # None where the manifest does not say
+    env: str | None = None
+
+
+def find_runs(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """The folders of runs at or below the paths, each once, and a sentence for every path without any."""
+    folders: dict[Path, Path] = {}  # by what they really are
+    problems: list[str] = []
+    for path in dict.fromkeys(paths):
+        if not path.is_dir():
+            what = "is a file" if path.exists() else "no such folder"
+            problems.append(f"{path}: {what}; give the folder of a run, of a sweep, or one above them")
+            continue
+        found = sorted(_search(path, problems))
+        for folder in found:
+            folders.setdefault(folder.resolve(), folder)
+        if not found:
+            problems.append(
+                f"{path}: holds no run, there is no {MANIFEST} in it or below it (links to folders are not "
+                "followed)"
+            )
+    return list(folders.values()), problems
+
+
+def _search(top: Path, problems: list[str]) -> Iterator[Path]:
+    """The runs at or below one folder; a run whose manifest is lost is one, too."""
+    entries = 0
+
+    def refused(error: OSError) -> None:
+        problems.append(f"{error.filename}: cannot be searched ({error.strerror})")
+
+    for name, inner, files in os.walk(top, onerror=refused):
+        if not {MANIFEST, CURVE, VISITS}.isdisjoint(files):
+            yield Path(name)
+        entries += len(inner) + len(files)
+        if entries > MOST_ENTRIES:
+            problems.append(
+                f"{top}: holds more than {MOST_ENTRIES:,} files and folders, the rest was not searched; name "
+                "the folders of the runs"
+            )
+            return
+        inner.sort()
+
+
+def read(folder: Path) -> Evidence | Unusable:
+    """Read the run in `folder`, every file that its manifest vouches for; nothing is raised."""
+    try:
+        run = read_run(folder)
+    except InputError as error:
+        return Unusable(folder, (str(error),))
+    config = run.manifest["config"]
+    world = next(filter(None, (_name_in(config.get("env"), key) for key in ("layout", "id", "source"))), None)
+    unusable = Unusable(folder, (), agent=_name_in(config.get("agent"), "name"), env=world)
+    if not run.is_finished:
+        status, cause = run.manifest["status"][:_LONGEST_NAME], run.manifest.get("error")
+        why = f": {' '.join(cause.split())[:300]}" if cause else ""
+        why = ": it is still running, or was killed" if status == "running" else why
+        told = f"{folder}: this run is {status!r}, not finished{why}"
+        return dataclasses.replace(unusable, reasons=(told,), state=_printable(status))
+    damaged = damage(run)
+    try:
+        if not damaged.keys() & {CURVE, SUMMARY}:
+            return _evidence(run, tuple(damaged.values()))
+    except InputError as error:
+        damaged = {"": str(error)} | damaged
+    return dataclasses.replace(unusable, reasons=tuple(damaged.values()))
+
+
+def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
+    manifest, config, where = run.manifest, run.manifest["config"], f"{run.manifest_file}: config"
+    if not isinstance(config.get("env"), dict):
+        raise InputError(f"{where}.env must be the settings of the world; is it of another version?")
+    summary, versions = run.read_summary(), manifest.get("versions")
+    of_summary = str(run.summary_file)
+    return Evidence(
+        folder=run.folder,
+        agent=_entry(config.get("agent"), "name", str, f"{where}.agent"),
+        env=_entry(summary, "env", str, of_summary),
+        seed=_entry(config, "seed", int, where),
+        settings=dict(_settings(config)),
+        world=config["env"],
+        layout="\n".join(manifest["layout"]),
+        gamma=_entry(config.get("evaluation"), "gamma", float, f"{where}.evaluation"),
+        optimal_value=_entry(summary, "optimal_value", float, of_summary),
+        seconds=_entry(summary, "train_seconds", float, of_summary),
+        started=str(manifest.get("started", ""))[:10],
+        version=_printable(str(versions.get("gridworld", "?"))) if isinstance(versions, dict) else "?",
+        curve=_read_curve(run),
+        pictures=run.pictures(),
+        step_limit=summary.get("max_episode_steps"),
+        privileges=privileges(config),
+        damage=damaged,
+    )
+
+
+def _settings(config: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Dotted names, and values as JSON."""
+    for key, value in flat(config):
+        if value or key not in NEWER:
+            text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+            yield printable(key), printable(text)
+
+
+def _entry(content: Any, key: str, kind: type, where: str) -> Any:
+    """A checked entry of a file; a name is made printable."""
+    value: Any = content.get(key) if isinstance(content, dict) else None
+    fits = isinstance(value, int | float if kind is float else kind) and not isinstance(value, bool)
+    if not fits or (kind is str and not value.strip()):
+        raise InputError(f"{where}: {key}={value!r} must be {_KINDS[kind]}; is it of another version?")
+    return _printable(value) if kind is str else kind(value)
+
+
+def _printable(text: str) -> str:
+    return "".join(sign if sign.isprintable() else "?" for sign in text)[:_LONGEST_NAME]
+
+
+def _name_in(content: Any, key: str) -> str | None:
+    value = content.get(key) if isinstance(content, dict) else None
+    return _printable(value) if isinstance(value, str) else None
+
+
+def reported() -> list[Metric]:
+    """The metrics of which a report has the last value, in the order of its tables."""
+    chosen = [metric for metric in METRICS if metric.in_report]
+    return sorted(chosen, key=lambda metric: (*_FIRST, metric.name).index(metric.name))
+
+
+def _read_curve(run: RunReader) -> dict[str, FloatArray]:
+    """The columns that the statistics need: those in `REQUIRED`, and optional ones that the file has."""
+    used = dict.fromkeys((*REQUIRED, *(metric.name for metric in reported()), SAMPLED_RETURN, ONLINE))
+    curve = read_columns(run, tuple(used))
+    curve["regret"] = np.maximum(0.0, curve["regret"])  # below zero is rounding
+    return curve
+
+
+def read_columns(run: RunReader, wanted: Sequence[str] | None = None) -> dict[str, FloatArray]:
+    """Read columns (evaluations,) of the learning curve as the run wrote them, NaN where a field is empty.
+
+    Args:
+        run: the run.
+        wanted: names of columns, which the file need not have; None: all that it has.
+
+    Raises:
+        InputError: the file is missing, too large, cut off, or holds what no run writes.
+    """
+    path = run.curve_file
+    lines = as_table(run.read(path, LARGEST_CSV), path).splitlines()
+    if lines and lines[0].count(",") >= _MOST_COLUMNS:
+        raise InputError(f"{path}: has more than {_MOST_COLUMNS} columns; is it of another version?")
+    try:
+        header, *rows = list(csv.reader(lines)) or [[]]
+    except csv.Error as error:
+        raise InputError(f"{path}: is not valid CSV ({error})") from None
+    if not rows:
+        raise InputError(f"{path}: has no row")
+    if missing := [name for name in REQUIRED if name not in header]:
+        raise InputError(f"{path}: has no column {', '.join(missing)}; is it of another version?")
+    for line, row in enumerate(rows, 2):
+        if len(row) != len(header):
+            raise InputError(f"{path}: line {line} has {len(row)} of {len(header)} columns, it was cut off")
+    curve = {}
+    for name in (name for name in (header if wanted is None else wanted) if name in header):
+        at = header.index(name)
+        try:
+            curve[name] = np.array([row[at] or "nan" for row in rows], dtype=np.float64)
+        except ValueError as error:
+            raise InputError(f"{path}: {name}: {printable(str(error))}") from None
+        if name != ONLINE and np.isnan(curve[name]).any():
+            raise InputError(f"{path}: {name} is NaN or empty; the run diverged or the file was changed")
+    steps = curve["step"]
+    if steps[0] != 0 or not np.isfinite(steps).all() or (np.diff(steps) <= 0).any():
+        raise InputError(f"{path}: the steps do not rise from 0 on, from row to row")
+    if not np.isin(curve["certified"], (0, 1)).all():
+        raise InputError(f"{path}: certified must be 0 or 1 in every row")
+    return curve

@@ -1,0 +1,317 @@
+"""The figures of settings: those of a sweep, a line for one key and a heatmap for two, and those of a search.
+
+Of a tuning study there are the three figures that Optuna draws: history, importances, parallel coordinates.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullLocator
+
+from gridworld.report import chart
+from gridworld.report.analysis import Result
+from gridworld.report.chart import COLOURS, INK, MUTED, PAPER, SMALL, WIDE, Chart, clipped, house_style
+from gridworld.report.grouping import differing, learning_key
+from gridworld.report.statistics import Interval
+from gridworld.report.table import number, steps_up_to
+from gridworld.report.tuning_study import TrialRow, TuningStudy
+from gridworld.world.mdp import FloatArray
+
+_HEIGHT = 190.0  # points
+_LEAST = 3  # configurations that make a sweep, and more of them than settings that differ
+_LINE = 64  # characters of tick labels next to each other
+_NEVER = "#c6c6c6"  # of cells without a finite value: no colour of the ramp
+_RAMP = LinearSegmentedColormap.from_list("share", ["#eaf2f8", "#7fb8dc", "#0a5a8c"])
+_HIGHEST = 1e200  # score that is drawn as it is; its inverse is the lowest
+_BEST = 0.1  # of the trials stand out in parallel coordinates
+_DONE, _PRUNED, _WINNER = COLOURS[0], MUTED, COLOURS[1]
+
+_Marks = list[tuple[str, float]]  # texts at an axis, and where, from 0 to 1
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """The results of one agent on one task by the values of what was swept, the smallest first.
+
+    Not every combination of values need have a result.
+    """
+
+    agent: str
+    keys: tuple[str, ...]
+    values: tuple[tuple[str, ...], ...]  # of each key
+    results: Mapping[tuple[str, ...], Result]  # by a value for each key
+
+
+def sweeps(results: Sequence[Result]) -> list[Sweep]:
+    """Find the agents among a task's results of which settings were swept."""
+    by_agent: dict[str, list[Result]] = defaultdict(list)
+    for result in results:
+        by_agent[result.group.runs[0].agent].append(result)
+    found = []
+    for agent, members in by_agent.items():
+        settings = [dict(learning_key(result.group.runs[0])) for result in members]
+        keys = tuple(differing(settings))
+        if len(members) >= max(_LEAST, len(keys) + 1):
+            places = [tuple(each.get(key, "") for key in keys) for each in settings]
+            values = tuple(tuple(sorted(set(column), key=_order)) for column in zip(*places, strict=True))
+            found.append(Sweep(agent, keys, values, dict(zip(places, members, strict=True))))
+    return found
+
+
+def _order(value: str) -> tuple[bool, float, str]:
+    """Numbers by their size, then words."""
+    try:
+        return False, float(value), ""
+    except ValueError:
+        return True, 0.0, value
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What a figure of a sweep shows of a result."""
+
+    name: str
+    title: str
+    statistic: str
+    of: Callable[[Result], Interval]
+    text: Callable[[Result], str]  # in a heatmap's cell
+    better: int  # 1 where more is better
+    form: Callable[..., str] = chart.compact
+
+
+def _share(result: Result) -> Interval:
+    share = result.certified
+    return Interval(share.count / share.total, share.low, share.high)
+
+
+_SHOWN = (
+    _Shown(
+        "certified",
+        "seeds certified",
+        "share of seeds certified at the end",
+        _share,
+        lambda result: f"{result.certified.count}/{result.certified.total}",
+        1,
+        chart.percent,
+    ),
+    _Shown(
+        "steps",
+        "steps to certificate",
+        "steps to the first certificate, median over seeds; none where half of them have no certificate",
+        lambda result: result.estimates["steps", "median"],
+        lambda result: steps_up_to(result.shortest_uncertified)(result.estimates["steps", "median"].point),
+        -1,
+    ),
+    _Shown(
+        "regret",
+        "final regret",
+        "interquartile mean (IQM) over seeds",
+        lambda result: result.estimates["regret", "iqm"],
+        lambda result: number(result.estimates["regret", "iqm"].point),
+        -1,
+    ),
+)
+
+
+def sweep_charts(sweep: Sweep, task: str) -> Iterator[Chart]:
+    """A figure for each metric that is finite somewhere and not 0 everywhere; none of three keys or more."""
+    if len(sweep.keys) > 2:
+        return
+    keys = " and ".join(map(_short, sweep.keys))
+    seeds = chart.seed_counts([len(result.group.runs) for result in sweep.results.values()])
+    draw = _line if len(sweep.keys) == 1 else _heatmap
+    for shown in _SHOWN:
+        points = np.array([shown.of(result).point for result in sweep.results.values()])
+        if np.isfinite(points).any() and points.any():
+            title = f"{shown.title[0].upper()}{shown.title[1:]} by {keys}"
+            description = f"{shown.statistic}; {sweep.agent} on {task}, {seeds} each"
+            yield draw(sweep, shown, f"{task} {sweep.agent} {shown.name} by {keys}", title, description)
+
+
+@house_style()
+def _line(sweep: Sweep, shown: _Shown, name: str, title: str, description: str) -> Chart:
+    (values,) = sweep.values
+    found = [shown.of(sweep.results[(value,)]) for value in values]
+    ends = np.array([(each.point, each.low, each.high) for each in found])
+    is_share = shown.form is chart.percent
+    top = 1.0 if is_share else 1.06 * float(ends[np.isfinite(ends)].max()) or 1.0
+    points, low, high = np.where(np.isfinite(ends[:, :1]), np.minimum(ends, top), np.nan).T
+    figure, axes = chart.new_figure(title, _HEIGHT, "y")
+    axes.yaxis.set_major_formatter(shown.form)
+    axes.set(ylim=(0.0, top), ylabel=shown.title, xlabel=_short(sweep.keys[0]))
+    axes.set(xlim=(-0.4, len(values) - 0.6), xticks=range(len(values)))
+    axes.set_xticklabels([clipped(value, max(4, _LINE // len(values))) for value in values])
+    axes.plot(points, "o-", color=_DONE, linewidth=2.2, markersize=7, clip_on=False)
+    axes.vlines(range(len(values)), low, high, color=_DONE, linewidth=4, alpha=0.35, clip_on=False)
+    for at in np.flatnonzero(~np.isfinite(ends[:, 0])):
+        axes.annotate("never", (at, top), (0, -10), textcoords="offset points", color=MUTED, ha="center")
+    kind = "Wilson's" if is_share else "bootstrap"
+    return Chart(name, title, f"{description}, with {kind} 95 % intervals", figure)
+
+
+@house_style()
+def _heatmap(sweep: Sweep, shown: _Shown, name: str, title: str, description: str) -> Chart:
+    rows, columns = sweep.values
+    levels = np.full((len(rows), len(columns)), np.nan)
+    texts = {}
+    for (row, column), result in sweep.results.items():
+        at, point = (rows.index(row), columns.index(column)), shown.of(result).point
+        levels[at] = shown.better * point if math.isfinite(point) else -math.inf
+        texts[at] = shown.text(result)
+    finite = levels[np.isfinite(levels)]
+    low, high = (0.0, 1.0) if shown.form is chart.percent else (float(finite.min()), float(finite.max()))
+    high = high if high > low else low + 1
+    figure, axes = chart.new_figure(title, 34 * len(rows))
+    colours, levels = _RAMP.with_extremes(bad=(0, 0, 0, 0), under=_NEVER), np.maximum(levels, low - 1)
+    mesh = axes.pcolormesh(levels, cmap=colours, vmin=low, vmax=high, edgecolors=PAPER, linewidth=2)
+    for at, text in texts.items():
+        red, green, blue, _ = mesh.to_rgba(levels[at])
+        if len(text) * len(columns) < _LINE:
+            colour = PAPER if 0.299 * red + 0.587 * green + 0.114 * blue < 0.55 else INK
+            axes.text(at[1] + 0.5, at[0] + 0.5, text, ha="center", va="center", color=colour)
+    axes.set(ylim=(len(rows), 0), xlabel=_short(sweep.keys[1]), ylabel=_short(sweep.keys[0]))
+    shown_columns = [clipped(value, max(4, _LINE // len(columns))) for value in columns]
+    axes.set_xticks(np.arange(len(columns)) + 0.5, shown_columns, color=INK, size=SMALL)
+    axes.set_yticks(np.arange(len(rows)) + 0.5, [clipped(value, 14) for value in rows], color=INK, size=SMALL)
+    grey = "; grey cells have no finite value" if (levels < low).any() else ""
+    return Chart(name, title, f"{description}; darker is better{grey}", figure)
+
+
+def tuning_charts(tuning: TuningStudy) -> Iterator[Chart]:
+    """Those that there is something to draw for."""
+    if tuning.scored:
+        yield _history(tuning)
+    if tuning.importances:
+        yield _importances(tuning)
+    done = [trial for trial in tuning.scored if trial.status == "done"]
+    if len(done) > 1:
+        yield _parallel(tuning, done)
+
+
+def _scale(trials: Sequence[TrialRow]) -> tuple[FloatArray, float, float, list[float]]:
+    """Scores for a logarithmic axis, its ends, and its marks: what is not positive lies at the lower end."""
+    scores = np.array([min(trial.score, _HIGHEST) for trial in trials])
+    positive = scores[scores > 0] if (scores > 0).any() else np.ones(1)
+    low = max(float(positive.min()), 1 / _HIGHEST) / 1.1
+    high = max(float(positive.max()) * 1.1, 2 * low)
+    factors = (1, 2, 5) if high < 1000 * low else (1,)
+    marks = [mark for mark in LogLocator(10, factors).tick_values(low, high) if low <= mark <= high]
+    return np.maximum(scores, low), low, high, marks
+
+
+@house_style()
+def _history(tuning: TuningStudy) -> Chart:
+    trials = sorted(tuning.scored, key=lambda trial: trial.number)
+    numbers = np.array([trial.number for trial in trials], float)
+    scores, low, high, marks = _scale(trials)
+    done = np.array([trial.status == "done" for trial in trials])
+    dots: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 6, "clip_on": False}
+    looks = {
+        "done": {"color": _DONE, "alpha": 0.75, **dots},
+        "pruned, score at that time": {"color": _PRUNED, "alpha": 0.45, **dots},
+    }
+    best: dict[str, Any] = {"color": _WINNER, "linewidth": 2.2, "clip_on": False}
+    legend = [(Line2D([], [], **look), name) for name, look in looks.items()]
+    legend += [(Line2D([], [], **best), "best so far")] if done.any() else []
+    figure, axes = chart.new_figure("Score by trial", _HEIGHT, "y", legend)
+    end = max(1.0, numbers.max())
+    axes.set(yscale="log", ylim=(low, high), ylabel="score, logarithmic", xlim=(0, end), xlabel="trial")
+    axes.set_yticks(marks, list(map(_power, marks)))
+    axes.yaxis.set_minor_locator(NullLocator())
+    for chosen, look in zip((done, ~done), looks.values(), strict=True):
+        axes.plot(numbers[chosen], scores[chosen], **look)
+    if done.any():
+        lowest = np.minimum.accumulate(scores[done])
+        axes.step([*numbers[done], end], [*lowest, lowest[-1]], where="post", **best)
+    return Chart(
+        f"{tuning.name} history",
+        f"Score by trial, {tuning.title.lower()}",
+        "a dot for each trial, on a logarithmic scale, lower is better, and a line for the best so far",
+        figure,
+    )
+
+
+@house_style()
+def _importances(tuning: TuningStudy) -> Chart:
+    ranked = sorted(tuning.importances.items(), key=lambda item: -item[1])
+    shares = np.nan_to_num([share for _, share in ranked]).clip(0, 1)
+    figure, axes = chart.new_figure("Importance of each key", 26.0 * len(ranked))
+    chart.rows_on(axes, [clipped(_short(key), 25) for key, _ in ranked])
+    axes.set(xlim=(0, max(0.01, shares.max())), xticks=[], xlabel="share of the score's variance")
+    bars = axes.barh(range(len(ranked)), shares, height=0.46, color=_DONE, clip_on=False)
+    axes.bar_label(bars, [f"{share:.2f}" for _, share in ranked], padding=6, size=SMALL, color=MUTED)
+    return Chart(
+        f"{tuning.name} importances",
+        f"Importance of each key, {tuning.title.lower()}",
+        "by Optuna's PED-ANOVA over the finished trials; the shares sum to one",
+        figure,
+    )
+
+
+@house_style()
+def _parallel(tuning: TuningStudy, done: Sequence[TrialRow]) -> Chart:
+    ranked = sorted(done, key=lambda trial: trial.score)
+    bold, keys = max(1, round(_BEST * len(ranked))), list(tuning.space)
+    scores, low, high, marks = _scale(ranked)
+    heights = _on_axis(np.array([*marks, *scores]), low, high, is_log=True)
+    columns = [(heights[len(marks) :], list(zip(map(_power, marks), heights, strict=False)))]
+    columns += [_axis(tuning.space[key], [trial.values[key] for trial in ranked]) for key in keys]
+    title = "What the best tenth of the finished trials chose, and the winner"
+    figure, axes = chart.new_figure(title, 250, width=WIDE)
+    axes.set(xlim=(0, max(1, len(keys))), ylim=(0, 1), xticks=[], yticks=[])
+    lines = [list(enumerate(heights)) for heights in zip(*(each for each, _ in columns), strict=True)]
+    winner = [line for trial, line in zip(ranked, lines, strict=True) if trial.number == tuning.winner]
+    looks = ((lines[bold:], MUTED, 0.5), (lines[:bold], _DONE, 1.6), (winner, _WINNER, 2.6))
+    for chosen, colour, width in looks:
+        axes.add_collection(LineCollection(chosen, colors=colour, linewidths=width, clip_on=False))
+    for index, (name, (_, texts)) in enumerate(zip(["score", *map(_short, keys)], columns, strict=True)):
+        axes.axvline(index, color=INK, linewidth=1, clip_on=False)
+        side = "left" if index == 0 else "right" if index == len(keys) else "center"
+        place: dict[str, Any] = {"textcoords": "offset points"}
+        below = 0, -18 if index % 2 == 0 else -34  # in two rows, for long names
+        axes.annotate(clipped(name, 34), (index, 0), below, weight="bold", ha=side, **place)
+        for text, height in texts:
+            axes.annotate(text, (index, height), (5, -4), size=10, color=MUTED, **place)
+    return Chart(
+        f"{tuning.name} parallel coordinates",
+        f"Parallel coordinates, {tuning.title.lower()}",
+        f"a line for each finished trial through its score and values; the best {bold} stand out, "
+        "the winner most",
+        figure,
+    )
+
+
+def _on_axis(numbers: FloatArray, low: float, high: float, is_log: bool) -> FloatArray:
+    """Where numbers lie between the ends of an axis, from 0 to 1."""
+    bend = np.log if is_log else np.asarray
+    return np.interp(bend(numbers), bend(np.array([low, high])), (0.0, 1.0))
+
+
+def _axis(dimension: Mapping[str, Any], texts: Sequence[str]) -> tuple[FloatArray, _Marks]:
+    """Where values lie on their axis, from 0 to 1, and its choices or ends."""
+    if dimension["type"] == "categorical":
+        choices = dimension["choices"]
+        places = {choice: index / max(1, len(choices) - 1) for index, choice in enumerate(choices)}
+        marks = [(clipped(choice, 12), height) for choice, height in places.items()]
+        return np.array([places.get(text, 0.0) for text in texts]), marks
+    low, high = dimension["low"], dimension["high"]
+    numbers = np.array([float(text or low) for text in texts])
+    return _on_axis(numbers, low, high, dimension["log"]), [(f"{low:g}", 0.0), (f"{high:g}", 1.0)]
+
+
+def _power(number: float) -> str:
+    return f"{number:.3g}"
+
+
+def _short(key: str) -> str:
+    """`agent.learning_rate` as learning_rate."""
+    return key.removeprefix("agent.")

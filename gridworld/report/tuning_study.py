@@ -1,0 +1,149 @@
+"""A tuning study on disk: study.json and trials.csv, read within bounds as a run's files are."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gridworld.errors import InputError
+from gridworld.process.console.terminal import plain
+from gridworld.process.memory_budget import check_memory
+from gridworld.report.table import Cell
+from gridworld.storage.csv_text import csv_rows
+from gridworld.storage.safe_read import LARGEST_CSV, as_table, read_bytes, sha256
+from gridworld.storage.sealed_json import read_sealed
+
+STUDY_JSON, TRIALS_CSV = "study.json", "trials.csv"
+TRIALS_SUM = "trials_sha256"  # in the former, of the latter
+_SCORED = ("done", "pruned")
+_OF_A_TRIAL = 6000  # bytes of memory that one comes to in the tables and figures of a page
+
+
+@dataclass(frozen=True)
+class TrialRow:
+    """A trial as trials.csv has it."""
+
+    number: int
+    status: str
+    score: float  # NaN where it has none
+    told: Mapping[str, str]  # the other columns
+    values: Mapping[str, str]  # what was chosen, by key
+
+
+@dataclass(frozen=True, eq=False)
+class TuningStudy:
+    """A finished study."""
+
+    folder: Path
+    name: str
+    agent: str
+    env: str
+    sentence: str  # the verdict
+    winner: int  # its trial
+    values: Mapping[str, Any]  # the winner's
+    began_from: Mapping[str, Any]  # the same keys before; empty where that was outside the space
+    space: Mapping[str, Mapping[str, Any]]
+    importances: Mapping[str, float]
+    finalists: Sequence[Sequence[Cell]]  # trial, score, certified; the winner first
+    trials: Sequence[TrialRow]
+
+    @property
+    def title(self) -> str:
+        """Of its section."""
+        return f"Tuning {self.agent} on {self.env}"
+
+    @property
+    def counts(self) -> str:
+        """How its trials ended."""
+        statuses = [trial.status for trial in self.trials]
+        counted = [f"{statuses.count(status)} {status}" for status in sorted(set(statuses))]
+        return f"{len(statuses)} trials: {', '.join(counted)}"
+
+    @property
+    def scored(self) -> list[TrialRow]:
+        """Those that have a score."""
+        return [t for t in self.trials if t.status in _SCORED and math.isfinite(t.score)]
+
+
+def find_tunings(paths: Sequence[Path]) -> tuple[list[TuningStudy], list[str]]:
+    """Read the studies in these folders and right below them; a sentence for each that cannot be read."""
+    found: dict[Path, TuningStudy] = {}
+    problems = []
+    for path in paths:
+        below = sorted(path.iterdir()) if path.is_dir() and os.access(path, os.R_OK) else []
+        for folder in [path, *(each for each in below if each.is_dir() and not each.is_symlink())]:
+            file = folder / STUDY_JSON
+            if os.path.lexists(file):
+                try:
+                    found.setdefault(file.resolve(), _read(folder))
+                except InputError as error:
+                    problems.append(str(error))
+    return list(found.values()), problems
+
+
+def _read(folder: Path) -> TuningStudy:
+    file, trials = folder / STUDY_JSON, folder / TRIALS_CSV
+    content, of_trials = read_sealed(file), read_bytes(trials, LARGEST_CSV)
+    if content.get(TRIALS_SUM, digest := sha256(of_trials)) != digest:  # the first format has none
+        raise InputError(
+            f"{trials}: is not the table that {STUDY_JSON} was written with; it was changed or damaged, or "
+            "the search was continued and has not finished"
+        )
+    table = as_table(of_trials, trials)
+    check_memory(trials, _OF_A_TRIAL * table.count("\n"))
+    try:
+        head, *rows = csv_rows(table)
+        winner = content["winner"]
+        space = {str(key): _dimension(dimension) for key, dimension in content["space"].items()}
+        return TuningStudy(
+            folder=folder,
+            name=_text(content["study"])[:80],
+            agent=_text(content["agent"])[:80],
+            env=_text(content["env"])[:80],
+            sentence=_text(content["confirmation"]["sentence"]),
+            winner=int(winner["trial"]),
+            values=dict(winner["values"]),
+            began_from=dict(content["began_from"] or {}),
+            space=space,
+            finalists=[
+                [str(int(each["trial"])), float(each["score"]), _certified(each)]
+                for each in content["finalists"]
+            ],
+            importances={str(key): float(share) for key, share in content["importances"].items()},
+            trials=[_trial(dict(zip(head, row, strict=True)), space) for row in rows],
+        )
+    except (KeyError, TypeError, ValueError, AttributeError, csv.Error) as error:
+        raise InputError(f"{file}: is not a finished study, or was changed ({error!r})") from None
+
+
+def _certified(finalist: Mapping[str, Any]) -> str:
+    failed = int(finalist.get("failed", 0))
+    return f"{finalist['certified']} / {finalist['seeds']}" + (f", {failed} failed" if failed else "")
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{str(value)[:40]} is not a text")
+    return plain(value)
+
+
+def _dimension(content: Mapping[str, Any]) -> dict[str, Any]:
+    if content["type"] == "categorical":
+        return {"type": "categorical", "choices": [str(choice) for choice in content["choices"]]}
+    low, high, log = float(content["low"]), float(content["high"]), bool(content["log"])
+    if not (0 if log else -math.inf) < low < high < math.inf:
+        raise ValueError(f"a range from {low} to {high}")
+    return {"type": str(content["type"]), "low": low, "high": high, "log": log}
+
+
+def _trial(row: Mapping[str, str], space: Mapping[str, Mapping[str, Any]]) -> TrialRow:
+    for key, dimension in space.items():
+        if row[key] and dimension["type"] != "categorical" and not float(row[key]) >= dimension["low"]:
+            raise ValueError(f"{key}={row[key]}")
+    values = {key: row[key] for key in space}
+    return TrialRow(int(row["trial"]), row["status"], float(row["score"] or "nan"), row, values)

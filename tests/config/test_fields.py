@@ -1,0 +1,194 @@
+"""What schemas declare at their fields, and who goes by it: bounds, privileges, and what a text is."""
+
+import dataclasses
+import math
+import re
+import types
+from pathlib import Path
+from typing import Any, Union, get_args, get_origin
+
+import pytest
+from helpers.support import CONF, NO_FILES, configure, train_in
+
+from gridworld.bounds import Bounds
+from gridworld.commands.report import main as report
+from gridworld.config.agents import agent_schemas
+from gridworld.config.composition.recipe_file import with_recipe
+from gridworld.config.composition.words import settings_of_a_run
+from gridworld.config.fields import BOUNDS, RATE, Text, declared
+from gridworld.config.plain_settings import foreign, texts_in
+from gridworld.config.settings import privileges
+from gridworld.config.train import TrainConfig, check_bounds
+from gridworld.config.tune import TuneConfig
+from gridworld.config.worlds import SOURCES
+from gridworld.errors import InputError
+from gridworld.run.summary import summary_text
+
+SECTIONS = (TrainConfig, TuneConfig, *agent_schemas().values(), *SOURCES.values())
+SECTIONS += tuple(type(each) for each in vars(TrainConfig()).values() if dataclasses.is_dataclass(each))
+BOUNDED = {
+    f"{schema.__name__}.{name}": (schema, name, metadata[BOUNDS], RATE in metadata)
+    for schema in SECTIONS
+    for name, metadata in declared(schema).items()
+    if BOUNDS in metadata
+}
+AGENTS = sorted(file.stem for file in (CONF / "agent").glob("*.yaml"))
+PLANS = "plans with the tables"
+
+
+def outside(limits: Bounds) -> list[float]:
+    found = [math.nan, math.inf]
+    found += (
+        []
+        if limits.low == -math.inf
+        else [limits.low if limits.above else limits.low - 1 - abs(limits.low) / 100]
+    )
+    found += [] if limits.high == math.inf else [limits.high * 1.01 + 1]
+    return found + ([] if limits.least == 0 else [limits.least / 10, -limits.least / 10])
+
+
+@pytest.mark.parametrize("name", BOUNDED)
+def test_a_number_outside_its_bounds_is_refused_and_one_inside_is_not(name: str) -> None:
+    schema, field, limits, is_rate = BOUNDED[name]
+    section = schema()
+    check_bounds(section)
+    for value in (limits.low + 1e-9 if limits.above else limits.low, limits.high):
+        if math.isfinite(value):
+            check_bounds(dataclasses.replace(section, **{field: value}), "x.")
+    for value in outside(limits):
+        for written in (value, f"lin_{value}") if is_rate else (value,):
+            with pytest.raises(InputError, match="^" + re.escape(f"x.{field}={written}: must be ")):
+                check_bounds(dataclasses.replace(section, **{field: written}), "x.")
+
+
+def used(*words: str) -> list[str]:
+    return privileges(dataclasses.asdict(configure(*words)))
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+def test_privileges_are_those_that_are_declared(agent: str) -> None:
+    plans = [PLANS] if agent == "value_iteration" else []
+    assert used(f"agent={agent}") == used(f"agent={agent}", "env.slip=0.1", "preset=none") == plans
+    exploring = used(f"agent={agent}", "exploring_starts=0.1", "stratified_draws=true")
+    assert exploring == ["starts anywhere", "stratified draws", *plans]
+
+
+def test_settings_from_a_manifest_may_be_anything() -> None:
+    assert privileges({}) == privileges({"agent": 3, "exploring_starts": None}) == []
+    for schema in agent_schemas().values():
+        assert privileges({"agent": {"algorithm": schema.algorithm}}) in ([], [PLANS])
+
+
+def test_a_result_and_a_report_name_privileges(tmp_path: Path) -> None:
+    for name, words in (("with", ["exploring_starts=0.5"]), ("without", ["exploring_starts=0"])):
+        own = ["agent=q_learning", "total_timesteps=300", "evaluation.every=100", f"agent.name={name}"]
+        summary = train_in(tmp_path / "runs" / name, *own, *words, *NO_FILES)
+        lines = [line for line in summary_text(summary, "x").splitlines() if "privileges" in line]
+        assert lines == (["  privileges: starts anywhere"] if name == "with" else [])
+    report([str(tmp_path / "runs"), "--formats"])
+    table = (tmp_path / "runs" / "report" / "tables" / "results.md").read_text("utf-8")
+    rows = [[cell.strip() for cell in line.split("|")] for line in table.splitlines() if line.startswith("|")]
+    column = rows[0].index("privileges")
+    assert {row[2]: row[column] for row in rows[2:]} == {"with": "starts anywhere", "without": ""}
+
+
+def holds_text(hint: Any) -> bool:
+    """Whether a value of this type may be a text, or have one in it."""
+    if get_origin(hint) in (Union, types.UnionType, list, dict, tuple):
+        values = get_args(hint)[1:] if get_origin(hint) is dict else get_args(hint)
+        return any(map(holds_text, values))
+    return hint not in (int, float, bool, type(None))
+
+
+def says_what_it_is(hint: Any) -> bool:
+    """Whether every part of a type that may be a text declares what it is."""
+    if any(isinstance(each, Text) for each in getattr(hint, "__metadata__", ())):
+        return True
+    parts = get_args(hint)[1:] if get_origin(hint) is dict else get_args(hint)
+    return all(says_what_it_is(part) for part in parts if holds_text(part)) if parts else not holds_text(hint)
+
+
+@pytest.mark.parametrize("name", settings_of_a_run())
+def test_every_text_says_what_it_is(name: str) -> None:
+    for hint in settings_of_a_run()[name]:
+        assert says_what_it_is(hint), f"{name}: {hint}: annotate it with one of gridworld.config.fields"
+
+
+def test_the_walk_finds_what_says_nothing() -> None:
+    silent = (str, Any, dict[str, Any], list[str], str | None, Union[int, str], bytes)  # noqa: UP007
+    assert not any(map(says_what_it_is, silent))
+    assert all(map(says_what_it_is, (int, float | None, list[int], dict[str, bool])))
+    assert not list(texts_in(dict[str, Any]))
+
+
+def recipe(tmp_path: Path, content: str) -> list[str]:
+    path = tmp_path / "winner.yaml"
+    path.write_text(content)
+    return [f"recipe={path}"]
+
+
+GYM = "defaults: [{override /env: gymnasium}]\nenv: "
+CLASS = "defaults: [{override /agent: qrdqn}]\nagent: "
+HOSTILE = {
+    "defaults: [{override /env: built}]\nenv: {builder: os.system, kwargs: {command: ls}}": "env.builder=",
+    "env: {builder: os.system}": "env.builder=os.system is called",  # whichever env the command line chooses
+    GYM + '{id: "evil:Env-v0"}': "env.id=evil:Env-v0 imports the module",
+    GYM + "{id: FrozenLake-v1, kwargs: {layout: /etc/shadow}}": "env.kwargs.layout=/etc/shadow is for code",
+    GYM + "{id: X-v0, kwargs: {a: [{b: ../x}]}}": "env.kwargs.a.b=../x is for code",
+    GYM + "{id: X-v0, kwargs: {env_id: 'evil:X-v0'}}": "env.kwargs.env_id=evil:X-v0 is for code",
+    GYM + "{id: X-v0, kwargs: {size: 1000000000}}": "env.kwargs.size=1000000000 is beyond 1,000",
+    GYM + "{id: X-v0, kwargs: {size: -.inf}}": "env.kwargs.size=-inf is beyond 1,000",
+    "callbacks: [{_target_: os.system, command: ls}]": "callbacks._target_=os.system is called",
+    "callbacks: [{_target_: stable_baselines3.common.callbacks.CheckpointCallback, save_path: /x}]": "writ",
+    "callbacks: [os.system]": "callbacks=os.system is called",
+    "defaults: [{override /env: arrays}]\nenv: {path: /etc/shadow}": "env.path=/etc/shadow leads out of",
+    "env: {layout: /etc/shadow}": "env.layout=/etc/shadow leads out of the current folder",
+    "env: {layout: maps/../../x}": "env.layout=maps/../../x leads out",
+    "env: {layout: link/x}": "env.layout=link/x leads out",
+    'env: {layout: "a\\0b"}': "env.layout=a\\x00b leads out",
+    CLASS + "{algorithm: evil.Agent}": "agent.algorithm=evil.Agent is from none of",
+    CLASS + "{algorithm: stable_baselines3_evil.A}": "agent.algorithm=stable_baselines3_evil.A is from none",
+    CLASS + "{policy: evil.Policy}": "agent.policy=evil.Policy is from none of",
+    CLASS + "{arguments: {policy_kwargs: {optimizer_class: evil.Adam}}}": "optimizer_class=evil.Adam is no",
+    CLASS + "{arguments: {whatever: [[evil.Adam]]}}": "agent.arguments.whatever=evil.Adam is no plain word",
+    CLASS
+    + "{arguments: {tensorboard_log: /tmp/x}}": "agent.arguments.tensorboard_log=/tmp/x is no plain word",
+    "agent: {policy_kwargs: {activation_fn: os.system}}": "activation_fn=os.system is from none of",
+    "agent: {policy_kwargs: {features_extractor_kwargs: {a: evil.X}}}": "a=evil.X is no plain word",
+    "agent: {policy_kwargs: {optimizer_kwargs: {_target_: os.system}}}": "_target_=os.system is no plain",
+    "agent: {replay_buffer_class: evil.Buffer}": "agent.replay_buffer_class=evil.Buffer is from none of",
+    "agent: {rollout_buffer_kwargs: {path: a/b}}": "agent.rollout_buffer_kwargs.path=a/b is no plain word",
+}
+
+
+@pytest.mark.parametrize("content", HOSTILE, ids=range(len(HOSTILE)))
+def test_a_recipe_that_would_run_code_or_read_files_needs_trust(
+    content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "link").symlink_to("/etc")
+    words = recipe(tmp_path, content)
+    with pytest.raises(InputError) as refused:
+        with_recipe(words)
+    sentence = str(refused.value)
+    assert HOSTILE[content] in sentence
+    assert sentence.endswith("; add trust=true if you trust whoever made this")
+    assert "\n" not in sentence
+    assert with_recipe([*words, "trust=true"])  # words for Hydra, which makes nothing of them yet
+
+
+def test_what_does_no_harm_needs_no_trust(tmp_path: Path) -> None:
+    lake = "{id: FrozenLake-v1, kwargs: {desc: [SFF, FHG], is_slippery: false, success_rate: 0.5}}"
+    assert configure(*with_recipe(recipe(tmp_path, GYM + lake))).env.kwargs["desc"] == ["SFF", "FHG"]
+    harmless = {
+        "env": {"layout": "maps/mine.txt", "path": "tables/..x.npz"},
+        "agent": {
+            "name": "it's mine: a/b.c",
+            "policy": "MlpPolicy",
+            "learning_rate": "lin_3e-4",
+            "replay_buffer_class": "gridworld.agents.sb3.replay_counts.ReplayCounts",
+            "arguments": {"ent_coef": "quad_0.01", "policy_kwargs": {"activation_fn": "torch.nn.ReLU"}},
+        },
+    }
+    assert not list(foreign(harmless))
+    assert [name for name, _, _ in foreign({"new": {"setting": "x"}})] == ["new.setting"]  # till it says
