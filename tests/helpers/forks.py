@@ -26,8 +26,6 @@ _SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 # This tree's package, wherever one is installed.
 _PATHS = [*filter(None, [os.environ.get("PYTHONPATH")]), str(_SCRIPTS.parent)]
 _FRESH = os.environ | {"PYTHONPATH": os.pathsep.join(_PATHS)}
-    "PYTHONPATH": os.pathsep.join([os.environ.get("PYTHONPATH", ""), str(_SCRIPTS.parent)])
-}  # this tree's package, wherever one is installed
 
 
 @dataclass(frozen=True)
