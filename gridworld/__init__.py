@@ -13,98 +13,66 @@ from gridworld.envs.registration import ENV_ID, register_envs, register_when_gym
 
 TYPE_CHECKING = False  # what type checkers take for True; `typing` itself would double the import's cost
 if TYPE_CHECKING:
-    from gridworld.agents.sb3.interop.exact_eval_callback import ExactEvalCallback
-    from gridworld.agents.sb3.interop.make_vec_env import make_vec_env
-    from gridworld.api.checking import CheckResult, check
-    from gridworld.api.diagnosis import diagnose
-    from gridworld.api.runs import RunResult, open_run, train
-    from gridworld.api.scores import evaluate
-    from gridworld.api.settings import compose
-    from gridworld.api.worlds import compile_env, make_vec
-    from gridworld.envs.env import GridWorldEnv
-    from gridworld.envs.observations import (
-        CoordinateObservation,
-        ImageObservation,
-        OneHotObservation,
-        VectorCoordinateObservation,
-        VectorImageObservation,
-        VectorOneHotObservation,
-    )
-    from gridworld.envs.vector_env import GridWorldVectorEnv
-    from gridworld.errors import InputError
-    from gridworld.world.exact.evaluation import Evaluator, Score
-    from gridworld.world.grid import compile_mdp
-    from gridworld.world.layout import Layout, load, shipped_layouts
-    from gridworld.world.mdp import Mdp
-    from gridworld.world.sources.arrays import load_world
+    from gridworld.agents.sb3.exact_eval import ExactEvalCallback as ExactEvalCallback
+    from gridworld.agents.sb3.vec_env import make_vec_env as make_vec_env
+    from gridworld.api.diagnosis import diagnose as diagnose
+    from gridworld.api.runs import RunResult as RunResult
+    from gridworld.api.runs import open_run as open_run
+    from gridworld.api.runs import train as train
+    from gridworld.api.settings import compose as compose
+    from gridworld.api.worlds import compile_env as compile_env
+    from gridworld.api.worlds import evaluate as evaluate
+    from gridworld.api.worlds import make_vec as make_vec
+    from gridworld.checking.run import CheckResult as CheckResult
+    from gridworld.checking.run import check as check
+    from gridworld.envs.env import GridWorldEnv as GridWorldEnv
+    from gridworld.envs.observations import CoordinateObservation as CoordinateObservation
+    from gridworld.envs.observations import ImageObservation as ImageObservation
+    from gridworld.envs.observations import OneHotObservation as OneHotObservation
+    from gridworld.envs.observations import VectorCoordinateObservation as VectorCoordinateObservation
+    from gridworld.envs.observations import VectorImageObservation as VectorImageObservation
+    from gridworld.envs.observations import VectorOneHotObservation as VectorOneHotObservation
+    from gridworld.envs.vector_env import GridWorldVectorEnv as GridWorldVectorEnv
+    from gridworld.errors import InputError as InputError
+    from gridworld.world.exact.evaluation import Evaluator as Evaluator
+    from gridworld.world.exact.evaluation import Score as Score
+    from gridworld.world.grid import compile_mdp as compile_mdp
+    from gridworld.world.layout import Layout as Layout
+    from gridworld.world.layout import load as load
+    from gridworld.world.layout import shipped_layouts as shipped_layouts
+    from gridworld.world.mdp import Mdp as Mdp
+    from gridworld.world.sources.arrays import load_world as load_world
 
 __version__ = "0.1.0"
 
-_HOME = {
-    "CheckResult": "api.checking",
-    "CoordinateObservation": "envs.observations",
-    "Evaluator": "world.exact.evaluation",
-    "ExactEvalCallback": "agents.sb3.interop.exact_eval_callback",
-    "GridWorldEnv": "envs.env",
-    "GridWorldVectorEnv": "envs.vector_env",
-    "ImageObservation": "envs.observations",
-    "InputError": "errors",
-    "Layout": "world.layout",
-    "Mdp": "world.mdp",
-    "OneHotObservation": "envs.observations",
-    "RunResult": "api.runs",
-    "Score": "world.exact.evaluation",
-    "VectorCoordinateObservation": "envs.observations",
-    "VectorImageObservation": "envs.observations",
-    "VectorOneHotObservation": "envs.observations",
-    "check": "api.checking",
-    "compile_env": "api.worlds",
-    "compile_mdp": "world.grid",
-    "compose": "api.settings",
-    "diagnose": "api.diagnosis",
-    "evaluate": "api.scores",
-    "load": "world.layout",
-    "load_world": "world.sources.arrays",
-    "make_vec": "api.worlds",
-    "make_vec_env": "agents.sb3.interop.make_vec_env",
-    "open_run": "api.runs",
-    "shipped_layouts": "world.layout",
-    "train": "api.runs",
+_NAMES = {  # the public names of each module
+    "agents.sb3.exact_eval": "ExactEvalCallback",
+    "agents.sb3.vec_env": "make_vec_env",
+    "api.diagnosis": "diagnose",
+    "api.runs": "RunResult open_run train",
+    "api.settings": "compose",
+    "api.worlds": "compile_env evaluate make_vec",
+    "checking.run": "CheckResult check",
+    "envs.env": "GridWorldEnv",
+    "envs.observations": (
+        "CoordinateObservation ImageObservation OneHotObservation "
+        "VectorCoordinateObservation VectorImageObservation VectorOneHotObservation"
+    ),
+    "envs.vector_env": "GridWorldVectorEnv",
+    "errors": "InputError",
+    "world.exact.evaluation": "Evaluator Score",
+    "world.grid": "compile_mdp",
+    "world.layout": "Layout load shipped_layouts",
+    "world.mdp": "Mdp",
+    "world.sources.arrays": "load_world",
 }
+_HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 
-__all__ = [
-    "ENV_ID",
-    "CheckResult",
-    "CoordinateObservation",
-    "Evaluator",
-    "ExactEvalCallback",
-    "GridWorldEnv",
-    "GridWorldVectorEnv",
-    "ImageObservation",
-    "InputError",
-    "Layout",
-    "Mdp",
-    "OneHotObservation",
-    "RunResult",
-    "Score",
-    "VectorCoordinateObservation",
-    "VectorImageObservation",
-    "VectorOneHotObservation",
-    "check",
-    "compile_env",
-    "compile_mdp",
-    "compose",
-    "diagnose",
-    "evaluate",
-    "load",
-    "load_world",
-    "make_vec",
-    "make_vec_env",
-    "open_run",
-    "register_envs",
-    "shipped_layouts",
-    "train",
-]
+__all__ = ["ENV_ID", "register_envs", *sorted(_HOME)]
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *_HOME]
 
 
 def __getattr__(name: str) -> object:

@@ -1,4 +1,4 @@
-"""The exception for a user's mistake, and its relatives; each is told in one sentence."""
+"""The exception for a user's mistake, and its relatives; each is explained in one sentence."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ DISTRIBUTION = "gridworld-sb3"  # the package's name for pip; on PyPI another pr
 
 
 class InputError(ValueError):
-    """A mistake in a map, a setting, an action or a file, told in one sentence.
+    """A mistake in a map, a setting, an action or a file, explained in one sentence.
 
     The sentence names the thing, where it is, and what would be right. Command lines print it without a
     traceback and exit with `EXIT_CODE`.
@@ -18,7 +18,7 @@ class InputError(ValueError):
 
 
 class MachineError(InputError):
-    """A disk was full or gone. What was begun is an interrupted run, and goes on once that is put right."""
+    """A disk was full or gone. What was begun is an interrupted run, to be resumed once that is put right."""
 
 
 class FolderLostError(InputError):
@@ -36,12 +36,11 @@ def reason(error: BaseException) -> str:
 
 def in_short(error: BaseException) -> str:
     """The kind of an exception of somebody else's code, and the first line of what it says."""
-    kind = type(error).__name__
     try:
         lines = str(error).strip().splitlines()
-    except Exception:  # it cannot even be told
-        return kind
-    return f"{kind}: {lines[0][:200]}" if lines else kind
+    except Exception:  # its own code fails, too
+        lines = []
+    return f"{type(error).__name__}: {lines[0][:200]}" if lines else type(error).__name__
 
 
 def failure(error: OSError) -> str:

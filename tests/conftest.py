@@ -17,7 +17,7 @@ from helpers.composing import compose_quickly
 from hypothesis import settings
 
 from gridworld.process.console import progress
-from gridworld.process.garbage import collect_less_often
+from gridworld.process.memory_budget import collect_less_often
 
 # The package and the tests are compiled once, not in every process.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

@@ -9,10 +9,9 @@ from pathlib import Path
 
 from gridworld.api.runs import RunResult, torch_threads_kept
 from gridworld.diagnosis.evidence import Evidence
-from gridworld.diagnosis.trials import beside, check_trusted
-from gridworld.diagnosis.trials import try_offers as _try_offers
-from gridworld.diagnosis.verdict import Diagnosis
+from gridworld.diagnosis.verdict import Diagnosis, check_trusted, trials_folder
 from gridworld.diagnosis.verdict import diagnose as _diagnose
+from gridworld.diagnosis.verdict import try_offers as _try_offers
 from gridworld.process.memory_budget import limited
 from gridworld.restore.saved_run import SavedRun
 
@@ -58,5 +57,5 @@ def diagnose(
             return found
         check_trusted(saved, found, trust)
         with tempfile.TemporaryDirectory(prefix="gridworld-") as elsewhere:
-            place = Path(elsewhere) if folder is None else beside(folder)
+            place = Path(elsewhere) if folder is None else trials_folder(folder)
             return dataclasses.replace(found, tried=tuple(_try_offers(saved, found, place, trust)))

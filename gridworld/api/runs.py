@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot
 from gridworld.api.settings import Override, compose_words, words
-from gridworld.config.pictures import PICTURES
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError, failure
 from gridworld.process.memory_budget import limited, unlimited
@@ -28,7 +27,8 @@ from gridworld.report.evidence import read_columns
 from gridworld.restore.resume import unfinished_of
 from gridworld.restore.saved_run import SavedRun, read_visits
 from gridworld.run.claim import check_free, claimed
-from gridworld.run.recovery import is_started
+from gridworld.run.reader import is_started
+from gridworld.training.setup import without_pictures
 from gridworld.training.train import train as train_in
 from gridworld.world.exact.evaluation import Evaluator
 
@@ -54,16 +54,7 @@ class RunResult:
     """
 
     def __init__(self, saved: SavedRun, folder: Path | None, agent: Callable[[], Agent]) -> None:
-        """Read the run's files.
-
-        Args:
-            saved: the run's folder, opened.
-            folder: its path, if it will stay.
-            agent: gives the trained agent.
-
-        Raises:
-            InputError: a file was changed since, or is missing.
-        """
+        """Read an opened run's files; `folder` is None if it will not stay, `agent` gives the trained one."""
         self.config: TrainConfig = saved.config
         self.summary: dict[str, Any] = saved.run.read_summary()
         self.curve: Curve = {
@@ -150,9 +141,15 @@ def train(
     if progress is not None:
         config.logging.progress = progress
     with _ONE_AT_A_TIME, torch_threads_kept(), _as_python_interrupts(folder is not None):
-        if folder is not None:
-            return _train_in(Path(folder).expanduser(), config, given)
-        return _train_without_files(config, given)
+        if folder is None:
+            return _train_without_files(config, given)
+        path = Path(folder).expanduser()
+        check_free(path, "folder")
+        try:
+            with claimed(path.absolute()):
+                return _finished(path.absolute(), config, given, path)
+        except OSError as error:
+            raise InputError(failure(error)) from None
 
 
 def open_run(folder: str | PathLike[str], trust: bool = False) -> RunResult:
@@ -179,22 +176,12 @@ def open_run(folder: str | PathLike[str], trust: bool = False) -> RunResult:
         return RunResult(saved, path, saved.agent)
 
 
-def _train_in(folder: Path, config: TrainConfig, given: list[str]) -> RunResult:
-    check_free(folder, "folder")
-    try:
-        with claimed(folder.absolute()):
-            return _finished(folder.absolute(), config, given, folder)
-    except OSError as error:
-        raise InputError(failure(error)) from None
-
-
 def _train_without_files(config: TrainConfig, given: list[str]) -> RunResult:
-    none = dataclasses.replace(config.recording, **dict.fromkeys((each.setting for each in PICTURES), False))
+    plain = without_pictures(config)
     quiet = dataclasses.replace(
-        config,
-        recording=none,
-        logging=dataclasses.replace(config.logging, tensorboard=False),
-        checkpoint=dataclasses.replace(config.checkpoint, every=None),
+        plain,
+        logging=dataclasses.replace(plain.logging, tensorboard=False),
+        checkpoint=dataclasses.replace(plain.checkpoint, every=None),
     )
     with tempfile.TemporaryDirectory(prefix="gridworld-", ignore_cleanup_errors=True) as place:
         result = _finished(Path(place), quiet, given, None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -54,7 +54,10 @@ def words(*overrides: Override, **settings: Any) -> list[str]:
     found: list[str] = []
     for override in (*overrides, settings):
         if isinstance(override, Mapping):
-            found += _assignments(override)
+            for key, value in flat(override):
+                if not _KEY.fullmatch(key):
+                    raise InputError(f"{key!r:.80}: must be the name of a setting, such as 'agent.gamma'")
+                found.append(_checked(f"{key}={literal(_plain(value), key)}"))
         elif isinstance(override, str):
             found.append(_checked(override))
         else:
@@ -63,7 +66,10 @@ def words(*overrides: Override, **settings: Any) -> list[str]:
                 "such as {'agent.gamma': 0.9}"
             )
     found = with_recipe(found)
-    _refuse_lists(found)
+    with contextlib.suppress(HydraException):  # which composing raises again
+        for parsed in OverridesParser.create().parse_overrides(found):
+            if parsed.is_sweep_override():
+                raise InputError(f"{parsed.input_line}: has several values; call train once for each")
     return found
 
 
@@ -77,25 +83,10 @@ def compose_words(words: list[str]) -> TrainConfig:
 
 def _checked(word: str) -> str:
     if word.startswith("-") or (not word.startswith("~") and "=" not in word):
-        raise InputError(f"{word}: is no override; write KEY=VALUE, for instance 'agent=dqn' or 'seed=3'")
+        raise InputError(f"{word}: is not an override; write KEY=VALUE, for instance 'agent=dqn' or 'seed=3'")
     if _OF_THE_COMMAND.match(word):
         raise InputError(f"{word}: belongs to the command line; here the run's folder is given by folder=...")
     return word
-
-
-def _refuse_lists(words: list[str]) -> None:
-    """Refuse values that would be a job each on a sweep's command line."""
-    with contextlib.suppress(HydraException):  # which composing tells
-        for override in OverridesParser.create().parse_overrides(words):
-            if override.is_sweep_override():
-                raise InputError(f"{override.input_line}: has several values; call train once for each")
-
-
-def _assignments(settings: Mapping[str, Any]) -> Iterator[str]:
-    for key, value in flat(settings):
-        if not _KEY.fullmatch(key):
-            raise InputError(f"{key!r:.80}: must be the name of a setting, such as 'agent.gamma'")
-        yield _checked(f"{key}={literal(_plain(value), key)}")
 
 
 def _plain(value: Any) -> Any:

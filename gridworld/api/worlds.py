@@ -1,14 +1,142 @@
-"""Worlds of one's own: an environment's as exact tables, and tables as a batch of environments."""
+"""Custom worlds and policies: a policy's exact score, an environment's tables, and tables as a batch."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from gridworld.envs.inspection import world_of
+import numpy as np
+from gymnasium.spaces import Discrete
+from numpy.typing import ArrayLike
+
+from gridworld.bounds import discount
+from gridworld.envs.inspection import Task, task_of, world_of
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.errors import InputError
+from gridworld.world.exact.evaluation import Evaluator, Score
+from gridworld.world.exact.markov_chain import one_hot_policy
 from gridworld.world.grid import GridMdp
-from gridworld.world.mdp import Mdp
+from gridworld.world.mdp import FloatArray, Mdp
+
+
+def evaluate(
+    model_or_table: Any = None,
+    env: Any = None,
+    gamma: float = 0.99,
+    *,
+    q: ArrayLike | None = None,
+    deterministic: bool = True,
+    max_episode_steps: int | None = None,
+) -> Score:
+    """Score a policy exactly: no episodes are played, and the score has no noise.
+
+    Args:
+        model_or_table: a model of SB3 or of any library with its interface (DQN, PPO, A2C, QRDQN, TRPO, ...),
+            or its policy, which acts as its `predict` does, with the environment's `action_masks()` if it
+            takes them; or a table: actions (S,), whole numbers from 0, or their probabilities (S, A);
+            by observations where the environment shows whole numbers.
+        env: an environment or a batch of Gymnasium or SB3: a GridWorld, or one with a transition table; a
+            compiled world (`compile_mdp`, `compile_env`); or the name of a map. The task is that of the
+            environment with its wrappers, which must be neutral or functions; see
+            `gridworld.world.sources.wrappers`. A model sees states as this environment shows them; where that
+            is the world's own observation of another kind, by the kind that has the model's observation
+            space. None: the environment that the model was trained on.
+        gamma: discount of value and regret.
+        q: in place of `model_or_table`: Q values (S, A), of which the first of the best actions is taken.
+        deterministic: whether to score a model's best action in every state, or the distribution that it
+            explores with, as SB3's `evaluate_policy` does.
+        max_episode_steps: step limit of an episode; None: the environment's own, or 100.
+
+    Returns:
+        Its `value`, `regret`, `certified`, and the `outcome` of an episode, which has the
+        probabilities of `goal`, `trap` and `timeout`, `expected_return` and `expected_length`.
+
+    Raises:
+        InputError: no world that is known exactly; a wrapper that may change it in an unknown way; a table
+            that does not fit it; a model that keeps a memory, or sees or does something else.
+
+    Example:
+        >>> evaluate([1] * 30, "classic").regret > 0.9  # always to the right
+        True
+        >>> import gymnasium
+        >>> round(evaluate([1] * 16, gymnasium.make("FrozenLake-v1")).outcome.goal, 3)  # always down
+        0.049
+    """
+    discount("gamma", gamma)
+    if (model_or_table is None) == (q is None):
+        raise InputError("evaluate: give one of a model or table, as the first argument, and q=...")
+    is_model = hasattr(model_or_table, "observation_space")
+    place = model_or_table.get_env() if env is None and hasattr(model_or_table, "get_env") else env
+    if place is None:
+        raise InputError("env: is needed; give an environment, a compiled world or the name of a map")
+    task = task_of(place, max_episode_steps)
+    mdp, limit = task.mdp, task.max_episode_steps
+    if is_model:
+        from gridworld.agents.sb3.exact_eval import tables_of  # here, since it imports torch
+
+        tables = tables_of(model_or_table, task)
+        if tables.sampled is None and not deterministic:
+            raise InputError(
+                f"{type(model_or_table).__name__}: has its own predict(), so the distribution that it "
+                "explores with is not known; take deterministic=True"
+            )
+        policy = tables.greedy if deterministic or tables.sampled is None else tables.sampled
+    else:
+        policy = _greedy(task, q) if q is not None else _policy(task, model_or_table)
+    return Evaluator(mdp, gamma, limit).score(policy)
+
+
+def _policy(task: Task, table: Any) -> FloatArray:
+    mdp, numbers = task.mdp, _numbers("the table", task, table)
+    if numbers.shape == (mdp.num_states,):
+        wrong = ~np.isin(numbers, np.arange(mdp.num_actions))
+        if wrong.any():
+            state = int(np.argmax(wrong))
+            raise InputError(
+                f"the table: state {state} has the action {numbers[state]:g}; must be {mdp.action_choices()}"
+            )
+        return one_hot_policy(numbers.astype(np.int64), mdp.num_actions)
+    _check_shape("the table", mdp, numbers)
+    if (numbers < 0).any() or (np.abs(numbers.sum(axis=1) - 1) > 1e-4).any():
+        raise InputError(
+            "the table: its rows are not probabilities, at least 0 with sum 1; give Q values as q=..."
+        )
+    return numbers
+
+
+def _greedy(task: Task, q: ArrayLike) -> FloatArray:
+    values = _numbers("q", task, q)
+    _check_shape("q", task.mdp, values)
+    return one_hot_policy(values.argmax(axis=1), task.mdp.num_actions)
+
+
+def _numbers(name: str, task: Task, table: Any) -> FloatArray:
+    """A table by states; where it is by what is shown, two states may look alike, or be renumbered."""
+    try:
+        numbers: FloatArray = np.asarray(table, dtype=np.float64)
+    except (TypeError, ValueError, RuntimeError):  # torch's, for a tensor with a gradient
+        kind = type(table).__name__
+        raise InputError(f"{name}: {kind} is neither a model nor a table of numbers") from None
+    if np.isnan(numbers).any():
+        raise InputError(f"{name}: has NaN")
+    mdp = task.mdp
+    if not numbers.ndim:
+        return numbers
+    if task.is_transformed and task.seen is not None:
+        seen = task.seen()
+        if isinstance(seen.space, Discrete) and len(numbers) == seen.space.n:
+            return np.asarray(numbers[seen.table() - seen.space.start])
+    is_by_number = len(numbers) == mdp.num_numbers < mdp.num_states
+    return np.asarray(numbers[mdp.number]) if is_by_number else numbers
+
+
+def _check_shape(name: str, mdp: Mdp, table: FloatArray) -> None:
+    size = mdp.num_states
+    if table.shape != (size, mdp.num_actions):
+        either = "" if name == "q" else f"({size},) actions or "
+        raise InputError(
+            f"{name}: has shape {table.shape}; this world has {size} states and "
+            f"{mdp.num_actions} actions, so it must be {either}({size}, {mdp.num_actions})"
+        )
 
 
 def compile_env(env: Any) -> Mdp:

@@ -1,4 +1,4 @@
-"""The probes: a row each, from one state up."""
+"""The probes: a row each, from one state up, and what must hold after training, by the solver's numbers."""
 
 from __future__ import annotations
 
@@ -6,33 +6,130 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from gridworld.checking import expectations as expect
+import numpy as np
+
 from gridworld.checking import worlds
 from gridworld.checking.training import Trained
-from gridworld.world.mdp import Mdp
+from gridworld.checking.worlds import BONUS
+from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.exact.markov_chain import Chain
+from gridworld.world.exact.solver import backup, solved
+from gridworld.world.mdp import BoolArray, FloatArray, Mdp
+
+TOLERANCE = 0.1  # of a value, relative to the largest number in the world
+LEAST_BEST = 0.99  # share of late steps with a best action
+PROBABILITY = 0.06  # tolerance of an action's
+_VISITED = 0.05  # share of steps; an actor-critic knows the values of the states that it is in
+_LIMIT = 100
+
+
+class UnmetError(Exception):
+    """An expectation that does not hold; says what was found instead."""
+
+
+def values(trained: Trained) -> str:
+    """Its values are the exact ones: Q* of a learner of Q, of an actor-critic V of its own policy."""
+    mdp, found, last = trained.mdp, trained.last.q, trained.last
+    if found is not None:
+        return _near(mdp, found, solved(mdp, trained.gamma).q)
+    often = trained.late.sum(axis=1) >= _VISITED * trained.late.sum()
+    return _near(mdp, last.values, Chain(mdp, last.sampled).value(trained.gamma), often)
+
+
+def optimal(trained: Trained) -> str:
+    """Its deterministic policy is optimal from the start, exactly."""
+    mdp = trained.mdp
+    score = Evaluator(mdp, trained.gamma, mdp.max_episode_steps or _LIMIT).score(trained.greedy)
+    if not score.certified:
+        actions = trained.greedy.argmax(axis=1)[_live(mdp)].tolist()
+        raise UnmetError(f"its best actions are {actions}, with regret {score.regret:.3g}")
+    return "optimal"
+
+
+def optimal_with_values(trained: Trained) -> str:
+    """Both."""
+    return f"{optimal(trained)}, {values(trained)}"
+
+
+def acts_as_learnt(trained: Trained) -> str:
+    """At the end of training nearly all its actions are optimal."""
+    best = solved(trained.mdp, trained.gamma).optimal
+    steps = int(trained.late.sum())
+    if steps == 0:
+        return "takes no steps"
+    share = float(trained.late[best].sum()) / steps
+    if share < LEAST_BEST:
+        raise UnmetError(f"{share:.0%} of its last actions are best ones, must be {LEAST_BEST:.0%}")
+    return f"{share:.0%} of its last actions are best ones"
+
+
+def acts_at_random(trained: Trained) -> str:
+    """In training, all actions of a state are as frequent as each other."""
+    shares = trained.visits / np.maximum(trained.visits.sum(axis=1, keepdims=True), 1)
+    uniform = np.full(shares.shape, 1 / trained.mdp.num_actions)
+    return _near(trained.mdp, shares, uniform, probability=True)
+
+
+def soft_optimal(trained: Trained) -> str:
+    """Its policy is the best one for the reward of its one step and `worlds.BONUS` times its entropy."""
+    gains = np.exp(solved(trained.mdp, trained.gamma).q / BONUS)
+    aim = gains / gains.sum(axis=1, keepdims=True)
+    return _near(trained.mdp, trained.last.sampled, aim, probability=True)
+
+
+def all_layers_learn(trained: Trained) -> str:
+    """Training has changed every parameter."""
+    if trained.frozen:
+        raise UnmetError(f"{', '.join(trained.frozen)} did not change")
+    return "all have changed"
+
+
+def first_backup(trained: Trained) -> str:
+    """Its Q values are one backup of what it had before training."""
+    mdp = trained.mdp
+    assert trained.first.q is not None
+    assert trained.last.q is not None
+    exact = backup(mdp, np.where(mdp.terminal, 0.0, trained.first.q.max(axis=1)), trained.gamma)
+    return _near(mdp, trained.last.q, exact)
+
+
+def _live(mdp: Mdp) -> BoolArray:
+    return np.asarray(mdp.reachable & ~mdp.terminal)
+
+
+def _near(
+    mdp: Mdp,
+    found: FloatArray,
+    exact: FloatArray,
+    states: BoolArray | None = None,
+    probability: bool = False,
+) -> str:
+    """Compare numbers of live states, or of these (S,) of them; says which is farthest from the exact one."""
+    where = _live(mdp) if states is None else _live(mdp) & states
+    where = np.broadcast_to(where.reshape(-1, *[1] * (exact.ndim - 1)), exact.shape)
+    tolerance = PROBABILITY
+    if not probability:
+        tolerance = TOLERANCE * max(np.abs(exact[where]).max(), np.abs(mdp.reward).max())
+    error = np.where(where, np.abs(found - exact), -1.0)
+    worst = tuple(int(each) for each in np.unravel_index(np.argmax(error), error.shape))
+    name = "P" if probability else "Q" if len(worst) == 2 else "V"
+    text = f"{name}({', '.join(map(str, worst))}) {found[worst]:.3f}, exact {exact[worst]:.3f}"
+    if not error[worst] <= tolerance:
+        raise UnmetError(f"{text}, tolerance {tolerance:.2g}")
+    return text
 
 
 @dataclass(frozen=True)
 class Probe:
-    """One question about an implementation.
+    """One question about an implementation."""
 
-    Attributes:
-        name: as the command line has it.
-        world: makes the world that it trains on.
-        holds: what must hold after training; raises `expectations.UnmetError`, else says what was found.
-        meaning: what a failure means.
-        gamma: the discount that it trains with.
-        arguments: arguments of the algorithm that differ from `settings`, where it takes them.
-        needs: an argument; an algorithm that does not take it is not asked.
-    """
-
-    name: str
-    world: Callable[[], Mdp]
-    holds: Callable[[Trained], str]
-    meaning: str
-    gamma: float = 0.9
-    arguments: Mapping[str, Any] = field(default_factory=dict)
-    needs: str = ""
+    name: str  # as the command line has it
+    world: Callable[[], Mdp]  # makes the world that it trains on
+    holds: Callable[[Trained], str]  # after training; raises `UnmetError`, else says what was found
+    meaning: str  # what a failure means
+    gamma: float = 0.9  # that it trains with
+    arguments: Mapping[str, Any] = field(default_factory=dict)  # that differ from `settings`
+    needs: str = ""  # an argument; an algorithm that does not take it is not asked
 
     @property
     def training(self) -> tuple[str, float, str]:
@@ -46,33 +143,33 @@ PROBES = (
     Probe(
         "constant",
         worlds.constant,
-        expect.values,
+        values,
         "the value is not learnt at all: its loss, its optimiser or the reward that reaches it",
     ),
     Probe(
         "discount",
         worlds.corridor,
-        expect.values,
+        values,
         "gamma is ignored or applied at the wrong step, or a reward belongs to another step",
         gamma=0.5,
     ),
     Probe(
         "choice",
         worlds.bandit,
-        expect.optimal,
+        optimal,
         "worse actions are preferred: the sign of the advantage, or rewards beside the wrong actions",
     ),
     Probe(
         "context",
         worlds.two_contexts,
-        expect.optimal,
+        optimal,
         "the policy does not depend on the state: observations are lost, mixed up or of another step",
         arguments=_NO_EXPLORATION_LEFT,
     ),
     Probe(
         "behaviour",
         worlds.two_contexts,
-        expect.acts_as_learnt,
+        acts_as_learnt,
         "it acts otherwise than it has learnt: exploration does not end, or ends late, or it sees another "
         "observation when it acts than when it learns",
         arguments=_NO_EXPLORATION_LEFT,
@@ -80,14 +177,14 @@ PROBES = (
     Probe(
         "layers",
         worlds.two_contexts,
-        expect.all_layers_learn,
+        all_layers_learn,
         "a layer never changes: it is not in the optimiser, cut off from the gradient or never copied",
         arguments=_NO_EXPLORATION_LEFT,
     ),
     Probe(
         "exploration",
         worlds.two_contexts,
-        expect.acts_at_random,
+        acts_at_random,
         "it explores less than its epsilon says: that is ignored, scaled or starts elsewhere",
         arguments={"exploration_initial_eps": 1.0, "exploration_final_eps": 1.0},
         needs="exploration_final_eps",
@@ -95,7 +192,7 @@ PROBES = (
     Probe(
         "entropy",
         worlds.dear_contexts,
-        expect.soft_optimal,
+        soft_optimal,
         "the entropy bonus is not what its coefficient says: its sign or scale is wrong, it is missing, or "
         "it is not that of each state's policy",
         arguments={"ent_coef": worlds.BONUS},
@@ -104,51 +201,51 @@ PROBES = (
     Probe(
         "delay",
         worlds.delay,
-        expect.optimal_with_values,
+        optimal_with_values,
         "credit does not reach earlier steps: returns, traces or next observations are of the wrong step",
     ),
     Probe(
         "termination",
         worlds.end_like_the_start,
-        expect.values,
+        values,
         "values are taken from beyond the end of an episode: the terminal flag is ignored",
     ),
     Probe(
         "truncation",
         worlds.endless,
-        expect.values,
+        values,
         "a step limit is treated as an end: the value of the state where it was cut is missing",
         gamma=0.8,
     ),
     Probe(
         "stochastic",
         worlds.gamble,
-        expect.optimal_with_values,
+        optimal_with_values,
         "it does not learn the mean of a random reward, but its extreme, its median or its last draw",
     ),
     Probe(
         "alternation",
         worlds.alternation,
-        expect.optimal_with_values,
+        optimal_with_values,
         "the value of the next state is wrong: another state's, or not that of its best action",
         gamma=0.8,
     ),
     Probe(
         "trap",
         worlds.trap,
-        expect.optimal_with_values,
+        optimal_with_values,
         "the next reward counts for more than the return: what follows is not added, or costs are lost",
     ),
     Probe(
         "slip",
         worlds.slippery,
-        expect.optimal_with_values,
+        optimal_with_values,
         "uncertain moves are not averaged over, or next states are not where the world went",
     ),
     Probe(
         "target",
         worlds.endless,
-        expect.first_backup,
+        first_backup,
         "targets are not computed with the target network: it never had an update, the values moved on",
         gamma=0.8,
         arguments={"target_update_interval": 10_000_000},

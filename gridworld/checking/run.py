@@ -1,51 +1,54 @@
-"""All probes of one implementation, in one process or several."""
+"""All probes of one implementation, in one process or several, and their table."""
 
 from __future__ import annotations
 
 import itertools
+import textwrap
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from typing import Any
 
-from gridworld.checking.expectations import UnmetError
-from gridworld.checking.probes import PROBES, Probe
-from gridworld.checking.settings import settings
+from gridworld.checking.probes import PROBES, Probe, UnmetError
+from gridworld.checking.settings import settings, subject
 from gridworld.checking.training import build, train
 from gridworld.config.agents import AgentConfig
 from gridworld.errors import InputError, in_short
+from gridworld.process.console.terminal import aligned
 
 Outcomes = list[tuple[bool | None, str]]  # of one probe on each seed: see `Finding`
 SEEDS = 3  # of a probe that fails at first: it has failed if it fails on most of them
+_WIDTH = 100
+_WORDS = {True: "passed", False: "FAILED", None: "-"}
 
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one probe.
+    """The result of one probe."""
 
-    Attributes:
-        name: of the probe.
-        passed: whether its expectation held; None: the algorithm has nothing of the kind.
-        found: what was found, on the last seed that decided.
-        meaning: what a failure means.
-        seeds: how many seeds it was trained on.
-        seconds: that this took, shared by the probes that look at the same training run.
-    """
+    name: str  # of the probe
+    passed: bool | None  # whether its expectation held; None: the algorithm has nothing of the kind
+    found: str  # what was found, on the last seed that decided
+    meaning: str  # what a failure means
+    seeds: int = 1  # how many seeds it was trained on
+    seconds: float = 0.0  # that this took, shared by the probes that look at the same training run
 
-    name: str
-    passed: bool | None
-    found: str
-    meaning: str
-    seeds: int = 1
-    seconds: float = 0.0
+    def __str__(self) -> str:
+        """A row of the table, and below it what a failure means."""
+        seeds = "" if self.seeds == 1 else f" ({self.seeds} seeds)"
+        cells = [self.name, _WORDS[self.passed], f"{self.seconds:.1f} s", f" {self.found}{seeds}"]
+        (line,) = aligned([cells], ("<12", "<7", ">7", "<0"))
+        if self.passed is False:
+            line += "\n" + textwrap.indent(textwrap.fill(self.meaning, _WIDTH), " " * 4)
+        return line
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """The findings of all probes on one implementation.
+    """The findings of all probes on one implementation; its text is their table.
 
     Attributes:
         name: of the implementation.
@@ -67,69 +70,74 @@ class CheckResult:
         """The names of the probes that failed."""
         return [each.name for each in self.findings if each.passed is False]
 
+    def verdict(self) -> str:
+        """The last line of the table."""
+        asked, failed = sum(each.passed is not None for each in self.findings), self.failed
+        what = f"failed {len(failed)} of {asked} probes ({', '.join(failed)})"
+        return f"{self.name}: {what if failed else f'passed all {asked} probes'}, {self.seconds:.0f} s"
+
     def __str__(self) -> str:
-        from gridworld.checking.table import text
-
-        return text(self)
+        return "\n".join([*map(str, self.findings), self.verdict()])
 
 
-def check_all(
-    config: AgentConfig,
-    given: Mapping[str, Any],
-    names: Sequence[str] = (),
+def check(
+    algorithm: Any,
+    arguments: Mapping[str, Any] | None = None,
+    probes: Sequence[str] = (),
     seed: int = 0,
     processes: int = 1,
-    told: Callable[[Finding], None] = lambda finding: None,
+    on_finding: Callable[[Finding], None] = lambda finding: None,
 ) -> CheckResult:
-    """Train on every probe's world and compare with the exact numbers.
+    """Train an implementation on small worlds with known answers, and compare with the exact numbers.
+
+    It takes about half a minute. `check.py --help` has the probes and what it means where one fails; a probe
+    fails if it fails on two of three seeds.
 
     Args:
-        config: the implementation, see `subject`.
-        given: arguments for it that differ from those of `settings`.
-        names: of the probes; none: all.
-        seed: the first of the `SEEDS` that a probe may take.
-        processes: how many train at a time.
-        told: called with every finding, in the order of the probes.
+        algorithm: a class with SB3's interface, its import path, or the name of a shipped agent. A class
+            trains in its own loop.
+        arguments: of its constructor, in place of those that the probes choose.
+        probes: names; none: all.
+        seed: the first of the three.
+        processes: how many train at a time; 1: in this process.
+        on_finding: called with every finding, in the order of the probes.
+
+    Returns:
+        `passed`, `failed` (names), `findings` (a row for each probe); its text is the table.
+
+    Raises:
+        InputError: no such implementation, probe or argument, or a class that refuses its arguments.
+
+    Example:
+        >>> check("q_learning").passed
+        True
     """
+    config, given = subject(algorithm), dict(arguments or {})
     started = time.monotonic()
-    groups = [list(group) for _, group in itertools.groupby(_chosen(names), lambda probe: probe.training)]
+    known = [probe.name for probe in PROBES]
+    for name in probes:
+        if name not in known:
+            raise InputError(f"--probe {name}: there is no such probe; there are {', '.join(known)}")
+    chosen = [probe for probe in PROBES if not probes or probe.name in probes]
+    groups = [list(group) for _, group in itertools.groupby(chosen, lambda probe: probe.training)]
     _try_out(config, given, groups[0][0], seed)
-    findings = []
-    for group in _findings(partial(_check_group, config, dict(given), seed), groups, processes):
-        findings += group
-        for finding in group:
-            told(finding)
+    findings: list[Finding] = []
+    check_group = partial(_check_group, config, given, seed)
+    with ProcessPoolExecutor(max(1, min(processes, len(groups))), get_context("spawn")) as pool:
+        for group in (map if processes == 1 else pool.map)(check_group, groups):
+            findings += group
+            for finding in group:
+                on_finding(finding)
     return CheckResult(config.name, tuple(findings), time.monotonic() - started)
 
 
-def _chosen(names: Sequence[str]) -> list[Probe]:
-    known = [probe.name for probe in PROBES]
-    for name in names:
-        if name not in known:
-            raise InputError(f"--probe {name}: there is no such probe; there are {', '.join(known)}")
-    return [probe for probe in PROBES if not names or probe.name in names]
-
-
 def _try_out(config: AgentConfig, given: Mapping[str, Any], probe: Probe, seed: int) -> None:
-    """Build it once: what it refuses is the user's mistake, and no finding."""
-    found = settings(config, probe, given)
-    if found is None:
-        return
-    try:
-        build(found[0], probe.world(), found[1].num_envs, seed)
-    except InputError as error:
-        raise InputError(str(error).replace("agent.arguments.", "--set ")) from None
-
-
-def _findings(
-    check: Callable[[list[Probe]], list[Finding]], groups: list[list[Probe]], processes: int
-) -> Iterator[list[Finding]]:
-    processes = min(processes, len(groups))
-    if processes == 1:
-        yield from map(check, groups)
-        return
-    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
-        yield from pool.map(check, groups)
+    """Build it once: what it refuses is the user's mistake, not a finding."""
+    if (found := settings(config, probe, given)) is not None:
+        try:
+            build(found[0], probe.world(), found[1].num_envs, seed)
+        except InputError as error:
+            raise InputError(str(error).replace("agent.arguments.", "--set ")) from None
 
 
 def _check_group(
@@ -139,23 +147,21 @@ def _check_group(
     started = time.monotonic()
     outcomes: dict[str, Outcomes] = {probe.name: [] for probe in group}
     for number in range(SEEDS):
-        unsettled = [probe for probe in group if _is_open(outcomes[probe.name])]
+        unsettled = [probe for probe in group if not _is_settled(outcomes[probe.name])]
         if unsettled:
             for probe, outcome in zip(unsettled, _once(config, given, seed + number, unsettled), strict=True):
                 outcomes[probe.name].append(outcome)
     seconds = (time.monotonic() - started) / len(group)
-    return [_finding(probe, outcomes[probe.name], seconds) for probe in group]
+    return [
+        Finding(probe.name, *outcomes[probe.name][-1], probe.meaning, len(outcomes[probe.name]), seconds)
+        for probe in group
+    ]
 
 
-def _is_open(outcomes: Outcomes) -> bool:
-    """Whether it has failed, but neither failed nor passed on most seeds."""
-    failures = [passed for passed, _ in outcomes].count(False)
-    return not outcomes or (0 < failures <= SEEDS // 2 and len(outcomes) - failures <= SEEDS // 2)
-
-
-def _finding(probe: Probe, outcomes: Outcomes, seconds: float) -> Finding:
-    passed, found = outcomes[-1]
-    return Finding(probe.name, passed, found, probe.meaning, len(outcomes), seconds)
+def _is_settled(outcomes: Outcomes) -> bool:
+    """Whether it has passed at once, or failed or passed on most seeds."""
+    failures, most = [passed for passed, _ in outcomes].count(False), SEEDS // 2 + 1
+    return bool(outcomes) and (not failures or max(failures, len(outcomes) - failures) >= most)
 
 
 def _once(config: AgentConfig, given: Mapping[str, Any], seed: int, probes: list[Probe]) -> Outcomes:

@@ -1,4 +1,4 @@
-"""With which arguments, and how long, an algorithm trains on the probes.
+"""What is checked, and with which arguments and how long it trains on the probes.
 
 They are chosen so that what fails is a bug: training goes on longer than SB3's own classes need, and the
 learning rate falls to 0, so that values come to rest well within the tolerance. The kind of an algorithm
@@ -7,9 +7,10 @@ shows in the names of its arguments. It gets those of the kind's that it takes, 
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import inspect
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,19 +26,12 @@ _FEW_QUANTILES = {"n_quantiles": 25}  # of a policy that has them; 200 take ten 
 
 @dataclass(frozen=True)
 class Kind:
-    """Algorithms that are trained alike.
+    """Algorithms that are trained alike."""
 
-    Attributes:
-        sign: an argument by which it is told.
-        steps: environment steps of a training run.
-        arguments: of the algorithm, by SB3's names.
-        num_envs: environments that step together.
-    """
-
-    sign: str
-    steps: int
-    arguments: Mapping[str, Any]
-    num_envs: int = _ENVS
+    sign: str  # an argument by which the kind is known
+    steps: int  # environment steps of a training run
+    arguments: Mapping[str, Any]  # of the algorithm, by SB3's names
+    num_envs: int = _ENVS  # that step together
 
 
 _EXPLORING = {"exploration_fraction": 0.5, "exploration_initial_eps": 1.0, "exploration_final_eps": 0.05}
@@ -80,17 +74,15 @@ KINDS = (  # the first that fits
 
 
 def settings(config: AgentConfig, probe: Probe, given: Mapping[str, Any]) -> tuple[AgentConfig, Kind] | None:
-    """The settings of an algorithm on a probe.
+    """The settings of an algorithm on a probe, whose own arguments go before the user's, and its kind.
 
-    Args:
-        config: what is checked.
-        probe: its own arguments go before the user's.
-        given: the user's arguments.
-
-    Returns:
-        The settings and the kind of the algorithm; None where it does not take what the probe needs.
+    None where it does not take what the probe needs.
     """
-    known = _argument_names(config)
+    if isinstance(config, SB3ClassConfig):
+        known = _arguments_of(_class_of(config))
+    else:
+        general = {field.name for field in dataclasses.fields(SB3Config)}
+        known = sorted({field.name for field in dataclasses.fields(config)} - general)
     for name in given:
         if name in _OURS:
             raise InputError(f"--set {name}: {_OURS[name]}; leave it out")
@@ -105,7 +97,7 @@ def settings(config: AgentConfig, probe: Probe, given: Mapping[str, Any]) -> tup
 
 def _with(config: AgentConfig, arguments: Mapping[str, Any]) -> AgentConfig:
     if isinstance(config, SB3ClassConfig):
-        policies = (name for name in class_of(config).policy_aliases if name.startswith("Mlp"))
+        policies = (name for name in _class_of(config).policy_aliases if name.startswith("Mlp"))
         policy = next(policies, config.policy)  # a class may have a name of its own for it
         return dataclasses.replace(config, policy=policy, arguments={**config.arguments, **arguments})
     for name, value in arguments.items():
@@ -115,30 +107,21 @@ def _with(config: AgentConfig, arguments: Mapping[str, Any]) -> AgentConfig:
     return dataclasses.replace(config, **arguments)
 
 
-def _argument_names(config: AgentConfig) -> list[str]:
-    if not isinstance(config, SB3ClassConfig):
-        fields = {field.name for field in dataclasses.fields(config)}
-        return sorted(fields - {field.name for field in dataclasses.fields(SB3Config)})
-    return _of_class(class_of(config))
-
-
 def _of_policy(config: AgentConfig) -> dict[str, Any]:
     if not isinstance(config, SB3ClassConfig):
         return {}
-    policy = class_of(config).policy_aliases.get(config.policy, object)
-    return {"policy_kwargs": _FEW_QUANTILES} if "n_quantiles" in _of_class(policy) else {}
+    policy = _class_of(config).policy_aliases.get(config.policy, object)
+    return {"policy_kwargs": _FEW_QUANTILES} if "n_quantiles" in _arguments_of(policy) else {}
 
 
-def class_of(config: SB3ClassConfig) -> Any:
-    """The class that is checked."""
-    from gridworld.agents.sb3.settings.constructor_arguments import (
-        algorithm_class,  # here, since it imports torch
-    )
+def _class_of(config: SB3ClassConfig) -> Any:
+    # here, since it imports torch
+    from gridworld.agents.sb3.settings.constructor_arguments import algorithm_class
 
     return algorithm_class("check", config.algorithm)
 
 
-def _of_class(kind: type) -> list[str]:
+def _arguments_of(kind: type) -> list[str]:
     """Names of its constructor's arguments; one with **kwargs takes those of its base class."""
     names: set[str] = set()
     for each in kind.__mro__:
@@ -150,3 +133,41 @@ def _of_class(kind: type) -> list[str]:
         if all(parameter.kind is not parameter.VAR_KEYWORD for parameter in parameters):
             break
     return sorted(name for name in names - {"policy", "env"} if not name.startswith("_"))
+
+
+def subject(algorithm: Any) -> AgentConfig:
+    """Name an implementation by its settings.
+
+    It is a class with SB3's interface or its import path, which trains in its own loop, or the name of a
+    shipped agent.
+    """
+    if inspect.isclass(algorithm):
+        algorithm = f"{algorithm.__module__}.{algorithm.__qualname__}"
+    name = str(algorithm)
+    if "." in name:
+        return SB3ClassConfig(name=name, algorithm=name, engine="stock")
+    from gridworld.config.composition.compose import compose
+    from gridworld.config.composition.conf_folder import conf_folder
+
+    known = sorted(file.stem for file in (conf_folder() / "agent").glob("*.yaml"))
+    if name not in known:
+        raise InputError(
+            f"check {name}: must be the import path of a class, e.g. my_package.MyPPO, or a shipped agent, "
+            f"which are {', '.join(known)}"
+        )
+    return compose(conf_folder(), [f"agent={name}"]).agent
+
+
+def arguments(words: Sequence[str]) -> dict[str, Any]:
+    """The arguments of `--set NAME=VALUE`; values are Python's, or text."""
+    found: dict[str, Any] = {}
+    plain = {"true": True, "false": False, "null": None}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not (name.isidentifier() and equals and value):
+            raise InputError(f"--set {word}: must be NAME=VALUE, e.g. learning_rate=0.001")
+        try:
+            found[name] = plain[value] if value in plain else ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            found[name] = value
+    return found

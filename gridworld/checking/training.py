@@ -20,27 +20,16 @@ _LAST = 0.6  # of training; what it does after that is its behaviour
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """An implementation after training.
-
-    Attributes:
-        mdp: the world.
-        gamma: the discount.
-        first: what it had before training.
-        last: what it has learnt.
-        greedy: (S, A), its own deterministic policy.
-        visits: (S, A), its actions in training.
-        late: (S, A), those in the last two fifths of it.
-        frozen: the names of the parameters that training left as they were.
-    """
+    """An implementation after training."""
 
     mdp: Mdp
     gamma: float
-    first: PolicySnapshot
-    last: PolicySnapshot
-    greedy: FloatArray
-    visits: IntArray
-    late: IntArray
-    frozen: list[str]
+    first: PolicySnapshot  # what it had before training
+    last: PolicySnapshot  # what it has learnt
+    greedy: FloatArray  # (S, A), its own deterministic policy
+    visits: IntArray  # (S, A), its actions in training
+    late: IntArray  # (S, A), those in the last two fifths of it
+    frozen: list[str]  # the names of the parameters that training left as they were
 
 
 def build(config: AgentConfig, mdp: Mdp, num_envs: int, seed: int) -> tuple[Agent, TrainingContext]:
@@ -52,20 +41,7 @@ def build(config: AgentConfig, mdp: Mdp, num_envs: int, seed: int) -> tuple[Agen
 
 
 def train(config: AgentConfig, mdp: Mdp, gamma: float, num_envs: int, steps: int, seed: int) -> Trained:
-    """Train an agent, with the loop of its own library.
-
-    Args:
-        config: its settings, the discount among them.
-        mdp: the world.
-        gamma: the discount.
-        num_envs: environments that step together.
-        steps: environment steps.
-        seed: of everything.
-
-    Raises:
-        InputError: it was refused, or diverged.
-        Exception: whatever the implementation raises.
-    """
+    """Train an agent, with the loop of its own library; raises whatever the implementation raises."""
     agent, context = build(config, mdp, num_envs, seed)
     first, before = agent.snapshot(), _parameters(agent)
     earlier = np.zeros_like(context.envs.visits)
@@ -79,17 +55,11 @@ def train(config: AgentConfig, mdp: Mdp, gamma: float, num_envs: int, steps: int
     after = _parameters(agent)
     frozen = [name for name, table in before.items() if name in after and np.array_equal(table, after[name])]
     visits = context.envs.visits.copy()
-    greedy = _greedy(agent, context)
+    greedy, predict = agent.snapshot().greedy_policy(), getattr(agent.model, "predict", None)
+    if predict is not None:  # a table has none
+        actions, _ = predict(context.observation.table(), deterministic=True)
+        greedy = one_hot_policy(np.asarray(actions).astype(np.int64), mdp.num_actions)
     return Trained(mdp, gamma, first, agent.snapshot(), greedy, visits, visits - earlier, frozen)
-
-
-def _greedy(agent: Agent, context: TrainingContext) -> FloatArray:
-    """What its own `predict` does in every state; of a table, what is best in it."""
-    predict = getattr(agent.model, "predict", None)
-    if predict is None:
-        return agent.snapshot().greedy_policy()
-    actions, _ = predict(context.observation.table(), deterministic=True)
-    return one_hot_policy(np.asarray(actions).astype(np.int64), context.envs.mdp.num_actions)
 
 
 def _parameters(agent: Agent) -> dict[str, NDArray[Any]]:

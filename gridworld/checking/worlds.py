@@ -2,7 +2,7 @@
 
 A world is a list with, for every live state and each of its actions, the outcomes (probability, next state,
 reward, whether it ends the episode). An end that leads to a live state's number looks like that state to the
-agent, and is none of its visits.
+agent, and does not count as a visit to it.
 """
 
 from __future__ import annotations
@@ -110,18 +110,18 @@ def _world(
     """Compile the rows; a number without a row is an end."""
     size = 1 + max(len(rows) - 1, *(each[1] for row in rows for outcomes in row for each in outcomes))
     shape = (size, len(rows[0]), max(len(outcomes) for row in rows for outcomes in row))
-    next_state = np.broadcast_to(np.arange(size)[:, None, None], shape).copy()
-    probability, reward = np.zeros(shape), np.zeros(shape)
-    terminated = np.ones(shape, dtype=np.bool_)
-    probability[:, :, 0] = 1.0
+    tables = Outcomes(
+        next_state=np.broadcast_to(np.arange(size)[:, None, None], shape).copy(),
+        probability=np.zeros(shape),
+        reward=np.zeros(shape),
+        terminated=np.ones(shape, dtype=np.bool_),
+        start=np.pad(np.asarray(start), (0, size - len(start))),
+    )
+    tables.probability[:, :, 0] = 1.0
+    columns = tables.probability, tables.next_state, tables.reward, tables.terminated
     for state, row in enumerate(rows):
         for action, outcomes in enumerate(row):
             for index, outcome in enumerate(outcomes):
-                where = state, action, index
-                probability[where], next_state[where], reward[where], terminated[where] = outcome
-    starts = np.zeros(size)
-    starts[: len(start)] = start
-    tables = Outcomes(
-        next_state=next_state, probability=probability, reward=reward, terminated=terminated, start=starts
-    )
+                for column, number in zip(columns, outcome, strict=True):
+                    column[state, action, index] = number
     return mdp_from_outcomes(name, tables, max_episode_steps=limit)

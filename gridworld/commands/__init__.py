@@ -19,40 +19,26 @@ from gridworld.errors import EXIT_CODE, InputError, failure
 from gridworld.process.console.command_line import program
 from gridworld.process.console.terminal import prepare, printing, tell_error
 from gridworld.process.early_signals import AtWork
-from gridworld.process.garbage import collect_less_often
+from gridworld.process.memory_budget import collect_less_often
 
 Main = Callable[[Sequence[str]], None]
 
-_SHARED: dict[str, dict[str, Any]] = {
+_BEST = "the model with the lowest exact regret on the way, not the last one"
+_TRUST = "import the classes that the run names, wherever they are from, and let its environment draw"
+_POLICY = "the best action, or the distribution it explores with"
+_SHARED: dict[str, dict[str, Any]] = {  # arguments that several commands have
     "run": {"type": Path, "help": "the run's folder, e.g. runs/2026-..."},
     "runs": {"type": Path, "nargs": "+", "metavar": "RUNS", "help": "folders, searched for runs"},
-    "--policy": {
-        "choices": ("greedy", "sampled"),
-        "default": "greedy",
-        "help": "the best action, or the distribution it explores with",
-    },
-    "--best": {
-        "action": "store_true",
-        "help": "the model with the lowest exact regret on the way, not the last one",
-    },
-    "--trust": {
-        "action": "store_true",
-        "help": "import the classes that the run names, wherever they are from, and let its environment draw",
-    },
+    "--policy": {"choices": ("greedy", "sampled"), "default": "greedy", "help": _POLICY},
+    "--best": {"action": "store_true", "help": _BEST},
+    "--trust": {"action": "store_true", "help": _TRUST},
 }
 
 
 def parser_of(
     command: str, about: str | None, *shared: str, epilog: str | None = None
 ) -> argparse.ArgumentParser:
-    """A command's parser.
-
-    Args:
-        command: its name.
-        about: what it does.
-        shared: those of its arguments that other commands have too.
-        epilog: what its help ends with.
-    """
+    """The parser of a command that has these of the `_SHARED` arguments."""
     parser = argparse.ArgumentParser(
         prog=program(command),
         description=about,

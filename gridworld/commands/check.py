@@ -13,9 +13,8 @@ import textwrap
 from collections.abc import Sequence
 
 from gridworld.checking.probes import PROBES
-from gridworld.checking.run import check_all
-from gridworld.checking.subject import arguments, subject
-from gridworld.checking.table import row, verdict
+from gridworld.checking.run import check
+from gridworld.checking.settings import arguments
 from gridworld.commands import parser_of, whole
 from gridworld.process.console.terminal import printable
 
@@ -26,15 +25,15 @@ _FAILED = 1  # the exit code
 def main(words: Sequence[str]) -> None:
     """Print a row per probe as it ends, and the verdict."""
     options = _parser().parse_args(words)
-    result = check_all(
-        subject(options.algorithm),
+    result = check(
+        options.algorithm,
         arguments(options.set),
         options.probe,
         options.seed,
         options.processes,
-        told=lambda finding: print(*map(printable, row(finding).splitlines()), sep="\n", flush=True),
+        on_finding=lambda finding: print(*map(printable, str(finding).splitlines()), sep="\n", flush=True),
     )
-    print(printable(verdict(result)))
+    print(printable(result.verdict()))
     if not result.passed:
         sys.exit(_FAILED)
 
@@ -47,17 +46,9 @@ def _parser() -> argparse.ArgumentParser:
     epilog = f"The probes, and what it means where one fails:\n{probes}"
     parser = parser_of("check", __doc__, epilog=epilog)
     option = parser.add_argument
-    option(
-        "algorithm",
-        help="the import path of a class of SB3's kind, e.g. my_package.MyPPO; or a shipped agent, e.g. dqn",
-    )
-    option(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="an argument for the class, e.g. learning_rate=0.001; may be repeated",
-    )
+    option("algorithm", help="a class of SB3's kind, e.g. my_package.MyPPO; or a shipped agent, e.g. dqn")
+    argument = "an argument for the class, e.g. learning_rate=0.001; may be repeated"
+    option("--set", action="append", default=[], metavar="NAME=VALUE", help=argument)
     option("--probe", action="append", default=[], metavar="NAME", help="only this probe; may be repeated")
     option("--seed", type=whole(0), default=0, help="the first of the three that a probe may take")
     processes = min(_PROCESSES, os.cpu_count() or 1)

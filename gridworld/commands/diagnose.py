@@ -9,12 +9,10 @@ from collections.abc import Sequence
 from gridworld.commands import parser_of
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.picture import draw_diagnosis
-from gridworld.diagnosis.trials import beside, check_trusted, try_offers
-from gridworld.diagnosis.verdict import Diagnosis, diagnose
+from gridworld.diagnosis.verdict import Diagnosis, check_trusted, diagnose, trials_folder, try_offers
 from gridworld.errors import InputError
-from gridworld.process.console.columns import aligned
 from gridworld.process.console.progress import telling_if_slow
-from gridworld.process.console.terminal import printable, tell
+from gridworld.process.console.terminal import aligned, printable, tell
 from gridworld.process.memory_budget import limited
 from gridworld.process.signals import Interrupted
 from gridworld.restore.saved_run import SavedRun
@@ -63,7 +61,7 @@ def _is_any_certified(saved: SavedRun, found: Diagnosis, options: argparse.Names
     """Train what there is to try, and print the results."""
     print("Trying:")
     certified = False
-    for trial in try_offers(saved, found, beside(options.run), options.trust):
+    for trial in try_offers(saved, found, trials_folder(options.run), options.trust):
         certified = trial.certified
         end = trial.why or ("certified optimal" if certified else f"regret {trial.regret:.3g}, not certified")
         print(printable(f"  {trial.command}"))
@@ -75,12 +73,8 @@ def _is_any_certified(saved: SavedRun, found: Diagnosis, options: argparse.Names
 
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("diagnose", __doc__, "run", "--trust")
-    parser.add_argument(
-        "--try",
-        dest="try_offers",
-        action="store_true",
-        help="train what there is to try, in RUN-tried, until one is certified; exit code 1 if none is",
-    )
+    tried = "train what there is to try, in RUN-tried, until one is certified; exit code 1 if none is"
+    parser.add_argument("--try", dest="try_offers", action="store_true", help=tried)
     return parser
 
 

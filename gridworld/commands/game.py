@@ -13,7 +13,7 @@ import numpy as np
 from gridworld.envs import rendering as drawing
 from gridworld.envs.env import GridWorldEnv
 from gridworld.envs.rendering import Frame
-from gridworld.storage.rng_state import independent_generator
+from gridworld.storage.serialization import independent_generator
 from gridworld.visualization.canvas import Canvas
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray

@@ -15,7 +15,7 @@ from gridworld.config.composition.compose import without_hydra
 from gridworld.errors import InputError
 from gridworld.run.claim import check_free, check_inside, claimed
 from gridworld.run.folder import MANIFEST
-from gridworld.storage.symlinks import check_no_links
+from gridworld.storage.atomic_write import check_no_links
 
 
 def run_folder(config: DictConfig) -> AbstractContextManager[None]:
@@ -35,7 +35,7 @@ def check_settings_of(config: DictConfig) -> None:
     if not (folder / MANIFEST).exists():
         return
     from gridworld.restore.resume import unfinished_of  # here, since it takes a second to import
-    from gridworld.run.recovery import is_started
+    from gridworld.run.reader import is_started
 
     # An interpolation may need what Hydra knows only in the job, where the settings are compared again.
     with contextlib.suppress(OmegaConfBaseException):

@@ -19,8 +19,8 @@ from gridworld.process.console.terminal import printable
 from gridworld.process.memory_budget import limited
 from gridworld.restore.saved_run import SavedRun, choose_policy, read_visits
 from gridworld.run.claim import check_inside, check_writable
+from gridworld.storage.atomic_write import make_inside
 from gridworld.storage.safe_read import check_no_link
-from gridworld.storage.symlinks import make_inside
 from gridworld.visualization import files
 from gridworld.visualization.episode import film
 from gridworld.visualization.picture import drawer
@@ -93,14 +93,9 @@ def _record(options: argparse.Namespace) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("record", __doc__, "run", "--policy", "--best", "--trust")
     option = parser.add_argument
-    option(
-        "--format",
-        nargs="+",
-        choices=(*files.FORMATS, *MAPS),
-        default=["png", "gif"],
-        help=f"one or more of {' '.join(files.FORMATS)} for episodes, {' '.join(MAPS)} for maps "
-        "(default png gif; mp4 needs the extra `video`)",
-    )
+    kinds = f"any of {' '.join(files.FORMATS)} for episodes, {' '.join(MAPS)} for maps"
+    kinds += " (default png gif; mp4 needs the extra `video`)"
+    option("--format", nargs="+", choices=(*files.FORMATS, *MAPS), default=["png", "gif"], help=kinds)
     option("--cell-size", type=whole(2), help="pixels (default 100, 80 in maps, less on large worlds)")
     option("--fps", type=whole(1, 100), default=4, help="frames a second, 1 to 100 (default 4)")
     option("--episodes", type=whole(1, 1000), default=1, help="one after the other (default 1)")

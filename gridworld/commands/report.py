@@ -56,45 +56,23 @@ def main(arguments: Sequence[str]) -> None:
     print(printable(str(page)))
     if options.open and not webbrowser.open(page.absolute().as_uri()):
         print(printable(f"--open: there is no browser here; open {page} in yours"), file=sys.stderr)
-    if not report.complete:
+    if sentences:
         sys.exit(1)
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("report", __doc__, "runs")
     option = parser.add_argument
-    option(
-        "--out",
-        type=Path,
-        help="the report's folder (default: report/ in the one folder given, else runs/report)",
-    )
+    option("--out", type=Path, help="its folder (default: report/ in the one folder given, else runs/report)")
     option("--open", action="store_true", help="show the page in the browser")
-    option(
-        "--readme",
-        type=Path,
-        help=f"also put the results into this Markdown file, between its lines {' and '.join(MARKERS)}",
-    )
-    option(
-        "--formats",
-        nargs="*",
-        choices=FORMATS,
-        default=FORMATS,
-        metavar="FORMAT",
-        help=f"of the figures' files, any of {' '.join(FORMATS)}; with no word, none (default: all of them)",
-    )
-    option(
-        "--log-steps",
-        action="store_true",
-        help="curves against the logarithm of the steps (without it, where an agent is ten times slower)",
-    )
-    option(
-        "--diagnose",
-        type=whole(0),
-        default=_MOST_DIAGNOSED,
-        metavar="COUNT",
-        help="say of so many runs at most why they are not certified, each in a second or some "
-        f"(default {_MOST_DIAGNOSED}; 0: of none)",
-    )
+    readme = f"also put the results into this Markdown file, between its lines {' and '.join(MARKERS)}"
+    option("--readme", type=Path, help=readme)
+    formats = f"of the figures' files, any of {' '.join(FORMATS)}; with no word, none (default: all of them)"
+    option("--formats", nargs="*", choices=FORMATS, default=FORMATS, metavar="FORMAT", help=formats)
+    logarithm = "curves against the logarithm of the steps (without it, where an agent is ten times slower)"
+    option("--log-steps", action="store_true", help=logarithm)
+    most = f"say of so many runs at most why they are not certified (default {_MOST_DIAGNOSED}; 0: of none)"
+    option("--diagnose", type=whole(0), default=_MOST_DIAGNOSED, metavar="COUNT", help=most)
     option("--seed", type=whole(0), default=0, help="of the bootstrap (default 0)")
     return parser
 

@@ -26,9 +26,8 @@ from gridworld.restore.reproduce import check_whole, compare, lengths, populatio
 from gridworld.restore.saved_run import settings_of
 from gridworld.run.claim import check_free, check_inside
 from gridworld.run.folder import MANIFEST
-from gridworld.run.identity.provenance import describe, differences, source_differences
-from gridworld.run.identity.stored_world import stored_world
-from gridworld.run.reader import RunReader, open_run, read_run
+from gridworld.run.provenance import describe, differences, source_differences
+from gridworld.run.reader import RunReader, open_run, read_run, stored_world
 from gridworld.training.setup import without_pictures
 
 DIFFERENT = 1  # exit code
@@ -101,9 +100,8 @@ def _in_folder(keep: Path | None, same_in: Callable[[Path], bool | None]) -> boo
 
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("reproduce", __doc__, "run", "--trust")
-    parser.add_argument(
-        "--keep", type=Path, metavar="FOLDER", help="write the new run there, with its pictures, and keep it"
-    )
+    kept = "write the new run there, with its pictures, and keep it"
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help=kept)
     return parser
 
 

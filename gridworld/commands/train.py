@@ -31,7 +31,7 @@ from gridworld.errors import EXIT_CODE, InputError
 from gridworld.process.console.command_line import called_from
 from gridworld.process.console.terminal import prepare, printable, printing, result_is_in_files, tell_error
 from gridworld.process.early_signals import AtWork
-from gridworld.process.garbage import collect_less_often
+from gridworld.process.memory_budget import collect_less_often
 from gridworld.run.claim import claimed
 from gridworld.run.folder import SWEEP_JSON, shown
 from gridworld.storage.safe_read import check_yaml
@@ -140,7 +140,7 @@ def run_job(settings: DictConfig) -> float:
 
 def _run_alone(config: TrainConfig, folder: Path, overrides: list[str]) -> float:
     """Train, or resume the run, in a folder that this process holds; returns the final regret."""
-    from gridworld.run.recovery import is_started
+    from gridworld.run.reader import is_started
     from gridworld.run.summary import Summary, train_and_tell
     from gridworld.training.train import train
 

@@ -40,7 +40,8 @@ class EnvConfig:
     @property
     def compiles_quickly(self) -> bool:
         """Whether it may be compiled while settings are composed: soon, and without code of the user's."""
-        return True
+        imports = ":" in getattr(self, "id", "")
+        return not imports and not isinstance(self, EnumeratedConfig | BuiltConfig)
 
     def compile(self) -> Mdp:
         """Compile the world."""
@@ -93,10 +94,6 @@ class GymnasiumConfig(EnvConfig):
     kwargs: Kwargs = field(default_factory=dict)  # of gymnasium.make
 
     @property
-    def compiles_quickly(self) -> bool:
-        return ":" not in self.id  # which would import a module
-
-    @property
     def name(self) -> str:
         return self.id
 
@@ -112,10 +109,6 @@ class EnumeratedConfig(GymnasiumConfig):
 
     source: Word = "enumerated"
     ignore: list[Word] = field(default_factory=list)  # attributes that are no part of its state, by your word
-
-    @property
-    def compiles_quickly(self) -> bool:
-        return False
 
     def compile(self) -> Mdp:
         from gridworld.world.sources.enumerated import enumerate_env
@@ -161,10 +154,6 @@ class BuiltConfig(EnvConfig):
     @property
     def name(self) -> str:
         return self.builder.rpartition(".")[2]
-
-    @property
-    def compiles_quickly(self) -> bool:
-        return False
 
     def compile(self) -> Mdp:
         from gridworld.world.sources.arrays import build

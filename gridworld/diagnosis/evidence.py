@@ -1,4 +1,18 @@
-"""What is known of a finished run: all that a cause is told by."""
+"""What is known of a finished run, and where its regret comes from: the exact share of each state.
+
+The performance-difference lemma says
+
+    V*(start) - V_π(start) = Σ_s d_π(s) [ V*(s) - Σ_a π(a|s) Q*(s, a) ],    d_π(s) = Σ_t γ^t P(s_t = s),
+
+a sum over states of the discounted visits under π times what its action there loses.
+With γ = 1 a policy that never ends has no such sum. The walk then stops where it cannot end any more, and
+such a state costs its visits times V* - V_π, all that is lost from there on.
+
+As `world.exact.evaluation` has it, value and regret are without a step limit. What an episode of training
+loses by being cut off is therefore no part of the split.
+
+Reference: S. Kakade and J. Langford, Approximately optimal approximate reinforcement learning, ICML 2002.
+"""
 
 from __future__ import annotations
 
@@ -15,66 +29,83 @@ from numpy.typing import NDArray
 from gridworld.agents import Agent, PolicySnapshot
 from gridworld.config.agents import falls, parse_schedule
 from gridworld.config.train import TrainConfig
-from gridworld.diagnosis.split import RegretSplit, split_regret
 from gridworld.errors import InputError
 from gridworld.report.evidence import read_columns
 from gridworld.restore.saved_run import SavedRun, read_visits
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import Chain
+from gridworld.world.exact.evaluation import Evaluator, Score
+from gridworld.world.exact.markov_chain import Chain, discounted_visits, stopping_states
 from gridworld.world.exact.solver import Solution, backup, pick, solved
-from gridworld.world.mdp import FloatArray, IntArray, Mdp
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+
+
+@dataclass(frozen=True, eq=False)
+class RegretSplit:
+    """The regret of one policy by state."""
+
+    score: Score  # of the policy
+    visits: FloatArray  # (S,), discounted, from the start on; where a walk that cannot end stops, its chance
+    lost: FloatArray  # (S,), what one visit costs
+    cost: FloatArray  # (S,), their product; sums to the regret
+    wrong: BoolArray  # (S,), reached, and its action is not among the optimal ones
+
+
+def split_regret(evaluator: Evaluator, policy: FloatArray) -> RegretSplit:
+    """Split the regret of a policy (S, A) over the states where it errs."""
+    mdp, best = evaluator.mdp, evaluator.solution
+    chain = Chain(mdp, policy)
+    stops = stopping_states(chain, best.gamma)
+    visits = discounted_visits(chain, best.gamma, stops)
+    with np.errstate(invalid="ignore"):  # where V* is -inf, every action is as good
+        chosen = np.where(chain.policy > 0, chain.policy * best.q, 0.0).sum(axis=1)
+        lost = best.v - chosen
+        lost[stops] = (best.v - chain.value(best.gamma))[stops]
+        cost = np.where(visits > 0, visits * lost, 0.0)
+    lost, cost = (np.where(np.isnan(each), 0.0, each) for each in (lost, cost))
+    errs = ((chain.policy > 0) & ~best.optimal).any(axis=1) & ~mdp.absorbing
+    return RegretSplit(evaluator.score(policy), visits, lost, cost, (visits > 0) & errs)
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """A run, as its files and its agent have it.
-
-    Attributes:
-        config: its settings.
-        overrides: those that its command line changed.
-        curve: (evaluations,) each, the columns of `curve.csv`.
-        visits: (S, A), how often training took each action in each state.
-        evaluator: of its world.
-        agent: what it trained.
-        snapshot: what the agent holds of every state.
-    """
+    """A run, as its files and its agent have it; what follows from these is computed when it is asked for."""
 
     config: TrainConfig
-    overrides: Sequence[str]
-    curve: Mapping[str, NDArray[Any]]
-    visits: NDArray[np.int64]
-    evaluator: Evaluator
+    overrides: Sequence[str]  # the words of its command line
+    curve: Mapping[str, NDArray[Any]]  # (evaluations,) each, the columns of `curve.csv`
+    visits: NDArray[np.int64]  # (S, A), how often training took each action in each state
+    evaluator: Evaluator  # of its world
     agent: Agent
-    snapshot: PolicySnapshot
+    snapshot: PolicySnapshot  # what the agent holds of every state
 
     @classmethod
     def of(cls, saved: SavedRun) -> Evidence:
         """Read a run's files."""
-        agent, shape = saved.agent(), saved.mdp.next_state.shape[:2]
-        return cls(
-            saved.config,
-            saved.overrides,
-            read_columns(saved.run),
-            read_visits(saved.run, shape),
-            saved.evaluator(),
-            agent,
-            agent.snapshot(),
-        )
+        agent, visits = saved.agent(), read_visits(saved.run, saved.mdp.next_state.shape[:2])
+        curve, evaluator = read_columns(saved.run), saved.evaluator()
+        return cls(saved.config, saved.overrides, curve, visits, evaluator, agent, agent.snapshot())
 
     @property
     def mdp(self) -> Mdp:
-        """The world."""
         return self.evaluator.mdp
-
-    @cached_property
-    def split(self) -> RegretSplit:
-        """The regret of the greedy policy."""
-        return split_regret(self.evaluator, self.snapshot.greedy_policy())
 
     @property
     def greedy(self) -> IntArray:
         """(S,), the greedy actions."""
         return self.snapshot.greedy
+
+    @property
+    def is_tabular(self) -> bool:
+        return self.config.agent.family == "tabular"
+
+    @property
+    def is_actor_critic(self) -> bool:
+        """Whether it has a policy of its own and no Q."""
+        return self.snapshot.q is None
+
+    @cached_property
+    def split(self) -> RegretSplit:
+        """The regret of the greedy policy."""
+        return split_regret(self.evaluator, self.snapshot.greedy_policy())
 
     @cached_property
     def gamma(self) -> float:
@@ -102,18 +133,7 @@ class Evidence:
     @cached_property
     def gap(self) -> FloatArray:
         """(S,), what the greedy action loses under the agent's own discount."""
-        lost: FloatArray = self.own.v - pick(self.own.q, self.greedy)
-        return lost
-
-    @property
-    def is_tabular(self) -> bool:
-        """Whether it learns a table."""
-        return self.config.agent.family == "tabular"
-
-    @property
-    def is_actor_critic(self) -> bool:
-        """Whether it has a policy of its own and no Q."""
-        return self.snapshot.q is None
+        return np.asarray(self.own.v - pick(self.own.q, self.greedy))
 
     @cached_property
     def largest_reward(self) -> float:
@@ -137,14 +157,8 @@ class Evidence:
 
     @property
     def usual_rate(self) -> float:
-        """A learning rate at which small networks learn with Adam; or a table, where nothing is chance."""
+        """A learning rate at which small networks learn with Adam; or a deterministic world's table."""
         return 0.5 if self.is_tabular else 0.005 if self.is_actor_critic else 0.001
-
-    @property
-    def has_plain_steps(self) -> bool:
-        """Whether a network's optimiser takes gradients as they are."""
-        optimizer = getattr(getattr(self.agent.model, "policy", None), "optimizer", None)
-        return "SGD" in type(optimizer).__name__
 
     def setting(self, name: str, default: float = 0.0) -> float:
         """A number among the agent's settings: as configured, or as its model has it by default.
@@ -169,23 +183,23 @@ class Evidence:
         """Whether one of the agent's settings is a schedule, which ends at 0."""
         return falls(self._given(name))
 
-    def multiplied(self, name: str, by: float, most: float = math.inf) -> str:
-        """The word that multiplies one of the agent's settings, of which a schedule stays one."""
-        given, value = self._given(name), min(by * self.setting(name), most)
-        return self.change(name, f"{given.partition('_')[0]}_{value:.3g}" if falls(given) else value)
+    def takes(self, name: str) -> bool:
+        """Whether the agent has a setting of this name."""
+        return hasattr(self.config.agent, name) or name in signature(type(self.agent.model)).parameters
 
     def change(self, name: str, value: float | str) -> str:
         """The word that sets one of the agent's settings on a command line."""
         text = value if isinstance(value, str) else f"{value:.3g}" if value % 1 else f"{value:.0f}"
         return f"{self.config.agent.key(name)}={text}"
 
+    def multiplied(self, name: str, by: float, most: float = math.inf) -> str:
+        """The word that multiplies one of the agent's settings, of which a schedule stays one."""
+        given, value = self._given(name), min(by * self.setting(name), most)
+        return self.change(name, f"{given.partition('_')[0]}_{value:.3g}" if falls(given) else value)
+
     def _given(self, name: str) -> Any:
         given = getattr(self.config.agent, name, None)
         return getattr(self.config.agent, "arguments", {}).get(name) if given is None else given
-
-    def takes(self, name: str) -> bool:
-        """Whether the agent has a setting of this name."""
-        return hasattr(self.config.agent, name) or name in signature(type(self.agent.model)).parameters
 
     @cached_property
     def updates(self) -> float:

@@ -1,33 +1,30 @@
-"""What a cause comes to for one run."""
+"""What a cause comes to for one run, and experiments on the tables that causes are told by."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from gridworld.config.agents import LINEAR
 from gridworld.diagnosis.evidence import Evidence
-from gridworld.world.mdp import BoolArray
+from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.exact.markov_chain import Chain, discounted_visits, stopping_states
+from gridworld.world.exact.solver import backup
+from gridworld.world.mdp import BoolArray, FloatArray, Mdp
 
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """One cause, as a run shows it.
+    """One cause, as a run shows it."""
 
-    Attributes:
-        cause: its name.
-        states: (S,), bool, where it explains an error.
-        why: what was found, the end of a sentence.
-        changes: words for a command line, the best first.
-    """
-
-    cause: str
-    states: BoolArray
-    why: str
-    changes: tuple[str, ...]
+    cause: str  # its name
+    states: BoolArray  # (S,), where it explains an error
+    why: str  # what was found, the end of a sentence
+    changes: tuple[str, ...]  # words for a command line, the best first
 
 
 ADAM = "torch.optim.Adam"
@@ -55,14 +52,15 @@ def falling(run: Evidence) -> tuple[str, ...]:
     if run.falls("learning_rate"):
         return ()
     rate = run.setting("learning_rate")
-    return (
-        run.change("learning_rate", f"{LINEAR}{rate if run.is_tabular else min(rate, run.usual_rate):g}"),
-    )
+    rate = rate if run.is_tabular else min(rate, run.usual_rate)
+    return (run.change("learning_rate", f"{LINEAR}{rate:g}"),)
 
 
 def faster(run: Evidence) -> tuple[str, ...]:
     """Words for a network that learns too slowly: what scales its steps, the usual rate, and a longer run."""
-    adam = (run.change("policy_kwargs.optimizer_class", ADAM),) if run.has_plain_steps else ()
+    optimizer = getattr(getattr(run.agent.model, "policy", None), "optimizer", None)
+    takes_gradients_as_they_are = "SGD" in type(optimizer).__name__
+    adam = (run.change("policy_kwargs.optimizer_class", ADAM),) if takes_gradients_as_they_are else ()
     by = run.usual_rate / max(run.setting("learning_rate"), 1e-300)
     return *adam, *((run.multiplied("learning_rate", by),) if by > 2 else ()), longer(run, 4)
 
@@ -78,3 +76,88 @@ def longer(run: Evidence, times: int) -> str:
     word = f"total_timesteps={total * max(times, math.ceil(min(max(updates, goals), _MOST)))}"
     by = run.usual_rate / max(run.setting("learning_rate", 1.0), 1e-300)
     return f"{word} {run.multiplied('learning_rate', by)}" if by > _FAR else word
+
+
+_SWEEPS = 1000
+_ROUNDS = 60
+
+
+def best_of_what_was_tried(evaluator: Evaluator, tried: BoolArray) -> FloatArray:
+    """(S,), the value of the best policy that takes tried actions (S, A) only; V* where nothing was tried."""
+    mdp, best = evaluator.mdp, evaluator.solution
+    known = tried.any(axis=1) & ~mdp.absorbing
+    least = np.where(np.isfinite(best.v), -best.scale.max(), best.v)
+    v: FloatArray = np.where(known, least, best.v)
+    for _ in range(_SWEEPS):
+        q = np.where(tried[known], backup(mdp, v, best.gamma, np.flatnonzero(known)), -np.inf)
+        new = q.max(axis=1, initial=-np.inf)
+        change = np.abs(new - v[known]).max(initial=0.0)
+        v[known] = new
+        if not change > 1e-9 * best.scale.max():
+            break
+    return v
+
+
+@lru_cache(maxsize=1)  # two causes ask
+def entropy_optimum(run: Evidence, bonus: float) -> FloatArray:
+    """The policy (S, A) that an entropy bonus aims at: π = softmax(A_π / bonus), found by iteration.
+
+    Where advantages are normalised, as PPO does, they are divided by their deviation under π first.
+    """
+    mdp, normalised = run.mdp, bool(getattr(run.agent.model, "normalize_advantage", False))
+    policy = np.full_like(run.snapshot.sampled, 1 / mdp.num_actions)
+    for _ in range(_ROUNDS):
+        v = Chain(mdp, policy).value(min(run.gamma, 0.9999))
+        advantage = backup(mdp, v, run.gamma) - v[:, None]
+        weight = run.mdp.acting[:, None] * policy
+        deviation = np.sqrt((weight * advantage**2).sum() / weight.sum()) if normalised else 1.0
+        logits = advantage / max(bonus * deviation, 1e-12)
+        aimed = np.exp(np.minimum(logits - logits.max(axis=1, keepdims=True), 0.0))
+        policy = 0.5 * policy + 0.5 * aimed / aimed.sum(axis=1, keepdims=True)
+    return policy
+
+
+def optimum_of_epsilon(mdp: Mdp, gamma: float, epsilon: float) -> FloatArray:
+    """Q (S, A) of the best policy whose actions are replaced by random ones with probability epsilon."""
+    v = np.zeros(mdp.num_states)
+    for _ in range(_SWEEPS):
+        q = backup(mdp, v, gamma)
+        new = ((1 - epsilon) * q.max(axis=1) + epsilon * q.mean(axis=1)) * ~mdp.absorbing
+        change, v = np.abs(new - v).max(), new
+        if change <= 1e-12:
+            break
+    return backup(mdp, v, gamma)
+
+
+def visits_needed(run: Evidence) -> float:
+    """How often an action must be tried to tell the closest actions apart; 0: nothing is left to chance.
+
+    A rate that falls linearly to 0 over n tries averages about the last √n targets. Three standard deviations
+    of that mean are to be below the smallest gap on the optimal policy's way.
+    """
+    mdp, own = run.mdp, run.own
+    targets = mdp.reward + own.gamma * np.where(mdp.terminal, 0.0, own.v)[mdp.next_state]
+    mean = (mdp.probability * targets).sum(axis=2, keepdims=True)
+    variance = (mdp.probability * (targets - mean) ** 2).sum(axis=2)
+    gap = own.v - np.where(own.optimal, -np.inf, own.q).max(axis=1)
+    way = on_the_way(run)
+    return float(9 * variance[way].max() / max(gap[way].min(), 1e-6) ** 2) ** 2
+
+
+def on_the_way(run: Evidence) -> BoolArray:
+    """(S,), where the optimal policy acts."""
+    chain = Chain(run.mdp, run.evaluator.optimal_policy())
+    gamma = run.evaluator.solution.gamma
+    return (discounted_visits(chain, gamma, stopping_states(chain, gamma)) > 0) & run.mdp.acting
+
+
+def sweeps_missing(run: Evidence) -> int:
+    """How many sweeps of value iteration from its own values make its errors right; 0: it cannot be told."""
+    v = run.q.max(axis=1) * ~run.mdp.terminal
+    states = np.flatnonzero(run.split.wrong)
+    for sweep in range(1, _SWEEPS):
+        q = backup(run.mdp, v, run.gamma)
+        if run.own.optimal[states, q[states].argmax(axis=1)].all():
+            return sweep
+        v = q.max(axis=1) * ~run.mdp.terminal
+    return 0

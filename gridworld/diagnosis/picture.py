@@ -15,15 +15,7 @@ from gridworld.world.mdp import FloatArray
 
 
 def draw_diagnosis(found: Diagnosis, cell_size: int | None = None) -> Frame:
-    """Draw the split of a run's regret.
-
-    Args:
-        found: the diagnosis of a run that has some.
-        cell_size: pixels; None: 80, less on large maps.
-
-    Returns:
-        (height, width, 3), RGB.
-    """
+    """Draw the split of a run's regret; `cell_size` in pixels, None: 80, less on large maps."""
     mdp, cost = found.mdp, np.maximum(found.split.cost, 0.0)
     cost = np.where(np.isfinite(cost) & (found.cause_of >= 0), cost, 0.0)
     causes = ", ".join(

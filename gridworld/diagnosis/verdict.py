@@ -1,23 +1,32 @@
-"""A diagnosis: the causes of a run's regret, the largest first, and what to change."""
+"""A diagnosis: the causes of a run's regret, the largest first, and what to change.
+
+What it offers can be put to the test: each offer trains as an ordinary run, until one is certified. The
+settings are composed from the offer's words; the world is the one that the run's folder holds.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from gridworld.config.plain_settings import check_foreign
+from gridworld.config.train import TrainConfig
 from gridworld.diagnosis.causes import CAUSES, PHRASES
-from gridworld.diagnosis.causes.objective import clearest_gamma
-from gridworld.diagnosis.evidence import Evidence
+from gridworld.diagnosis.causes.objective import recommended_gamma
+from gridworld.diagnosis.evidence import Evidence, RegretSplit
 from gridworld.diagnosis.finding import Finding
-from gridworld.diagnosis.split import RegretSplit
+from gridworld.errors import InputError
 from gridworld.process.console.command_line import command
+from gridworld.restore.saved_run import SavedRun
 from gridworld.world.exact.evaluation import score_of_optimum
-from gridworld.world.mdp import FloatArray, IntArray, Mdp
+from gridworld.world.mdp import IntArray, Mdp
 
 _MOST_CHANGES = 3
 _NAMELESS = 1e-12  # of the regret: a share that is rounding
@@ -25,21 +34,13 @@ _NAMELESS = 1e-12  # of the regret: a share that is rounding
 
 @dataclass(frozen=True)
 class Trial:
-    """An offer that was trained, see `trials`.
+    """An offer that was trained."""
 
-    Attributes:
-        command: the offered command line.
-        folder: of its run.
-        regret: of the greedy policy at its end; infinite where it did not come to its end.
-        certified: whether that policy is certified optimal.
-        why: why it did not come to its end, else "".
-    """
-
-    command: str
-    folder: Path
-    regret: float
-    certified: bool
-    why: str = ""
+    command: str  # the offered command line
+    folder: Path  # of its run
+    regret: float  # of the greedy policy at its end; infinite where it did not come to its end
+    certified: bool  # whether that policy is certified optimal
+    why: str = ""  # why it did not come to its end
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,49 +98,30 @@ class Diagnosis:
 
 
 def diagnose(run: Evidence) -> Diagnosis:
-    """Find the causes of a run's regret."""
-    split = run.split
-    nowhere = np.full(run.mdp.num_states, -1)
+    """Find the causes of a run's regret: each state belongs to the first cause that claims it."""
+    split, cause_of = run.split, np.full(run.mdp.num_states, -1)
     if split.score.certified:
-        return Diagnosis(run.mdp, run.greedy, split, (), (), nowhere, ())
+        return Diagnosis(run.mdp, run.greedy, split, (), (), cause_of, ())
     cost = np.where(split.wrong, np.maximum(split.cost, 0.0), 0.0)
     if not np.isfinite(cost).all() or not cost.any():  # without a discount, endless: where it never ends
         cost = np.where(split.wrong | np.isinf(split.cost), 1.0, 0.0)
-    found, shares, cause_of = _assigned(run, cost)
-    order = sorted(range(len(found)), key=lambda index: -shares[index])
-    place = np.array([*(order.index(index) for index in range(len(found))), -1])
-    findings = tuple(found[index] for index in order)
-    return Diagnosis(
-        run.mdp,
-        run.greedy,
-        split,
-        findings,
-        tuple(shares[index] for index in order),
-        place[cause_of],
-        _offers(run, findings),
-    )
-
-
-def _assigned(run: Evidence, cost: FloatArray) -> tuple[list[Finding], list[float], IntArray]:
-    """Each state to the first cause that claims it, until nothing is left to explain."""
-    found: list[Finding] = []
-    shares: list[float] = []
-    cause_of = np.full(run.mdp.num_states, -1)
+    found: dict[str, Finding] = {}  # by the cause's name, which several rules may find
+    shares: dict[str, float] = {}
     for cause in CAUSES:
         left = (cause_of < 0) & (cost > 0)
         if cost[left].sum() <= _NAMELESS * cost.sum():
             break
         finding = cause(run)
-        mine = left & finding.states if finding is not None else left & False
-        if finding is None or not mine.any():
-            continue
-        if (index := next((n for n, each in enumerate(found) if each.cause == finding.cause), None)) is None:
-            index = len(found)
-            found.append(finding)
-            shares.append(0.0)
-        cause_of[mine] = index
-        shares[index] += float(cost[mine].sum() / cost.sum())
-    return found, shares, cause_of
+        if finding is not None and (mine := left & finding.states).any():
+            name = finding.cause
+            found.setdefault(name, finding)
+            shares[name] = shares.get(name, 0.0) + float(cost[mine].sum() / cost.sum())
+            cause_of[mine] = list(found).index(name)
+    order = sorted(found, key=lambda name: -shares[name])
+    place = np.array([*(order.index(name) for name in found), -1])
+    findings = tuple(found[name] for name in order)
+    ordered = tuple(shares[name] for name in order)
+    return Diagnosis(run.mdp, run.greedy, split, findings, ordered, place[cause_of], _offers(run, findings))
 
 
 def _offers(run: Evidence, findings: tuple[Finding, ...]) -> tuple[tuple[str, ...], ...]:
@@ -151,7 +133,7 @@ def _offers(run: Evidence, findings: tuple[Finding, ...]) -> tuple[tuple[str, ..
     first, others = findings[0].changes, [word for each in findings[1:] for word in each.changes[:1]]
     changes = list(dict.fromkeys((*first, *others)))[:_MOST_CHANGES]
     key, fits = run.config.agent.key("gamma"), score_of_optimum(run.evaluator, run.own.gamma).certified
-    gamma = "" if fits else run.change("gamma", clearest_gamma(run, run.split.wrong))
+    gamma = "" if fits else run.change("gamma", recommended_gamma(run, run.split.wrong))
     return tuple(
         _with(run.overrides, (each if fits or key in each else f"{each} {gamma}").split(" "))
         for each in changes
@@ -165,3 +147,62 @@ def _with(overrides: Sequence[str], changes: Sequence[str]) -> tuple[str, ...]:
 
 def _key(word: str) -> str:
     return re.sub(r"^\++|=.*$", "", word, flags=re.DOTALL)
+
+
+def try_offers(saved: SavedRun, found: Diagnosis, folder: Path, trust: bool = False) -> Iterator[Trial]:
+    """Train the offers of a diagnosis in turn, until one is certified; yields each trial as it ends.
+
+    Args:
+        saved: the run.
+        found: its diagnosis.
+        folder: the runs are in it, each in a new one.
+        trust: whether settings may name classes and callbacks from anywhere, and interpolations.
+
+    Raises:
+        InputError: the run's settings are not trusted, or the folder cannot be written.
+        Interrupted: training was asked to stop.
+    """
+    # here, since it takes a second
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    from gridworld.config.composition.compose import compose
+    from gridworld.config.composition.conf_folder import conf_folder
+    from gridworld.config.composition.hydra_errors import sentence
+    from gridworld.run.claim import claimed
+    from gridworld.training.train import train
+
+    for words, line in zip(found.offers, found.commands, strict=True):
+        place = next(each for n in range(1, 10**6) if not (each := folder / str(n)).exists()).absolute()
+        try:
+            composed = compose(conf_folder(), list(words))
+        except (HydraException, OmegaConfBaseException) as error:
+            raise InputError(sentence(error)) from None
+        config = dataclasses.replace(composed, env=saved.config.env)
+        if not trust:
+            _check_harmless(config, saved)
+        try:
+            with claimed(place):
+                summary = train(config, place, list(words), lambda env: saved.mdp)
+            trial = Trial(line, place, summary["regret"], summary["certified"])
+        except InputError as error:  # training diverged, say
+            trial = Trial(line, place, math.inf, False, str(error))
+        yield trial
+        if trial.certified:
+            return
+
+
+def trials_folder(folder: Path) -> Path:
+    """Where the offers of a run in `folder` are trained."""
+    return folder.resolve().parent / f"{folder.resolve().name}-tried"
+
+
+def check_trusted(saved: SavedRun, found: Diagnosis, trust: bool) -> None:
+    """Check that to compose and train the offers runs no code of a stranger's choice."""
+    if found.offers and not trust:
+        _check_harmless(saved.config, saved)
+
+
+def _check_harmless(config: TrainConfig, saved: SavedRun) -> None:
+    built = {"agent": dataclasses.asdict(config.agent), "callbacks": config.callbacks}
+    check_foreign(built, str(saved.run.manifest_file), "--trust")

@@ -19,8 +19,7 @@ from gridworld.bounds import STEP_LIMIT
 from gridworld.envs import rendering as drawing
 from gridworld.envs.rendering import CELL_SIZE, Frame
 from gridworld.errors import InputError
-from gridworld.storage.rng_state import generator_state, set_generator_state
-from gridworld.storage.serialization import State, StateError, fill
+from gridworld.storage.serialization import State, StateError, fill, generator_state, set_generator_state
 from gridworld.world.grid import mdp_or_compiled
 from gridworld.world.layout import CLASSIC, NUM_COLS, NUM_ROWS, Layout, positive_int
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp

@@ -25,8 +25,7 @@ from gridworld.process.console.terminal import plain, printable, tell
 from gridworld.report.evidence import ONLINE, Evidence, Unusable, read_columns
 from gridworld.report.evidence import read as read_evidence
 from gridworld.run.folder import WORLD
-from gridworld.run.identity.stored_world import stored_world
-from gridworld.run.reader import LARGEST_RESULT, RunReader, open_run
+from gridworld.run.reader import LARGEST_RESULT, RunReader, open_run, stored_world
 from gridworld.storage.safe_read import sha256
 from gridworld.world.metrics import METRICS
 from gridworld.world.sources.arrays import world_bytes
@@ -77,11 +76,7 @@ class ExportedRun:
 
 
 def read(folder: Path, copies: Path) -> ExportedRun:
-    """Read a finished run; `copies` is an empty folder, for copies of its files.
-
-    Raises:
-        InputError: It is no finished run, or a file is missing, too large, or not the one that the run wrote.
-    """
+    """Read a finished run; `copies` is an empty folder, for copies of its files."""
     evidence = read_evidence(folder)
     if isinstance(evidence, Unusable):
         raise InputError("; ".join(evidence.reasons))

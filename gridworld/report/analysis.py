@@ -16,8 +16,7 @@ from gridworld.report import statistics
 from gridworld.report.evidence import ONLINE, SAMPLED_RETURN, Evidence, reported
 from gridworld.report.grouping import Group, Study
 from gridworld.report.statistics import Interval, Share
-from gridworld.run.identity.stored_world import stored_world
-from gridworld.run.reader import read_run
+from gridworld.run.reader import read_run, stored_world
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray
 

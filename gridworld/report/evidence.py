@@ -21,7 +21,6 @@ import numpy as np
 from gridworld.config.settings import NEWER, flat, privileges
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import printable
-from gridworld.run.damage import damage
 from gridworld.run.folder import CURVE, MANIFEST, SUMMARY, VISITS
 from gridworld.run.reader import RunReader, read_run
 from gridworld.storage.safe_read import LARGEST_CSV, as_table
@@ -153,7 +152,7 @@ def read(folder: Path) -> Evidence | Unusable:
         why = ": it is still running, or was killed" if status == "running" else why
         told = f"{folder}: this run is {status!r}, not finished{why}"
         return dataclasses.replace(unusable, reasons=(told,), state=_printable(status))
-    damaged = damage(run)
+    damaged = run.damage()
     try:
         if not damaged.keys() & {CURVE, SUMMARY}:
             return _evidence(run, tuple(damaged.values()))

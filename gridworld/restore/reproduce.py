@@ -32,10 +32,9 @@ from gridworld.process.parallel.together import mixing
 from gridworld.restore.resume import open_unfinished
 from gridworld.restore.saved_run import read_visits, settings_of
 from gridworld.run.folder import BEST_MODEL, EVENTS, MANIFEST, MODEL
-from gridworld.run.identity.fingerprint import settings_hash
-from gridworld.run.identity.stored_world import stored_world
 from gridworld.run.manifest import NUMBERS_DEPEND_ON
-from gridworld.run.reader import LARGEST_RESULT, RunReader, read_run
+from gridworld.run.provenance import settings_hash
+from gridworld.run.reader import LARGEST_RESULT, RunReader, read_run, stored_world
 from gridworld.run.summary import Summary
 from gridworld.storage.event_file import read_scalars
 from gridworld.storage.safe_read import LARGEST_CSV, as_table

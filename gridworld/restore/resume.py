@@ -24,11 +24,8 @@ from gridworld.process.console.terminal import printable, tell
 from gridworld.restore.saved_run import settings_of
 from gridworld.run.checkpoints import MOST_STEPS, Checkpoints, steps_of
 from gridworld.run.folder import CHECKPOINTS, CURVE
-from gridworld.run.identity.fingerprint import environment, identity, settings
-from gridworld.run.identity.provenance import git, source_differences
-from gridworld.run.identity.stored_world import stored_world
-from gridworld.run.reader import RunReader
-from gridworld.run.recovery import run_to_resume
+from gridworld.run.provenance import environment, git, identity, settings, source_differences
+from gridworld.run.reader import RunReader, read_run, stored_world
 from gridworld.run.summary import Summary
 from gridworld.run.train_log import TrainLog
 from gridworld.run.writer import RunWriter
@@ -48,7 +45,7 @@ _NAMED = 3  # settings that differ
 
 def open_unfinished(folder: Path, trust: bool = False) -> Unfinished:
     """Read a run that is to be resumed; `trust` imports its settings' classes, wherever they are from."""
-    run = run_to_resume(folder)
+    run = read_run(folder)
     config = settings_of(run, trust, allow="trust=true")
     return Unfinished(run, config, stored_world(run, config.env), trust)
 

@@ -24,10 +24,9 @@ from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import tell
 from gridworld.process.memory_budget import limited
-from gridworld.process.npz import DAMAGED
+from gridworld.process.user_input import DAMAGED
 from gridworld.run.folder import shown
-from gridworld.run.identity.stored_world import stored_world
-from gridworld.run.reader import RunReader, open_run
+from gridworld.run.reader import RunReader, open_run, stored_world
 from gridworld.training.setup import make_context
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.grid import GridMdp

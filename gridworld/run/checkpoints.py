@@ -1,6 +1,6 @@
 """Checkpoints of a run: its whole state in one file, written atomically; the last two are kept.
 
-    checkpoints/000000012032.state    after 12,032 steps
+    checkpoints/000000012032.state    after 12,032 steps; `numpy.load` opens it
 
 The order of writing makes them safe against a power cut: first the files that the checkpoint has marks of
 (`storage.append_log`), then the checkpoint under another name, then its name, then the folder. A checkpoint
@@ -16,11 +16,10 @@ from gridworld.errors import InputError
 from gridworld.process.memory_budget import BudgetError
 from gridworld.process.parallel.together import clock
 from gridworld.run.folder import CHECKPOINTS
-from gridworld.storage.atomic_write import replacing, sync_folder
+from gridworld.storage.atomic_write import remove_path, sync_folder, write_bytes
 from gridworld.storage.file_lock import check_ours
 from gridworld.storage.safe_read import check_no_link, read_bytes
 from gridworld.storage.serialization import State, StateError, decode, encode
-from gridworld.storage.symlinks import remove_path
 
 _KEPT = 2
 _SUFFIX = ".state"
@@ -40,70 +39,55 @@ class Checkpoints:
     """The checkpoints in a run's folder.
 
     Attributes:
-        newest: Environment steps at the newest one that this process wrote or resumed from; None: none.
-        held: Environment steps at one that is kept however many are saved; None: none.
+        newest: environment steps at the newest one that this process wrote or resumed from; None: none.
     """
 
     def __init__(self, run_folder: Path) -> None:
         self.folder = run_folder / CHECKPOINTS
         self.newest: int | None = None
-        self.held: int | None = None
 
     def save(self, steps: int, state: State, durable: bool = True, small: bool = False) -> None:
         """Write a checkpoint and remove the oldest.
 
         Args:
-            steps: Environment steps so far.
-            state: What `storage.serialization` can encode.
-            durable: Make it survive a power cut.
-            small: Compress it, which takes longer.
+            steps: environment steps so far.
+            state: what `storage.serialization` can encode.
+            durable: make it survive a power cut.
+            small: compress it, which takes longer.
 
         Raises:
-            FolderLostError: The run's folder is no longer this process's.
-            OSError: It could not be written; the ones before are still there.
+            FolderLostError: the run's folder is no longer this process's.
+            OSError: it could not be written; the ones before are still there.
         """
         check_no_link(self.folder)
         check_ours(self.folder)
         is_new = not self.folder.exists()
         self.folder.mkdir(exist_ok=True)
-        with replacing(self._path(steps), durable) as part, part.open("wb") as file:
-            for piece in encode(state, compress=small):
-                file.write(piece)
+        write_bytes(self._path(steps), encode(state, compress=small), durable)
         if durable and is_new:
             sync_folder(self.folder.parent)
         self.newest = steps
-        self.keep(_KEPT, self.held)
+        self.keep(_KEPT)
 
-    def keep(self, count: int, held: int | None = None) -> None:
-        """Remove all but the `count` newest, and the one of `held` environment steps."""
+    def keep(self, count: int) -> None:
+        """Remove all but the `count` newest."""
         for old in self.files()[count:]:
-            if steps_of(old) != held:
-                remove_path(old)
+            remove_path(old)
 
     def files(self) -> list[Path]:
-        """The files, newest first.
-
-        Raises:
-            InputError: The folder is a symbolic link; what it leads to is not the run's.
-        """
+        """The files, newest first; refuses a folder that is a link: what it leads to is another's."""
         check_no_link(self.folder)
         return sorted(self.folder.glob(f"[0-9]*{_SUFFIX}"), reverse=True)
 
     def states(self) -> Iterator[tuple[Path, State | StateError]]:
-        """Read the checkpoints, newest first.
-
-        Yields:
-            Each file with its state, or with the error that says why it cannot be read.
-        """
+        """Each file, newest first, with its state or the error that says why it cannot be read."""
         for path in self.files():
             try:
                 yield path, decode(read_bytes(path, _MOST_BYTES), path)
             except BudgetError:
                 raise
-            except InputError as error:
+            except (InputError, StateError) as error:
                 yield path, StateError(str(error).removeprefix(f"{path}: "))
-            except StateError as error:
-                yield path, error
 
     def forget_after(self, steps: int) -> None:
         """Remove the checkpoints of more than `steps` environment steps, from which the run is resumed."""
@@ -117,12 +101,7 @@ class Checkpoints:
 
 
 class Pace:
-    """When the next checkpoint is due.
-
-    Args:
-        every: Environment steps between two; None: never; "auto": as often as `_MOST_SHARE` allows.
-        steps: Environment steps so far.
-    """
+    """When the next checkpoint is due: every so many steps; None: never; "auto": as `_MOST_SHARE` allows."""
 
     def __init__(self, every: int | str | None, steps: int = 0) -> None:
         self.never = every is None

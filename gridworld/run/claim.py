@@ -10,22 +10,13 @@ from pathlib import Path
 from gridworld.errors import FolderLostError, InputError
 from gridworld.run.folder import CHECKPOINTS, HYDRA, LOCK, MANIFEST, SWEEP_JSON, RunFolder, shown
 from gridworld.run.reader import read_run
-from gridworld.storage.atomic_write import make_folder, tidy
+from gridworld.storage.atomic_write import make_folder, remove_inside, tidy
 from gridworld.storage.file_lock import check_ours, locked
 from gridworld.storage.safe_read import check_no_link
-from gridworld.storage.symlinks import remove_inside
 
 
 def check_inside(path: Path, key: str) -> None:
-    """Check that a relative path stays below the current folder.
-
-    Args:
-        path: What the user gave.
-        key: The option or setting that has it, for the error.
-
-    Raises:
-        InputError: It is the current folder, or leads out of it.
-    """
+    """Refuse a relative path that leads out of the current folder; `key` is the option that has it."""
     normal = os.path.normpath(path)
     if os.path.isabs(normal) or normal.split(os.sep)[0] not in (os.curdir, os.pardir):
         return
@@ -37,14 +28,8 @@ def check_inside(path: Path, key: str) -> None:
 
 
 def check_writable(folder: Path, key: str) -> None:
-    """Check that a folder can be made, where there is none, and written to; `key` as for `check_inside`.
-
-    Raises:
-        InputError: It cannot.
-    """
-    existing = folder
-    while not existing.exists() and existing != existing.parent:
-        existing = existing.parent
+    """Refuse a folder that cannot be made, where there is none, or written to."""
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
     if not existing.is_dir():
         raise InputError(f"{folder}: cannot be made, {existing} is a file; choose another {key}")
     if not os.access(existing, os.W_OK | os.X_OK):
@@ -52,14 +37,15 @@ def check_writable(folder: Path, key: str) -> None:
 
 
 def check_free(folder: Path, key: str = "hydra.run.dir") -> None:
-    """Check that a run can be written to a folder; `key` as for `check_inside`.
+    """Refuse a folder that cannot be written, or holds a finished run, a sweep or other runs.
 
     An unfinished run in it is accepted here: whether it is the same one is checked with the settings.
-
-    Raises:
-        InputError: The folder cannot be written, or holds a finished run, a sweep or other runs.
     """
-    if _is_finished(folder):
+    try:
+        is_finished = read_run(folder).is_finished
+    except InputError:  # there is none, or its manifest is damaged
+        is_finished = False
+    if is_finished:
         longer = f", or make that run longer by {RunFolder(folder).resume_command()} total_timesteps=..."
         can_be_longer = any(folder.glob(f"{CHECKPOINTS}/*"))
         raise InputError(
@@ -73,20 +59,9 @@ def check_free(folder: Path, key: str = "hydra.run.dir") -> None:
     check_writable(folder, key)
 
 
-def _is_finished(folder: Path) -> bool:
-    try:
-        return read_run(folder).is_finished
-    except InputError:  # there is none, or its manifest is damaged, of which a checkpoint may have a copy
-        return False
-
-
 @contextlib.contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Hold a run's folder for this process.
-
-    Raises:
-        InputError: Another process holds it.
-    """
+    """Hold a run's folder for this process; an `InputError` if another process holds it."""
     with locked(folder / LOCK, wait=0) as is_ours:
         if not is_ours:
             raise InputError(f"{shown(folder)}: another process is at work in it; wait for it or stop it")
@@ -98,8 +73,8 @@ def claimed(folder: Path) -> Iterator[None]:
     """Make a run's folder and hold it for this process; afterwards, undo that where no run was started.
 
     Raises:
-        InputError: Another process holds the folder.
-        OSError: The folder could not be made; or one of the block, which then names the folder.
+        InputError: another process holds the folder.
+        OSError: the folder could not be made; or one of the block, which then names the folder.
     """
     make_folder(folder.parent)
     folder.mkdir(exist_ok=True)
@@ -110,18 +85,11 @@ def claimed(folder: Path) -> Iterator[None]:
             error.filename = error.filename or shown(folder)  # a failed write names no file
             raise
         finally:
-            _remove_unless_started(folder)
-
-
-def _remove_unless_started(folder: Path) -> None:
-    """Remove what Hydra wrote for a run that never started; only for the process that holds the lock."""
-    with contextlib.suppress(FolderLostError):
-        check_ours(folder / MANIFEST)
-        if (folder / MANIFEST).exists():
-            return
-        tidy(folder)
-        with contextlib.suppress(OSError):
-            remove_inside(folder, HYDRA)
-        (folder / LOCK).unlink(missing_ok=True)
-        with contextlib.suppress(OSError):
-            folder.rmdir()
+            # Remove what Hydra wrote for a run that never started.
+            with contextlib.suppress(FolderLostError, OSError):
+                check_ours(folder / MANIFEST)
+                if not (folder / MANIFEST).exists():
+                    tidy(folder)
+                    remove_inside(folder, HYDRA)
+                    (folder / LOCK).unlink(missing_ok=True)
+                    folder.rmdir()

@@ -57,25 +57,13 @@ SWEEP_JSON = "sweep.json"  # a sweep's folder has this instead of a manifest
 
 # Patterns of all that training writes, except the manifest.
 OUTPUTS = (
-    *(
-        *RESULTS,
-        WORLD,
-        *(each.file for each in pictures.PICTURES),
-        CHECKPOINTS,
-        TRAIN_LOG,
-        ERROR_FILE,
-        EVENTS,
-    ),
-    "source*.diff",
+    *(*RESULTS, WORLD, *(each.file for each in pictures.PICTURES)),
+    *(CHECKPOINTS, TRAIN_LOG, ERROR_FILE, EVENTS, "source*.diff"),
 )
 
 
 class RunFolder:
-    """The paths of a run's files.
-
-    Args:
-        folder: The run's folder; it need not exist.
-    """
+    """The paths of a run's files; its folder need not exist."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -1,30 +1,30 @@
-"""Reading a run's folder: its manifest, and the files with its result, verified.
+"""Reading a run's folder: its manifest, its world, and the files with its result, verified.
 
-`read_run` reads a run whatever its status, `open_run` a finished one. `run.recovery` also reads a run whose
-manifest is lost, from a checkpoint's copy.
+`read_run` reads a run whatever its status, `open_run` a finished one, `find_run` one that there may be.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from gridworld.config.worlds import EnvConfig, MapConfig
 from gridworld.errors import InputError
-from gridworld.run.folder import MANIFEST, PICTURES, RunFolder
+from gridworld.run.folder import CHECKED, MANIFEST, PICTURES, RunFolder
 from gridworld.run.manifest import read_manifest
 from gridworld.storage.safe_read import LARGEST_JSON, as_object, file_sha256, read_bytes, sha256
 
+if TYPE_CHECKING:
+    from gridworld.world.mdp import Mdp
+
 LARGEST_RESULT = 2**30  # bytes of a file
+_COPIES = 3  # of a world: the file, its arrays, and what is computed while they are checked
 
 
 class RunReader(RunFolder):
-    """A run that another process wrote.
-
-    Args:
-        folder: The run's folder.
-        manifest: The manifest's content, as `manifest.check_manifest` accepts it.
-    """
+    """A run that another process wrote: its folder, and the manifest as `read_manifest` gives it."""
 
     def __init__(self, folder: Path, manifest: dict[str, Any]) -> None:
         super().__init__(folder)
@@ -48,20 +48,12 @@ class RunReader(RunFolder):
         return next((attempt["git"] for attempt in reversed(attempts) if "git" in attempt), None)
 
     def read(self, path: Path, most: int, copies: int = 1) -> bytes:
-        """Read a file with a part of the result.
+        """Read one of the run's files of at most `most` bytes, of which `copies` will be in memory.
 
         Only a finished run has checksums; the files of another are read unverified.
 
-        Args:
-            path: One of the run's files.
-            most: The largest size allowed, in bytes.
-            copies: How often the content will be in memory, for the memory budget.
-
-        Returns:
-            The whole content.
-
         Raises:
-            InputError: The file is missing, too large, or not the one that the run wrote.
+            InputError: the file is missing, too large, or not the one that the run wrote.
         """
         content = read_bytes(path, most, copies)
         if self.is_finished:
@@ -69,25 +61,26 @@ class RunReader(RunFolder):
         return content
 
     def read_summary(self) -> dict[str, Any]:
-        """The content of summary.json, verified as by `read`.
-
-        Raises:
-            InputError: As for `read`, or the file is no JSON object.
-        """
+        """The content of summary.json, verified as by `read`."""
         return as_object(self.read(self.summary_file, LARGEST_JSON), self.summary_file)
 
     def verify(self, path: Path) -> None:
-        """Compare a file's checksum with the manifest's.
-
-        Raises:
-            InputError: The file is not the one that the run wrote.
-        """
+        """Compare a file's checksum with the manifest's; an `InputError` where it is another file."""
         self._check(path, file_sha256(path, LARGEST_RESULT))
 
-    def pictures(self) -> dict[str, str | None]:
-        """The checksum of each picture that the run drew; None where the manifest's format has none."""
-        if self.manifest.get("format", 1) == 1:
-            return dict.fromkeys(PICTURES)
+    def damage(self) -> dict[str, str]:
+        """By name, a sentence for each file of a finished run that is missing, unreadable or another."""
+        found = {}
+        for name in CHECKED:
+            try:
+                if name in self.manifest.get("sha256", {}):
+                    self.verify(self.folder / name)
+            except InputError as error:
+                found[name] = str(error)
+        return found
+
+    def pictures(self) -> dict[str, str]:
+        """The checksum of each picture that the run drew."""
         sums = self.manifest.get("sha256", {})
         return {name: sums[name] for name in PICTURES if name in sums}
 
@@ -106,11 +99,7 @@ class RunReader(RunFolder):
 
 
 def open_run(folder: Path) -> RunReader:
-    """Read a finished run.
-
-    Raises:
-        InputError: As for `read_run`, or the run is not finished.
-    """
+    """Read a finished run."""
     run = read_run(folder)
     if not run.is_finished:
         raise InputError(
@@ -120,22 +109,60 @@ def open_run(folder: Path) -> RunReader:
 
 
 def read_run(folder: Path) -> RunReader:
-    """Read a run, finished or not.
-
-    Raises:
-        InputError: The folder holds no run, or its manifest was damaged or changed.
-    """
+    """Read a run, finished or not."""
     check_is_run(folder)
     return RunReader(folder, read_manifest(folder / MANIFEST))
 
 
-def check_is_run(folder: Path) -> None:
-    """Check that a folder has a manifest, whatever is in it.
+def find_run(folder: Path) -> RunReader | None:
+    """Read the run in a folder, if one has started there."""
+    return read_run(folder) if is_started(folder) else None
 
-    Raises:
-        InputError: It has none, or there is no such folder.
+
+def is_started(folder: Path) -> bool:
+    """Whether a folder holds a run: a manifest, or beside an empty one a result.
+
+    A power cut may leave a manifest empty before anything of the run was saved.
     """
+    run = RunFolder(folder)
+    try:
+        is_empty = not read_bytes(run.manifest_file, LARGEST_JSON).strip(b"\0")
+    except InputError:
+        return os.path.lexists(run.manifest_file)
+    results = (run.summary_file, run.model_file)
+    return not is_empty or any(path.exists() and path.stat().st_size for path in results)
+
+
+def check_is_run(folder: Path) -> None:
+    """Check that a folder has a manifest, whatever is in it."""
     if not folder.exists():
         raise InputError(f"{folder}: no such folder; give the folder of a run, e.g. one in runs/")
     if not os.path.lexists(folder / MANIFEST):
         raise InputError(f"{folder}: not a run's folder, it has no {MANIFEST}")
+
+
+def stored_world(run: RunReader, env: EnvConfig) -> Mdp:
+    """The world that a run keeps, a map in its manifest or tables in its folder, whatever its settings say.
+
+    Args:
+        run: the run.
+        env: its settings of the world, whose name a map gets.
+
+    Raises:
+        InputError: it is no valid map; or its tables are missing, damaged, or not those of the manifest.
+    """
+    from gridworld.world.layout import parse  # here, since most commands need no world
+    from gridworld.world.sources.arrays import world_from_bytes
+
+    text = "\n".join(run.manifest["layout"])
+    if isinstance(env, MapConfig):
+        layout = parse(text, f"{run.manifest_file}: layout")
+        return env.compile_on(dataclasses.replace(layout, name=env.layout))
+    is_noted = run.world_file.name in run.manifest.get("sha256", {})  # not of an unfinished run
+    content = (run.read if is_noted else read_bytes)(run.world_file, LARGEST_RESULT, _COPIES)
+    mdp = world_from_bytes(content, str(run.world_file))
+    if mdp.text() != text:
+        raise InputError(
+            f"{run.world_file}: is not the world that {MANIFEST} names; it was damaged or changed"
+        )
+    return mdp

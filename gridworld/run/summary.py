@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gridworld.process.console.columns import aligned
-from gridworld.process.console.terminal import printable
+from gridworld.process.console.terminal import aligned, printable
 from gridworld.process.signals import Interrupted
 from gridworld.run.folder import EVENTS, RunFolder, shown
 from gridworld.run.reader import read_run
@@ -25,29 +23,17 @@ _ROUNDING = 1e-9  # of a probability
 def train_and_tell(
     folder: Path, train: Callable[[], Summary], advise: Callable[[Path], list[str]]
 ) -> Summary:
-    """Train, and print what comes of it; ends the program if training is interrupted.
-
-    Args:
-        folder: The run's folder.
-        train: Trains in it.
-        advise: Makes lines on what to do next with a run that is not certified.
-
-    Returns:
-        The run's summary.
-    """
+    """Train and print the summary, with advice if the run is not certified; exits if it is interrupted."""
     try:
         summary = train()
     except Interrupted as interruption:
         run = read_run(folder)
         print(interruption_text(interruption, run, run.manifest), file=sys.stderr)
         sys.exit(interruption.exit_code)
-    try:
-        place = shlex.quote(shown(folder))
-        print(summary_text(summary, place, [] if summary["certified"] else advise(folder)))
-        if any(folder.glob(EVENTS)):
-            print(printable(f"  curves: tensorboard --logdir {place}"), flush=True)
-    except BrokenPipeError:  # the reader has left, as `| head` does; the files are written
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    place = shlex.quote(shown(folder))
+    print(summary_text(summary, place, [] if summary["certified"] else advise(folder)))
+    if any(folder.glob(EVENTS)):
+        print(printable(f"  curves: tensorboard --logdir {place}"), flush=True)
     return summary
 
 
@@ -64,16 +50,7 @@ def interruption_text(interruption: Interrupted, run: RunFolder, manifest: Mappi
 
 
 def summary_text(summary: Summary, folder: str, advice: Sequence[str] = ()) -> str:
-    """The result beside the optimum, the verdict, what to do next, and where the files are.
-
-    Args:
-        summary: The content of summary.json.
-        folder: The run's folder, quoted for a shell.
-        advice: Lines on what to do next.
-
-    Returns:
-        Several lines, printable.
-    """
+    """The result beside the optimum, the verdict, what to do next, and where the files are, as lines."""
     agent, env, seed = summary["agent"], summary["env"], summary["seed"]
     steps, seconds = summary["timesteps"], summary["train_seconds"]
     rows = [
@@ -132,13 +109,7 @@ def verdict(summary: Summary) -> str:
 
 
 def circles_text(count: int, names: Sequence[str], timeout_probability: float) -> str:
-    """Half a sentence on a policy that may never end; "" where it always does.
-
-    Args:
-        count: of the states in which it loops.
-        names: of the first few of them.
-        timeout_probability: that an episode is cut off by the step limit.
-    """
+    """Half a sentence on a policy that loops in `count` states, the first few with `names`; "" if none."""
     if not count:
         return ""
     more = f" and {count - len(names)} more states" if count > len(names) else ""

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import warnings
 from contextvars import ContextVar
 from datetime import UTC, datetime
+from logging.handlers import MemoryHandler
 from pathlib import Path
-from types import TracebackType
-from typing import Any, ClassVar, Self, TextIO
+from typing import ClassVar, Self
 
-from gridworld.errors import FolderLostError
 from gridworld.process.console.terminal import TOLD, plain
-from gridworld.storage.file_lock import check_ours
-from gridworld.storage.system_calls import open_carefully
+from gridworld.storage.atomic_write import remove_path
 
-_printed: set[tuple[str, str, str, int]] = set()  # warnings that this process has printed
+_WARNINGS = "py.warnings"  # the logger to which Python's warnings are sent
+_printed: set[str] = set()  # warnings that this process has printed
 
 
-class TrainLog(logging.Handler):
+class TrainLog:
     """Takes Python's warnings, what is logged as one, and what is told on standard error, inside its block.
 
     The lines are kept until there is a file. What goes to the terminal is the same as without it. Of runs
@@ -29,90 +27,66 @@ class TrainLog(logging.Handler):
     """
 
     _all: ClassVar[list[TrainLog]] = []  # inside whose blocks the process is
-    _show: ClassVar[Any]  # what Python warns with otherwise
 
     def __init__(self) -> None:
-        super().__init__(logging.INFO)
-        self._lines: list[str] = []
-        self._path: Path | None = None
+        self._handler = MemoryHandler(1)  # keeps everything until it has a target
+        self._handler.addFilter(self._takes)
 
     def __enter__(self) -> Self:
-        root = logging.getLogger()
-        others = [handler for handler in root.handlers if not isinstance(handler, TrainLog)]
-        self._is_alone = not others  # then Python prints warnings only while there is no handler
-        for logger in (root, TOLD):
-            logger.addHandler(self)
+        for logger in (logging.getLogger(), TOLD):
+            logger.addHandler(self._handler)
         with warnings.catch_warnings():  # forgets what was warned about before, in another run
             pass
-        if not self._all:
-            TrainLog._show = warnings.showwarning
-            warnings.showwarning = _warn
+        logging.captureWarnings(True)
         self._all.append(self)
         self._token = _current.set(self)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         _current.reset(self._token)
         self._all.remove(self)
-        if not self._all:
-            warnings.showwarning = TrainLog._show
+        logging.captureWarnings(bool(self._all))
         for logger in (logging.getLogger(), TOLD):
-            logger.removeHandler(self)
+            logger.removeHandler(self._handler)
+        if self._handler.target is not None:
+            self._handler.target.close()
 
     def open(self, path: Path) -> None:
         """Append to a file from here on, beginning with what was kept."""
-        self._path = path
-        lines, self._lines = self._lines, []
-        self._append("".join(lines))
+        with contextlib.suppress(OSError):  # which are told elsewhere
+            if path.is_symlink() or not path.is_file():
+                remove_path(path)
+            file = logging.FileHandler(path, encoding="utf-8", errors="backslashreplace")
+            file.setFormatter(_Lines())
+            file.handleError = lambda record: None  # type: ignore[method-assign]
+            self._handler.setTarget(file)
+            self._handler.flush()
 
-    def add(self, text: str, level: str = "INFO") -> None:
+    def add(self, text: str, level: int = logging.INFO) -> None:
         """Append a line."""
-        self._append(f"{datetime.now(UTC).isoformat(timespec='seconds')} {level} {plain(text)}\n")
+        self._handler.emit(TOLD.makeRecord(TOLD.name, level, "", 0, text, (), None))
 
-    def emit(self, record: logging.LogRecord) -> None:
-        """See `logging.Handler`."""
-        if self._at_work() is not self:
-            return
-        if record.name != TOLD.name and record.levelno < logging.WARNING:
-            return
-        self.add(record.getMessage(), record.levelname)
-        last = logging.lastResort
-        has_handler = not self._is_alone or logging.getLogger(record.name).handlers
-        if last is not None and record.levelno >= last.level and not has_handler:
+    def _takes(self, record: logging.LogRecord) -> bool:
+        """Whether a record is for this run's log; what would be printed without the log still is."""
+        # In a thread, the log of the only run is meant, if there is one only.
+        at_work = _current.get() or (self._all[0] if len(self._all) == 1 else None)
+        if at_work is not self or (record.name != TOLD.name and record.levelno < logging.WARNING):
+            return False
+        text, last = record.getMessage(), logging.lastResort
+        handlers = [*logging.getLogger().handlers, *logging.getLogger(record.name).handlers]
+        others = [each for each in handlers if not isinstance(each, MemoryHandler | logging.NullHandler)]
+        is_new = record.name != _WARNINGS or text not in _printed
+        if record.name == _WARNINGS:
+            _printed.add(text)
+        if last is not None and record.levelno >= last.level and not others and is_new:
             last.handle(record)
+        return True
 
-    @classmethod
-    def _at_work(cls) -> TrainLog | None:
-        """The log of the run that is at work here; in a thread, of the only one, if it is the only one."""
-        return _current.get() or (cls._all[0] if len(cls._all) == 1 else None)
 
-    def _append(self, text: str) -> None:
-        if self._path is None:
-            self._lines.append(text)
-            return
-        with contextlib.suppress(OSError, FolderLostError):  # which are told elsewhere
-            check_ours(self._path)
-            with open(open_carefully(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND), "ab") as file:
-                file.write(text.encode("utf-8", "backslashreplace"))
+class _Lines(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        return f"{now} {record.levelname} {plain(record.getMessage().strip())}"
 
 
 _current: ContextVar[TrainLog | None] = ContextVar("current", default=None)  # of the run that is at work
-
-
-def _warn(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
-    """Stands for `warnings.showwarning` while a log is open."""
-    if (log := TrainLog._at_work()) is not None:
-        log.add(f"{category.__name__}: {message} ({filename}, line {lineno})", "WARNING")
-    key = (str(message), category.__name__, filename, lineno)
-    if key not in _printed:
-        _printed.add(key)
-        TrainLog._show(message, category, filename, lineno, file, line)

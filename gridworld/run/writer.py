@@ -7,30 +7,37 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import recorded_command_line
 from gridworld.process.parallel.together import mixed
-from gridworld.run.folder import CHECKED, CHECKPOINTS, OUTPUTS, WORLD, RunFolder
-from gridworld.run.identity import provenance
-from gridworld.run.identity.provenance import describe, source_differences
+from gridworld.run import provenance
+from gridworld.run.folder import CHECKED, CHECKPOINTS, OUTPUTS, RunFolder
 from gridworld.run.manifest import NUMBERS_DEPEND_ON
+from gridworld.run.provenance import describe, source_differences
 from gridworld.run.reader import LARGEST_RESULT, RunReader
-from gridworld.storage.atomic_write import json_text, sync, sync_folder, tidy, write_bytes, write_json
+from gridworld.storage.atomic_write import (
+    remove_path,
+    replacing,
+    sync,
+    sync_folder,
+    tidy,
+    write_bytes,
+    write_json,
+)
 from gridworld.storage.safe_read import check_no_link, file_sha256
 from gridworld.storage.sealed_json import sealed
-from gridworld.storage.symlinks import remove_path
 from gridworld.world.grid import GridMdp
 from gridworld.world.mdp import Mdp
 from gridworld.world.sources.arrays import world_bytes
 
+NEEDED = ("step", "return", "length", "goal_probability")  # columns of a learning curve
+
 
 class RunWriter(RunFolder):
-    """A run in progress, in a folder that this process holds. `start` or `resume` one.
-
-    Args:
-        folder: The run's folder.
-        manifest: The manifest's content, which this object changes from here on.
-    """
+    """A run in progress, in a folder that this process holds. `start` or `resume` one."""
 
     def __init__(self, folder: Path, manifest: dict[str, Any]) -> None:
         super().__init__(folder)
@@ -52,14 +59,11 @@ class RunWriter(RunFolder):
         from then on (see `settle`); where it replaces another run, from the start.
 
         Args:
-            folder: The run's folder, which exists.
-            config: The resolved settings.
-            world: The compiled world, which the manifest or the folder keeps.
-            overrides: The settings given on the command line.
-            replace: Remove what the folder has of an earlier run.
-
-        Raises:
-            InputError: The folder holds a run, and `replace` is not set.
+            folder: the run's folder, which exists.
+            config: the resolved settings.
+            world: the compiled world, which the manifest or the folder keeps.
+            overrides: the settings given on the command line.
+            replace: remove what the folder has of an earlier run; without it, a run there is refused.
         """
         content = {
             "status": "running",
@@ -89,10 +93,10 @@ class RunWriter(RunFolder):
         """Write the manifest of a run that is resumed from a checkpoint.
 
         Args:
-            earlier: The run as its folder has it.
-            step: Environment steps at the checkpoint.
-            total_timesteps: The run's length from here on.
-            differs: How the environment differs from the one that the run was started in.
+            earlier: the run as its folder has it.
+            step: environment steps at the checkpoint.
+            total_timesteps: the run's length from here on.
+            differs: how the environment differs from the one that the run was started in.
         """
         again: dict[str, Any] = {"at": _now(), "step": step, "command": recorded_command_line()}
         again |= _mixed_runs()
@@ -120,23 +124,17 @@ class RunWriter(RunFolder):
         """Make the manifest, then these files, and all names in the folder survive a power cut."""
         if self._is_settled and not files:
             return
-        own = [] if self._is_settled else [self.manifest_file, *self._beside_the_manifest()]
+        own = [] if self._is_settled else [self.manifest_file, self.world_file]
+        own += [] if self._is_settled else self.folder.glob("source*.diff")
         sync([*own, *files], self.folder)
         if not self._is_settled:
             sync_folder(self.folder.parent)
         self._is_settled = True
 
-    def _beside_the_manifest(self) -> list[Path]:
-        return [path for pattern in ("source*.diff", WORLD) for path in self.folder.glob(pattern)]
-
     @property
     def manifest(self) -> Mapping[str, Any]:
         """The manifest's content, as it is now."""
         return self._manifest
-
-    def text(self) -> str:
-        """The manifest as its file has it."""
-        return json_text(sealed(self._manifest))
 
     def end(self, status: str, error: str | None = None, **progress: int | None) -> None:
         """Record how the run ended.
@@ -144,17 +142,15 @@ class RunWriter(RunFolder):
         Args:
             status: "finished", "interrupted" or "failed". The results of a finished run are durable already:
                 see `settle`.
-            error: Why it did not finish.
-            progress: Environment steps `reached`, and those at the newest `checkpoint`.
+            error: why it did not finish.
+            progress: environment steps `reached`, and those at the newest `checkpoint`.
         """
         self._manifest |= {"status": status, "ended": _now(), **progress}
         if error is not None:
             self._manifest["error"] = error
         if status == "finished":
-            there = [name for name in CHECKED if (self.folder / name).exists()]
-            self._manifest["sha256"] = {
-                name: file_sha256(self.folder / name, LARGEST_RESULT) for name in there
-            }
+            there = [path for name in CHECKED if (path := self.folder / name).exists()]
+            self._manifest["sha256"] = {path.name: file_sha256(path, LARGEST_RESULT) for path in there}
         self._write()
 
     def _keep_diff(self, git: dict[str, Any] | None, durable: bool = False) -> None:
@@ -175,15 +171,34 @@ def record_failure(run: RunReader, why: str) -> None:
 
 
 def clear(folder: Path) -> None:
-    """Remove all that a run wrote to its folder, except the manifest. Other files stay.
-
-    Raises:
-        InputError: The checkpoints' folder is a symbolic link.
-    """
+    """Remove all that a run wrote to its folder, except the manifest. Other files stay."""
     _remove_partial_files(folder)
     for pattern in OUTPUTS:
         for path in folder.glob(pattern):
             remove_path(path)
+
+
+def write_evaluations(path: Path, curve: Mapping[str, NDArray[Any]], **more: NDArray[Any]) -> None:
+    """Write a learning curve as SB3's `EvalCallback` does, for the scripts that plot its `evaluations.npz`.
+
+    SB3 has a column per sampled episode. An exact evaluation has one number, the expectation, so there is one
+    column, whose mean is exact and whose standard deviation is 0.
+
+    Args:
+        path: the file.
+        curve: (n,) by name, those of `NEEDED`: they become `timesteps` (n,) and, (n, 1) each, `results`,
+            which are not discounted, `ep_lengths` and `successes`, the probability of the goal.
+        more: other arrays to put beside them.
+    """
+    named: dict[str, Any] = {
+        **more,
+        "timesteps": curve["step"].astype(np.int64),
+        "results": curve["return"][:, None],
+        "ep_lengths": curve["length"][:, None],
+        "successes": curve["goal_probability"][:, None],
+    }
+    with replacing(path) as part, part.open("wb") as file:  # given a path, numpy would add .npz to it
+        np.savez(file, **named)
 
 
 def _remove_partial_files(folder: Path) -> None:

@@ -3,10 +3,12 @@
 After a power cut, a file that was renamed into its place may be empty, or its name may be the old one: the
 disk has a file's content once the file is synced, and its name once the folder is.
 
-What is half written has a name of its own beside the path, and a lock by which others see that somebody is at
-it. Each process removes what killed ones left where it writes first.
+What is half written has a name of its own beside the path, with the process that is at it. Each process
+removes what killed ones left where it writes first. Whatever writes raises `FolderLostError` where the folder
+is no longer this process's (see `file_lock`).
 
-Whatever writes raises `FolderLostError` where the folder is no longer this process's (see `file_lock`).
+The folder `top` that a user named may be a link, since that is the user's. A link in it may be anybody's, and
+lead to any folder of the reader's: the functions `..._inside` go through none.
 """
 
 from __future__ import annotations
@@ -16,21 +18,20 @@ import errno
 import json
 import os
 import re
-import threading
-from collections.abc import Callable, Iterable, Iterator
+import shutil
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gridworld.errors import FolderLostError
-from gridworld.storage.file_lock import check_ours, is_at
-from gridworld.storage.symlinks import remove_path
-from gridworld.storage.system_calls import OPENS_FOLDERS, TO_SYNC, open_carefully, take_lock
+from gridworld.storage.file_lock import check_ours
+from gridworld.storage.safe_read import check_no_link
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _NOT_SYNCED = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)  # where a file system cannot sync a folder
-_PART = re.compile(r"\..+\.\d+\.(old\.)?part", re.DOTALL)
+_HOST = os.uname().nodename
+_PART = re.compile(rf"\..+\.{re.escape(_HOST)}\.(\d+)\.(old\.)?part", re.DOTALL)
 _tidied: set[str] = set()  # folders, by this process
 
 
@@ -38,8 +39,7 @@ _tidied: set[str] = set()  # folders, by this process
 def replacing(path: Path, durable: bool = False) -> Iterator[Path]:
     """Replace a file atomically: the block writes to a path beside it, which then takes its place.
 
-    If the block raises, the file stays as it was. Where one of the paths is a symbolic link, it is replaced
-    and not followed.
+    If the block raises, the file stays as it was. A symbolic link is replaced and not followed.
 
     Args:
         path: the file.
@@ -49,19 +49,15 @@ def replacing(path: Path, durable: bool = False) -> Iterator[Path]:
         FolderLostError: the folder is no longer this process's.
         OSError: it names `path`, not the path beside it.
     """
-    check_ours(path)
-    part = _beside(path, "part")
-    with _named_for(path, part):
-        _tidy_once(path.parent)
-        with _at_work_on(part):
-            try:
-                yield part
-                if durable:
-                    _sync(part)
-                check_ours(path)
-                os.replace(part, path)
-            finally:
-                part.unlink(missing_ok=True)
+    with _beside(path) as part:
+        try:
+            yield part
+            if durable:
+                _sync(part)
+            check_ours(path)
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
         if durable:
             sync_folder(path.parent)
 
@@ -70,80 +66,56 @@ def replacing(path: Path, durable: bool = False) -> Iterator[Path]:
 def replacing_folder(folder: Path) -> Iterator[Path]:
     """Replace a folder as a whole: the block fills a new one beside it, which then takes its place.
 
-    If the block raises, the folder stays as it was. Where `folder` is a symbolic link, the link is replaced.
-
-    Raises:
-        FolderLostError: the folder above is no longer this process's.
-        OSError: it names `folder`, or what is in it.
+    If the block raises, the folder stays as it was. Raises as `replacing` does.
     """
-    check_ours(folder)
-    new, old = _beside(folder, "part"), _beside(folder, "old.part")
-    with _named_for(folder, new):
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        _tidy_once(folder.parent)
-        remove_path(old)
-        with _at_work_on(new, is_folder=True):
-            try:
-                yield new
-                check_ours(folder)
-                if os.path.lexists(folder):
-                    folder.rename(old)
-                try:
-                    new.rename(folder)
-                except OSError:
-                    if os.path.lexists(old):
-                        old.rename(folder)
-                    raise
-            finally:
-                for path in (new, old):
-                    with contextlib.suppress(OSError, FolderLostError):
-                        remove_path(path)
-
-
-def _beside(path: Path, kind: str) -> Path:
-    """A name that no other process uses. `tidy` finds what a killed process leaves."""
-    return path.with_name(f".{path.name}.{os.getpid()}.{kind}")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with _beside(folder) as new:
+        old = new.with_suffix(".old.part")
+        new.mkdir()
+        try:
+            yield new
+            check_ours(folder)
+            if os.path.lexists(folder):
+                folder.rename(old)
+            new.rename(folder)
+            remove_path(old)
+        finally:
+            shutil.rmtree(new, ignore_errors=True)
 
 
 @contextlib.contextmanager
-def _at_work_on(part: Path, is_folder: bool = False) -> Iterator[None]:
-    """Make an empty file or folder that `tidy` leaves alone during the block."""
-    with contextlib.ExitStack() as opened:
-        while True:
-            remove_path(part)
-            part.mkdir() if is_folder else part.touch(exist_ok=False)
-            if not OPENS_FOLDERS:
-                break
-            with contextlib.suppress(FileNotFoundError):
-                file = _open(part)
-                opened.callback(os.close, file)
-                with contextlib.suppress(OSError):  # of a file system without locks
-                    take_lock(file, wait=True)
-                if is_at(file, part):  # it was not tidied up before it was locked
-                    break
-        yield
-
-
-def _open(part: Path) -> int:
-    return open_carefully(part, os.O_RDONLY if part.is_dir() else os.O_RDWR)
-
-
-def _tidy_once(folder: Path) -> None:
-    if (where := os.path.abspath(folder)) not in _tidied:
-        _tidied.add(where)
-        tidy(folder)
-
-
-@contextlib.contextmanager
-def _named_for(path: Path, part: Path) -> Iterator[None]:
-    """Let an `OSError` of the block name `path` where it names nothing or `part`."""
+def _beside(path: Path) -> Iterator[Path]:
+    """A free path that only this process writes to; an `OSError` about it names `path`."""
+    check_ours(path)
+    part = path.with_name(f".{path.name}.{_HOST}.{os.getpid()}.part")
     try:
-        yield
+        if (folder := os.path.abspath(path.parent)) not in _tidied:
+            _tidied.add(folder)
+            tidy(path.parent)
+        remove_path(part)
+        yield part
     except OSError as error:
         where = Path(os.fsdecode(error.filename or part))
         if where.is_relative_to(part):
             error.filename = str(path / where.relative_to(part))
         raise
+
+
+def tidy(folder: Path) -> None:
+    """Remove what processes of this machine had half written that are not there any more."""
+    for path in folder.glob(".*.part"):
+        if (found := _PART.fullmatch(path.name)) and not _is_alive(int(found[1])):
+            remove_path(path)
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass
+    return True
 
 
 def sync(files: Iterable[Path], folder: Path) -> None:
@@ -165,32 +137,11 @@ def sync_folder(folder: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    file = open_carefully(path, TO_SYNC)
+    file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     try:
         os.fsync(file)
     finally:
         os.close(file)
-
-
-@contextlib.contextmanager
-def in_background(work: Callable[[], None]) -> Iterator[None]:
-    """Run `work`, which waits for a disk, in another thread beside the block; raises what it raises."""
-    failures: list[BaseException] = []
-
-    def attempt() -> None:
-        try:
-            work()
-        except BaseException as error:
-            failures.append(error)
-
-    thread = threading.Thread(target=attempt, name="sync")
-    thread.start()
-    try:
-        yield
-    finally:
-        thread.join()
-    for failure in failures:
-        raise failure
 
 
 def make_folder(folder: Path) -> None:
@@ -201,41 +152,62 @@ def make_folder(folder: Path) -> None:
         sync_folder(folder.parent)
 
 
-def tidy(folder: Path) -> None:
-    """Remove what killed processes had half written; what somebody is at work on is locked."""
-    for path in folder.glob(".*.part"):
-        if OPENS_FOLDERS and _PART.fullmatch(path.name) and not path.is_symlink():  # those are nobody's
-            with contextlib.suppress(OSError), contextlib.ExitStack() as opened:
-                file = _open(path)
-                opened.callback(os.close, file)
-                if take_lock(file):
-                    remove_path(path)
+def make_inside(top: Path, *names: str) -> Path:
+    """Make the folder `top`/names[0]/... and those between; refuses a link below `top`."""
+    path = _inside(top, names)
+    check_ours(path)
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def remove_inside(top: Path, *names: str) -> None:
+    """Remove what is at `top`/names[0]/..., if anything; refuses a link on the way to it."""
+    remove_path(_inside(top, names[:-1]) / names[-1])
+
+
+def names_inside(top: Path, *names: str) -> list[str]:
+    """The sorted names in the folder `top`/names[0]/..., if there is one; refuses a link below `top`."""
+    path = _inside(top, names)
+    return sorted(os.listdir(path)) if path.is_dir() else []
+
+
+def check_no_links(top: Path, *names: str) -> None:
+    """Refuse a folder to be written in that is reached through a link below `top`, or holds one."""
+    for name in names_inside(top, *names):
+        check_no_link(top.joinpath(*names, name))
+
+
+def _inside(top: Path, names: Iterable[str]) -> Path:
+    path = top
+    for name in names:
+        path = path / name
+        check_no_link(path)
+    return path
+
+
+def remove_path(path: Path) -> None:
+    """Remove the file, folder or link (not what it leads to) at a path, if there is one."""
+    check_ours(path)
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str, durable: bool = False) -> None:
     """Write UTF-8; `durable` as for `replacing`."""
-    with replacing(path, durable) as part:
-        part.write_text(text, encoding="utf-8")
+    write_bytes(path, text.encode(), durable)
 
 
-def write_bytes(path: Path, content: bytes, durable: bool = False) -> None:
+def write_bytes(path: Path, content: bytes | memoryview, durable: bool = False) -> None:
     """Write bytes; `durable` as for `replacing`."""
     with replacing(path, durable) as part:
         part.write_bytes(content)
 
 
 def write_json(path: Path, content: Any, durable: bool = False) -> None:
-    """Write indented JSON; `durable` as for `replacing`.
-
-    Raises:
-        ValueError: NaN or an infinity is in it, which JSON does not have.
-    """
-    write_text(path, json_text(content), durable)
-
-
-def json_text(content: Any) -> str:
-    """The text that `write_json` writes."""
-    return json.dumps(content, indent=2, allow_nan=False) + "\n"
+    """Write indented JSON; `durable` as for `replacing`. NaN and infinities are a `ValueError`."""
+    write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n", durable)
 
 
 def write_array(path: Path, array: NDArray[Any]) -> None:

@@ -2,21 +2,18 @@
 
 A record is the length (8 bytes, little-endian), the length's checksum (4), the serialised event, and its
 checksum (4). A checksum is CRC-32C, rotated and shifted by a constant, so that a record inside a record is
-not taken for one. TensorBoard's own writer does the same in a thread of its own with a checksum in pure
-Python, which takes the interpreter from training: for every picture as long as two evaluations take. And it
-cannot be truncated to a mark when a run is resumed.
+not taken for one. TensorBoard's own writer has a thread and a checksum in pure Python, which takes as long
+for a picture as two evaluations, and it cannot truncate its file when a run is resumed.
 """
 
 from __future__ import annotations
 
-import io
 import os
-import socket
 import struct
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import google_crc32c
 from google.protobuf.message import DecodeError
@@ -35,14 +32,7 @@ _MASK_DELTA = 0xA282EAD8
 
 
 def read_scalars(path: Path) -> Iterator[tuple[str, int, float]]:
-    """Read the scalars of an event file, one record at a time.
-
-    Yields:
-        (tag, step, value), in the order in which they were written.
-
-    Raises:
-        InputError: the file is truncated or damaged.
-    """
+    """Read (tag, step, value) of an event file's scalars, in the order in which they were written."""
     with open_ordinary(path) as file:
         size = os.fstat(file.fileno()).st_size
         while (start := file.tell()) < size:
@@ -55,8 +45,7 @@ def read_scalars(path: Path) -> Iterator[tuple[str, int, float]]:
                     yield value.tag, event.step, value.simple_value
 
 
-def _record(file: io.BufferedReader, size: int, path: Path) -> bytes:
-    """The next record of a file of that size. Raises `DecodeError`."""
+def _record(file: BinaryIO, size: int, path: Path) -> bytes:
     frame = file.read(_HEADER)
     if len(frame) < _HEADER or _checksum(frame[:8]) != frame[8:]:
         raise DecodeError
@@ -75,7 +64,7 @@ class EventFile:
 
     def __init__(self, folder: Path, mark: dict[str, Any] | None = None) -> None:
         now = time.time()
-        name = f"events.out.tfevents.{int(now)}.{socket.gethostname()}.{os.getpid()}"
+        name = f"events.out.tfevents.{int(now)}.{os.uname().nodename}.{os.getpid()}"
         self.journal = AppendLog(folder / (name if mark is None else mark["name"]), mark)
         if mark is None:
             self._write(Event(wall_time=now, file_version=_VERSION))

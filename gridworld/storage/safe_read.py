@@ -15,34 +15,47 @@ import json
 import math
 import os
 import stat
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import check_memory
-from gridworld.storage.system_calls import open_carefully
 
 LARGEST_JSON = 4 * 2**20  # bytes
 LARGEST_CSV = 64 * 2**20
 _DEEPEST = 100  # levels of JSON; what reads it further may call itself for each
-_LARGEST_WHOLE = 2**63
 # Bytes of memory that a byte of text may come to as Python's objects: short strings in short lists.
 _AS_CSV, AS_JSON = 64, 48
 
 
-def read_bytes(path: Path, most: int, copies: int = 1) -> bytes:
-    """Read a whole file.
+def open_ordinary(path: Path, mode: str = "rb", most: float = math.inf) -> BinaryIO:
+    """Open a regular file of at most `most` bytes; "r+b" to write to it, too, without a buffer."""
+    try:  # without O_NONBLOCK, opening a pipe waits for somebody to write into it
+        flags = (os.O_RDONLY if mode == "rb" else os.O_RDWR) | os.O_NOFOLLOW | os.O_NONBLOCK
+        descriptor = os.open(path, flags)
+    except FileNotFoundError:
+        raise InputError(f"{path.parent}: has no {path.name}") from None
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise InputError(f"{path}: is a symbolic link, which is not followed out of a run") from None
+        what = "read" if mode == "rb" else "written"
+        raise InputError(f"{path}: cannot be {what} ({error.strerror})") from None
+    found = os.fstat(descriptor)
+    if not stat.S_ISREG(found.st_mode) or found.st_size > most:
+        os.close(descriptor)
+        ordinary = stat.S_ISREG(found.st_mode)
+        raise InputError(f"{path}: {f'is larger than {_size(most)}' if ordinary else 'is no ordinary file'}")
+    return cast("BinaryIO", open(descriptor, mode, buffering=-1 if mode == "rb" else 0))
 
-    Args:
-        path: the file.
-        most: bytes; a larger file is refused.
-        copies: how often its content will be in memory, for the memory budget.
-    """
-    with _opened(path, most) as file:
+
+def read_bytes(path: Path, most: int, copies: int = 1) -> bytes:
+    """Read a whole file of at most `most` bytes, of which `copies` will be in memory."""
+    with open_ordinary(path, most=most) as file:
         check_memory(path, copies * os.fstat(file.fileno()).st_size)
-        return file.read(most)
+        try:
+            return file.read(most)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
 
 
 def read_table(path: Path) -> str:
@@ -74,7 +87,7 @@ def as_object(content: bytes, path: Path) -> dict[str, Any]:
     check_memory(path, AS_JSON * len(content))
     text = as_text(content, path)
     try:
-        found = json.loads(text, parse_constant=_refuse, parse_float=_real, parse_int=_whole)
+        found = json.loads(text, parse_constant=_number, parse_float=_number, parse_int=_whole)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is no JSON, it was changed or cut off ({error})") from None
     if not isinstance(found, dict):
@@ -84,36 +97,23 @@ def as_object(content: bytes, path: Path) -> dict[str, Any]:
     return found
 
 
-def _refuse(constant: str) -> None:
-    raise ValueError(f"JSON has no {constant}")
-
-
-def _real(text: str) -> float:
+def _number(text: str) -> float:
     number = float(text)
-    if math.isinf(number):
-        raise ValueError(f"{text[:20]} is too large a number")
+    if not math.isfinite(number):
+        raise ValueError(f"{text[:20]} is too large a number, or none")
     return number
 
 
 def _whole(text: str) -> int:
     number = int(text)
-    if abs(number) >= _LARGEST_WHOLE:
+    if abs(number) >= 2**63:
         raise ValueError(f"{text[:20]}... is too large a number")
     return number
 
 
 def _is_deeper(content: Any, most: int) -> bool:
-    level = [content]
-    for _ in range(most):
-        level = [
-            inner
-            for outer in level
-            for inner in (outer.values() if isinstance(outer, dict) else outer)
-            if isinstance(inner, dict | list)
-        ]
-        if not level:
-            return False
-    return True
+    inner = content.values() if isinstance(content, dict) else content
+    return most == 0 or any(_is_deeper(each, most - 1) for each in inner if isinstance(each, dict | list))
 
 
 def check_yaml(folder: Path) -> None:
@@ -122,11 +122,10 @@ def check_yaml(folder: Path) -> None:
     Hydra would read a pipe or a device, which need not end, and follows links.
     """
     for depth in ("", "*/", "*/*/"):  # as deep as its groups are
-        for file in sorted(folder.glob(f"{depth}*.yaml")):
-            found = file.stat() if file.exists() else None
-            if found is not None and not stat.S_ISREG(found.st_mode):
+        for file in filter(Path.exists, sorted(folder.glob(f"{depth}*.yaml"))):
+            if not file.is_file():
                 raise InputError(f"{file}: is no ordinary file; give a yaml file, or take it away")
-            if found is not None and found.st_size > LARGEST_JSON:
+            if file.stat().st_size > LARGEST_JSON:
                 raise InputError(f"{file}: is larger than {_size(LARGEST_JSON)}, which is no configuration")
 
 
@@ -143,48 +142,9 @@ def sha256(content: bytes) -> str:
 
 def file_sha256(path: Path, most: int) -> str:
     """SHA-256 of a file of at most `most` bytes, which is not held in memory."""
-    with _opened(path, most) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    with open_ordinary(path, most=most) as file:
+        return hashlib.file_digest(cast("io.BufferedReader", file), "sha256").hexdigest()
 
 
-@contextmanager
-def _opened(path: Path, most: int) -> Iterator[io.BufferedReader]:
-    with open_ordinary(path) as file:
-        if os.fstat(file.fileno()).st_size > most:
-            raise InputError(f"{path}: is larger than {_size(most)}")
-        try:
-            yield file
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-
-
-def open_ordinary(path: Path) -> io.BufferedReader:
-    """Open a regular file for reading."""
-    return open(_descriptor(path, os.O_RDONLY), "rb")
-
-
-def open_to_go_on(path: Path) -> io.FileIO:
-    """Open an existing regular file for reading and writing, without a buffer."""
-    return open(_descriptor(path, os.O_RDWR), "r+b", buffering=0)
-
-
-def _descriptor(path: Path, flags: int) -> int:
-    # Without O_NONBLOCK, opening a pipe waits for somebody to write into it.
-    try:
-        descriptor = open_carefully(path, flags)
-    except FileNotFoundError:
-        raise InputError(f"{path.parent}: has no {path.name}") from None
-    except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise InputError(f"{path}: is a symbolic link, which is not followed out of a run") from None
-        raise InputError(
-            f"{path}: cannot be {'read' if flags == os.O_RDONLY else 'written'} ({error.strerror})"
-        ) from None
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise InputError(f"{path}: is no ordinary file")
-    return descriptor
-
-
-def _size(count: int) -> str:
+def _size(count: float) -> str:
     return f"{count / 2**20:,.0f} MiB" if count >= 2**20 else f"{count:,} bytes"

@@ -23,11 +23,10 @@ from gridworld.errors import InputError
 from gridworld.process.console.command_line import recorded_command_line
 from gridworld.run.claim import check_writable
 from gridworld.run.folder import HYDRA, LOCK, MANIFEST, SWEEP_JSON
-from gridworld.run.identity.provenance import versions
-from gridworld.storage.atomic_write import make_folder, tidy, write_json
+from gridworld.run.provenance import versions
+from gridworld.storage.atomic_write import check_no_links, make_folder, tidy, write_json
 from gridworld.storage.file_lock import locked
 from gridworld.storage.sealed_json import read_sealed, sealed
-from gridworld.storage.symlinks import check_no_links, links_in
 from gridworld.sweep.plan import Job, folder_name
 
 STOP = ".stop"  # in the sweep's folder: no more jobs begin, wherever they wait
@@ -97,10 +96,9 @@ class SweepFolder:
             The jobs' entries; a new job has a folder's name of its own.
         """
         taken = {entry.job.lower() for entry in self.entries.values()}
-        taken |= {
-            file.parent.name.lower() for file in self.path.glob(f"*/{MANIFEST}")
-        }  # also those of no job
-        taken |= {name.lower() for name in links_in(self.path)}
+        # Also the folders of no job.
+        taken |= {file.parent.name.lower() for file in self.path.glob(f"*/{MANIFEST}")}
+        taken |= {path.name.lower() for path in self.path.iterdir() if path.is_symlink()}
         lines = [e.overrides for e in self.entries.values()] + [job.overrides for job in jobs]
         common = set(lines[0]).intersection(*lines)
         for job in jobs:

@@ -14,7 +14,7 @@ from gridworld.errors import FolderLostError, InputError, MachineError, reason
 from gridworld.process.signals import Interrupted
 from gridworld.restore.resume import unfinished_of
 from gridworld.run.folder import ERROR_FILE, LOCK, MANIFEST
-from gridworld.run.recovery import find_run, is_started
+from gridworld.run.reader import find_run, is_started
 from gridworld.run.writer import clear, record_failure
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.file_lock import locked

@@ -12,9 +12,8 @@ from typing import Any
 
 from gridworld.errors import InputError
 from gridworld.run.folder import ERROR_FILE, LOCK
-from gridworld.run.identity.fingerprint import settings_hash
-from gridworld.run.reader import RunReader
-from gridworld.run.recovery import find_run
+from gridworld.run.provenance import settings_hash
+from gridworld.run.reader import RunReader, find_run
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.csv_text import csv_rows, csv_text
 from gridworld.storage.file_lock import is_locked

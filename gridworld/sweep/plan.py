@@ -25,7 +25,7 @@ from gridworld.config.plain_settings import foreign, has_own_code
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig
 from gridworld.errors import InputError
-from gridworld.run.identity.fingerprint import settings_hash
+from gridworld.run.provenance import settings_hash
 from gridworld.training.setup import check_settings, notes
 from gridworld.world.mdp import Mdp
 

@@ -20,7 +20,7 @@ from gridworld.agents import family
 from gridworld.config.train import TrainConfig
 from gridworld.errors import reason
 from gridworld.process.console.command_line import called_from
-from gridworld.process.garbage import collect_less_often
+from gridworld.process.memory_budget import collect_less_often
 from gridworld.process.parallel.together import mixing
 from gridworld.process.signals import exiting, handling, send_sigterm
 from gridworld.storage.atomic_write import write_bytes

@@ -12,6 +12,7 @@ import logging
 import math
 import shlex
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,13 +27,12 @@ from gridworld.process.console.terminal import tell
 from gridworld.process.parallel.together import clock
 from gridworld.process.signals import StopRequest
 from gridworld.run.checkpoints import Checkpoints, Pace
-from gridworld.run.evaluations_file import NEEDED, write_evaluations
 from gridworld.run.folder import CURVE, EVENTS
-from gridworld.run.identity.fingerprint import environment, identity
+from gridworld.run.provenance import environment, identity
 from gridworld.run.summary import MOST_NAMED, Summary
-from gridworld.run.writer import RunWriter
+from gridworld.run.writer import NEEDED, RunWriter, write_evaluations
 from gridworld.storage.append_log import AppendLog
-from gridworld.storage.atomic_write import in_background, sync, write_array, write_bytes, write_json
+from gridworld.storage.atomic_write import sync, write_array, write_bytes, write_json
 from gridworld.storage.serialization import State, fitting
 from gridworld.training.learning_curve import (
     CHARTS,
@@ -96,7 +96,6 @@ CONTENT = {  # the type of each key of a checkpoint
     "format": int,
     "identity": str,
     "environment": dict,
-    "manifest": str,  # as the run's was then
     "steps": int,
     "total_timesteps": int,
     "seconds": float,
@@ -255,7 +254,6 @@ class Session:
         state = {
             "format": FORMAT,
             **self._origin,
-            "manifest": self._run.text(),
             "steps": steps,
             "total_timesteps": self._config.total_timesteps,
             "seconds": clock() - self._started,
@@ -277,15 +275,18 @@ class Session:
         if self._events is not None:
             timeless = {key: value for key, value in summary.items() if key not in CLOCK}
             self._events.text("run/summary", as_markdown(timeless), last.step)
-        with in_background(self._settle):
+        with ThreadPoolExecutor(1) as disk:  # pictures are drawn while it is waited for
+            settling = disk.submit(self._settle)
             parts.pictures.finish(last)
+        settling.result()
         return summary
 
     def _settle(self) -> None:
         """Make the results, and the checkpoint that makes the run longer, survive a power cut."""
-        if newest := self.checkpoints.files()[:1]:
-            sync(newest, self.checkpoints.folder)
-        self._run.settle(*self._run.results())
+        newest = self.checkpoints.files()[:1]
+        self._run.settle(*newest, *self._run.results())
+        if newest:
+            sync([], self.checkpoints.folder)
 
     def _write_evaluations(self) -> None:
         if self._parts.curve.newest is not None:

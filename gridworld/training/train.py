@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import logging
 import os
 import shlex
 import traceback
@@ -20,7 +21,7 @@ from gridworld.process.console.command_line import recorded_command_line
 from gridworld.process.console.terminal import tell
 from gridworld.process.signals import Interrupted
 from gridworld.run.folder import MANIFEST, RunFolder, shown
-from gridworld.run.recovery import is_started
+from gridworld.run.reader import is_started
 from gridworld.run.summary import Summary, interruption_text
 from gridworld.run.train_log import TrainLog
 from gridworld.run.writer import RunWriter
@@ -139,7 +140,7 @@ def _note_end(run: RunWriter, log: TrainLog, error: BaseException, progress: dic
     # What is not an `Exception` is a signal's that came before the session takes them itself.
     failed = isinstance(error, Exception) and not isinstance(error, OSError)
     status = "failed" if failed else "interrupted"
-    log.add(f"{status}: {reason(error)}", "ERROR")
+    log.add(f"{status}: {reason(error)}", logging.ERROR)
     if failed and not isinstance(error, InputError | StateError):
         write_text(run.error_file, traceback.format_exc())
     run.end(status, reason(error), **progress)

@@ -21,8 +21,7 @@ from gridworld.config.composition.recipe_file import IN_A_STUDY, overrides
 from gridworld.config.fields import Effect
 from gridworld.config.settings import ON_RESULT, with_effects
 from gridworld.config.train import TrainConfig
-from gridworld.storage.atomic_write import write_text
-from gridworld.storage.symlinks import make_inside
+from gridworld.storage.atomic_write import make_inside, write_text
 from gridworld.tune.study_spec import ConfFolders, compose_in
 
 EXPERIMENT, _FILE = IN_A_STUDY
@@ -33,18 +32,7 @@ _OF_A_RECIPE = ON_RESULT - {Effect.SEED, Effect.MACHINE}
 def write_recipe(
     folder: Path, folders: ConfFolders, choices: Mapping[str, str], config: TrainConfig, about: str
 ) -> Path:
-    """Write the recipe, and check that it composes to `config` again.
-
-    Args:
-        folder: the study's.
-        folders: where yaml files come from.
-        choices: the file of each group in `config.recipe_file.CHOSEN`.
-        config: the winner's configuration.
-        about: a comment on where it is from.
-
-    Returns:
-        The recipe's path.
-    """
+    """Write the recipe, and check that it composes to `config` again."""
     chosen = [f"{group}={choice}" for group, choice in choices.items()]
     bare = without_hydra(compose_in(folders, "train", chosen))
     values = OmegaConf.create(_difference(_relevant(bare), _relevant(config)))

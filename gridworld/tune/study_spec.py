@@ -35,12 +35,11 @@ from gridworld.config.tune import TuneConfig
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import program
 from gridworld.process.parallel.machine import core_count
-from gridworld.sweep.plan import shape
 from gridworld.training.setup import check_settings
-from gridworld.tune.search.search_space import SearchSpace
+from gridworld.tune.objective import Objective
+from gridworld.tune.search_space import SearchSpace
 
-_SAMPLERS = ("tpe", "random")
-_PRUNERS = ("median", "hyperband", "none")
+_KNOWN = {"sampler": ("tpe", "random"), "pruner": ("median", "hyperband", "none")}
 _LARGEST_SEED = 2**32
 _TRIALS_AT_ONCE = 8  # over all workers; the sampler knows nothing of those that have not ended
 
@@ -74,16 +73,13 @@ class StudySpec:
         return Path(str(self.settings.folder))
 
     @property
-    def measured(self) -> TrainConfig:
-        """`base` evaluated often enough, which changes nothing else about it."""
-        evaluation = self.base.evaluation
-        every = min(evaluation.every, math.ceil(self.base.total_timesteps / self.settings.evaluations))
-        return dataclasses.replace(self.base, evaluation=dataclasses.replace(evaluation, every=every))
-
-    @property
-    def seeds(self) -> tuple[int, ...]:
-        """The seeds of a trial."""
-        return tuple(range(self.base.seed, self.base.seed + self.settings.seeds))
+    def objective(self) -> Objective:
+        """What is minimised: the base evaluated often enough, on the first seeds."""
+        evaluation, settings = self.base.evaluation, self.settings
+        every = min(evaluation.every, math.ceil(self.base.total_timesteps / settings.evaluations))
+        measured = dataclasses.replace(self.base, evaluation=dataclasses.replace(evaluation, every=every))
+        seeds = tuple(range(self.base.seed, self.base.seed + settings.seeds))
+        return Objective(measured, seeds, settings.reports, settings.stop_after)
 
     @property
     def final_seeds(self) -> range:
@@ -92,10 +88,9 @@ class StudySpec:
         return range(first, first + self.settings.final_seeds)
 
     @property
-    def held_out(self) -> tuple[int, ...]:
+    def held_out(self) -> range:
         """The held-out seeds after those, by which nothing is chosen."""
-        first = self.final_seeds.stop
-        return tuple(range(first, first + self.settings.confirm_seeds))
+        return range(self.final_seeds.stop, self.final_seeds.stop + self.settings.confirm_seeds)
 
 
 def compose_study(folders: ConfFolders, words: Sequence[str]) -> StudySpec:
@@ -115,14 +110,18 @@ def compose_study(folders: ConfFolders, words: Sequence[str]) -> StudySpec:
         search = compose_in(folders, "tune", of_search)
         space_name = str(search.hydra.runtime.choices["tune"])
         settings = cast(TuneConfig, OmegaConf.to_object(search.tune))
-    except (HydraException, OmegaConfBaseException, YAMLError) as error:
-        raise InputError(_sentence(error)) from None
+    except YAMLError as error:
+        mark: Any = getattr(error, "problem_mark", None)
+        where = f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}" if mark else "a yaml file"
+        raise InputError(f"{where}: cannot be read ({getattr(error, 'problem', None) or error})") from None
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(sentence(error)) from None
     _check(settings)
     settings = _completed(settings, choices["agent"], base)
     space = SearchSpace(settings.space, space_name)
     space.check(base, check_settings(base))
     spec = StudySpec(folders, base, choices, settings, space)
-    if spec.held_out[-1] >= _LARGEST_SEED:
+    if spec.held_out.stop > _LARGEST_SEED:
         raise InputError(f"seed={base.seed}: leaves no room for the other seeds after it, below 2**32")
     return spec
 
@@ -139,8 +138,8 @@ def compose_in(folders: ConfFolders, name: str, overrides: Sequence[Override | s
 
 def _divide(words: Sequence[str]) -> tuple[list[Override], list[Override]]:
     """Overrides of the search and of the run."""
-    overrides = _parse(words)
-    for override in overrides:
+    of_search, of_run = list[Override](), list[Override]()
+    for override in _parse(words):
         if override.is_sweep_override():
             raise InputError(
                 f"{override.input_line}: a study searches from one configuration; give one value, and put "
@@ -150,11 +149,8 @@ def _divide(words: Sequence[str]) -> tuple[list[Override], list[Override]]:
             raise InputError(
                 f"{override.input_line}: {program('tune')} makes its own folder; see tune.folder"
             )
-    is_search = [each.key_or_group.split(".")[0] == "tune" for each in overrides]
-    return (
-        [each for each, search in zip(overrides, is_search, strict=True) if search],
-        [each for each, search in zip(overrides, is_search, strict=True) if not search],
-    )
+        (of_search if override.key_or_group.split(".")[0] == "tune" else of_run).append(override)
+    return of_search, of_run
 
 
 def _parse(words: Sequence[str]) -> list[Override]:
@@ -165,11 +161,8 @@ def _check(settings: TuneConfig) -> None:
     check_bounds(settings, "tune.")
     if settings.workers == 0:
         raise InputError("tune.workers=0: must be at least 1, or -1 for one on each core")
-    for key, value, known in (
-        ("sampler", settings.sampler, _SAMPLERS),
-        ("pruner", settings.pruner, _PRUNERS),
-    ):
-        if value not in known:
+    for key, known in _KNOWN.items():
+        if (value := getattr(settings, key)) not in known:
             raise InputError(f"tune.{key}={value}: must be {', '.join(known[:-1])} or {known[-1]}")
 
 
@@ -179,14 +172,6 @@ def _completed(settings: TuneConfig, agent: str, base: TrainConfig) -> TuneConfi
         raise InputError(f"tune.study={study}: must be of letters, digits and _.,=+-, e.g. {slug(study)}")
     workers = core_count() if settings.workers == -1 else settings.workers
     together = settings.together or (1 if workers == 1 else math.ceil(_TRIALS_AT_ONCE / workers))
-    together = together if shape(base) is not None else 1
+    together = together if base.agent.shape is not None else 1
     folder = settings.folder or f"runs/{study}"
     return dataclasses.replace(settings, study=study, folder=folder, workers=workers, together=together)
-
-
-def _sentence(error: Exception) -> str:
-    if isinstance(error, YAMLError):
-        mark: Any = getattr(error, "problem_mark", None)
-        where = f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}" if mark else "a yaml file"
-        return f"{where}: cannot be read ({getattr(error, 'problem', None) or error})"
-    return sentence(error)

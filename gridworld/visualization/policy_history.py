@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,15 +11,13 @@ from gridworld.agents import PolicySnapshot
 from gridworld.envs.board import board_of
 from gridworld.envs.rendering import fitting_cell_size
 from gridworld.storage.serialization import State
-from gridworld.visualization.animation import Animation, animation_of_frames
+from gridworld.visualization.animation import animation_of_frames
 from gridworld.visualization.canvas import shown
 from gridworld.visualization.paths import explored
 from gridworld.visualization.picture import Draw, Subject
 from gridworld.visualization.policy_map import caption_at, draw_policy_map, draw_policy_table
 from gridworld.visualization.sheet import PAPER, VIRIDIS, Sheet, linear
 from gridworld.visualization.state_table import Numbers, table_states
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.mdp import BoolArray
 
 TENSORBOARD_SIDE: int | None = None
 
@@ -31,12 +28,28 @@ _MOSAIC_SIDE = 640  # pixels, where there are several panels
 
 
 def draw(subject: Subject) -> Draw:
-    """The animation of the subject's history, of one size."""
+    """The policy map, or table, over training as an animation of one size, with one scale of colours."""
     assert subject.history is not None
-    known = explored(subject.evaluator.mdp, subject.visits)
-    animation = subject.history.animation(
-        subject.evaluator, known, lambda step: caption_at(subject, step), subject.visits
-    )
+    mdp, optimal = subject.evaluator.mdp, subject.evaluator.solution.optimal
+    moments = subject.history.moments()
+    board, known = board_of(mdp), explored(mdp, subject.visits)
+    states = np.flatnonzero(shown(mdp)) if board.panels else table_states(mdp, subject.visits)
+    visited = states[known[states]]
+    scale = linear(VIRIDIS, np.stack([moment.values[visited] for moment in moments]))
+    cell_size = fitting_cell_size(mdp, _SIDE if len(board.panels) <= 1 else _MOSAIC_SIDE)
+
+    def sheet(moment: Moment) -> Sheet:
+        values, greedy = moment.values.astype(np.float64), moment.greedy
+        caption = caption_at(subject, moment.step)
+        if board.panels:
+            return draw_policy_map(mdp, values, greedy, optimal, caption, cell_size, scale, known)
+        numbers = np.full(optimal.shape, np.nan)
+        np.put_along_axis(numbers, greedy[:, None].astype(np.intp), values[:, None], axis=1)
+        drawn = Numbers("value", numbers, scale, written=False)
+        return draw_policy_table(mdp, states, drawn, greedy, optimal, known, caption)
+
+    frames = (sheet(moment).packed() for moment in moments)
+    animation = animation_of_frames(frames, [PAPER, *scale.ramp.tolist()])
     return lambda cell_size: animation
 
 
@@ -95,35 +108,3 @@ class PolicyHistory:
         self._every, self._seen = int(state["every"]), int(state["seen"])
         self._kept = moments[: state["kept"]]
         self._last = moments[-1] if moments else None
-
-    def animation(
-        self,
-        evaluator: Evaluator,
-        known: BoolArray,
-        caption: Callable[[int], str],
-        visits: NDArray[np.int64] | None = None,
-    ) -> Animation:
-        """The policy map, or table, over training; one scale of colours for all of it.
-
-        `known` (S,) are the states that training acted in at any time; by `visits` (S, A) those of a table
-        are chosen. `caption` is of a map after so many steps.
-        """
-        mdp, optimal, moments = evaluator.mdp, evaluator.solution.optimal, self.moments()
-        board = board_of(mdp)
-        states = np.flatnonzero(shown(mdp)) if board.panels else table_states(mdp, visits)
-        visited = states[known[states]]
-        scale = linear(VIRIDIS, np.stack([moment.values[visited] for moment in moments]))
-        cell_size = fitting_cell_size(mdp, _SIDE if len(board.panels) <= 1 else _MOSAIC_SIDE)
-
-        def sheet(moment: Moment) -> Sheet:
-            values, greedy, words = moment.values.astype(np.float64), moment.greedy, caption(moment.step)
-            if board.panels:
-                return draw_policy_map(mdp, values, greedy, optimal, words, cell_size, scale, known)
-            numbers = np.full(optimal.shape, np.nan)
-            np.put_along_axis(numbers, greedy[:, None].astype(np.intp), values[:, None], axis=1)
-            drawn = Numbers("value", numbers, scale, written=False)
-            return draw_policy_table(mdp, states, drawn, greedy, optimal, known, words)
-
-        return animation_of_frames(
-            (sheet(moment).packed() for moment in moments), [PAPER, *scale.ramp.tolist()]
-        )

@@ -25,7 +25,7 @@ from os import PathLike, fspath
 from typing import Any
 
 from gridworld.errors import InputError
-from gridworld.process.users_file import open_users_file
+from gridworld.process.user_input import open_users_file
 
 Cell = tuple[int, int]  # (row, column), both from 0, the top-left cell first
 

@@ -16,10 +16,9 @@ import os
 import numpy as np
 import pytest
 
-from gridworld.checking import expectations as expect
+from gridworld.checking import probes as expect
 from gridworld.checking.probes import PROBES, Probe
-from gridworld.checking.settings import settings
-from gridworld.checking.subject import subject
+from gridworld.checking.settings import settings, subject
 from gridworld.checking.training import Trained, train
 from gridworld.world.exact.markov_chain import Chain
 from gridworld.world.exact.solver import backup, solved

@@ -17,7 +17,7 @@ from gridworld.commands.console import COMMANDS
 from gridworld.config.composition.conf_folder import conf_folder
 from gridworld.errors import DISTRIBUTION
 from gridworld.process.console import command_line
-from gridworld.run.identity.provenance import code
+from gridworld.run.provenance import code
 
 TEXTS = (".py", ".md", ".yaml", ".toml", ".cff", ".j2")
 
@@ -165,7 +165,7 @@ def test_it_trains_from_the_wheel(wheel: Path, tmp_path: Path) -> None:
 
     where = "from gridworld.config.composition.conf_folder import conf_folder as f; print(f())"
     assert run(sys.executable, "-c", where).strip() == str(site / "gridworld" / "conf")
-    same = "from gridworld.run.identity.provenance import code; print(code())"
+    same = "from gridworld.run.provenance import code; print(code())"
     assert run(sys.executable, "-c", same).strip() == code()  # a run may go on in a checkout
     command = str(site / "bin" / "gridworld")
     run(command, "train", *SHORT["q_learning"], "hydra.run.dir=run")

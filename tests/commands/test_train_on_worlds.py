@@ -11,8 +11,7 @@ from PIL import Image
 
 from gridworld.errors import InputError
 from gridworld.restore.saved_run import SavedRun
-from gridworld.run.identity.stored_world import stored_world
-from gridworld.run.reader import read_run
+from gridworld.run.reader import read_run, stored_world
 from gridworld.world.sources.gymnasium_table import compile_gymnasium
 
 TRAINED = (

@@ -6,7 +6,7 @@ from helpers.oracle import MOVES, World, maps
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gridworld.diagnosis.split import split_regret
+from gridworld.diagnosis.evidence import split_regret
 from gridworld.world.exact.evaluation import Evaluator
 from gridworld.world.exact.markov_chain import one_hot_policy
 from gridworld.world.grid import compile_mdp
@@ -63,16 +63,6 @@ def test_the_shares_add_up_to_the_regret(rows, settings, seed, greedy, gamma) ->
         assert split.cost.sum() == regret
     if gamma < 1:  # else it may cost something to go in circles by optimal actions
         assert np.abs(split.cost[~split.wrong]).max() <= 1e-7 * scale
-
-
-def test_a_large_world_adds_up_too() -> None:
-    rows = "\n".join(
-        "S" + "." * 29 if row == 0 else "." * 29 + ("G" if row == 29 else ".") for row in range(30)
-    )
-    evaluator = Evaluator(compile_mdp(parse(rows, "map"), slip=0.2, step_reward=-0.01), 0.99, 200)
-    policy = _policy(900, 1, greedy=False)
-    split = split_regret(evaluator, policy)
-    assert split.cost.sum() == pytest.approx(evaluator.score(policy).regret, abs=1e-9)
 
 
 def test_an_optimal_policy_costs_nothing_anywhere() -> None:

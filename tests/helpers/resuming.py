@@ -16,7 +16,7 @@ from tensorboard.compat.proto.event_pb2 import Event
 from gridworld.agents import sb3, tabular
 from gridworld.restore.resume import open_unfinished, unfinished_of
 from gridworld.run.checkpoints import Checkpoints
-from gridworld.run.recovery import is_started
+from gridworld.run.reader import is_started
 from gridworld.storage.serialization import decode
 from gridworld.training.together import run_together
 from gridworld.training.train import train, training
@@ -140,7 +140,7 @@ def last_state(folder: Path) -> dict[str, Any] | None:
     if not files:
         return None
     state = decode(files[0].read_bytes())
-    for key in ("seconds", "marks", "manifest"):  # which has the time of the start
+    for key in ("seconds", "marks"):
         del state[key]
     curve = state["curve"]
     del curve["seconds"]

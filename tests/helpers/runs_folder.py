@@ -14,7 +14,7 @@ import numpy as np
 from helpers.support import configure
 
 from gridworld.report import tuning_study as tuning
-from gridworld.run.identity.fingerprint import settings_hash
+from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import read_run
 from gridworld.storage.safe_read import sha256
 from gridworld.storage.sealed_json import sealed

@@ -49,9 +49,9 @@ import gridworld
 from gridworld.config.composition.compose import compose
 from gridworld.envs.rendering import import_pygame
 from gridworld.process.console import progress
-from gridworld.process.garbage import collect_less_often
+from gridworld.process.memory_budget import collect_less_often
 from gridworld.report import page
-from gridworld.tune import progress as search_progress
+from gridworld.tune import search as tune_search
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 
@@ -264,7 +264,7 @@ if __name__ == "__main__":
     gc.disable()
     _import_everything()
     progress._SECONDS_BETWEEN_LINES = 600.0
-    search_progress._SECONDS_BETWEEN_TABLES = 0.3
+    tune_search._SECONDS_BETWEEN_TABLES = 0.3
     _wait_less_for_slurm()
     compose_quickly()
     compose(CONF, [])

@@ -1,6 +1,5 @@
 """The budget of memory that commands have for what they read, and the lines that tell of what takes long."""
 
-import json
 import re
 import time
 from pathlib import Path
@@ -13,11 +12,14 @@ from gridworld.commands import evaluate
 from gridworld.errors import InputError
 from gridworld.process.console import progress
 from gridworld.process.console.progress import telling_if_slow
-from gridworld.process.memory_budget import VARIABLE, BudgetError, check_memory, is_limited, limited
-from gridworld.report.tuning_study import find_tunings
-from gridworld.restore.saved_run import SavedRun
-from gridworld.storage.safe_read import as_object, as_table, check_yaml, sha256
-from gridworld.storage.sealed_json import sealed
+from gridworld.process.memory_budget import (
+    VARIABLE,
+    BudgetError,
+    check_memory,
+    is_limited,
+    limited,
+)
+from gridworld.storage.safe_read import as_object, as_table, check_yaml
 from gridworld.storage.serialization import decode, encode
 
 
@@ -26,13 +28,10 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, "20MB")
 
 
-def test_without_a_limit_nothing_is_refused() -> None:
-    check_memory("a model", 1e30)
-
-
 def test_the_sentence_says_what_it_would_take_the_budget_and_how_to_raise_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    check_memory("a model", 1e30)  # without a limit nothing is refused
     with limited():
         check_memory("a model", 10**9)
         with pytest.raises(BudgetError) as refused:
@@ -65,23 +64,11 @@ def test_text_is_refused_by_what_it_comes_to() -> None:
 
 @pytest.mark.usefixtures("small")
 def test_a_state_is_refused_by_what_its_arrays_say_before_they_are_made() -> None:
-    content = b"".join(encode({"a": np.zeros(5_000_000)}))
-    assert len(content) < 1000
+    content = encode({"a": np.zeros(5_000_000)}, compress=True)
+    assert len(content) < 200_000
     assert decode(content)["a"].size == 5_000_000
-    with limited(), pytest.raises(BudgetError, match="this one: would take about 40 MB"):
+    with limited(), pytest.raises(BudgetError, match="this one: would take about 120 MB"):
         decode(content, "this one")
-
-
-def test_an_agent_that_is_only_asked_keeps_nothing(tmp_path: Path) -> None:
-    for agent in ("dqn", "ppo", "a2c"):
-        train_in(tmp_path / agent, *SHORT[agent], "recording.frames=false", "recording.gif=false")
-        saved = SavedRun(tmp_path / agent)
-        before = saved.snapshot()
-        if agent == "dqn":
-            saved.config.agent.buffer_size = 10**13
-        else:
-            saved.config.agent.n_steps = 10**10
-        assert (saved.snapshot().sampled == before.sampled).all()
 
 
 def test_what_takes_long_says_so_until_it_is_done(
@@ -122,17 +109,3 @@ def test_yaml_of_gigabytes_is_not_read(tmp_path: Path) -> None:
         file.truncate(5 * 2**20)
     with pytest.raises(InputError, match=r"a\.yaml: is larger than 4 MiB"):
         check_yaml(tmp_path)
-
-
-def test_a_study_of_too_many_trials_is_told_and_left_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    table = "trial,status,score\n" + "".join(f"{number},done,0.5\n" for number in range(10_000))
-    (tmp_path / "trials.csv").write_text(table)
-    study = sealed({"study": "mine", "trials_sha256": sha256(table.encode())})
-    (tmp_path / "study.json").write_text(json.dumps(study))
-    monkeypatch.setenv(VARIABLE, "50MB")
-    with limited():
-        found, problems = find_tunings([tmp_path])
-    assert found == []
-    assert "trials.csv: would take about 60 MB of memory" in problems[0]

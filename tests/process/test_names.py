@@ -15,11 +15,8 @@ from helpers.support import SHORT, train_in
 from gridworld.commands import evaluate, jobs, record, report, reproduce, run
 from gridworld.commands import resume as resume_command
 from gridworld.process.console.terminal import prepare
-from gridworld.process.signals import Interrupted
 from gridworld.report.table import Table, to_captioned_markdown, to_csv, to_markdown
 from gridworld.report.tuning_study import find_tunings
-from gridworld.run.folder import RunFolder, shown
-from gridworld.run.summary import interruption_text
 from gridworld.storage.sealed_json import sealed
 from gridworld.sweep import console
 from gridworld.sweep.folder import SweepFolder
@@ -121,13 +118,6 @@ def test_what_is_said_of_a_sweeps_jobs(tmp_path: Path, capsys: pytest.CaptureFix
     console.tell_end(sweep.path, [JobRow("x", EVIL, FAILED, error=EVIL)], 1, "stopped", ())
     out, err = capsys.readouterr()
     assert all(sign == "\n" or sign.isprintable() for sign in out + err)
-
-
-def test_what_is_said_at_the_end(tmp_path: Path) -> None:
-    assert shown(tmp_path / EVIL).isprintable()
-    (line,) = interruption_text(Interrupted(2), RunFolder(tmp_path / EVIL), {"config": {}}).splitlines()
-    assert line.isprintable()
-    assert SHOWN in line
 
 
 def test_what_is_logged(caplog: pytest.LogCaptureFixture) -> None:

@@ -5,7 +5,6 @@ But where what it prints is its result, it fails at its end if that could not be
 
 import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +12,7 @@ from pathlib import Path
 import pytest
 from helpers.support import ROOT, SHORT, script, train_in
 
-from gridworld.process.console.terminal import printable
+from gridworld.storage.sealed_json import sealed
 
 NO_UTF8 = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 ASCII = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii"}
@@ -82,15 +81,6 @@ def test_names_in_a_locale_without_utf8(environment: dict[str, str], tmp_path: P
     assert refused.stderr.startswith("error: layout 'n")
 
 
-@pytest.mark.parametrize("look", ["evaluate.py run", "report.py run --formats"])
-@pytest.mark.parametrize("end", ["| true", ">&- 2>&-"])
-def test_looking_at_a_run_ends_well_too(look: str, end: str, tmp_path: Path) -> None:
-    train_in(tmp_path / "run", *SHORT["q_learning"], "recording.learning=false")
-    done = shell(f"set -o pipefail; SCRIPT {look} {end}", tmp_path)
-    told = re.sub(rb"writing the report: \d+ s so far; .*\n", b"", done.stderr)  # on a busy machine
-    assert (done.returncode, told) == (0, b"")
-
-
 def check_full_disk(told: str, code: int) -> None:
     """That a command failed at it, and says nothing else."""
     assert (code, told) == (
@@ -126,8 +116,8 @@ def test_a_result_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     folder = tmp_path / "sweep" / "seed=0"
     train_in(folder, *SHORT["q_learning"], "recording.learning=false")
     entry = {"job": "seed=0", "hash": "x", "overrides": ["seed=0"]}
-    content = {"format": 1, "asked": [{"overrides": ["seed=0"]}], "jobs": [entry]}
-    (tmp_path / "sweep" / "sweep.json").write_text(json.dumps(content))
+    content = {"asked": [{"overrides": ["seed=0"]}], "jobs": [entry]}
+    (tmp_path / "sweep" / "sweep.json").write_text(json.dumps(sealed(content)))
     run = f"sweep/{folder.name}"
     for line in (f"evaluate.py {run}", "jobs.py sweep", f"record.py {run} --format policy"):
         print_to_a_full_disk(line, tmp_path)
@@ -145,9 +135,3 @@ def test_a_result_that_is_cut_short_is_an_error(tmp_path: Path) -> None:
 def test_a_mistake_has_its_exit_code_whoever_reads_it(tmp_path: Path) -> None:
     assert shell("SCRIPT evaluate.py nowhere 2>&-", tmp_path).returncode == 2
     assert shell("SCRIPT train.py seed=x 2>/dev/full", tmp_path).returncode == 2
-
-
-def test_what_is_printed_cannot_act_on_the_terminal() -> None:
-    assert printable("plain ä 日本") == "plain ä 日本"
-    assert printable("\x1b[2J\r\n\x07\u202e\ud800") == "\\x1b[2J\\r\\n\\x07\\u202e\\ud800"
-    assert len(printable("x" * 10**6)) < 2100

@@ -20,7 +20,7 @@ from gridworld.commands import reproduce as command
 from gridworld.commands.reproduce import main
 from gridworld.errors import InputError
 from gridworld.run.folder import SOURCE_DIFF
-from gridworld.run.identity.provenance import describe, differences, source_of
+from gridworld.run.provenance import describe, differences, source_of
 from gridworld.storage.event_file import EventFile, read_scalars
 
 PARTS = ["learning curve", "final weights", "best weights", "visits", "summary", "TensorBoard points"]

@@ -1,11 +1,11 @@
 """What a checkpoint holds: all that matters, nothing damaged, and nothing else is let in."""
 
 import copy
-import hashlib
+import io
 import os
 import random
 import shutil
-import struct
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,41 +18,11 @@ from helpers.support import SHORT, configure
 from gridworld.errors import InputError
 from gridworld.restore.resume import _why_not
 from gridworld.run.checkpoints import Checkpoints, Pace
-from gridworld.run.identity.fingerprint import identity
-from gridworld.storage.serialization import State, StateError, decode, encode, same
+from gridworld.run.provenance import identity
+from gridworld.storage.serialization import State, StateError, decode, encode
 
 CORRUPTIONS = int(os.environ.get("GRIDWORLD_CORRUPTIONS", "200"))
 LESS = [*("recording.frames=false", "recording.gif=false", "env.slip=0.1", "logging.policy_map_every=0")]
-
-SAMPLE: dict[str, Any] = {
-    "number": 3,
-    "real": -0.1,
-    "infinite": float("inf"),
-    "none": None,
-    "truth": True,
-    "text": "a\u00e9",
-    "list": [1, [2.5, {"deep": np.arange(6, dtype=np.uint8).reshape(2, 3)}]],
-    "empty": np.empty((0, 3), dtype=np.float32),
-    "zeros": np.zeros(100_000),
-    "mostly zeros": np.eye(300, dtype=np.float32)[:200],
-    "scalar": np.array(2.5),
-    "truths": np.array([True, False]),
-}
-
-
-@pytest.mark.parametrize("compress", [False, True])
-def test_a_state_comes_back_to_the_bit(compress: bool) -> None:
-    data = b"".join(encode(SAMPLE, compress))
-    assert differences(decode(data), SAMPLE) == []
-    assert len(data) < 350_000  # zeros at the end take no room
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"a": object()}, {1: 2}, {"@": 1}, {"a": (1, 2)}, {"a": np.array(["x"])}, {"a": {1, 2}}]
-)
-def test_what_is_no_state_is_not_written(wrong: Any) -> None:
-    with pytest.raises(TypeError):
-        encode(wrong)
 
 
 def damaged(data: bytes, count: int) -> Iterator[bytes]:
@@ -73,50 +43,39 @@ def damaged(data: bytes, count: int) -> Iterator[bytes]:
 def test_no_damaged_checkpoint_is_accepted(tmp_path: Path) -> None:
     begin(tmp_path, *SHORT["dqn"], *LESS)
     data = Checkpoints(tmp_path).files()[0].read_bytes()
-    decode(data)
-    accepted = 0
+    whole, accepted = decode(data), 0
     for wrong in damaged(data, CORRUPTIONS):
         try:
-            decode(wrong)
+            accepted += differences(decode(wrong), whole) != []  # a zip has bits that mean nothing
         except StateError:
             continue
-        accepted += wrong != data
     assert accepted == 0
-
-
-def resealed(tree: str, rest: bytes = b"") -> bytes:
-    """A file with a checksum that is right: what somebody with bad intentions would make."""
-    body = b"-" + struct.pack("<Q", len(tree)) + tree.encode() + rest
-    return b"gridworld state\x01" + hashlib.sha256(body).digest() + body
 
 
 @pytest.mark.parametrize(
     "tree",
     [
-        "",
-        "[]",
-        "nonsense",
-        "{}",
-        '{"arrays": [], "state": []}',
-        '{"arrays": [], "state": {"a": {"@": 0}}}',
-        '{"arrays": [], "state": {"a": {"@": -1}}}',
-        '{"arrays": [], "state": {"a": {"@": "x"}}}',
-        '{"arrays": [["|O", [1], 8]], "state": {}}',
-        '{"arrays": [["<f8", [-1], 0]], "state": {}}',
-        '{"arrays": [["<f8", [1000000, 1000000], 0]], "state": {}}',
-        '{"arrays": [["<f8", [1.5], 0]], "state": {}}',
-        '{"arrays": [["<f8", [1], 8]], "state": {}}',
-        '{"arrays": [["<f8", [0], 8]], "state": {}}',
-        '{"arrays": [[["<f8"], [1], 8]], "state": {}}',
-        '{"arrays": [["<f8", 1, 8]], "state": {}}',
-        '{"arrays": 3, "state": {}}',
-        '{"arrays": [], "state": ' + "[" * 100_000 + "]" * 100_000 + "}",
+        *("", "[]", "nonsense", '{"a": {"@": 0}}', '{"a": {"@": "y"}}', '{"a": {"@": "x", "b": 1}}'),
+        *('{"a": {"@": "text"}}', '{"a": {"@": ["x"]}}', '{"a": ' + "[" * 100_000 + "]" * 100_000 + "}"),
     ],
-    ids=range(18),
+    ids=range(9),
 )
 def test_a_hostile_state_is_refused(tree: str) -> None:
+    """Its checksums are right: what somebody with bad intentions would make."""
+    content = io.BytesIO()
+    np.savez(content, x=np.zeros(1))
+    with zipfile.ZipFile(content, "a") as archive:
+        archive.writestr("state.json", tree)
+        archive.writestr("text", "no array")
     with pytest.raises(StateError):
-        decode(resealed(tree))
+        decode(content.getvalue())
+
+
+def test_a_pickle_in_a_state_is_refused() -> None:
+    content = io.BytesIO()
+    np.savez(content, x=np.array([{}]), **{"state.json": np.zeros(1)})
+    with pytest.raises(StateError):
+        decode(content.getvalue())
 
 
 # What may be anything, since it follows from the rest or is not looked at again; all else must be missed.
@@ -161,7 +120,7 @@ def changed(state: State, path: tuple[str, ...], *value: Any) -> State:
 def ends(folder: Path, copied: Path, state: State) -> dict[str, Any] | None:
     """What comes of going on from this state; None: it is refused."""
     shutil.copytree(folder, copied)
-    Checkpoints(copied).files()[0].write_bytes(b"".join(encode(state)))
+    Checkpoints(copied).files()[0].write_bytes(encode(state))
     try:
         go_on(copied)
     except InputError:
@@ -202,7 +161,7 @@ def test_what_is_left_out_is_missed(agent: str, tmp_path: Path, monkeypatch: pyt
             began_with = at(first["agent"], path)
         except KeyError:
             continue
-        if same(began_with, at(whole["agent"], path)):
+        if differences(began_with, at(whole["agent"], path)) == []:
             continue
         outcome = ends(tmp_path / "run", tmp_path / "copy", changed(whole, ("agent", *path), began_with))
         if outcome is None or differences(outcome, calm):

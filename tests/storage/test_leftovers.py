@@ -45,7 +45,7 @@ def test_the_next_writer_removes_what_killed_ones_left(name: str, tmp_path: Path
     killed = [writer(tmp_path, "dies", name).pid for _ in range(2)]
     (tmp_path / ".film.9.part.txt").touch()  # none of ours
     living = writer(tmp_path, "waits", name)
-    at_work = f".{name}.{living.pid}.part"
+    at_work = f".{name}.{os.uname().nodename}.{living.pid}.part"
     assert names(tmp_path) == sorted([".film.9.part.txt", at_work])
     assert living.pid not in killed
     writer(tmp_path, "ends", "other.csv")

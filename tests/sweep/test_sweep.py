@@ -259,21 +259,7 @@ def test_a_job_that_was_made_longer_is_no_longer_done(swept: Path) -> None:
 def test_a_job_with_a_damaged_manifest_is_told(keep: int, swept: Path) -> None:
     file = swept / "sweep" / "seed=0" / "manifest.json"
     file.write_bytes(file.read_bytes()[:keep])
-    shutil.rmtree(file.parent / "checkpoints")  # which have a copy of it
     check_told_and_begun_anew(swept, "manifest.json: is no JSON, it was changed or cut off")
-
-
-def test_a_job_with_a_damaged_manifest_goes_on_by_a_checkpoints(swept: Path) -> None:
-    file = swept / "sweep" / "seed=0" / "manifest.json"
-    file.write_bytes(b"")
-    curve = (file.parent / "curve.csv").read_bytes()
-    again = sweep("seed=0,1", cwd=swept)
-    assert again.returncode == 0, again.stderr
-    assert "1 to run" in again.stderr
-    assert "manifest.json: is no JSON" in again.stderr
-    assert "; goes by the copy in checkpoints/" in again.stderr
-    assert statuses(swept / "sweep") == {"seed=0": "done", "seed=1": "done"}
-    assert (file.parent / "curve.csv").read_bytes() == curve
 
 
 def check_told_and_begun_anew(cwd: Path, why: str) -> None:

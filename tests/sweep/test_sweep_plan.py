@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from gridworld.config.composition.compose import register_schemas
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.run.identity.fingerprint import settings_hash
+from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import read_run
 from gridworld.run.writer import RunWriter
 from gridworld.sweep.plan import Job, expand, folder_name, plan

@@ -24,7 +24,7 @@ NAME: ContextVar[str] = ContextVar("name", default="outside")
 def handlers_are_put_back() -> Iterator[None]:
     before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGALRM)
     yield
-    assert signals._listeners == []
+    assert StopRequest._listening == []
     assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGALRM)) == before
     assert signal.getitimer(signal.ITIMER_REAL)[0] == 0
 

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -51,22 +52,30 @@ DIRECTIONS = {"up": (-1, 0), "right": (0, 1), "down": (1, 0), "left": (0, -1)}
 def from_gymnasium(name: str, places: IntArray, names: str, panel_names: tuple[str, ...] = ()) -> Mdp:
     env = gym.make(name).unwrapped
     table = env.P  # type: ignore[attr-defined]
-    most, none = len(table[0][0]), [(0.0, 0, 0.0, False)]
-    actions = range(len(table[0]))
-    rows = [
-        [(table[state][action] + most * none)[:most] for action in actions] for state in range(len(table))
-    ]
-    probability, next_state, reward, terminated = np.moveaxis(np.array(rows, dtype=float), -1, 0)
+    most = len(table[0][0])
+    rows = [list(row.values()) for row in table.values()]
+    padded = [[(each + most * [(0.0, 0, 0.0, False)])[:most] for each in row] for row in rows]
+    probability, next_state, reward, terminated = np.moveaxis(np.array(padded, dtype=float), -1, 0)
+    start = np.asarray(env.initial_state_distrib, dtype=float)  # type: ignore[attr-defined]
     outcomes = Outcomes(
         next_state=next_state.astype(int),
         probability=probability,
         reward=reward,
         terminated=terminated.astype(bool),
-        start=np.asarray(env.initial_state_distrib, dtype=float),  # type: ignore[attr-defined]
+        start=start,
     )
     return mdp_from_outcomes(
         name, outcomes, action_names=names.split(), places=places, panel_names=panel_names
     )
+
+
+def certain(name: str, next_state: IntArray, end: int, reward: float = 0.0, **settings: Any) -> Mdp:
+    """A world without chance, by the states (S, A) that actions lead to; entering the end is worth 1."""
+    targets = next_state[..., None]
+    rewards, start = np.where(targets == end, 1.0, reward), np.eye(len(next_state))[0]
+    tables = {"next_state": targets, "probability": np.ones(targets.shape), "reward": rewards}
+    outcomes = Outcomes(**tables, terminated=targets == end, start=start)
+    return mdp_from_outcomes(name, outcomes, **settings)
 
 
 def one_panel(rows: int, cols: int) -> IntArray:
@@ -91,38 +100,19 @@ TAXI = from_gymnasium(
 def chain(length: int) -> Mdp:
     """Action 0 leads back to the start, action 1 to the next state, the last of which is the end."""
     next_state = np.stack([np.zeros(length, dtype=int), np.arange(1, length + 1)], axis=1)
-    next_state = np.append(next_state, [[length, length]], axis=0)[..., None]
-    reward = np.where(next_state == length, 1.0, -0.5)
-    start = np.eye(length + 1)[0]
-    outcomes = Outcomes(
-        next_state=next_state,
-        probability=np.ones(next_state.shape),
-        reward=reward,
-        terminated=next_state == length,
-        start=start,
-    )
-    return mdp_from_outcomes("chain", outcomes, action_names=["back", "on"])
+    next_state = np.append(next_state, [[length, length]], axis=0)
+    return certain("chain", next_state, length, -0.5, action_names=["back", "on"])
 
 
 def deep_sea(size: int, mirrored: bool) -> Mdp:
     """Each step goes down, and left or right; `mirrored`: actions are swapped in every other row."""
     cells = size * size
     rows, cols = np.divmod(np.arange(cells), size)
-    swap = (rows % 2 == 1) & mirrored
-    next_state = np.full((cells + 1, 2, 1), cells)
-    for action in range(2):
-        right = (action == 1) != swap
-        col = np.clip(np.where(right, cols + 1, cols - 1), 0, size - 1)
-        next_state[:-1, action, 0] = np.where(rows == size - 1, cells, (rows + 1) * size + col)
-    outcomes = Outcomes(
-        next_state=next_state,
-        probability=np.ones(next_state.shape),
-        reward=np.zeros(next_state.shape),
-        terminated=next_state == cells,
-        start=np.eye(cells + 1)[0],
-    )
+    right = (np.arange(2) == 1) != ((rows % 2 == 1) & mirrored)[:, None]
+    beside = np.clip(np.where(right, cols[:, None] + 1, cols[:, None] - 1), 0, size - 1)
+    next_state = np.where(rows[:, None] == size - 1, cells, (rows[:, None] + 1) * size + beside)
     places = np.append(one_panel(size, size), [[-1, -1, -1]], axis=0)
-    return mdp_from_outcomes("deep sea", outcomes, places=places)
+    return certain("deep sea", np.append(next_state, [[cells, cells]], axis=0), cells, places=places)
 
 
 def subject(mdp: Mdp, q: NDArray[np.float64], visits: NDArray[np.int64]) -> Subject:
@@ -168,15 +158,7 @@ def test_panels_stand_in_a_mosaic_near_to_square_with_a_blank_line_between_two()
 
 def test_of_two_states_in_a_place_the_first_that_can_be_reached_is_shown() -> None:
     places = np.array([(0, 0, 0), (0, 0, 1), (0, 0, 1), (0, 0, 2)])
-    next_state = np.array([2, 2, 3, 3]).reshape(4, 1, 1)
-    outcomes = Outcomes(
-        next_state=next_state,
-        probability=np.ones(next_state.shape),
-        reward=np.zeros(next_state.shape),
-        terminated=next_state == 3,
-        start=np.eye(4)[0],
-    )
-    mdp = mdp_from_outcomes("crowd", outcomes, places=places)
+    mdp = certain("crowd", np.array([2, 2, 3, 3])[:, None], 3, places=places)
     assert board_of(mdp).state.tolist() == [[0, 2, 3]]
     assert ansi(mdp, 2) == "SAG\n"
 

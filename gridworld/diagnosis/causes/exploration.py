@@ -6,8 +6,7 @@ import numpy as np
 
 from gridworld.config.agents import LINEAR
 from gridworld.diagnosis.evidence import Evidence
-from gridworld.diagnosis.experiments import best_of_what_was_tried
-from gridworld.diagnosis.finding import Finding, longer
+from gridworld.diagnosis.finding import Finding, best_of_what_was_tried, longer
 from gridworld.world.exact.markov_chain import Chain
 from gridworld.world.mdp import BoolArray
 

@@ -26,10 +26,7 @@ _SECONDS = 2.5  # of the processor
 
 def faulty_class(run: Evidence) -> Finding | None:
     """The library's own class is certified with the same settings."""
-    if run.config.agent.family != "sb3":
-        return None
-    sound = of_library(run.config.agent)
-    if sound is None:
+    if (sound := of_library(run.config.agent)) is None:
         return None
     until, steps = time.process_time() + _SECONDS, []
     lost = bool(run.curve["certified"].any())
@@ -47,11 +44,9 @@ def faulty_class(run: Evidence) -> Finding | None:
 
 
 def of_library(config: AgentConfig) -> SB3ClassConfig | None:
-    """The same settings for the algorithm of Stable-Baselines3 or sb3-contrib that a class is derived from.
+    """The same settings for the algorithm of SB3 or sb3-contrib that a class is derived from.
 
-    Returns:
-        The settings, without arguments that only the derived class takes; None: it is the library's own, or
-        derived from no algorithm that could train.
+    They lack arguments that only the derived class takes. None where it is the library's own class.
     """
     if not isinstance(config, SB3ClassConfig):
         return None

@@ -6,13 +6,18 @@ import numpy as np
 
 from gridworld.config.agents import LINEAR
 from gridworld.diagnosis.evidence import Evidence, entropy
-from gridworld.diagnosis.experiments import (
+from gridworld.diagnosis.finding import (
+    Finding,
+    costliest,
     entropy_optimum,
+    falling,
+    faster,
+    longer,
     on_the_way,
+    slower,
     sweeps_missing,
     visits_needed,
 )
-from gridworld.diagnosis.finding import Finding, costliest, falling, faster, longer, slower
 from gridworld.world.exact.solver import backup
 from gridworld.world.mdp import BoolArray
 
@@ -60,10 +65,8 @@ def scaled(run: Evidence) -> Finding | None:
     scale, largest = run.setting("reward_scale", 1.0), float(np.abs(run.own.v[run.mdp.acting]).max())
     if scale == 1 or _SMALL <= scale * largest <= _LARGE:
         return None
-    why = (
-        f"with its reward_scale of {scale:g} the values that it learns reach {scale * largest:.2g}, where "
-        "those of an untrained network are about 0.1"
-    )
+    reach = f"with its reward_scale of {scale:g} the values that it learns reach {scale * largest:.2g}"
+    why = f"{reach}, where those of an untrained network are about 0.1"
     return Finding("scale", run.split.wrong, why, (run.change("reward_scale", 1 / run.largest_reward),))
 
 
@@ -134,9 +137,10 @@ def _too_short(run: Evidence) -> bool:
 
 
 def _of_a_short_run(run: Evidence, states: BoolArray) -> Finding:
-    why = f"it was still learning after {run.config.total_timesteps:,} steps"
-    told = f"{why}; a random walk meets the goal once in {run.steps_to_goal:,.0f}"
-    return Finding("budget", states, told, (longer(run, 10),))
+    steps = (
+        f"{run.config.total_timesteps:,} steps; a random walk meets the goal once in {run.steps_to_goal:,.0f}"
+    )
+    return Finding("budget", states, f"it was still learning after {steps}", (longer(run, 10),))
 
 
 def _behind(run: Evidence) -> str:
@@ -184,9 +188,7 @@ def unsettled(run: Evidence) -> Finding:
 
 
 def _settling(run: Evidence) -> tuple[str, ...]:
-    """Smaller steps. Of a table, only such as have forgotten the first values by its end; where targets are
-    chance, means of enough of them.
-    """
+    """Smaller steps; of a table such as forget its first values, or average enough of random targets."""
     if not run.is_tabular:
         return slower(run)[0], *falling(run), longer(run, 4)
     way = on_the_way(run)
@@ -195,11 +197,9 @@ def _settling(run: Evidence) -> tuple[str, ...]:
         times = int(np.clip(needed / max(tried, 1.0), 4, _MOST_TIMES))
         fades = run.change("learning_rate", f"{LINEAR}{run.usual_rate:g}")
         if run.config.agent.algorithm == "q_learning":  # whose values do not depend on how it explores
-            fades = " ".join(
-                (fades, *(run.change(f"exploration_{end}_eps", 1.0) for end in ("initial", "final")))
-            )
+            always = (run.change(f"exploration_{end}_eps", 1.0) for end in ("initial", "final"))
+            fades = " ".join([fades, *always])
         return f"{longer(run, times)} {fades}", f"{longer(run, 16 * times)} {fades} {_EVENLY}"
-    rates = (each for each in (0.5, 0.1) if each < run.setting("learning_rate"))
-    return *(run.change("learning_rate", each) for each in rates if (1 - each) ** tried < _FORGOTTEN), longer(
-        run, 4
-    )
+    rates = [each for each in (0.5, 0.1) if each < run.setting("learning_rate")]
+    forgetful = [each for each in rates if (1 - each) ** tried < _FORGOTTEN]
+    return *(run.change("learning_rate", each) for each in forgetful), longer(run, 4)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gridworld.diagnosis.evidence import Evidence, entropy
-from gridworld.diagnosis.experiments import entropy_optimum, optimum_of_epsilon
-from gridworld.diagnosis.finding import Finding, costliest
+from gridworld.diagnosis.finding import Finding, costliest, entropy_optimum, optimum_of_epsilon
 from gridworld.world.exact.evaluation import fitting_discounts
 from gridworld.world.exact.solver import pick, solved
 from gridworld.world.mdp import BoolArray, FloatArray
@@ -27,7 +26,7 @@ def other_optimum(run: Evidence) -> Finding | None:
     why = (
         f"what it does is optimal under its gamma of {run.gamma:g}, not under the evaluation's {best.gamma:g}"
     )
-    gammas = dict.fromkeys((clearest_gamma(run, states), best.gamma))
+    gammas = dict.fromkeys((recommended_gamma(run, states), best.gamma))
     return Finding("objective", states, why, tuple(run.change("gamma", each) for each in gammas))
 
 
@@ -43,7 +42,7 @@ def faint_gamma(run: Evidence) -> Finding | None:
 
 
 def _faint(run: Evidence, limit: FloatArray) -> Finding | None:
-    better = clearest_gamma(run, run.split.wrong)
+    better = recommended_gamma(run, run.split.wrong)
     clear = gap_under(run, better)
     states = run.split.wrong & (run.gap < limit) & (clear > _CLEARER * run.gap)
     if better == run.gamma or not states.any():
@@ -62,17 +61,11 @@ def _faint(run: Evidence, limit: FloatArray) -> Finding | None:
 def gap_under(run: Evidence, gamma: float) -> FloatArray:
     """(S,), what the greedy action loses under a discount."""
     best = solved(run.mdp, gamma)
-    gap: FloatArray = best.v - pick(best.q, run.greedy)
-    return gap
+    return np.asarray(best.v - pick(best.q, run.greedy))
 
 
-def clearest_gamma(run: Evidence, states: BoolArray) -> float:
-    """Of discounts with the evaluation's optimum, that whose smallest gap is largest.
-
-    Args:
-        run: the run.
-        states: (S,), bool, where it errs.
-    """
+def recommended_gamma(run: Evidence, states: BoolArray) -> float:
+    """Of discounts with the evaluation's optimum, that whose smallest gap in these states (S,) is largest."""
     gammas = fitting_discounts(run.evaluator)
     found = {gamma: float(np.min(gap_under(run, gamma)[states], initial=np.inf)) for gamma in gammas}
     return max(found, key=lambda each: found[each])
@@ -106,7 +99,5 @@ def too_much_epsilon(run: Evidence) -> Finding | None:
     states = run.split.wrong & ((gap <= 1e-9) | unresolved)
     if not states.any():
         return None
-    why = (
-        f"it learns what is optimal for an agent that acts at random with probability {epsilon:g}, as it does"
-    )
+    why = f"it learns what is optimal for an agent that is random with probability {epsilon:g}, as it is"
     return Finding("epsilon", states, why, (run.change("exploration_final_eps", epsilon / 10),))

@@ -24,12 +24,7 @@ _is_telling: ContextVar[bool] = ContextVar("is_telling", default=False)
 
 
 class ProgressLine:
-    """A line that may be offered at any time, and is printed when it is due.
-
-    Args:
-        enabled: if not, nothing is ever printed.
-        seconds_between_lines: where standard error is no terminal.
-    """
+    """A line that may be offered at any time, and is printed when it is due; never if not `enabled`."""
 
     def __init__(self, enabled: bool, seconds_between_lines: float = 10.0) -> None:
         self._enabled = enabled
@@ -56,26 +51,26 @@ class ProgressLine:
 
 
 class Progress:
-    """Progress of a run in environment steps: a bar on a terminal or in a notebook, lines elsewhere.
-
-    Args:
-        total: steps of the whole run.
-        label: what stands before the bar, of one line.
-        enabled: if not, nothing is ever printed.
-    """
+    """Progress of a run in environment steps: a bar on a terminal or in a notebook, lines elsewhere."""
 
     def __init__(self, total: int, label: str, enabled: bool = True) -> None:
         self._total = total
         self._label = printable(label)
         self._line = ProgressLine(enabled, _SECONDS_BETWEEN_LINES)
         self._bar: Any = None
-        if enabled and (sys.stderr.isatty() or _is_notebook()):
-            self._bar = _tqdm()(
-                total=total, desc=self._label, unit="step", unit_scale=True, dynamic_ncols=True
-            )
+        shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+        is_notebook = "IPKernelApp" in getattr(shell, "config", {})
+        if enabled and (sys.stderr.isatty() or is_notebook):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # that there are no widgets, where text does as well
+                if is_notebook:
+                    from tqdm.auto import tqdm
+                else:
+                    from tqdm import tqdm
+            self._bar = tqdm(total=total, desc=self._label, unit="step", unit_scale=True, dynamic_ncols=True)
 
     def update(self, step: int, note: str) -> None:
-        """Tell that `step` steps are done; `note` says how it goes."""
+        """Show that `step` steps are done; `note` says how it goes."""
         if self._bar is not None:
             self._bar.set_postfix_str(note, refresh=False)
             self._bar.update(min(step, self._total) - self._bar.n)
@@ -89,37 +84,24 @@ class Progress:
             self._bar.close()
 
 
-def _tqdm() -> Any:
-    """The class of tqdm's bars: a widget in a notebook that has widgets, else text."""
-    if not _is_notebook():
-        from tqdm import tqdm as text_bar
-
-        return text_bar
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that there are no widgets, where text does as well
-        from tqdm.auto import tqdm as notebook_bar
-    return notebook_bar
-
-
-def _is_notebook() -> bool:
-    """Whether this process is a Jupyter kernel."""
-    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-    return "IPKernelApp" in getattr(shell, "config", {})
-
-
 @contextmanager
 def telling_if_slow(what: str) -> Iterator[None]:
-    """Tell every few seconds that the block is still at work on `what`, if memory is limited.
+    """Print every few seconds that the block is still at work on `what`, if memory is limited.
 
     That is so for commands that read what somebody else may have written (`memory_budget`). Within another
-    such block only the outer one tells.
+    such block only the outer one prints.
     """
     if not is_limited() or _is_telling.get():
         yield
         return
-    token = _is_telling.set(True)
-    over = threading.Event()
-    teller = threading.Thread(target=_tell, args=(printable(what), over), daemon=True)
+    token, over, began = _is_telling.set(True), threading.Event(), time.monotonic()
+
+    def tell() -> None:
+        while not over.wait(_SECONDS_BETWEEN_LINES):
+            seconds = time.monotonic() - began
+            print(f"{printable(what)}: {seconds:.0f} s so far; Ctrl-C ends it", file=sys.stderr, flush=True)
+
+    teller = threading.Thread(target=tell, daemon=True)
     teller.start()
     try:
         yield
@@ -129,18 +111,8 @@ def telling_if_slow(what: str) -> Iterator[None]:
         _is_telling.reset(token)
 
 
-def _tell(what: str, over: threading.Event) -> None:
-    began = time.monotonic()
-    while not over.wait(_SECONDS_BETWEEN_LINES):
-        print(f"{what}: {time.monotonic() - began:.0f} s so far; Ctrl-C ends it", file=sys.stderr, flush=True)
-
-
 def time_left(done: int, to_do: int, seconds: float) -> str:
-    """Estimate the rest from what `done` parts have taken.
-
-    Returns:
-        A phrase that ends a line, e.g. ", about 30 s left"; empty where nothing is done yet.
-    """
+    """How long the rest may take if `done` parts took `seconds`, e.g. ", about 30 s left"; "" for none."""
     return f", about {duration(to_do * seconds / done)} left" if done > 0 else ""
 
 

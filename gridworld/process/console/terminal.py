@@ -1,8 +1,8 @@
 """Output to a terminal, a file or a pipe: printing never fails, and names from files act on no terminal.
 
 A command goes on when a reader leaves (`| head`), a terminal is hung up, a disk is full, or the locale cannot
-encode a character, which is then printed as `\\xNN`. A command whose result is what it prints fails at its
-end if that could not be written, unless the reader left.
+encode a character, which is then printed as `\\xNN`: a run is not lost to its own messages. A command whose
+result is what it prints fails at its end if that could not be written, unless the reader left.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import io
 import logging
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TextIO
 
@@ -29,10 +29,7 @@ TOLD.propagate = False
 
 
 class _Forgiving(io.FileIO):
-    """A file descriptor whose `write` never fails, and which keeps the first error other than a closed pipe.
-
-    Needed below the buffer: with `reconfigure(errors=...)` alone, printing to a closed pipe would raise.
-    """
+    """A file whose `write` never fails, and which keeps the first error other than a closed pipe."""
 
     failure: OSError | None = None
     is_result = False  # whether the command is for what it prints
@@ -54,18 +51,14 @@ def prepare() -> None:
 
 
 def result_is_in_files() -> None:
-    """Tell that this command's result is the files that it writes, and not what it prints."""
+    """Note that this command's result is the files that it writes, and not what it prints."""
     if output := _output():
         output.is_result = False
 
 
 @contextmanager
 def printing() -> Iterator[None]:
-    """Check at the end of the block, also of one that raises `SystemExit`, whether its output was written.
-
-    Raises:
-        InputError: it was not, and it is the command's result.
-    """
+    """Refuse at the end of the block, also of one that exits, a result that could not be printed."""
     try:
         yield
     except SystemExit:
@@ -106,8 +99,8 @@ def _prepared(stream: TextIO | None, original: TextIO | None, number: int) -> Te
 def printable(text: str) -> str:
     """Escape what would move a terminal's cursor, change its colours or begin a line, and bound the length.
 
-    To be used on whatever a command prints that has a name in it from outside: of a folder, a job, a map or
-    an agent, from a file or an error.
+    For whatever a command prints that has a name in it from outside: of a folder, a job, a map or an agent,
+    from a file or an error.
     """
     shown = plain(text)
     return shown if len(shown) <= _LONGEST else f"{shown[:_LONGEST]} ..."
@@ -115,11 +108,9 @@ def printable(text: str) -> str:
 
 def plain(text: str) -> str:
     """`printable` for text of any length."""
-    return text if text.isprintable() else "".join(map(_plain_sign, text))
-
-
-def _plain_sign(sign: str) -> str:
-    return sign if sign.isprintable() else repr(sign)[1:-1]
+    if text.isprintable():
+        return text
+    return "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in text)
 
 
 def _make_printable(record: logging.LogRecord) -> bool:
@@ -136,3 +127,18 @@ def tell(text: str) -> None:
 def tell_error(text: str) -> None:
     """Print a mistake as one line on standard error."""
     print(f"error: {printable(text)}", file=sys.stderr)
+
+
+def aligned(rows: Sequence[Sequence[str]], columns: Sequence[str]) -> list[str]:
+    """Align cells in columns that are at least a blank apart, a line for each row.
+
+    Args:
+        rows: the cells, as many in every row as there are `columns`.
+        columns: for each, "<" to align left (words) or ">" to align right (numbers), and its least width,
+            e.g. ">9". A column is as wide as its widest cell.
+    """
+    forms = [
+        f"{column[0]}{max([int(column[1:]), *(len(row[index]) for row in rows)])}"
+        for index, column in enumerate(columns)
+    ]
+    return [" ".join(map(format, row, forms)).rstrip() for row in rows]

@@ -23,7 +23,7 @@ import submitit
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import printable
 from gridworld.process.parallel.processes import LostError
-from gridworld.storage.symlinks import make_inside, remove_inside
+from gridworld.storage.atomic_write import make_inside, remove_inside
 from gridworld.sweep.launchers import Group, Launch, Task, collect
 
 _FOLDER = ".slurm"  # in the sweep's: what submitit writes

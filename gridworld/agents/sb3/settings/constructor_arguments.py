@@ -19,7 +19,7 @@ from gridworld.agents.sb3.settings.schemas import SB3CheckedConfig, SB3ClassConf
 from gridworld.agents.sb3.settings.validation import FALLING, SCHEDULES
 from gridworld.config.agents import falls, parse_schedule
 from gridworld.errors import InputError
-from gridworld.process.import_path import imported
+from gridworld.process.user_input import imported
 
 Arguments = dict[str, Any]
 
@@ -39,14 +39,9 @@ _KINDS: dict[str, type] = {
 def algorithm_and_arguments(
     config: SB3Config, features: Mapping[str, Any] = MappingProxyType({})
 ) -> tuple[type[BaseAlgorithm], Arguments]:
-    """Translate settings to a class of SB3's kind and its keyword arguments.
+    """A class of SB3's kind, and its keyword arguments but for environments, seed and device.
 
-    Args:
-        config: the agent's settings.
-        features: what the observation adds to the settings of an `MlpPolicy`.
-
-    Returns:
-        The class; its arguments but for the environments, the seed and the device.
+    `features` is what the observation adds to the settings of an `MlpPolicy`.
     """
     if isinstance(config, SB3ClassConfig):
         algorithm = algorithm_class("agent.algorithm", config.algorithm)

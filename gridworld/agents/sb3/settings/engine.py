@@ -50,13 +50,7 @@ def why_not(config: SB3Config, algorithm: type[BaseAlgorithm], arguments: Mappin
     """Why these settings need SB3's own loop, or None where the engine gives the same.
 
     It does where the network's outputs at a state follow from the parameters and that state alone: whatever
-    the mode, the other states of the batch and the passes before. That is known of SB3's own networks with
-    the classes that are listed; of any other class it is not, whatever its name.
-
-    Args:
-        config: the agent's settings.
-        algorithm: its class, one of SB3's that the engine has a version of.
-        arguments: of the class, with classes imported.
+    the mode, the other states of the batch and the passes before. That is known of the classes listed alone.
     """
     where, given = "agent", vars(config)
     if isinstance(config, SB3ClassConfig):
@@ -67,12 +61,8 @@ def why_not(config: SB3Config, algorithm: type[BaseAlgorithm], arguments: Mappin
     for name, known, reason in _CLASSES:
         if name in classes and classes[name] not in known:
             own = as_dict(given.get("policy_kwargs") or {}).get(name)
-            path = (
-                f"{where}.policy_kwargs.{name}={own}"
-                if own
-                else f"observation.features={classes[name].__name__}"
-            )
-            return f"{path} {reason}"
+            chosen = f"{where}.policy_kwargs.{name}={own}"
+            return f"{chosen if own else f'observation.features={classes[name].__name__}'} {reason}"
     counts = arguments.get("replay_buffer_class") is ReplayCounts and issubclass(algorithm, DQN)
     for name in ("replay_buffer", "rollout_buffer"):
         is_known = arguments.get(f"{name}_class") is None or (counts and name == "replay_buffer")
