@@ -128,9 +128,11 @@ class _Sweep:
         self._table = JobTable(folder.path)
         self._line = ProgressLine(any(job.config.logging.progress for job in jobs))
         self._rows: dict[str, JobRow] = {}
-        self._before = {  # rows with what no folder says
-            self._names[job.hash]: JobRow("", "", FAILED, error=job.mistake) for job in jobs if job.mistake
-        }
+        # Rows with what no folder says: mistakes in the settings, a full disk.
+        self._before = {job: row for job, row in self._table.read().items() if row.status == FAILED}
+        for job in jobs:
+            if job.mistake:
+                self._before[self._names[job.hash]] = JobRow("", "", FAILED, error=job.mistake)
         self._lost: dict[str, str] = {}  # why a process was lost, by the hashes of its jobs
         self._begun = 0
         self._started = self._due = time.monotonic()
@@ -166,7 +168,7 @@ class _Sweep:
         self._look(_ORPHANS_END_WITHIN)
         rows = {self._names[job.hash]: self._row(job) for job in self._jobs}
         seconds = time.monotonic() - self._started
-        mistaken = [name for name, row in self._before.items() if row.status == FAILED]
+        mistaken = [self._names[job.hash] for job in self._jobs if job.mistake]
         console.tell_end(self._folder.path, list(rows.values()), seconds, stopped, mistaken)
         return code or int(any(row.status != DONE for row in rows.values()))
 
@@ -189,6 +191,7 @@ class _Sweep:
             found.append([])
             for job in group:
                 row = self._rows.pop(self._names[job.hash])
+                self._before.pop(row.job, None)
                 replaces = row.status == FAILED
                 path = folder / row.job
                 own = SweepJob(path, self._begun, job.hash, job.config, job.overrides, replaces)

@@ -143,8 +143,8 @@ def test_a_failure_stops_no_other_job(launcher: str, tmp_path: Path) -> None:
     assert sorted(statuses(tmp_path / "sweep").values()) == ["done"] * 4 + ["failed"] * 2
     assert [row[2] for row in results(done.stdout)] == ["learning_rate=0.1", "learning_rate=0.2"]
     row = table(tmp_path / "sweep")["agent.learning_rate=2,seed=0"]
-    assert row["error"].startswith("agent.learning_rate=2: a step towards the target must be")
-    assert done.stderr.count("agent.learning_rate=2: a step towards the target must be") == 2
+    assert row["error"].startswith("agent.learning_rate=2: must be above 0 and at most 1")
+    assert done.stderr.count("agent.learning_rate=2: must be above 0 and at most 1") == 2
     assert "retry_failed" not in done.stderr  # it would fail again
 
 
