@@ -19,7 +19,7 @@ from gridworld.process.parallel.together import LARGEST
 from gridworld.sweep.plan import Job
 
 AUTO = "auto"
-RUNS_FILES = 3  # that a run has open: its lock, its curve, its events
+RUNS_FILES = 5  # that a run has open: its lock, its curve, its events, its log
 _SHARE_OF_MEMORY = 4  # a population takes a fourth of what is free, shared by the workers
 _RUNS_BYTES = 16 * 2**20  # of a run beside its agent, with its pictures
 _OTHER_FILES = 64  # of the process

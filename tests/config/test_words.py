@@ -112,7 +112,6 @@ def test_options_have_dashes() -> None:
         ("gama=1", "did you mean agent.gamma or evaluation.gamma\\?"),
         ("agent.slip=1", "did you mean env.slip\\?"),
         ("agent=ppo agent.buffer_size=1", "'buffer_size' not in 'PPOConfig'; --cfg job shows all keys"),
-        ("+experiment=maze_dqn", "a plus would add; write experiment=maze_dqn$"),
         ("+agent=ppo", "\\+agent=ppo: agent has a place for its choice already, .*; write agent=ppo$"),
     ],
 )

@@ -38,7 +38,7 @@ def prepared(words: Sequence[str], own: Sequence[Path] = ()) -> list[str]:
         key, _, value = word.partition("=")
         if key == "tuned" and "hydra.searchpath" not in chosen:
             _check_recipe(value, [conf_folder(), *own])
-        if key == "experiment" and value in pairs():
+        if key.lstrip("+") == "experiment" and value in pairs():
             pair = zip(("env", "agent"), pairs()[value], strict=True)
             found += [f"{group}={name}" for group, name in pair if group not in chosen]
         elif takes_whole_numbers(key.lstrip("+")) and re.search(r"[.eE]", value):
