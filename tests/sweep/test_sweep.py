@@ -481,7 +481,7 @@ def test_the_jobs_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     *rows, total = capsys.readouterr().out.splitlines()
     assert [row.split()[0] for row in rows] == ["seed=0", "seed=-1", "seed=1"]
     assert [row.split()[1] for row in rows] == ["done", "failed", "done"]
-    assert rows[1].endswith("seed=-1: must be at least 0 (says jobs.csv alone)")
+    assert rows[1].endswith("seed=-1: must be from 0 to 4294967295 (says jobs.csv alone)")
     assert total == "3 jobs: 2 done, 1 failed"
     jobs_command.main([str(tmp_path / "sweep"), "--status", "failed"])
     assert len(capsys.readouterr().out.splitlines()) == 2

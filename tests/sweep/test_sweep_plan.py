@@ -104,7 +104,7 @@ def test_a_sweep_runs_the_same_job_once_and_knows_mistakes() -> None:
         lambda words: configure(*words),
     )
     assert [job.overrides for job in jobs] == [("seed=0",), ("seed=1",), ("seed=-1",)]
-    assert [job.mistake for job in jobs] == [None, None, "seed=-1: must be at least 0"]
+    assert [job.mistake for job in jobs] == [None, None, "seed=-1: must be from 0 to 4294967295"]
 
 
 def job(*overrides: str, swept: Sequence[str] = (), digest: str = "0123456789abcdef") -> Job:
