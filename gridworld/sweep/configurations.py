@@ -24,6 +24,7 @@ from gridworld.config.composition.words import prepared
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 
+_MOST_BASES = 64
 _SEED = re.compile(r"seed=(0|[1-9][0-9]*)")
 _NUMBERED = "${hydra.job.num}"  # hydra.sweep.subdir unless it is set; the sweeper has its own names
 # Of Hydra's own part: what all jobs of a sweep have in common.
@@ -79,6 +80,8 @@ class Configurations:
         ours = rest[max(own, default=0) :]  # Hydra applies values in their order, after all choices
         lines = tuple(str(each.input_line) for each in overrides if each not in ours)
         if lines not in self._bases:
+            if len(self._bases) >= _MOST_BASES:
+                self._bases.clear()
             self._bases[lines] = pickle.dumps(self._by_hydra(list(lines)))
         settings: DictConfig = pickle.loads(self._bases[lines])
         try:

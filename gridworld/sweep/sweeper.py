@@ -78,6 +78,7 @@ def run_sweep(words: list[str], context: HydraContext, master: DictConfig, setti
             here = folder.path.absolute()
             worker = Worker(here, os.getcwd(), shared_part(master, here), callbacks)
             in_turn = callbacks is not None or runs_in_turn(settings, master.hydra)
+            in_processes = launcher == "joblib" and not settings.stop_at_first_failure
             may_fork = {job.hash for job in jobs if job.in_fork and not in_turn and launcher == "forks"}
 
             def run(launch: Launch, is_second: bool) -> None:
@@ -88,8 +89,8 @@ def run_sweep(words: list[str], context: HydraContext, master: DictConfig, setti
                     launch,
                     worker_count(own.get("n_jobs", 1)),
                     launcher == "forks",
-                    lambda group: launcher == "joblib" or group[0].hash in may_fork,
-                    least=1 if is_second or launcher == "joblib" else 2,
+                    lambda group: in_processes or group[0].hash in may_fork,
+                    least=1 if is_second or in_processes else 2,
                 )
 
             code = _Sweep(folder, jobs, words, worker).run(run, divide, settings.retry_failed)
