@@ -13,8 +13,8 @@ from gridworld.envs.registration import ENV_ID, register_envs, register_when_gym
 
 TYPE_CHECKING = False  # what type checkers take for True; `typing` itself would double the import's cost
 if TYPE_CHECKING:
-    from gridworld.agents.sb3.interop.exact_eval_callback import ExactEvalCallback as ExactEvalCallback
-    from gridworld.agents.sb3.interop.make_vec_env import make_vec_env as make_vec_env
+    from gridworld.agents.sb3.exact_eval import ExactEvalCallback as ExactEvalCallback
+    from gridworld.agents.sb3.vec_env import make_vec_env as make_vec_env
     from gridworld.api.diagnosis import diagnose as diagnose
     from gridworld.api.runs import RunResult as RunResult
     from gridworld.api.runs import open_run as open_run
@@ -46,8 +46,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _NAMES = {  # the public names of each module
-    "agents.sb3.interop.exact_eval_callback": "ExactEvalCallback",
-    "agents.sb3.interop.make_vec_env": "make_vec_env",
+    "agents.sb3.exact_eval": "ExactEvalCallback",
+    "agents.sb3.vec_env": "make_vec_env",
     "api.diagnosis": "diagnose",
     "api.runs": "RunResult open_run train",
     "api.settings": "compose",

@@ -12,7 +12,7 @@ import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from gridworld.config.agents import MISSING
 from gridworld.errors import InputError
@@ -32,19 +32,12 @@ WriteScalars = Callable[[Mapping[str, float], int], None]  # ({tag: value}, envi
 
 @dataclass(frozen=True, eq=False)
 class PolicySnapshot:
-    """What an agent has learnt about every state at one moment: all that evaluation and pictures need.
+    """What an agent has learnt about every state at one moment: all that evaluation and pictures need."""
 
-    Attributes:
-        greedy: (S,), integers, the action of the greedy policy.
-        sampled: (S, A), float64, the action probabilities of the policy that it explores with.
-        values: (S,), float64, its estimate of V.
-        q: (S, A), float64, its estimate of Q; None where it has none.
-    """
-
-    greedy: IntArray
-    sampled: FloatArray
-    values: FloatArray
-    q: FloatArray | None = None
+    greedy: IntArray  # (S,), the action of the greedy policy
+    sampled: FloatArray  # (S, A), float64, the action probabilities of the policy that it explores with
+    values: FloatArray  # (S,), float64, its estimate of V
+    q: FloatArray | None = None  # (S, A), float64, its estimate of Q; None where it has none
 
     def greedy_policy(self) -> FloatArray:
         """The greedy policy's action probabilities, (S, A)."""
@@ -56,29 +49,17 @@ class PolicySnapshot:
 
 @dataclass(frozen=True, eq=False)
 class TrainingContext:
-    """What an agent learns on.
+    """What an agent learns on."""
 
-    Attributes:
-        envs: its environments, which reset in the same step.
-        observation: what it sees of a state.
-        seed: of its own random numbers and of the environments'.
-        device: torch's name of a device, or `auto`.
-        threads: of its numerical library.
-        write_scalars: takes the agent's own training metrics; None: they are not wanted.
-        callbacks: the configured callbacks, as plain values (`config.train.TrainConfig`).
-        features: what the observation adds to an `MlpPolicy`'s settings (`config.train.ObservationConfig`).
-        only_asked: it will not learn, and needs no memory for transitions.
-    """
-
-    envs: StatisticsVectorEnv
-    observation: ObservationTable
-    seed: int
-    device: str
-    threads: int = 1
-    write_scalars: WriteScalars | None = None
-    callbacks: Sequence[Any] = ()
-    features: Mapping[str, Any] = field(default_factory=dict)
-    only_asked: bool = False
+    envs: StatisticsVectorEnv  # which reset in the same step
+    observation: ObservationTable  # what it sees of a state
+    seed: int  # of its own random numbers and of the environments'
+    device: str  # torch's name of a device, or `auto`
+    threads: int = 1  # of its numerical library
+    write_scalars: WriteScalars | None = None  # takes its training metrics; None: they are not wanted
+    callbacks: Sequence[Any] = ()  # the configured ones, as plain values (`config.train.TrainConfig`)
+    features: Mapping[str, Any] = field(default_factory=dict)  # an observation's, of an `MlpPolicy`
+    only_asked: bool = False  # it will not learn, and needs no memory for transitions
 
 
 class Agent(Protocol):
@@ -103,7 +84,7 @@ class Agent(Protocol):
                 to be called again at the latest, and 0 where learning is to end. It may be called sooner.
             on_safe_point: called with the steps so far where nothing is half done, so that `get_state` is
                 complete, and once more at the end if that is such a point.
-            state: of `get_state`, to go on from; None: from the start.
+            state: of `get_state`, to continue from; None: from the start.
 
         Raises:
             ValueError: `state` does not fit.
@@ -123,21 +104,12 @@ class Agent(Protocol):
         """What it has learnt so far, as the content of a model file."""
 
     def load(self, path: Path) -> None:
-        """Take the parameters from a model file.
-
-        Raises:
-            InputError: they cannot be read, or do not fit.
-        """
+        """Take the parameters from a model file; InputError: they cannot be read, or do not fit."""
 
 
 @dataclass(eq=False)
 class Learning:
-    """A run that is about to learn.
-
-    Attributes:
-        agent: ready to learn.
-        total_timesteps: see `Agent.learn`, as for all others.
-    """
+    """An agent that is about to learn, with the arguments of `Agent.learn`."""
 
     agent: Agent
     total_timesteps: int
@@ -146,16 +118,8 @@ class Learning:
     state: State | None = None
 
 
-@runtime_checkable
-class InPopulations(Protocol):
-    """An agent that can learn as one of a population."""
-
-    def learn_together(self, learnings: Sequence[Learning]) -> list[BaseException | None]:
-        """See `learn_together`; all agents are of this one's class."""
-
-
 def learn_together(learnings: Sequence[Learning]) -> list[BaseException | None]:
-    """Let agents learn, those that fit into one population as one.
+    """Let agents learn, those of a class with a `learn_together` of its own at once.
 
     Returns:
         What each ended with; None where it came to its end.
@@ -163,7 +127,7 @@ def learn_together(learnings: Sequence[Learning]) -> list[BaseException | None]:
     found: dict[int, BaseException | None] = {}
     classes: dict[type, list[int]] = {}
     for place, learning in enumerate(learnings):
-        if isinstance(learning.agent, InPopulations):
+        if hasattr(learning.agent, "learn_together"):
             classes.setdefault(type(learning.agent), []).append(place)
             continue
         try:
@@ -174,10 +138,9 @@ def learn_together(learnings: Sequence[Learning]) -> list[BaseException | None]:
         except BaseException as error:
             found[place] = error
     for places in classes.values():
-        members = [learnings[place] for place in places]
-        agent = members[0].agent
-        assert isinstance(agent, InPopulations)
-        found |= dict(zip(places, agent.learn_together(members), strict=True))
+        first: Any = learnings[places[0]].agent
+        errors = first.learn_together([learnings[place] for place in places])
+        found |= dict(zip(places, errors, strict=True))
     return [found[place] for place in range(len(learnings))]
 
 
@@ -188,11 +151,7 @@ class Family(Protocol):
         """The schemas of its agents, by their names in Hydra's group `agent/schema`."""
 
     def check(self, config: TrainConfig) -> None:
-        """Check a run's settings.
-
-        Raises:
-            InputError: the first setting that could not train as it says.
-        """
+        """Check a run's settings; InputError: the first one that could not train as it says."""
 
     def import_for(self, config: AgentConfig) -> None:
         """Import what training takes; settings that cannot work are left for the run to refuse."""
@@ -201,30 +160,14 @@ class Family(Protocol):
         """Whether a run with this `device` computes on the processor, not on a GPU."""
 
     def build(self, config: AgentConfig, context: TrainingContext) -> Agent:
-        """Build an agent that is ready to learn.
-
-        Raises:
-            InputError: a setting that only the algorithm's library can judge.
-        """
+        """Build an agent; InputError: a setting that only the algorithm's library can judge."""
 
     def weights(self, path: Path, most: int) -> dict[str, NDArray[Any]]:
-        """The arrays of a model file by name.
-
-        Args:
-            path: the model file.
-            most: bytes; a larger file is refused.
-
-        Raises:
-            InputError: the file cannot be read.
-        """
+        """The arrays of a model file by name; InputError: it has more than `most` bytes, or is damaged."""
 
 
 def family(config: AgentConfig) -> Family:
-    """Import the family of an agent's settings.
-
-    Raises:
-        InputError: there is no such family, or the settings are another algorithm's.
-    """
+    """Import the family of an agent's settings."""
     known = sorted(module.name for module in pkgutil.iter_modules(__path__))
     if config.family not in known:
         raise InputError(

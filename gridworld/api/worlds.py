@@ -71,7 +71,7 @@ def evaluate(
     task = task_of(place, max_episode_steps)
     mdp, limit = task.mdp, task.max_episode_steps
     if is_model:
-        from gridworld.agents.sb3.interop.foreign_model import tables_of  # here, since it imports torch
+        from gridworld.agents.sb3.exact_eval import tables_of  # here, since it imports torch
 
         tables = tables_of(model_or_table, task)
         if tables.sampled is None and not deterministic:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import argparse
 import os
 import platform
+import sys
 from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
-from gridworld.benchmark.measure import FULL, QUICK, ComparisonResult, lines
 from gridworld.commands import parser_of
 from gridworld.errors import InputError
+from gridworld.process.console.command_line import program
 from gridworld.run.claim import check_inside, check_writable
 from gridworld.storage.atomic_write import write_json
 
+_DOCS = Path(__file__).resolve().parents[2] / "docs"  # where the measurements are, in the source
 # By the table's name on the command line: its module, imported where it is asked for.
 _TABLES = {table: table for table in ("stepping", "training", "worlds", "population")}
 _TABLES |= {"whole": "end_to_end", "files": "file_system"}
@@ -29,18 +32,22 @@ def main(arguments: Sequence[str]) -> None:
     if options.out.is_dir():
         raise InputError(f"--out {options.out}: is a folder; name a file in it")
     check_writable(options.out.parent, "--out")
-    workload = QUICK if options.quick else FULL
-    results: list[ComparisonResult] = []
+    if not (_DOCS / "benchmarks").is_dir():
+        raise InputError(f"{program('benchmark')}: what it measures is in docs/benchmarks of the source")
+    sys.path.append(str(_DOCS))
+    measure = import_module("benchmarks.measure")
+    workload = measure.QUICK if options.quick else measure.FULL
+    results: list[Any] = []
 
-    def measured() -> Iterator[ComparisonResult]:
+    def measured() -> Iterator[Any]:
         for table in (known for known in _TABLES if known in options.only):
-            for comparison in import_module(f"gridworld.benchmark.{_TABLES[table]}").comparisons(workload):
+            for comparison in import_module(f"benchmarks.{_TABLES[table]}").comparisons(workload):
                 results.append(comparison.measure(workload.repetitions))
                 yield results[-1]
 
     machine = f"{platform.machine()}, {os.cpu_count()} cores"
     print(f"medians of {workload.repetitions}, one torch thread, {machine}")
-    for line in lines(measured()):
+    for line in measure.lines(measured()):
         print(line, flush=True)
     write_json(options.out, {"scale": vars(workload), "results": [vars(result) for result in results]})
 

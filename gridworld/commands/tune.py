@@ -80,8 +80,8 @@ def main(arguments: Sequence[str]) -> None:
         return
     result_is_in_files()
     from gridworld.process.signals import Interrupted
-    from gridworld.tune.search.worker_pool import SearchError
     from gridworld.tune.study import tune
+    from gridworld.tune.workers import SearchError
 
     try:
         tune(spec)

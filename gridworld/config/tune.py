@@ -50,8 +50,6 @@ class TuneConfig:
     reports: int = field(default=10, metadata=bounds(1))  # looks of the pruner at a seed's curve
     # a trial's seed ends at this many certificates in a row
     stop_after: Optional[int] = field(default=3, metadata=bounds(1))  # noqa: UP045
-    # seconds; a worker that gives no sign for three times as long loses its trial
-    heartbeat: int = field(default=5, metadata=bounds(1))
     space: dict[str, DimensionConfig] = field(default_factory=dict)  # conf/tune/*.yaml
 
 

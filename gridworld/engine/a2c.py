@@ -9,8 +9,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridworld.engine.losses import Array, Coefficients, log_softmax, losses_of, normalized, slopes_of, sum_up
-from gridworld.engine.on_policy import OnPolicy
+from gridworld.engine.networks import Array
+from gridworld.engine.on_policy import (
+    Coefficients,
+    OnPolicy,
+    log_softmax,
+    losses_of,
+    normalized,
+    slopes_of,
+    sum_up,
+)
 from gridworld.engine.population import FEW_STATES
 from gridworld.world.mdp import IntArray
 
@@ -33,15 +41,12 @@ class A2C(OnPolicy):
         coefficients = Coefficients(nothing, None, self.column("ent_coef"), self.column("vf_coef"))
         slopes = slopes_of(new, new, sums, coefficients)
         self.networks.backward(slopes[0], slopes[1][..., None])
-        finite = self.optimizer.step(self.settings("learning_rate"), self.active)
-        self.check_gradients(finite)
-        self._log(losses_of(new, new, sums, coefficients), new[0], sums.positive + sums.negative)
-
-    def _log(self, losses: dict[str, Array], log_prob: Array, gains: Array) -> None:
-        policy_loss = -(gains * log_prob).sum(axis=(-2, -1))
+        self.check(self.optimizer.step(self.settings("learning_rate"), self.active), "the gradient")
+        losses = losses_of(new, new, sums, coefficients)
+        policy_loss = -((sums.positive + sums.negative) * new[0]).sum(axis=(-2, -1))
         for run in self.going():
             run.model._n_updates += 1
             run.record("train/entropy_loss", float(losses["entropy_loss"][run.row]))
             run.record("train/policy_loss", float(policy_loss[run.row]))
             run.record("train/value_loss", float(losses["value_loss"][run.row]))
-        self.check_losses(losses["loss"])
+        self.check(np.isfinite(losses["loss"]), "a loss")

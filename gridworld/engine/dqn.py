@@ -40,7 +40,7 @@ class DQN(Population):
     def __init__(self, runs: Sequence[Run], states: Sequence[State | None]) -> None:
         self._outputs: Array | None = None  # of the networks as they are, of all states
         self._greedy: IntArray | None = None  # (P, S), by these
-        self._best: Array | None = None  # of the target networks
+        self._best: Array | None = None  # (P, S), what the target networks say of each state's best action
         self.target = make_networks(runs, lambda run: run.target_parameters, is_target=True)
         model, envs = runs[0].model, runs[0].envs
         self.replay: Replay = (
@@ -70,7 +70,8 @@ class DQN(Population):
             self._count(step, is_last=steps == self.train_freq.frequency)
             if not self.active.any():
                 return
-            self._store(states, actions, step)
+            columns = states, actions, step.last_states, step.rewards, step.terminated
+            self.replay.store(*(each.reshape(len(self.runs), -1) for each in columns))  # type: ignore[arg-type]
             self._after_step(step)
         if self.num_timesteps > self.learning_starts:
             updates = self.gradient_steps if self.gradient_steps >= 0 else steps * self.num_envs
@@ -120,13 +121,6 @@ class DQN(Population):
         scales = np.array([run.reward_scale for run in self.runs])
         rewards *= scales[:, None]
 
-    def _store(self, states: IntArray, actions: IntArray, step: Step) -> None:
-        by_run = (
-            each.reshape(len(self.runs), -1)
-            for each in (states, actions, step.last_states, step.rewards, step.terminated)
-        )
-        self.replay.store(*by_run)  # type: ignore[arg-type]
-
     def _after_step(self, step: Step) -> None:
         """Update target networks and exploration rates, and log episodes, as SB3 does after a step."""
         model = self.runs[0].model
@@ -151,8 +145,9 @@ class DQN(Population):
 
     def _update(self, steps: int) -> None:
         """Make gradient steps, each on a minibatch of its own."""
-        going, best = self.active.copy(), self.best()
-        learning_rates = self.settings("learning_rate")
+        if self._best is None:
+            self._best = self.of_best_action(self._shaped(self.target.run()[0]))
+        going, best, learning_rates = self.active.copy(), self._best, self.settings("learning_rate")
         gamma = np.array([run.model.gamma for run in self.runs], dtype=np.float32)[:, None]
         at_once, losses = max(1, _DRAWN_AT_ONCE // self.replay.width(self.batch_size)), []
         for first in range(0, steps, at_once):
@@ -170,14 +165,14 @@ class DQN(Population):
                 self.networks.backward(slopes)
                 going &= self.optimizer.step(learning_rates, going)
                 self._outputs = self._greedy = None
-        self.check_gradients(going)
+        self.check(going, "the gradient")
         mean = np.stack(losses, axis=1).mean(axis=1)
         for run in self.going():
             run.model._n_updates += steps
             run.record("train/learning_rate", learning_rates[run.row])
             run.record("train/n_updates", run.model._n_updates, for_tensorboard=False)
             run.record("train/loss", float(mean[run.row]))
-        self.check_losses(mean)
+        self.check(np.isfinite(mean), "a loss")
 
     def _targets(self, drawn: Transitions, best: Array, gamma: Array) -> Array:
         """(n, P, B): rewards and what the target network expects of the best action in the next state."""
@@ -205,12 +200,6 @@ class DQN(Population):
             self._outputs = self._shaped(self.networks.run()[0])
         return self._outputs
 
-    def best(self) -> Array:
-        """(P, S), what the target networks say of the best action in each state."""
-        if self._best is None:
-            self._best = self.of_best_action(self._shaped(self.target.run()[0]))
-        return self._best
-
     def _shaped(self, outputs: Array) -> Array:
         """(P, U, ...) of what the networks return."""
         return outputs
@@ -230,17 +219,9 @@ class DQN(Population):
     def losses_and_slopes(
         outputs: Array, index: IntArray, actions: IntArray, targets: Array, shares: FloatArray | None
     ) -> tuple[Array, Array]:
-        """Compute the Huber losses of P minibatches and their slopes, see above.
+        """The Huber losses (P,) of minibatches (P, B), and their slopes, one for each output (P, U, A).
 
-        Args:
-            outputs: (P, U, A), Q.
-            index: (P, B), which of the U states each transition begins in.
-            actions: (P, B).
-            targets: (P, B), float32.
-            shares: (P, B), see `Transitions`.
-
-        Returns:
-            The losses (P,); the slopes, as many as there are outputs, in their order.
+        `index` says which of the U states each transition begins in.
         """
         (runs, num_states, num_actions), count = outputs.shape, index.shape[1]
         pair = (index + num_states * np.arange(runs)[:, None]) * num_actions + actions

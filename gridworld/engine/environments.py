@@ -6,8 +6,9 @@ Each run draws slips and starts from its own generator, in the order in which `G
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,53 +20,35 @@ from gridworld.world.mdp import BoolArray, FloatArray
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Step:
-    """One step; arrays are (P · E,).
+    """One step; arrays are (P · E,)."""
 
-    Attributes:
-        index: (state · A + action) · K + outcome, in the tables.
-        last_states: where the steps led to, before the reset of episodes that ended.
-        rewards: float64.
-        terminated: bool.
-        over: bool, terminated or at the step limit.
-        which: (m,), ascending, where the m episodes that ended were.
-        returns: (m,), theirs, undiscounted.
-        lengths: (m,), theirs.
-    """
-
-    pairs: StateArray
-    last_states: StateArray
+    pairs: StateArray  # state · A + action
+    last_states: StateArray  # where the steps led to, before the reset of episodes that ended
     rewards: FloatArray
     terminated: BoolArray
-    over: BoolArray
-    which: StateArray
-    returns: FloatArray
-    lengths: StateArray
+    over: BoolArray  # terminated or at the step limit
+    which: StateArray  # (m,), ascending, where the m episodes that ended were
+    returns: FloatArray  # (m,), theirs, undiscounted
+    lengths: StateArray  # (m,), theirs
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rollout:
-    """n steps; arrays are (n, P, E), pairs are state · A + action.
+    """n steps; arrays are (n, P, E)."""
 
-    Attributes:
-        truncated: cut off by the step limit alone.
-        final_states: (P, E), after the last step.
-        ended: of each run, (step, return, length) of its episodes that ended, in this order.
-    """
-
-    pairs: StateArray
+    pairs: StateArray  # state · A + action
     rewards: FloatArray
     last_states: StateArray
     terminated: BoolArray
-    truncated: BoolArray
-    final_states: StateArray
-    ended: list[tuple[StateArray, FloatArray, StateArray]]
+    truncated: BoolArray  # cut off by the step limit alone
+    final_states: StateArray  # (P, E), after the last step
+    ended: list[tuple[StateArray, FloatArray, StateArray]]  # of each run, (step, return, length)
 
 
 class Environments:
     """The environments of P runs in one world, which reset in the step that ends an episode.
 
-    Args:
-        batches: of the runs; they are stale until `put_back`, but for their statistics.
+    The runs' own batches are stale until `put_back`, but for their statistics.
     """
 
     def __init__(self, batches: Sequence[StatisticsVectorEnv]) -> None:
@@ -112,12 +95,7 @@ class Environments:
         return Step(pairs, last_states, rewards, terminated, over, *ended)
 
     def roll(self, policies: FloatArray, draws: NDArray[np.float32]) -> Rollout:
-        """Step n times.
-
-        Args:
-            policies: (P, S, A), probabilities of actions.
-            draws: (n, P · E), uniform: a draw means the action that is the number of thresholds it reaches.
-        """
+        """Step n times with policies (P, S, A); uniform draws (n, P · E) say which actions are taken."""
         runs, num_states, num_actions = policies.shape
         limits = np.ascontiguousarray(policies.cumsum(axis=2).reshape(-1, num_actions).T[:-1])
         first = np.repeat(np.arange(runs) * num_states, self.num_envs)
@@ -150,7 +128,7 @@ class Environments:
         """(P · E,), drawn where an environment moves."""
         moving = np.flatnonzero(~self._terminal.take(self.states))
         situations = pairs[moving]
-        draws = self._draws(moving, situations)
+        draws = self._by_run(moving, lambda batch, part: batch.draw_numbers(situations[part]))
         thresholds = self._thresholds.take(situations, axis=1)
         drawn = (draws >= thresholds[0]).astype(np.int64)
         for each in thresholds[1:]:
@@ -162,12 +140,12 @@ class Environments:
     def _starts(self, which: StateArray) -> StateArray:
         if len(self._start_states) == 1:
             return np.full(len(which), self._start_states[0])
-        cuts = np.searchsorted(which, self._bounds).tolist()
-        parts = zip(self._batches, itertools.pairwise(cuts), strict=True)
-        return np.concatenate([batch.draw_starts(end - start) for batch, (start, end) in parts])
+        starts: StateArray = self._by_run(
+            which, lambda batch, part: batch.draw_starts(part.stop - part.start)
+        )
+        return starts
 
-    def _draws(self, which: StateArray, situations: StateArray) -> FloatArray:
-        """A number in [0, 1) for each of these environments, ascending, from its run's generator."""
-        cuts = np.searchsorted(which, self._bounds).tolist()
-        parts = zip(self._batches, itertools.pairwise(cuts), strict=True)
-        return np.concatenate([batch.draw_numbers(situations[start:end]) for batch, (start, end) in parts])
+    def _by_run(self, which: StateArray, draw: Callable[[StatisticsVectorEnv, slice], Any]) -> Any:
+        """What each run's own generator draws for its part of these environments, which are ascending."""
+        parts = itertools.starmap(slice, itertools.pairwise(np.searchsorted(which, self._bounds).tolist()))
+        return np.concatenate([draw(*pair) for pair in zip(self._batches, parts, strict=True)])

@@ -8,7 +8,7 @@ in the same order. Rows begin at multiples of 64 bytes, as tensors of their own 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -46,34 +46,6 @@ def copy_row(row: Tensor, parameters: Sequence[Tensor]) -> None:
         parameter.data.copy_(part)  # which may be a view of the row, and leaves a graph as it is
 
 
-class Networks(Protocol):
-    """P networks; each has one or more outputs for a state.
-
-    Attributes:
-        weights: (P, W).
-        gradients: (P, W), of the last `backward`.
-    """
-
-    weights: Tensor
-    gradients: Tensor
-
-    def run(self, states: IntArray | None = None) -> tuple[Array, ...]:
-        """Run the networks.
-
-        Args:
-            states: (U,), which states; only where P is 1. None: all.
-
-        Returns:
-            (P, U, n) of each output, float32; views that the next run may overwrite.
-        """
-
-    def backward(self, *slopes: Array) -> None:
-        """Set `gradients` to those of losses with these slopes in the outputs of the last run."""
-
-    def push(self, changes: Tensor) -> tuple[Array, ...]:
-        """How the outputs of the last run change, to first order, with changes (P, W) of the weights."""
-
-
 class DenseNetworks:
     """Linear layers with tanh or ReLU between them, differentiated by hand.
 
@@ -81,7 +53,7 @@ class DenseNetworks:
     that it makes alone. The first layer's product with a unit vector is a column of its weights.
 
     Args:
-        vectors: (P, W), the weights.
+        vectors: (P, W), copied to `weights`; `gradients` (P, W) are those of the last `backward`.
         parameters: those of one network, in the order of a row.
         nets: the layers of each output.
         features: (S, n), what the first layers see of each state; None: its unit vector.
@@ -97,20 +69,21 @@ class DenseNetworks:
         self.weights, self.gradients = aligned(vectors), aligned(torch.zeros_like(vectors))
         self._features = None if features is None else features.expand(len(vectors), *features.shape)
         place = {id(parameter): number for number, parameter in enumerate(parameters)}
-        shapes = [parameter.shape for parameter in parameters]
-        weights, gradients = cut(self.weights, shapes), cut(self.gradients, shapes)
-        self._shapes, self._places = shapes, []
-        self._nets, self._slopes = [], []
-        for layers in nets:
-            linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
-            pairs = [(place[id(layer.weight)], place[id(layer.bias)]) for layer in linear]
-            self._places.append(pairs)
-            self._nets.append([(weights[weight], weights[bias]) for weight, bias in pairs])
-            self._slopes.append([(gradients[weight], gradients[bias]) for weight, bias in pairs])
+        self._shapes = [parameter.shape for parameter in parameters]
+        self._places = [
+            [(place[id(each.weight)], place[id(each.bias)]) for each in layers if isinstance(each, nn.Linear)]
+            for layers in nets
+        ]
+        self._nets, self._slopes = self._by_layer(self.weights), self._by_layer(self.gradients)
         kinds = {type(layer) for layers in nets for layer in layers if not isinstance(layer, nn.Linear)}
         self._activation = kinds.pop() if kinds else nn.Tanh
         self._passes: list[list[Tensor | None]] = []
         self._states: Tensor | None = None
+
+    def _by_layer(self, vectors: Tensor) -> list[list[tuple[Tensor, Tensor]]]:
+        """Views of the weights and the biases in vectors (P, W), layer by layer of each output."""
+        views = cut(vectors, self._shapes)
+        return [[(views[weight], views[bias]) for weight, bias in pairs] for pairs in self._places]
 
     @staticmethod
     def fit(nets: Iterable[Sequence[nn.Module]], parameters: Sequence[Tensor]) -> bool:
@@ -128,7 +101,7 @@ class DenseNetworks:
         return known and alternate and own == {id(each) for each in parameters}
 
     def run(self, states: IntArray | None = None) -> tuple[Array, ...]:
-        """See `Networks.run`."""
+        """Outputs (P, U, n) of states (U,), only where P is 1, or of all; the next run may overwrite them."""
         self._states = None if states is None else torch.as_tensor(states, device=self.weights.device)
         self._passes = [self._run(net) for net in self._nets]
         return tuple(np.asarray(passed[-1].cpu()) for passed in self._passes if passed[-1] is not None)
@@ -144,14 +117,10 @@ class DenseNetworks:
             if inputs is None:
                 columns = weight.transpose(1, 2)
                 outputs = (columns if states is None else columns[:, states]) + bias[:, None]
-            elif (
-                weight.shape[1] == 1 and inputs.stride(1) == 1
-            ):  # columns of weights, which a batch adds up otherwise
+            elif weight.shape[1] == 1 and inputs.stride(1) == 1:  # which a batch would add up otherwise
                 rows = zip(inputs, weight, bias, strict=True)
                 outputs = torch.stack([nn.functional.linear(*row) for row in rows])
-            elif (
-                weight.shape[1] == 1
-            ):  # a batch of these adds up as one alone does; of those below it would not
+            elif weight.shape[1] == 1:  # a batch of these adds up as one alone does, not of those below
                 outputs = torch.bmm(weight, inputs.transpose(1, 2)).transpose(1, 2) + bias[:, None]
             else:
                 outputs = torch.baddbmm(bias[:, None], inputs, weight.transpose(1, 2))
@@ -159,7 +128,7 @@ class DenseNetworks:
         return found
 
     def backward(self, *slopes: Array) -> None:
-        """See `Networks.backward`."""
+        """Set `gradients` to those of losses with these slopes in the outputs of the last run."""
         for given, net, passed, gradients in zip(slopes, self._nets, self._passes, self._slopes, strict=True):
             slope = torch.as_tensor(given.astype(np.float32), device=self.weights.device)
             for number in range(len(net) - 1, -1, -1):
@@ -180,12 +149,9 @@ class DenseNetworks:
                     slope = _BACKWARD[self._activation](torch.bmm(slope, weight), inputs)
 
     def push(self, changes: Tensor) -> tuple[Array, ...]:
-        """See `Networks.push`."""
-        views = cut(changes, self._shapes)
-        return tuple(
-            self._push(net, passed, [(views[weight], views[bias]) for weight, bias in pairs]).cpu().numpy()
-            for net, passed, pairs in zip(self._nets, self._passes, self._places, strict=True)
-        )
+        """How the outputs of the last run change, to first order, with changes (P, W) of the weights."""
+        of_nets = zip(self._nets, self._passes, self._by_layer(changes), strict=True)
+        return tuple(self._push(*of_net).cpu().numpy() for of_net in of_nets)
 
     def _push(
         self,
@@ -212,13 +178,7 @@ class DenseNetworks:
 
 
 class ModuleNetworks:
-    """Any network of one run, differentiated by torch.
-
-    Args:
-        vector: (W,), the weights.
-        parameters: in the order of a row; they become views of it.
-        forward: runs it on some states, or on all: outputs (U, n).
-    """
+    """Any network of one run, differentiated by torch; its parameters become views of its row of weights."""
 
     def __init__(
         self,
@@ -236,14 +196,14 @@ class ModuleNetworks:
         self._pulled: list[tuple[Tensor, Sequence[Tensor]]] = []  # of each output, slopes and gradients
 
     def run(self, states: IntArray | None = None) -> tuple[Array, ...]:
-        """See `Networks.run`."""
+        """See `DenseNetworks.run`."""
         self._outputs, self._pulled = (), []
         with torch.enable_grad():
             self._outputs = self._forward(states)
         return tuple(output.detach().cpu().numpy()[None] for output in self._outputs)
 
     def backward(self, *slopes: Array) -> None:
-        """See `Networks.backward`."""
+        """See `DenseNetworks.backward`."""
         self.gradients.zero_()
         given = [
             torch.as_tensor(slope, dtype=output.dtype, device=output.device).view_as(output)
@@ -252,7 +212,7 @@ class ModuleNetworks:
         _pull(self._outputs, given, self._parameters, accumulate_grad=True)
 
     def push(self, changes: Tensor) -> tuple[Array, ...]:
-        """See `Networks.push`: a pass back through the pass back, which is linear in the slopes."""
+        """See `DenseNetworks.push`: a pass back through the pass back, which is linear in the slopes."""
         self._pulled = self._pulled or [self._pull(output) for output in self._outputs]
         given = cut(changes[0], [each.shape for each in self._parameters])
         moved = [_pull(pulled, given, [slopes])[0] for slopes, pulled in self._pulled]
@@ -278,3 +238,6 @@ def _pull(
         accumulate_grad=accumulate_grad,
     )
     return found
+
+
+Networks = DenseNetworks | ModuleNetworks

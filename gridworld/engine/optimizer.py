@@ -25,14 +25,9 @@ _SMALLEST = math.ulp(0.0)  # a denormal number
 class Optimizer:
     """Steps on gradients that are clipped by each network's norm, as Stable-Baselines3 clips them.
 
-    Each row of the weights is a parameter, and one that makes no step has no gradient: torch skips it. So
-    every run has its own count of steps, and its numbers are those of an optimiser of its own.
-
-    Args:
-        own: the optimiser of each run, for its class and settings; equal but for the learning rate.
-        weights: (P, W).
-        gradients: (P, W), which it steps on.
-        max_norms: (P,), inf where nothing is clipped.
+    Each row of the weights (P, W) is a parameter, and one that makes no step has no gradient: torch skips it.
+    So every run has its own count of steps, and its numbers are those of an optimiser of its own. `own` are
+    the runs' optimisers, equal but for the learning rate; of `max_norms` (P,) inf clips nothing.
     """
 
     def __init__(
@@ -57,22 +52,18 @@ class Optimizer:
         self._active: list[bool] = []
 
     def step(self, learning_rates: Sequence[float], active: BoolArray) -> BoolArray:
-        """Make a step of the networks that are active.
-
-        Args:
-            learning_rates: (P,).
-            active: (P,).
-
-        Returns:
-            (P,), which of them had finite gradients; the others made no step.
-        """
+        """Make a step of the networks (P,) that are active and have finite gradients; returns which did."""
         norms = torch.linalg.vector_norm(self._gradients, dim=1)
         if self._may_clip:
             scales = torch.clamp(self._max_norms / (norms.double() + 1e-6), max=1.0)
             self._gradients *= scales.float()[:, None]
         finite: BoolArray = active & torch.isfinite(norms).cpu().numpy()
         if self._rates != (rates := list(learning_rates)):
-            self._set_rates(rates)
+            self._rates, settings = rates, {**self._groups[0]}
+            groups: dict[float, list[Tensor]] = {}  # rows of one rate, which are stepped on at once
+            for row, rate in zip(self._rows, rates, strict=True):
+                groups.setdefault(rate, []).append(row)
+            self._groups[:] = [{**settings, "lr": rate, "params": rows} for rate, rows in groups.items()]
         if self._active != (now := finite.tolist()):
             self._active = now
             for row, slope, steps in zip(self._rows, self._slopes, now, strict=True):
@@ -81,29 +72,24 @@ class Optimizer:
             self._step(self._optimizer)
         return finite
 
-    def _set_rates(self, rates: list[float]) -> None:
-        """Put rows of one learning rate into one group, which the optimiser steps on at once."""
-        self._rates, settings = rates, {**self._groups[0]}
-        groups: dict[float, list[Tensor]] = {}
-        for row, rate in zip(self._rows, rates, strict=True):
-            groups.setdefault(rate, []).append(row)
-        self._groups[:] = [{**settings, "lr": rate, "params": rows} for rate, rows in groups.items()]
-
     def get_state(self, run: int) -> dict[str, Any]:
         """Each number that the optimiser keeps of a run; none before its first step."""
         state = self._optimizer.state.get(self._rows[run], {})
         return {name: value.cpu().numpy().copy() for name, value in state.items()}
 
     def set_state(self, run: int, state: dict[str, Any]) -> None:
-        """Mirrors `get_state`.
-
-        Raises:
-            StateError: it is of another kind of optimiser, or of other weights.
-        """
+        """Mirrors `get_state`."""
         if not state:
             return
         row = self._rows[run]
-        found = self._after_a_step(row)
+        # What the optimiser keeps of a row after a step, for names, shapes and types.
+        make: Any = type(self._optimizer)
+        other = torch.zeros_like(row)
+        other.grad = torch.zeros_like(row)
+        optimizer = make([{**self._groups[0], "params": [other]}])
+        with torch.no_grad():
+            self._step(optimizer)
+        found = dict(optimizer.state[other])
         if state.keys() != found.keys():
             raise StateError(f"the optimiser's state has {', '.join(state)}, must have {', '.join(found)}")
         for name, value in found.items():
@@ -111,16 +97,6 @@ class Optimizer:
             fill(own, state[name], f"the optimiser's {name}")
             found[name] = torch.as_tensor(own, device=value.device)
         self._optimizer.state[row] = found
-
-    def _after_a_step(self, row: Tensor) -> dict[str, Tensor]:
-        """What the optimiser keeps of a row after a step, for names, shapes and types."""
-        make: Any = type(self._optimizer)
-        other = torch.zeros_like(row)
-        other.grad = torch.zeros_like(row)
-        optimizer = make([{**self._groups[0], "params": [other]}])
-        with torch.no_grad():
-            self._step(optimizer)
-        return dict(optimizer.state[other])
 
 
 @contextlib.contextmanager

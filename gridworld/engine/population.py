@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from gridworld.engine.environments import Environments
-from gridworld.engine.networks import Array, DenseNetworks, ModuleNetworks, Networks
+from gridworld.engine.networks import DenseNetworks, ModuleNetworks, Networks
 from gridworld.engine.optimizer import Optimizer
 from gridworld.engine.run import Run
 from gridworld.process.console.terminal import tell
@@ -23,13 +23,9 @@ FEW_STATES = 1024  # up to here all states are cheaper than finding out which on
 
 
 class Population:
-    """P runs of one algorithm in one world.
+    """P runs of one algorithm in one world, equal by `kind`, from the start or from `states` of `get_state`.
 
     A run that has ended keeps its row, which changes no more, until the others make a smaller population.
-
-    Args:
-        runs: equal by `kind`.
-        states: of `get_state`, to continue from; None: from the start.
 
     Attributes:
         active: (P,), the runs that have not ended.
@@ -43,13 +39,9 @@ class Population:
         self.runs = runs
         for row, run in enumerate(runs):
             run.population, run.row = self, row
-        first = runs[0]
-        mdp = first.envs.mdp
-        self.num_envs, self.num_states, self.num_actions = (
-            first.envs.num_envs,
-            mdp.num_states,
-            mdp.num_actions,
-        )
+        first, mdp = runs[0], runs[0].envs.mdp
+        self.num_envs, self.num_states = first.envs.num_envs, mdp.num_states
+        self.num_actions = mdp.num_actions
         self.active: BoolArray = np.ones(len(runs), dtype=np.bool_)
         self.all_networks = self.networks_of(runs)
         self.networks = self.all_networks[0]
@@ -83,11 +75,9 @@ class Population:
 
     def _optimizer(self) -> Optimizer:
         own = [run.model.policy.optimizer for run in self.runs]
-        return Optimizer(own, self.networks.weights, self.networks.gradients, self._max_norms())
-
-    def _max_norms(self) -> list[float]:
         norms = [getattr(run.model, "max_grad_norm", None) for run in self.runs]
-        return [np.inf if norm is None else float(norm) for norm in norms]
+        most = [np.inf if norm is None else float(norm) for norm in norms]
+        return Optimizer(own, self.networks.weights, self.networks.gradients, most)
 
     def settings(self, name: str) -> list[float]:
         """(P,), a setting of each run at this time of training."""
@@ -157,24 +147,17 @@ class Population:
         sums = [each.weights.sum(dim=1).cpu().numpy() for each in self.all_networks]
         finite: BoolArray = np.isfinite(np.stack(sums)).all(axis=0)
         for run in self.going():
-            if not finite[run.row] and not self._is_finite(run):
+            rows = [each.weights[run.row] for each in self.all_networks]
+            if finite[run.row] or all(bool(torch.isfinite(row).all()) for row in rows):
+                run.safe_point(self.num_timesteps)
+            else:
                 run.diverge("the network's weights are no finite number")
-                continue
-            run.safe_point(self.num_timesteps)
         return self.remaining()
 
-    def _is_finite(self, run: Run) -> bool:
-        return all(bool(torch.isfinite(each.weights[run.row]).all()) for each in self.all_networks)
-
-    def check_losses(self, losses: Array) -> None:
-        """End the runs whose loss (P,) is no finite number."""
-        for run in self.going(~np.isfinite(losses)):
-            run.diverge("a loss is no finite number")
-
-    def check_gradients(self, finite: BoolArray) -> None:
-        """End the runs whose gradients were no finite numbers."""
+    def check(self, finite: BoolArray, what: str) -> None:
+        """End the runs (P,) that had a number that is not finite."""
         for run in self.going(~finite):
-            run.diverge("the gradient is no finite number")
+            run.diverge(f"{what} is no finite number")
 
     def get_state(self, run: Run) -> State:
         """All that a run's next steps depend on."""
@@ -199,11 +182,9 @@ class Population:
 
 
 def train(runs: Sequence[Run], states: Sequence[State | None]) -> None:
-    """Train runs until each has ended, those of one kind as a population; errors are in their `error`.
+    """Train runs that have begun until each has ended, those of one kind as a population.
 
-    Args:
-        runs: with their hooks; `Run.begin` was called.
-        states: of `get_state`, to continue from; None: from the start.
+    `states` are of `get_state`, or None; errors are in the runs' `error`.
     """
     groups: dict[Hashable, list[Run]] = {}
     for run, state in zip(runs, states, strict=True):
@@ -234,14 +215,7 @@ def make_networks(
     outputs: slice = slice(None),
     is_target: bool = False,
 ) -> Networks:
-    """The networks of some runs, with the weights that SB3's models have.
-
-    Args:
-        runs: the runs.
-        parameters: of a run's network.
-        outputs: which of its outputs.
-        is_target: whether it is the target network.
-    """
+    """The networks of some runs, or their target networks, with the weights that SB3's models have."""
     first, of_runs = runs[0], [parameters(run) for run in runs]
     vectors = [torch.cat([each.detach().reshape(-1) for each in own]) for own in of_runs]
     inputs, nets = (first.target if is_target else first.inputs), first.nets[outputs]

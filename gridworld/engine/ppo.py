@@ -7,16 +7,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from gridworld.engine.losses import (
-    Array,
+from gridworld.engine.networks import Array
+from gridworld.engine.on_policy import (
     Coefficients,
+    OnPolicy,
     Sums,
     divergence,
     log_softmax,
     losses_of,
     slopes_of,
 )
-from gridworld.engine.on_policy import OnPolicy
 from gridworld.engine.run import Run
 from gridworld.storage.serialization import State
 from gridworld.world.mdp import BoolArray, IntArray
@@ -54,7 +54,7 @@ class PPO(OnPolicy):
         for _ in range(self.n_epochs):
             if not active.any():
                 break
-            log.begin_epoch(active)
+            log.epochs += active
             if self.batch_size >= pairs.shape[1]:  # whatever their order
                 whole = whole or list(self.summed_up(pairs[:, None], advantages[:, None], returns[:, None]))
                 minibatches: Iterator[tuple[IntArray | None, Sums]] = iter(whole)
@@ -71,11 +71,8 @@ class PPO(OnPolicy):
                 slopes = slopes_of(new, before, sums, coefficients)
                 self.networks.backward(slopes[0], slopes[1][..., None])
                 finite = self.optimizer.step(learning_rates, active)
-                self.check_gradients(finite | ~active)
+                self.check(finite | ~active, "the gradient")
                 active &= finite
-        self._log(log)
-
-    def _log(self, log: _Log) -> None:
         means = log.means()
         names = ["clip_range", "clip_range_vf"] if self.clips_values else ["clip_range"]
         means |= {name: np.array(self.settings(name)) for name in names}
@@ -83,23 +80,16 @@ class PPO(OnPolicy):
             run.model._n_updates += int(log.epochs[run.row])
             for name, mean in means.items():
                 run.record(f"train/{name}", float(mean[run.row]))
-        self.check_losses(means["loss"])
+        self.check(np.isfinite(means["loss"]), "a loss")
 
 
 class _Log:
-    """The losses of an update, of which SB3 logs the means.
-
-    Attributes:
-        epochs: (P,), that each run began.
-    """
+    """The losses of an update, of which SB3 logs the means."""
 
     def __init__(self, runs: int) -> None:
-        self.epochs = np.zeros(runs, dtype=np.int64)
+        self.epochs = np.zeros(runs, dtype=np.int64)  # that each run began
         self._losses: list[dict[str, Array]] = []
         self._epoch: list[Array] = []  # of each step, that of each run; 0 where it had ended
-
-    def begin_epoch(self, active: BoolArray) -> None:
-        self.epochs += active
 
     def add(self, active: BoolArray, losses: dict[str, Array]) -> None:
         self._losses.append(losses)

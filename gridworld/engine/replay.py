@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,56 +16,18 @@ Float32Array = NDArray[np.float32]
 
 
 class Transitions(NamedTuple):
-    """n minibatches of B transitions of each of P runs, (n, P, B) each.
-
-    `ends` is 1 where no value follows: at a time-out one does. `shares` are what part of its minibatch each
-    transition makes up; None: all the same.
-    """
+    """n minibatches of B transitions of each of P runs, (n, P, B) each."""
 
     states: IntArray
     actions: IntArray
     following: IntArray
     rewards: Float32Array
-    ends: Float32Array
-    shares: FloatArray | None
-
-
-class Replay(Protocol):
-    """What P runs of one algorithm remember."""
-
-    def store(
-        self, states: IntArray, actions: IntArray, following: IntArray, rewards: FloatArray, ends: BoolArray
-    ) -> None:
-        """Add a step of all environments, (P, E) each."""
-
-    def draw(self, generators: Sequence[np.random.RandomState | None], count: int, size: int) -> Transitions:
-        """Draw n minibatches for each run.
-
-        Args:
-            generators: of the runs; None: for this one nothing is drawn.
-            count: n.
-            size: B, which need not be the number of columns that come back.
-        """
-
-    def width(self, size: int) -> int:
-        """How many columns a minibatch of B transitions has."""
-
-    def get_state(self, run: int) -> State:
-        """What a run remembers."""
-
-    def set_state(self, run: int, state: State) -> None:
-        """Mirrors `get_state`."""
+    ends: Float32Array  # 1 where no value follows: at a time-out one does
+    shares: FloatArray | None  # what part of its minibatch each transition makes up; None: all the same
 
 
 class UniformReplay:
-    """The newest transitions, drawn uniformly: SB3's `ReplayBuffer`, with its draws.
-
-    Args:
-        runs: P.
-        buffer_size: environment steps of each run.
-        num_envs: E.
-        num_states: of the world.
-    """
+    """The newest transitions of P runs, drawn uniformly: SB3's `ReplayBuffer`, with its draws."""
 
     def __init__(self, runs: int, buffer_size: int, num_envs: int, num_states: int) -> None:
         self._rows, self._num_envs = max(buffer_size // num_envs, 1), num_envs
@@ -87,7 +49,7 @@ class UniformReplay:
     def store(
         self, states: IntArray, actions: IntArray, following: IntArray, rewards: FloatArray, ends: BoolArray
     ) -> None:
-        """See `Replay.store`."""
+        """Add a step of all environments, (P, E) each."""
         step = states, actions, following, rewards, ends
         for column, values in zip(self._columns.values(), step, strict=True):
             column[:, self._position] = values
@@ -95,11 +57,14 @@ class UniformReplay:
         self._is_full |= self._position == 0
 
     def width(self, size: int) -> int:
-        """See `Replay.width`."""
+        """How many columns a minibatch of B transitions has."""
         return size
 
     def draw(self, generators: Sequence[np.random.RandomState | None], count: int, size: int) -> Transitions:
-        """See `Replay.draw`; of each minibatch the steps, then the environments, as SB3 draws them."""
+        """Draw n = `count` minibatches of B = `size` for each run that has a generator here.
+
+        Of each minibatch the steps are drawn, then the environments, as SB3 draws them.
+        """
         bounds = np.array([[self._rows if self._is_full else self._position], [self._num_envs]])
         which = np.zeros((count, len(generators), size), dtype=np.int64)
         for run, generator in enumerate(generators):
@@ -117,13 +82,13 @@ class UniformReplay:
         )
 
     def get_state(self, run: int) -> State:
-        """See `Replay.get_state`."""
+        """What a run remembers."""
         count = self._rows if self._is_full else self._position
         columns = {name: column[run, :count].copy() for name, column in self._columns.items()}
         return {**columns, "position": self._position, "is_full": self._is_full}
 
     def set_state(self, run: int, state: State) -> None:
-        """See `Replay.set_state`."""
+        """Mirrors `get_state`."""
         self._position, self._is_full = int(state["position"]), bool(state["is_full"])
         if not 0 <= self._position < self._rows:
             raise StateError(f"the replay's position must be from 0 to {self._rows - 1}")
@@ -137,11 +102,6 @@ class CountedReplay:
 
     A minibatch is drawn by systematic sampling: of a transition with the share p of all that was met, it has
     B p, rounded up or down by chance. The mean is that of uniform sampling, the noise far smaller.
-
-    Args:
-        runs: P.
-        num_states: S.
-        num_actions: A.
     """
 
     def __init__(self, runs: int, num_states: int, num_actions: int) -> None:
@@ -154,7 +114,7 @@ class CountedReplay:
     def store(
         self, states: IntArray, actions: IntArray, following: IntArray, rewards: FloatArray, ends: BoolArray
     ) -> None:
-        """See `Replay.store`."""
+        """See `UniformReplay.store`."""
         numbers = ((states * self._num_actions + actions) * self._num_states + following) * 2 + ends
         for run, met in enumerate(numbers + 1j * rewards.astype(np.float32)):
             known, counts = self._met[run], self._counts[run]
@@ -167,11 +127,11 @@ class CountedReplay:
             self._counts[run] += np.bincount(rows, minlength=len(self._counts[run]))
 
     def width(self, size: int) -> int:
-        """See `Replay.width`: as many as the run that has met most."""
+        """See `UniformReplay.width`: as many as the run that has met most."""
         return max(map(len, self._counts))
 
     def draw(self, generators: Sequence[np.random.RandomState | None], count: int, size: int) -> Transitions:
-        """See `Replay.draw`; columns of runs that have met fewer end in transitions of no share."""
+        """See `UniformReplay.draw`; columns of runs that have met fewer end in transitions of no share."""
         shape = count, len(generators), self.width(size)
         found = [
             np.zeros(shape, kind)
@@ -190,7 +150,7 @@ class CountedReplay:
         return Transitions(*found)
 
     def get_state(self, run: int) -> State:
-        """See `Replay.get_state`."""
+        """See `UniformReplay.get_state`."""
         met = self._met[run]
         return {
             "transitions": met.real.copy(),
@@ -199,7 +159,7 @@ class CountedReplay:
         }
 
     def set_state(self, run: int, state: State) -> None:
-        """See `Replay.set_state`."""
+        """See `UniformReplay.set_state`."""
         count = len(state["counts"])
         met, counts = np.empty(count, dtype=np.complex128), np.empty(count, dtype=np.int64)
         for name, column in (("transitions", met.real), ("rewards", met.imag), ("counts", counts)):
@@ -211,18 +171,21 @@ class CountedReplay:
         self._met[run], self._counts[run] = met, counts
 
 
+Replay = UniformReplay | CountedReplay
+
+
 def systematic_sample(counts: IntArray, size: int, chance: FloatArray) -> IntArray:
-    """Draw minibatches from what was met: every N/B-th of all in a row, from a random one on.
+    """Draw n minibatches of B from N transitions: every N/B-th of all in a row, from a random one on.
 
     G. Kitagawa, Monte Carlo Filter and Smoother for Non-Gaussian Nonlinear State Space Models, 1996.
 
     Args:
         counts: (R,), how often each transition was met, N times in all.
-        size: B, of a minibatch.
-        chance: (n,), numbers from [0, 1), where each of n minibatches begins.
+        size: B.
+        chance: (n,), numbers from [0, 1), where each minibatch begins.
 
     Returns:
-        (n, R), how often each transition is in each minibatch, B in all.
+        (n, R), how often each transition is in each minibatch.
     """
     ends = np.cumsum(counts)
     before = np.ceil(size * (ends / ends[-1]) - chance[:, None])  # points before each end

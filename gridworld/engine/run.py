@@ -13,7 +13,6 @@ import torch
 from torch import nn
 
 from gridworld.config.agents import Decay
-from gridworld.engine.inputs import Inputs
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
 from gridworld.storage.serialization import (
@@ -27,50 +26,31 @@ from gridworld.world.mdp import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from gridworld.engine.population import Population
-
-
-def _go_on(steps: int) -> int:
-    return steps + 1
+    from gridworld.engine.sb3_format import Inputs
 
 
 @dataclass(eq=False)
 class Run:
-    """A run.
+    """A run."""
 
-    Attributes:
-        model: SB3's own, for settings, counters and the names of logged values. Its weights are stale.
-        parameters: of its network, in the order of its optimiser, which a row of the weights has too.
-        inputs: what the network sees of each state.
-        nets: the layers of each output.
-        envs: its environments, for their generator and their statistics.
-        reward_scale: rewards are multiplied by it.
-        falling: settings that fall over training in ways that SB3 has not.
-        torch_generator: where SB3 draws from torch's own.
-        numpy_generator: where SB3 draws from numpy's own.
-        log_interval: as SB3's `learn` takes it.
-        target: what its target network sees of each state, where it has one.
-        target_parameters: of that, in the same order.
-        counts_transitions: whether its replay counts transitions.
-    """
-
-    model: Any
-    parameters: Sequence[nn.Parameter]
-    inputs: Inputs
-    nets: Sequence[Sequence[nn.Module]]
-    envs: StatisticsVectorEnv
-    reward_scale: float
-    falling: Mapping[str, Decay]
-    torch_generator: torch.Generator
-    numpy_generator: np.random.RandomState
-    log_interval: int = 1
-    target: Inputs | None = None
-    target_parameters: Sequence[nn.Parameter] = ()
-    counts_transitions: bool = False
+    model: Any  # SB3's own, for settings, counters and the names of logged values; its weights are stale
+    parameters: Sequence[nn.Parameter]  # of its network, in the order of its optimiser and of a row
+    inputs: Inputs  # what the network sees of each state
+    nets: Sequence[Sequence[nn.Module]]  # the layers of each output
+    envs: StatisticsVectorEnv  # for their generator and their statistics
+    reward_scale: float  # that rewards are multiplied by
+    falling: Mapping[str, Decay]  # settings that fall over training in ways that SB3 has not
+    torch_generator: torch.Generator  # in place of torch's own
+    numpy_generator: np.random.RandomState  # in place of numpy's own
+    log_interval: int = 1  # as SB3's `learn` takes it
+    target: Inputs | None = None  # what its target network sees of each state, where it has one
+    target_parameters: Sequence[nn.Parameter] = ()  # of that, in the same order
+    counts_transitions: bool = False  # whether its replay counts transitions
     population: Population = field(init=False, repr=False)
     row: int = field(init=False, default=0)
     total_timesteps: int = field(init=False, default=0)
     next_call: int = field(init=False, default=0)  # the steps by which `on_step` wants to be called
-    on_step: Callable[[int], int] = field(init=False, default_factory=lambda: _go_on)
+    on_step: Callable[[int], int] = field(init=False, default_factory=lambda: lambda steps: steps + 1)
     on_safe_point: Callable[[int], None] | None = field(init=False, default=None)
     error: BaseException | None = field(init=False, default=None)  # that it ended with
     has_ended: bool = field(init=False, default=False)  # before its last step
@@ -110,21 +90,19 @@ class Run:
     def step_on(self, steps: int) -> None:
         """Call what wants to be called after these steps of the run; it may end the run."""
         self.model.num_timesteps = steps
-        self._call(self._on_step, steps)
-
-    def _on_step(self, steps: int) -> None:
-        self.next_call = self.on_step(steps)
-        if not self.next_call:
-            self.population.end(self)
+        try:
+            self.next_call = self.on_step(steps)
+        except BaseException as error:
+            self.fail(error)
+        else:
+            if not self.next_call:
+                self.population.end(self)
 
     def safe_point(self, steps: int) -> None:
         """Let the run be saved, where its state is whole."""
-        if self.on_safe_point is not None:
-            self._call(self.on_safe_point, steps)
-
-    def _call(self, hook: Callable[[int], None], steps: int) -> None:
         try:
-            hook(steps)
+            if self.on_safe_point is not None:
+                self.on_safe_point(steps)
         except BaseException as error:
             self.fail(error)
 
@@ -135,19 +113,13 @@ class Run:
 
     def diverge(self, what: str) -> None:
         """End the run, since `what` is no finite number."""
-        model = self.model
-        self.fail(
-            InputError(
-                f"training diverged at update {model._n_updates:,}, after {model.num_timesteps:,} steps: "
-                f"{what}; try a smaller learning rate"
-            )
-        )
+        updates, steps = self.model._n_updates, self.model.num_timesteps
+        where = f"training diverged at update {updates:,}, after {steps:,} steps"
+        self.fail(InputError(f"{where}: {what}; try a smaller learning rate"))
 
     def get_state(self) -> State:
         """Its generators, environments and counters, for `Population.get_state`."""
-        model = self.model
-        logged = model.logger.name_to_value
-        excluded = model.logger.name_to_excluded
+        model, excluded = self.model, self.model.logger.name_to_excluded
         return {
             "torch_generator": self.torch_generator.get_state().numpy().copy(),
             "numpy_generator": self.numpy_generator.get_state(legacy=False),
@@ -160,16 +132,12 @@ class Run:
             "seconds": (time.time_ns() - model.start_time) / 1e9,
             "logged": [
                 [name, float(value), "tensorboard" in (excluded[name] or ())]
-                for name, value in logged.items()
+                for name, value in model.logger.name_to_value.items()
             ],
         }
 
     def set_state(self, state: State) -> None:
-        """Mirrors `get_state`.
-
-        Raises:
-            StateError: the state of another run.
-        """
+        """Mirrors `get_state`."""
         model = self.model
         if state["num_timesteps"] < 0 or state["num_updates"] < 0 or state["num_episodes"] < 0:
             raise StateError("counters must be at least 0")

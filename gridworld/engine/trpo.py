@@ -28,9 +28,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gridworld.engine.losses import Array, Sums, log_softmax
-from gridworld.engine.networks import Networks, aligned
-from gridworld.engine.on_policy import OnPolicy
+from gridworld.engine.networks import Array, Networks, aligned
+from gridworld.engine.on_policy import OnPolicy, Sums, log_softmax
 from gridworld.engine.optimizer import Optimizer
 from gridworld.engine.population import make_networks
 from gridworld.engine.run import Run
@@ -56,12 +55,8 @@ class TRPO(OnPolicy):
         policies = make_networks(runs, policy_parameters, slice(0, 1))
         return [policies, make_networks(runs, value_parameters, slice(1, 2))]
 
-    @property
-    def critic(self) -> Networks:
-        """The networks of the values."""
-        return self.all_networks[1]
-
     def _optimizer(self) -> Optimizer:
+        self.critic = self.all_networks[1]  # the networks of the values
         own = [run.model.policy.optimizer for run in self.runs]
         return Optimizer(own, self.critic.weights, self.critic.gradients, [math.inf] * len(own))
 
@@ -84,7 +79,13 @@ class TRPO(OnPolicy):
     def update(self, old: tuple[Array, Array], pairs: IntArray, advantages: Array, returns: Array) -> None:
         """See `OnPolicy.update`."""
         samples = pairs, advantages, returns
-        surrogate, divergence, is_improved = self._improve_policies(old[0], *samples)
+        order = self.orders(pairs.shape[1], self.active)
+        part = order[:, None, :: self.runs[0].model.sub_sampling_factor]
+        ((states, sums),) = self.summed_up(*(each.take(part) for each in samples))
+        collected = old[0] if states is None else old[0][:, states]
+        start = log_softmax(self.networks.run(states)[0])
+        steps = self._longest_steps(start, collected, sums)
+        surrogate, divergence, is_improved = self._search_lines(states, start, collected, sums, steps)
         value_loss = self._fit_values(*samples)
         for run in self.going():
             run.model._n_updates += 1
@@ -92,18 +93,7 @@ class TRPO(OnPolicy):
             run.record("train/value_loss", float(value_loss[run.row]))
             run.record("train/kl_divergence_loss", float(divergence[run.row]))
             run.record("train/is_line_search_success", float(is_improved[run.row]))
-        self.check_losses(value_loss)
-
-    def _improve_policies(self, old: Array, *samples: Array) -> tuple[Array, Array, BoolArray]:
-        """Make the policies' steps; returns surrogates, divergences and whether one was made, (P,) each."""
-        order = self.orders(samples[0].shape[1], self.active)
-        part = order[:, None, :: self.runs[0].model.sub_sampling_factor]
-        ((states, sums),) = self.summed_up(*(each.take(part) for each in samples))
-        if states is not None:
-            old = old[:, states]
-        start = log_softmax(self.networks.run(states)[0])
-        steps = self._longest_steps(start, old, sums)
-        return self._search_lines(states, start, old, sums, steps)
+        self.check(np.isfinite(value_loss), "a loss")
 
     def _longest_steps(self, start: Array, old: Array, sums: Sums) -> Tensor:
         """(P, W), along the natural gradients to the borders of the trust regions, to second order."""
@@ -132,7 +122,10 @@ class TRPO(OnPolicy):
     def _search_lines(
         self, states: IntArray | None, start: Array, old: Array, sums: Sums, steps: Tensor
     ) -> tuple[Array, Array, BoolArray]:
-        """Shorten steps until they improve surrogates in the trust regions; see `_improve_policies`."""
+        """Shorten steps until they improve surrogates in the trust regions.
+
+        Returns surrogates, divergences and whether a step was made, (P,) each.
+        """
         weights, gains = self.networks.weights, sums.positive + sums.negative
         before, surrogate = weights.clone(), _surrogate(start, old, gains)
         target = np.array([run.model.target_kl for run in self.runs])
@@ -175,8 +168,7 @@ class TRPO(OnPolicy):
                 pull = sums.states * error
                 losses.append((pull * error).sum(axis=-1) + sums.deviation)
                 self.critic.backward(2 * pull[..., None])
-                finite = self.optimizer.step(learning_rates, self.active)
-                self.check_gradients(finite)
+                self.check(self.optimizer.step(learning_rates, self.active), "the gradient")
         return np.asarray(np.stack(losses, axis=1).mean(axis=1))
 
 
@@ -195,15 +187,10 @@ def value_parameters(run: Run) -> list[nn.Parameter]:
 def conjugate_gradients(
     product: Callable[[Tensor], Tensor], vectors: Tensor, guess: Tensor, steps: int
 ) -> Tensor:
-    """Solve P linear systems A x = b, those of sb3-contrib's solver side by side.
+    """Solve P linear systems A x = b (P, W), those of sb3-contrib's solver side by side, from a guess.
 
+    A product A x has `aligned` rows, and may overwrite the one before and b.
     M. Hestenes and E. Stiefel, Methods of conjugate gradients for solving linear systems, 1952.
-
-    Args:
-        product: A x (P, W) of x (P, W), with `aligned` rows; the next product may overwrite it.
-        vectors: b (P, W), which a product may overwrite.
-        guess: (P, W), where to begin.
-        steps: at most.
     """
     vectors, solution = aligned(vectors), aligned(guess)
     residual = aligned(vectors - product(solution))

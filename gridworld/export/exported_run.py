@@ -76,11 +76,7 @@ class ExportedRun:
 
 
 def read(folder: Path, copies: Path) -> ExportedRun:
-    """Read a finished run; `copies` is an empty folder, for copies of its files.
-
-    Raises:
-        InputError: It is no finished run, or a file is missing, too large, or not the one that the run wrote.
-    """
+    """Read a finished run; `copies` is an empty folder, for copies of its files."""
     evidence = read_evidence(folder)
     if isinstance(evidence, Unusable):
         raise InputError("; ".join(evidence.reasons))

@@ -7,6 +7,7 @@ or of an import path.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import shutil
 from pathlib import Path
@@ -67,21 +68,15 @@ hf upload USER/{group} .
 
 
 def to_hub(run: ExportedRun, out: Path, project: str) -> str:
-    """Write the folder of a run in `out`, named for it, and return it; nothing is uploaded.
-
-    It says nothing of the project. Raises `InputError` where the agent's class has a name that cannot be
-    imported.
-    """
+    """Write the folder of a run in `out`, named for it, and return it; nothing is uploaded."""
     folder = out / run.name
+    with contextlib.suppress(InputError):  # it is something else
+        if read_object(folder / _RESULTS).get("run") == run.identity:
+            return str(folder)
     if folder.exists():
-        try:
-            identity = read_object(folder / _RESULTS).get("run")
-        except InputError:  # it is something else
-            identity = None
-        if identity != run.identity:
-            folder = out / f"{run.name}-{run.identity}"
-    if folder.exists():
-        return str(folder)
+        folder = out / f"{run.name}-{run.identity}"
+        if folder.exists():
+            return str(folder)
     card = _card(run)
     with replacing_folder(folder) as new:
         shutil.copyfile(run.models[0], new / f"{run.group}.zip")

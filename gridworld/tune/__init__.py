@@ -1,15 +1,9 @@
 """Tuning: search an agent's settings for those certified on most seeds, and soonest, by Optuna.
 
-    study_spec.py      a command line -> the configuration to begin from, and how to search
-    study.py           a study from its beginning to its verdict
-    study_folder.py    whose the study's folder is; trials.csv and study.json, for readers without Optuna
-    existing_study.py  checks of a study that is there already
-    search/            the search space, the objective, the storage, and the workers that run trials
-    progress.py        trials.csv and the progress line, kept up to date
-    finalists.py       the best few trials on more seeds, to choose the winner
-    confirmation.py    the winner beside what the search began from, on seeds that neither was chosen by
-    recipe.py          the winner as a yaml for train.py
-
-Optuna's storage decides; the files in the study's folder follow from it. Workers use the storage only, so it
-does not matter which machine they are on.
+study_spec.py, search_space.py   a command line -> the configuration to begin from, and how to search
+study.py                         a study from its beginning to its verdict
+search.py, objective.py          the study in its database; trials, and what their settings come to
+finalists.py, confirmation.py    the best few on more seeds; the winner on seeds that nothing was chosen by
+workers.py                       the processes that train all this
+study_folder.py, recipe.py       trials.csv and study.json, for readers without Optuna; the winner's yaml
 """

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -20,23 +19,20 @@ import numpy as np
 
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import printable, tell
-from gridworld.process.parallel.together import LARGEST
+from gridworld.process.console.terminal import tell
 from gridworld.report import statistics
 from gridworld.report.table import number, steps_up_to
+from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import find_run
 from gridworld.storage.atomic_write import check_no_links, make_inside, names_inside, remove_inside
 from gridworld.sweep.job import JobError, run_in_sweep
-from gridworld.sweep.job_table import FAILED, JobTable, run_status
-from gridworld.sweep.plan import plan, shape
-from gridworld.training.together import Training, run_alone
-from gridworld.tune.search.worker import become_worker, is_stopped, run_all
-from gridworld.tune.search.worker_pool import share
+from gridworld.sweep.job_table import FAILED, JobTable
+from gridworld.training.together import Training, run_together
+from gridworld.tune.workers import Ask
 from gridworld.world.mdp import FloatArray
 
 CONFIRM = "confirm"  # the runs' folder, in the study's
 _HASH_SHOWN = 8  # characters
-_ENDED = ("finished", "failed")
 
 
 @dataclass(frozen=True)
@@ -49,30 +45,36 @@ class HeldOutRun:
 
 @dataclass(frozen=True)
 class HeldOutRuns:
-    """Such runs, and how many workers share them."""
+    """A worker's task: such runs, together where they can. What came of them is in their folders."""
 
     runs: tuple[HeldOutRun, ...]
-    workers: int
+
+    def __call__(self, ask: Ask) -> bool:
+        for result in run_together([partial(_run, run) for run in self.runs]):
+            if isinstance(result, Exception):
+                raise result
+        return True
+
+
+def _run(run: HeldOutRun) -> Training[None]:
+    make_inside(run.folder.parents[1], CONFIRM, run.folder.name)
+    try:
+        yield from run_in_sweep(run.config, run.folder, [], stop_at_failure=False)
+    except JobError as error:
+        tell(f"{run.folder}: {error}")
 
 
 def held_out_runs(folder: Path, name: str, config: TrainConfig, seeds: Sequence[int]) -> list[HeldOutRun]:
     """A run of a configuration on each seed.
 
     A run's folder has a hash of its settings in its name: other settings are other runs.
-
-    Args:
-        folder: the study's.
-        name: what the runs' folders are called before the hash and the seed.
-        config: the configuration, whose own seed does not matter.
-        seeds: the held-out seeds.
     """
-    of_seed = {str(seed): dataclasses.replace(config, seed=seed) for seed in seeds}
-    planned = plan((([seed], []) for seed in of_seed), lambda words: of_seed[words[0]])
-    runs = folder / CONFIRM
-    return [
-        HeldOutRun(runs / f"{name},{job.hash[:_HASH_SHOWN]},seed={seed}", of_seed[seed])
-        for seed, job in zip(of_seed, planned, strict=True)
-    ]
+    world, runs = config.env.compile().text(), []
+    for seed in seeds:
+        of_seed = dataclasses.replace(config, seed=seed)
+        digest = settings_hash(dataclasses.asdict(of_seed), world)[:_HASH_SHOWN]
+        runs.append(HeldOutRun(folder / CONFIRM / f"{name},{digest},seed={seed}", of_seed))
+    return runs
 
 
 def prepare(folder: Path, runs: Sequence[HeldOutRun]) -> None:
@@ -99,35 +101,22 @@ def _damage(folder: Path) -> list[str]:
     return [] if run is None or not run.is_finished else list(run.damage().values())
 
 
-def run_held_out(all_runs: HeldOutRuns, worker: int, parent: int) -> None:
-    """A worker's process: run its part, then what nobody has run yet, until all have ended.
-
-    See `worker_pool.WorkerMain`.
-    """
-    become_worker(parent)
-    part = share(all_runs.runs, worker, all_runs.workers)
-    together = LARGEST if shape(part[0].config) is not None else 1
-    left = [run for run in all_runs.runs if run not in part]
-    for start in range(0, len(part), together):
-        some = [] if is_stopped() else part[start : start + together]
-        ran: list[bool] = run_all([partial(_run, run) for run in some])
-        left += [run for run, is_well in zip(some, ran, strict=True) if is_well]
-    while left and not is_stopped():
-        # Some may be running elsewhere, in this study's other workers or in another command's.
-        left = [run for run in left if run_status(run.folder) not in _ENDED]
-        left = [run for run in left if is_stopped() or run_alone(_run(run))]
-    sys.exit(0)
-
-
-def _run(run: HeldOutRun) -> Training[bool]:
-    """Run it; False where it failed in this process."""
-    make_inside(run.folder.parents[1], CONFIRM, run.folder.name)
-    try:
-        yield from run_in_sweep(run.config, run.folder, [], stop_at_failure=False)
-    except JobError as error:
-        print(printable(f"{run.folder}: {error}"), file=sys.stderr, flush=True)
-        return False
-    return True
+def certified_since(folder: Path) -> float | None:
+    """The steps until a run's certificate that held, infinite without one; None for a run that failed."""
+    if damaged := _damage(folder):
+        raise InputError("; ".join(damaged))
+    run = find_run(folder)
+    row = JobTable(folder.parent).row(folder.name)
+    if run is None or run.manifest["status"] == "failed":
+        if run is not None or (row is not None and row.status == FAILED):
+            return None
+    elif run.is_finished:
+        since = run.read_summary().get("certified_since_step")
+        if since is not None and (type(since) is not int or since < 0):
+            raise InputError(f"{run.summary_file}: certified_since_step must be a number of steps, or null")
+        return math.inf if since is None else float(since)
+    why = (row.error if row is not None else "") or (run.manifest.get("error", "") if run is not None else "")
+    raise InputError("it did not come to its end" + (f" ({why})" if why else ""))
 
 
 @dataclass(frozen=True)
@@ -142,19 +131,22 @@ class HeldOutResults:
 
     def text(self) -> str:
         """The share certified, and the median step, with their intervals, in a few words."""
-        text = f"certified on {self.certified.count} of {self.certified.total} "
-        text += f"[{100 * self.certified.low:.0f} %, {100 * self.certified.high:.0f} %]"
-        median = statistics.interval(statistics.median, [self.steps], 0)
-        form = steps_up_to(self.total)
-        bounds = f"[{form(median.low)}, {form(median.high)}]"
-        text += f", for good by step {form(median.point)} {bounds} in the median"
-        told = [f"{len(self.failed)} failed and count as not certified: {', '.join(self.failed)}"]
-        left_out = (
-            f"{len(self.left_out)} of {len(self.steps) + len(self.left_out)} left out, without a result"
+        median, form = statistics.interval(statistics.median, [self.steps], 0), steps_up_to(self.total)
+        share = self.certified
+        text = (
+            f"certified on {share.count} of {share.total} "
+            f"[{100 * share.low:.0f} %, {100 * share.high:.0f} %], for good by step {form(median.point)} "
+            f"[{form(median.low)}, {form(median.high)}] in the median"
         )
-        told.append(f"{left_out}: {', '.join(self.left_out)}")
-        told = [each for each, names in zip(told, (self.failed, self.left_out), strict=True) if names]
-        return f"{text} ({'; '.join(told)})" if told else text
+        notes = []
+        if self.failed:
+            notes += [f"{len(self.failed)} failed and count as not certified: {', '.join(self.failed)}"]
+        if self.left_out:
+            asked = len(self.steps) + len(self.left_out)
+            notes += [
+                f"{len(self.left_out)} of {asked} left out, without a result: {', '.join(self.left_out)}"
+            ]
+        return f"{text} ({'; '.join(notes)})" if notes else text
 
 
 def read_results(runs: Sequence[HeldOutRun]) -> HeldOutResults:
@@ -162,7 +154,7 @@ def read_results(runs: Sequence[HeldOutRun]) -> HeldOutResults:
     steps, failed, left_out = [], [], []
     for run in runs:
         try:
-            found = _steps(run.folder)
+            found = certified_since(run.folder)
         except InputError as error:
             tell(f"{run.folder}: is left out; {error}")
             left_out.append(run.folder.name)
@@ -171,8 +163,7 @@ def read_results(runs: Sequence[HeldOutRun]) -> HeldOutResults:
         failed += [run.folder.name] if found is None else []
     if not steps:
         raise InputError(f"{runs[0].folder.parent}: no held-out run has a result; run the command again")
-    certified = int(np.isfinite(steps).sum())
-    share_of = statistics.share(certified, len(steps))
+    share_of = statistics.share(int(np.isfinite(steps).sum()), len(steps))
     total = runs[0].config.total_timesteps
     return HeldOutResults(share_of, np.array(steps), total, tuple(failed), tuple(left_out))
 
@@ -182,18 +173,15 @@ def verdict_on(winner: HeldOutResults, began_from: HeldOutResults, name: str) ->
 
     It goes by what the search minimises: first the share certified, then how soon. The latter is the
     probability that a run of the winner is certified before one of the other's, ties half.
-
-    Args:
-        winner: the results of the winner's runs.
-        began_from: those of the configuration that the search began from.
-        name: of the winner, for the sentence.
-
-    Returns:
-        The `confirmation` of study.json: the verdict, a sentence, the intervals and both results.
     """
     more = statistics.difference(winner.certified, began_from.certified)
     sooner = statistics.improvement([(-winner.steps, -began_from.steps)], 0)
-    verdict = ("does not beat", "cannot be told apart from", "beats")[1 + _sign(more, sooner)]
+    # A significant difference in shares decides. Where there is none, being sooner does, unless the shares
+    # lean the other way: then what is gained in time might be paid for in certificates.
+    side, time = _side(more, 0.0), _side(sooner, 0.5)
+    if side == 0 and time * more.point >= 0:
+        side = time
+    verdict = ("does not beat", "cannot be told apart from", "beats")[1 + side]
     asked = len(winner.steps) + len(winner.left_out)
     sentence = (
         f"On {asked} held-out seeds {name} {verdict} the settings that the search began from: "
@@ -210,18 +198,6 @@ def verdict_on(winner: HeldOutResults, began_from: HeldOutResults, name: str) ->
     }
 
 
-def _sign(more: statistics.Interval, sooner: statistics.Interval) -> int:
-    """1 for better, -1 for worse, 0 where the runs do not tell.
-
-    A significant difference in shares decides. Where there is none, being sooner does, unless the shares lean
-    the other way: then what is gained in time might be paid for in certificates.
-    """
-    if share := _side(more, 0.0):
-        return share
-    time = _side(sooner, 0.5)
-    return 0 if time * more.point < 0 else time
-
-
 def _side(interval: statistics.Interval, neutral: float) -> int:
     """On which side of the neutral value the whole interval lies; 0 where it holds it."""
     return int(interval.low > neutral) - int(interval.high < neutral)
@@ -234,21 +210,3 @@ def _plain(results: HeldOutResults) -> dict[str, Any]:
         "failed": results.failed,
         "left_out": results.left_out,
     }
-
-
-def _steps(folder: Path) -> float | None:
-    """The steps until the certificate that held, infinite without one; None for a run that failed."""
-    if told := _damage(folder):
-        raise InputError("; ".join(told))
-    run = find_run(folder)
-    row = JobTable(folder.parent).row(folder.name)
-    if run is None or run.manifest["status"] == "failed":
-        if run is not None or (row is not None and row.status == FAILED):
-            return None
-    elif run.is_finished:
-        since = run.read_summary().get("certified_since_step")
-        if since is not None and (type(since) is not int or since < 0):
-            raise InputError(f"{run.summary_file}: certified_since_step must be a number of steps, or null")
-        return math.inf if since is None else float(since)
-    why = (row.error if row is not None else "") or (run.manifest.get("error", "") if run is not None else "")
-    raise InputError("it did not come to its end" + (f" ({why})" if why else ""))

@@ -7,43 +7,27 @@ Results are attributes of the study, so that machines share them.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import sys
-import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from gridworld.errors import InputError, reason
+from optuna import Study
+from optuna.trial import FrozenTrial, TrialState
+
 from gridworld.process.console.terminal import tell
-from gridworld.process.parallel.together import LARGEST
-from gridworld.training.together import Training
-from gridworld.tune.search.objective import SEEDS, Objective, SeedScore, Stopped, learning, read_score, score
-from gridworld.tune.search.worker import StudyContext, become_worker, is_stopped, run_all, study_of
-from gridworld.tune.search.worker_pool import share
+from gridworld.tune.objective import SEEDS, FinalRuns, SeedScore, read_score, score
+from gridworld.tune.study_spec import StudySpec
+from gridworld.tune.workers import Workers
 
-if TYPE_CHECKING:
-    from optuna import Study
-    from optuna.trial import FrozenTrial
-
-_FAILED = sys.float_info.max  # the regret of a run that did
 FINAL = "final "  # what the names of these attributes begin with
-
-
-@dataclass(frozen=True)
-class FinalRuns:
-    """Runs of finalists on final seeds, and how many workers share them."""
-
-    context: StudyContext
-    runs: tuple[tuple[int, Mapping[str, Any], int], ...]  # (number of the trial, its values, seed)
-    workers: int
+_FAILED = sys.float_info.max  # the regret of a run that did
 
 
 @dataclass(frozen=True)
 class Finalist:
-    """How a trial stands after its final runs, by its own seeds and the final seeds together."""
+    """A trial after its final runs, by its own seeds and the final seeds together."""
 
     trial: int
     score: float
@@ -52,100 +36,63 @@ class Finalist:
     failed: int  # of these, runs that ended by an error, and count as not certified
 
 
-def choose_finalists(study: Study, count: int, began_from: Mapping[str, Any] | None) -> list[FrozenTrial]:
+def choose_finalists(study: Study, spec: StudySpec) -> list[FrozenTrial]:
     """The best complete trials, no two alike, and the one of the configuration that the search began from.
 
-    Args:
-        study: the study.
-        count: how many of the best.
-        began_from: that configuration's parameters, where it lies in the search space.
+    Machines that search together may end with a few trials more than were asked for; these do not count.
     """
-    from optuna.trial import TrialState
-
-    complete = study.get_trials(deepcopy=False, states=[TrialState.COMPLETE])
+    began_from = spec.space.parameters_of(spec.base)
+    ended = study.get_trials(deepcopy=False)[: spec.settings.trials]
+    complete = [trial for trial in ended if trial.state == TrialState.COMPLETE]
     found: list[FrozenTrial] = []
     for trial in sorted(complete, key=lambda trial: (trial.value, trial.number)):
         is_new = all(trial.params != other.params for other in found)
-        if is_new and (len(found) < count or trial.params == began_from):
+        if is_new and (len(found) < spec.settings.finalists or trial.params == began_from):
             found.append(trial)
     return found
 
 
-def run_finals(runs: FinalRuns, worker: int, parent: int) -> None:
-    """A worker's process: run a part, or for a worker that was lost whatever nobody has run yet.
+def rank_finalists(
+    spec: StudySpec, study: Study, trials: Sequence[FrozenTrial], workers: Workers
+) -> list[Finalist]:
+    """Run what the finalists lack on the final seeds; returns them, the winner first."""
+    runs = {
+        _name(trial, seed): (spec.space.values(trial.params), seed)
+        for seed in spec.final_seeds
+        for trial in trials
+        if _name(trial, seed) not in study.user_attrs
+    }
+    if runs:
+        print(
+            f"the {len(trials)} finalists on {len(spec.final_seeds)} seeds more: {len(runs)} runs",
+            file=sys.stderr,
+            flush=True,
+        )
+    shares = workers.shares(list(runs), spec.base.agent.shape is not None)
+    tasks = [FinalRuns(spec.objective, {name: runs[name] for name in names}) for names in shares]
 
-    See `worker_pool.WorkerMain`.
-    """
-    become_worker(parent)
-    with study_of(runs.context) as storage, contextlib.suppress(Stopped):
-        _run_missing(runs, storage.load(), worker)
-    sys.exit(0)
+    def on_end(task: FinalRuns, results: Mapping[str, SeedScore | str] | None) -> None:
+        for name, (_, seed) in task.runs.items():
+            result = results[name] if results is not None else "the workers that ran it were killed"
+            if isinstance(result, str):
+                tell(f"{name.removeprefix(FINAL)} failed, and counts as not certified: {result}")
+                result = SeedScore(seed, None, _FAILED)
+            study.set_user_attr(name, dataclasses.asdict(result))
 
-
-def _run_missing(runs: FinalRuns, study: Study, worker: int) -> None:
-    part = share(runs.runs, worker, runs.workers)
-    attributes = study.user_attrs
-    tasks = [
-        partial(_run, runs.context.objective, study, *run)
-        for run in part
-        if _name(run[0], run[2]) not in attributes
-    ]
-    together = LARGEST if runs.context.objective.can_join() else 1
-    for start in range(0, len(tasks), together):
-        run_all(tasks[start : start + together])
-
-
-def _run(
-    objective: Objective, study: Study, number: int, values: Mapping[str, Any], seed: int
-) -> Training[None]:
-    try:
-        result = yield from learning(objective.config(values), seed, is_stopped)
-    except Exception as error:  # the run failed, though its trial did not
-        tell(f"trial {number} on the final seed {seed} failed, and counts as not certified: {reason(error)}")
-        if not isinstance(error, InputError | ArithmeticError):
-            traceback.print_exc()
-        result = SeedScore(seed, None, _FAILED)
-    study.set_user_attr(_name(number, seed), dataclasses.asdict(result))
+    workers.run(lambda: tasks.pop(0) if tasks else None, on_end)
+    return sorted(_ranked(spec, study, trials), key=lambda finalist: (finalist.score, finalist.trial))
 
 
-def ranking(study: Study, trials: Sequence[FrozenTrial], seeds: Sequence[int], total: int) -> list[Finalist]:
-    """Rank the finalists by all of their seeds.
-
-    Args:
-        study: the study, which has every final run's result.
-        trials: the finalists.
-        seeds: the final seeds.
-        total: a run's budget in environment steps.
-
-    Returns:
-        The finalists, the winner first.
-    """
-    attributes = study.user_attrs
-    found = []
+def _ranked(spec: StudySpec, study: Study, trials: Sequence[FrozenTrial]) -> Iterator[Finalist]:
+    attributes: Mapping[str, Any] = study.user_attrs
     for trial in trials:
         results = [read_score(each) for each in trial.user_attrs[SEEDS]]
-        results += [read_score(attributes[_name(trial.number, seed)]) for seed in seeds]
+        results += [read_score(attributes[_name(trial, seed)]) for seed in spec.final_seeds]
         certified = sum(result.certified_since is not None for result in results)
-        value = score(results, total, len(results))
+        value = score(results, spec.base.total_timesteps, len(results))
         failed = sum(result.regret == _FAILED for result in results)
-        found.append(Finalist(trial.number, value, certified, len(results), failed))
-    return sorted(found, key=lambda finalist: (finalist.score, finalist.trial))
+        yield Finalist(trial.number, value, certified, len(results), failed)
 
 
-def missing(
-    study: Study, finalists: Sequence[tuple[int, Mapping[str, Any]]], seeds: Sequence[int]
-) -> tuple[tuple[int, Mapping[str, Any], int], ...]:
-    """The final runs, as in `FinalRuns`, that have no result yet.
-
-    Args:
-        study: the study.
-        finalists: the number of each one's trial, and its values.
-        seeds: the final seeds.
-    """
-    attributes = study.user_attrs
-    runs = ((number, values, seed) for seed in seeds for number, values in finalists)
-    return tuple(run for run in runs if _name(run[0], run[2]) not in attributes)
-
-
-def _name(number: int, seed: int) -> str:
-    return f"{FINAL}trial={number},seed={seed}"
+def _name(trial: FrozenTrial, seed: int) -> str:
+    return f"{FINAL}trial={trial.number},seed={seed}"

@@ -32,18 +32,7 @@ _OF_A_RECIPE = ON_RESULT - {Effect.SEED, Effect.MACHINE}
 def write_recipe(
     folder: Path, folders: ConfFolders, choices: Mapping[str, str], config: TrainConfig, about: str
 ) -> Path:
-    """Write the recipe, and check that it composes to `config` again.
-
-    Args:
-        folder: the study's.
-        folders: where yaml files come from.
-        choices: the file of each group in `config.recipe_file.CHOSEN`.
-        config: the winner's configuration.
-        about: a comment on where it is from.
-
-    Returns:
-        The recipe's path.
-    """
+    """Write the recipe, and check that it composes to `config` again."""
     chosen = [f"{group}={choice}" for group, choice in choices.items()]
     bare = without_hydra(compose_in(folders, "train", chosen))
     values = OmegaConf.create(_difference(_relevant(bare), _relevant(config)))

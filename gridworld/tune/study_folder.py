@@ -1,12 +1,12 @@
 """A study's folder: whose it is, and what it says of the search.
 
 search.json     the study's name and what makes its trials comparable, from its beginning on
-trials.csv      a row per trial
+trials.csv      a row per trial that has ended
 study.json      what was searched and what came of it, with the checksum of trials.csv
 confirm/        the held-out runs; see `confirmation`
 experiment/     the winner as a recipe; see `recipe`
 study.db        Optuna's storage, unless tune.storage names another
-.lock           held, shared, by each process that runs the study
+.lock           held by the command at work, unless the study is in a database that others share
 
 The tables are made anew from the storage, which may be elsewhere, or be deleted. The report reads them, so
 that it needs neither Optuna nor the database.
@@ -28,7 +28,7 @@ from optuna.trial import FrozenTrial, TrialState
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import recorded_command_line
 from gridworld.report.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
-from gridworld.run.claim import check_writable
+from gridworld.run.claim import alone_in, check_writable
 from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON
 from gridworld.run.provenance import versions
 from gridworld.storage.atomic_write import check_no_links, make_folder, tidy, write_json, write_text
@@ -37,32 +37,13 @@ from gridworld.storage.file_lock import noted
 from gridworld.storage.safe_read import LARGEST_CSV, file_sha256
 from gridworld.storage.sealed_json import read_sealed, sealed
 from gridworld.tune.confirmation import CONFIRM
+from gridworld.tune.objective import ERROR, SEEDS, WORKER
 from gridworld.tune.recipe import EXPERIMENT
-from gridworld.tune.search.objective import ERROR, SEEDS, WORKER
-from gridworld.tune.search.search_space import SearchSpace
-from gridworld.tune.search.storage import check_same_search, draw_of, is_lost
+from gridworld.tune.search_space import SearchSpace
 from gridworld.tune.study_spec import StudySpec
 
 SEARCH_JSON = "search.json"
-_FIELDS = (
-    "trial",
-    "status",
-    "score",
-    "certified",
-    "steps",
-    "regret",
-    "seconds",
-    "repeats",
-    "worker",
-    "error",
-)
-_STATUSES = {
-    TrialState.COMPLETE: "done",
-    TrialState.PRUNED: "pruned",
-    TrialState.FAIL: "failed",
-    TrialState.RUNNING: "running",
-    TrialState.WAITING: "waiting",
-}
+_STATUSES = {TrialState.COMPLETE: "done", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
 
 
 def check_study_folder(folder: Path) -> None:
@@ -76,43 +57,32 @@ def check_study_folder(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def at_work_in(folder: Path) -> Iterator[None]:
-    """Make the folder and hold its lock, shared by others at the study; one that stays empty is removed."""
+def at_work_in(folder: Path, is_shared: bool = False) -> Iterator[None]:
+    """Make the folder and hold it, unless others share the study; one that stays empty is removed."""
     make_folder(folder)
-    lock = folder / LOCK
+    if is_shared:
+        (folder / LOCK).touch()
     try:
-        lock.touch()
-        with noted(lock):
-            tidy(folder)
+        with noted(folder / LOCK) if is_shared else alone_in(folder):
+            if not is_shared:
+                tidy(folder)
             yield
     finally:
         with contextlib.suppress(OSError):
             if [path.name for path in folder.iterdir()] == [LOCK]:
-                lock.unlink()
-                folder.rmdir()
+                (folder / LOCK).unlink()
+            folder.rmdir()
 
 
-def is_claimed(folder: Path, name: str, about: Mapping[str, Any]) -> bool:
-    """Whether the folder is this study's already.
-
-    Args:
-        folder: the study's folder.
-        name: the study's name.
-        about: what makes its trials comparable, as JSON.
-    """
-    file = next((each for each in (folder / SEARCH_JSON, folder / STUDY_JSON) if os.path.lexists(each)), None)
-    if file is None:
+def is_claimed(folder: Path, name: str) -> bool:
+    """Whether the folder is the named study's already."""
+    if not os.path.lexists(folder / SEARCH_JSON):
         return False
-    content = read_sealed(file)
-    owner = content.get("study")
-    if not isinstance(owner, str):
-        raise InputError(f"{file}: does not say whose the folder is; put back a good copy")
+    owner = read_sealed(folder / SEARCH_JSON).get("study")
     if owner != name:
         raise InputError(
-            f"{folder}: is the folder of the study {owner}; choose another tune.folder, "
-            f"or tune.study={owner} to go on with that"
+            f"{folder}: is the folder of the study {owner}; choose another tune.folder, or tune.study={owner}"
         )
-    check_same_search(name, content.get("about", {}), about)
     return True
 
 
@@ -123,15 +93,12 @@ def claim(folder: Path, name: str, about: Mapping[str, Any]) -> None:
 
 def write_trials(folder: Path, study: optuna.Study, space: SearchSpace, durable: bool = False) -> None:
     """Write a row per trial, with its values as a run would get them; `durable` as for `replacing`."""
-    rows: list[list[Any]] = [[*_FIELDS, *space.dimensions]]
-    lost: dict[int, int] = {}
-    for trial in study.get_trials(deepcopy=False):
+    rows = []
+    for trial in study.get_trials(deepcopy=False, states=tuple(_STATUSES)):
         values = space.values(trial.params)
-        row = _row(trial) | {"repeats": lost.get(draw_of(trial), "")}
-        if is_lost(trial):
-            lost[draw_of(trial)] = trial.number
-        rows.append([*(row[name] for name in _FIELDS), *(values.get(key, "") for key in space.dimensions)])
-    write_text(folder / TRIALS_CSV, csv_text(rows), durable)
+        rows.append(_row(trial) | {key: values.get(key, "") for key in space.dimensions})
+    head = [*_row(optuna.create_trial(state=TrialState.FAIL)), *space.dimensions]
+    write_text(folder / TRIALS_CSV, csv_text([head, *(list(row.values()) for row in rows)]), durable)
 
 
 def _row(trial: FrozenTrial) -> dict[str, Any]:
@@ -140,15 +107,15 @@ def _row(trial: FrozenTrial) -> dict[str, Any]:
     value = trial.value
     if trial.state == TrialState.PRUNED and trial.intermediate_values:
         value = trial.intermediate_values[max(trial.intermediate_values)]
-    ended = trial.duration.total_seconds() if trial.duration is not None else None
+    duration = trial.duration
     return {
         "trial": trial.number,
-        "status": "lost" if is_lost(trial) else _STATUSES[trial.state],
+        "status": _STATUSES[trial.state],
         "score": "" if value is None or math.isnan(value) else f"{value:.6f}",
         "certified": f"{len(steps)}/{len(seeds)}" if seeds else "",
         "steps": round(fmean(steps)) if steps else "",
         "regret": f"{fmean(seed['regret'] for seed in seeds):.6g}" if seeds else "",
-        "seconds": "" if ended is None else f"{ended:.2f}",
+        "seconds": "" if duration is None else f"{duration.total_seconds():.2f}",
         "worker": trial.user_attrs.get(WORKER, ""),
         "error": trial.user_attrs.get(ERROR, ""),
     }
@@ -163,7 +130,7 @@ def write_study(spec: StudySpec, study: optuna.Study, outcome: dict[str, Any]) -
         "command": recorded_command_line(),
         "versions": versions() | {"optuna": optuna.__version__},
         "total_timesteps": spec.base.total_timesteps,
-        "seeds": list(spec.seeds),
+        "seeds": list(spec.objective.seeds),
         "space": spec.space.plain(),
         "began_from": spec.space.parameters_of(spec.base),
         "importances": _importances(study),
@@ -174,7 +141,7 @@ def write_study(spec: StudySpec, study: optuna.Study, outcome: dict[str, Any]) -
 
 
 def _importances(study: optuna.Study) -> dict[str, float]:
-    """The importance of each key, by Optuna's PED-ANOVA; empty where there are too few trials to tell."""
+    """The importance of each key, by Optuna's PED-ANOVA; empty where there are too few trials for it."""
     complete = study.get_trials(deepcopy=False, states=[TrialState.COMPLETE])
     if len(complete) < 4 or len({trial.value for trial in complete}) < 2:
         return {}

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-import hydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
@@ -23,24 +21,27 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from gridworld.config.composition.compose import register_schemas, slug, without_hydra
+from gridworld.config.composition.compose import (
+    compose_whole,
+    register_schemas,
+    search_path,
+    slug,
+    without_hydra,
+)
 from gridworld.config.composition.hydra_errors import sentence
-from gridworld.config.composition.loader import composing_from
 from gridworld.config.composition.recipe_file import CHOSEN, with_recipe
 from gridworld.config.train import AUTO, TrainConfig, check_bounds
 from gridworld.config.tune import TuneConfig
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import program
 from gridworld.process.parallel.machine import core_count
-from gridworld.sweep.plan import shape
 from gridworld.training.setup import check_settings
-from gridworld.tune.search.search_space import SearchSpace
+from gridworld.tune.objective import Objective
+from gridworld.tune.search_space import SearchSpace
 
-_SAMPLERS = ("tpe", "random")
-_PRUNERS = ("median", "hyperband", "none")
+_KNOWN = {"sampler": ("tpe", "random"), "pruner": ("median", "hyperband", "none")}
 _LARGEST_SEED = 2**32
 _TRIALS_AT_ONCE = 8  # over all workers; the sampler knows nothing of those that have not ended
-_PLAIN = re.compile(r"[\w./:-]+")  # what Hydra takes without quotes
 
 
 @dataclass(frozen=True)
@@ -72,16 +73,13 @@ class StudySpec:
         return Path(str(self.settings.folder))
 
     @property
-    def measured(self) -> TrainConfig:
-        """`base` evaluated often enough, which changes nothing else about it."""
-        evaluation = self.base.evaluation
-        every = min(evaluation.every, math.ceil(self.base.total_timesteps / self.settings.evaluations))
-        return dataclasses.replace(self.base, evaluation=dataclasses.replace(evaluation, every=every))
-
-    @property
-    def seeds(self) -> tuple[int, ...]:
-        """The seeds of a trial."""
-        return tuple(range(self.base.seed, self.base.seed + self.settings.seeds))
+    def objective(self) -> Objective:
+        """What is minimised: the base evaluated often enough, on the first seeds."""
+        evaluation, settings = self.base.evaluation, self.settings
+        every = min(evaluation.every, math.ceil(self.base.total_timesteps / settings.evaluations))
+        measured = dataclasses.replace(self.base, evaluation=dataclasses.replace(evaluation, every=every))
+        seeds = tuple(range(self.base.seed, self.base.seed + settings.seeds))
+        return Objective(measured, seeds, settings.reports, settings.stop_after)
 
     @property
     def final_seeds(self) -> range:
@@ -90,10 +88,9 @@ class StudySpec:
         return range(first, first + self.settings.final_seeds)
 
     @property
-    def held_out(self) -> tuple[int, ...]:
+    def held_out(self) -> range:
         """The held-out seeds after those, by which nothing is chosen."""
-        first = self.final_seeds.stop
-        return tuple(range(first, first + self.settings.confirm_seeds))
+        return range(self.final_seeds.stop, self.final_seeds.stop + self.settings.confirm_seeds)
 
 
 def compose_study(folders: ConfFolders, words: Sequence[str]) -> StudySpec:
@@ -113,14 +110,18 @@ def compose_study(folders: ConfFolders, words: Sequence[str]) -> StudySpec:
         search = compose_in(folders, "tune", of_search)
         space_name = str(search.hydra.runtime.choices["tune"])
         settings = cast(TuneConfig, OmegaConf.to_object(search.tune))
-    except (HydraException, OmegaConfBaseException, YAMLError) as error:
-        raise InputError(_sentence(error)) from None
+    except YAMLError as error:
+        mark: Any = getattr(error, "problem_mark", None)
+        where = f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}" if mark else "a yaml file"
+        raise InputError(f"{where}: cannot be read ({getattr(error, 'problem', None) or error})") from None
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(sentence(error)) from None
     _check(settings)
     settings = _completed(settings, choices["agent"], base)
     space = SearchSpace(settings.space, space_name)
     space.check(base, check_settings(base))
     spec = StudySpec(folders, base, choices, settings, space)
-    if spec.held_out[-1] >= _LARGEST_SEED:
+    if spec.held_out.stop > _LARGEST_SEED:
         raise InputError(f"seed={base.seed}: leaves no room for the other seeds after it, below 2**32")
     return spec
 
@@ -130,25 +131,15 @@ def compose_in(folders: ConfFolders, name: str, overrides: Sequence[Override | s
     lines = [str(each.input_line) if isinstance(each, Override) else each for each in overrides]
     if folders.own:
         lines.append(search_path(folders.own))
-    with (
-        warnings.catch_warnings(),
-        composing_from(folders.conf.absolute()),
-    ):
+    with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)  # a folder that is not there
-        return hydra.compose(name, lines, return_hydra_config=True)
-
-
-def search_path(folders: Sequence[Path]) -> str:
-    """The override by which Hydra searches these folders too."""
-    places = [f"file://{folder.resolve()}" for folder in folders]
-    quoted = [place if _PLAIN.fullmatch(place) else f"'{place}'" for place in places]
-    return f"hydra.searchpath=[{','.join(quoted)}]"
+        return compose_whole(folders.conf.absolute(), name, lines)[0]
 
 
 def _divide(words: Sequence[str]) -> tuple[list[Override], list[Override]]:
     """Overrides of the search and of the run."""
-    overrides = _parse(words)
-    for override in overrides:
+    of_search, of_run = list[Override](), list[Override]()
+    for override in _parse(words):
         if override.is_sweep_override():
             raise InputError(
                 f"{override.input_line}: a study searches from one configuration; give one value, and put "
@@ -158,11 +149,8 @@ def _divide(words: Sequence[str]) -> tuple[list[Override], list[Override]]:
             raise InputError(
                 f"{override.input_line}: {program('tune')} makes its own folder; see tune.folder"
             )
-    is_search = [each.key_or_group.split(".")[0] == "tune" for each in overrides]
-    return (
-        [each for each, search in zip(overrides, is_search, strict=True) if search],
-        [each for each, search in zip(overrides, is_search, strict=True) if not search],
-    )
+        (of_search if override.key_or_group.split(".")[0] == "tune" else of_run).append(override)
+    return of_search, of_run
 
 
 def _parse(words: Sequence[str]) -> list[Override]:
@@ -173,11 +161,8 @@ def _check(settings: TuneConfig) -> None:
     check_bounds(settings, "tune.")
     if settings.workers == 0:
         raise InputError("tune.workers=0: must be at least 1, or -1 for one on each core")
-    for key, value, known in (
-        ("sampler", settings.sampler, _SAMPLERS),
-        ("pruner", settings.pruner, _PRUNERS),
-    ):
-        if value not in known:
+    for key, known in _KNOWN.items():
+        if (value := getattr(settings, key)) not in known:
             raise InputError(f"tune.{key}={value}: must be {', '.join(known[:-1])} or {known[-1]}")
 
 
@@ -187,14 +172,6 @@ def _completed(settings: TuneConfig, agent: str, base: TrainConfig) -> TuneConfi
         raise InputError(f"tune.study={study}: must be of letters, digits and _.,=+-, e.g. {slug(study)}")
     workers = core_count() if settings.workers == -1 else settings.workers
     together = settings.together or (1 if workers == 1 else math.ceil(_TRIALS_AT_ONCE / workers))
-    together = together if shape(base) is not None else 1
+    together = together if base.agent.shape is not None else 1
     folder = settings.folder or f"runs/{study}"
     return dataclasses.replace(settings, study=study, folder=folder, workers=workers, together=together)
-
-
-def _sentence(error: Exception) -> str:
-    if isinstance(error, YAMLError):
-        mark: Any = getattr(error, "problem_mark", None)
-        where = f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}" if mark else "a yaml file"
-        return f"{where}: cannot be read ({getattr(error, 'problem', None) or error})"
-    return sentence(error)

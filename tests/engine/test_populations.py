@@ -82,7 +82,7 @@ def flat(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         yield path, node.tobytes() if isinstance(node, np.ndarray) else repr(node)
 
 
-def train(runs: Sequence[Learned], sizes: bool = False) -> list[Found | BaseException]:
+def train(runs: Sequence[Learned]) -> list[Found | BaseException]:
     errors = learn_together([run.learning() for run in runs])
     return [run.found() if error is None else error for run, error in zip(runs, errors, strict=True)]
 
@@ -191,14 +191,8 @@ DIFFERENT: dict[str, list[list[str]]] = {  # of each argument; the empty one is 
 }
 # Settings of which the runs of a population have one value.
 OF_SHAPE = {
-    *(
-        "target_update_interval=2",
-        "target_update_interval=8",
-        "tau=0.5",
-        "learning_starts=0",
-        "buffer_size=40",
-    ),
-    "clip_range_vf=0.01",
+    *("target_update_interval=2", "target_update_interval=8", "tau=0.5", "learning_starts=0"),
+    *("buffer_size=40", "clip_range_vf=0.01"),
 }
 OBSERVATIONS: list[Words] = [(), ("observation=coordinates",), ("observation=none",), ("observation=image",)]
 NETS = ["", "net_arch=[20]", "net_arch=[7,1]", "net_arch=[]", "net_arch=[33,5,16]"]
@@ -253,50 +247,30 @@ def test_runs_that_differ_in_all_that_may_differ(agent: str, meetings: list[int]
     assert max(meetings) == 3
 
 
-# Pairs of which each needs its own arrays, or its own branch of an update.
-APART: list[tuple[str, str]] = [
-    ("env.slip=0", "env.slip=0.2"),
-    ("env.slip=0.1", "env.slip=0.2"),
-    ("env.step_reward=-0.01", "env.step_reward=-0.1"),
-    ("env.goal_reward=1", "env.goal_reward=2"),
-    ("env.trap_reward=-1", "env.trap_reward=-2"),
-    ("exploring_starts=0", "exploring_starts=0.5"),
-    ("env=classic", "env=cliff"),
-    ("env.max_episode_steps=9", "env.max_episode_steps=20"),
-    ("stratified_draws=false", "stratified_draws=true"),
-    ("n_envs=4", "n_envs=8"),
+# Settings of which each needs its own arrays, or its own branch of an update, beside the agent's own.
+APART = [
+    *("env.slip=0", "env.slip=0.1", "env.slip=0.2", "env.step_reward=-0.1", "env.goal_reward=2"),
+    *("env.trap_reward=-2", "exploring_starts=0.5", "env=cliff", "env.max_episode_steps=9"),
+    *("stratified_draws=true", "n_envs=8"),
 ]
 OWN_APART = {
-    "ppo": [
-        ("agent.clip_range_vf=null", "agent.clip_range_vf=0.2"),
-        ("agent.target_kl=null", "agent.target_kl=1e-4"),
-    ],
-    "dqn": [
-        ("agent.reward_scale=null", "agent.reward_scale=0.5"),
-        ("agent.replay_buffer_class=null", f"agent.replay_buffer_class={COUNTS}"),
-    ],
+    "ppo": ["agent.clip_range_vf=0.2", "agent.target_kl=1e-4"],
+    "dqn": ["agent.reward_scale=0.5", f"agent.replay_buffer_class={COUNTS}"],
 }
 
 
-@pytest.mark.parametrize(
-    ("agent", "pair"),
-    [(agent, pair) for agent in ("ppo", "dqn") for pair in APART + OWN_APART[agent]],
-    ids=str,
-)
-def test_runs_of_other_worlds_or_branches_train_as_alone_in_either_order(
-    agent: str, pair: tuple[str, str]
-) -> None:
-    runs = [(*SMALL[agent], each, "seed=3") for each in pair]
+@pytest.mark.parametrize("agent", ["ppo", "dqn"])
+def test_runs_of_other_worlds_or_branches_train_as_alone_in_either_order(agent: str) -> None:
+    runs = [(*SMALL[agent], each, "seed=3") for each in ["env.slip=0", *APART, *OWN_APART[agent]]]
     assert_as_alone(runs)
     assert_as_alone(runs[::-1])
 
 
+SHORT_SEARCH = ("line_search_max_iter=2", "cg_max_steps=3", "cg_damping=1e-4", "target_kl=1")
+ONE_SAMPLE = ("agent.batch_size=1", "total_timesteps=24", "agent.normalize_advantage=false")
 WRITTEN = {
     "ppo one step": ("ppo", ("agent.n_steps=1", "agent.batch_size=4")),
-    "ppo one sample": (
-        "ppo",
-        ("agent.n_steps=2", "agent.batch_size=1", "total_timesteps=24", "agent.normalize_advantage=false"),
-    ),
+    "ppo one sample": ("ppo", ("agent.n_steps=2", *ONE_SAMPLE)),
     "ppo whole batch": ("ppo", ("agent.batch_size=32", "agent.normalize_advantage=false")),
     "ppo whole rollout": ("ppo", ("agent.batch_size=32", "agent.n_epochs=4", "agent.target_kl=0.002")),
     "ppo one environment": ("ppo", ("n_envs=1", "agent.n_steps=15", "agent.batch_size=5")),
@@ -309,10 +283,7 @@ WRITTEN = {
     ),
     "trpo short searches": (
         "trpo",
-        (
-            *("+agent.arguments.line_search_max_iter=2", "+agent.arguments.cg_max_steps=3"),
-            *("+agent.arguments.cg_damping=1e-4", "agent.arguments.target_kl=1"),
-        ),
+        tuple(f"++agent.arguments.{each}" for each in SHORT_SEARCH),
     ),
     "dqn one sample": ("dqn", ("agent.batch_size=1", "agent.gradient_steps=1", "agent.train_freq=1")),
     "dqn many steps": ("dqn", ("agent.gradient_steps=-1", "n_envs=3")),
@@ -340,12 +311,6 @@ def test_all_activations(activation: str, meetings: list[int]) -> None:
     assert max(meetings) == (2 if activation in ("Tanh", "ReLU") else 1)
 
 
-# What ends one of them
-
-
-RATE = {agent: word(agent, "learning_rate=1e38") for agent in SMALL}
-
-
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("place", [0, 1])
 @pytest.mark.parametrize("agent", SMALL)
@@ -353,7 +318,7 @@ def test_one_that_diverges_leaves_the_others_alone(agent: str, place: int) -> No
     # so that gradients are clipped at the step, too
     tight = word(agent, "max_grad_norm=0.01" if agent != "trpo" else "")
     runs = [(*SMALL[agent], *tight, f"seed={seed}") for seed in range(3)]
-    runs[place] = (*runs[place], *RATE[agent])
+    runs[place] = (*runs[place], *word(agent, "learning_rate=1e38"))
     found = together(runs)
     assert isinstance(found[place], Exception)
     assert "no finite number" in str(found[place])
@@ -382,9 +347,6 @@ def test_one_that_fails_or_is_stopped_leaves_the_others_alone(agent: str) -> Non
     assert int(stopped[".num_timesteps"]) < 70  # type: ignore[index]
 
 
-# The self-test
-
-
 def test_where_products_add_up_otherwise_runs_train_one_by_one(
     monkeypatch: pytest.MonkeyPatch, meetings: list[int], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -403,4 +365,3 @@ def test_where_products_add_up_otherwise_runs_train_one_by_one(
     assert set(meetings) == {1}
     told = capsys.readouterr().err
     assert len(re.findall(r"^population: .* train one by one$", told, re.MULTILINE)) == 1
-    monkeypatch.undo()

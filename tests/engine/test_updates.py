@@ -10,7 +10,7 @@ from sb3_contrib import QRDQN, TRPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.logger import KVWriter, Logger
 
-from gridworld.agents.sb3.engine_agent import extractors_kind
+from gridworld.agents.sb3.agent import extractors_kind
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.engine import a2c, dqn, on_policy, population

@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gridworld.benchmark.measure import ComparisonResult, lines
 from gridworld.commands import jobs as jobs_command
 from gridworld.process.console.terminal import aligned, printable
 from gridworld.run.summary import summary_text
@@ -87,15 +86,6 @@ def test_a_goal_that_is_reached_more_often_for_less_is_explained() -> None:
     summary |= {"timeout_probability": 0.0, "optimal_goal_probability": 0.9863}
     [line] = [line for line in summary_text(summary, "x").splitlines() if "goal probability" in line]
     assert line.endswith("0.9863   more often than the optimum, for less value")
-
-
-@given(NUMBERS, NUMBERS, NUMBERS)
-def test_the_table_of_a_benchmark(ours: float, theirs: float, ratio: float) -> None:
-    result = ComparisonResult("stepping, per second", "n" * 60, ours, "a peer", theirs, ratio, 1)
-    _, heading, line = lines(iter([result]))
-    assert heading.split()[-4:] == ["ours", "peer", "ratio", "peer"]
-    assert len(line.split()) == 6
-    assert line.split()[3] == f"{ratio:.2f}x"
 
 
 def test_the_list_of_a_sweeps_jobs(

@@ -38,7 +38,7 @@ from gridworld.storage.sealed_json import sealed
 from gridworld.storage.serialization import decode, encode
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.job_table import JobTable
-from gridworld.tune.confirmation import _steps
+from gridworld.tune.confirmation import certified_since
 from gridworld.tune.study_folder import is_claimed
 
 Telling = Callable[[Path], str]  # all that a command makes of a folder; raises `InputError`
@@ -84,7 +84,7 @@ def reproduced(folder: Path) -> str:
 
 
 def confirmed(folder: Path) -> str:
-    return str(_steps(folder / "run"))
+    return str(certified_since(folder / "run"))
 
 
 def listed(folder: Path) -> str:
@@ -103,7 +103,7 @@ def tuned(folder: Path) -> str:
 
 
 def claimed(folder: Path) -> str:
-    return str(is_claimed(folder / "study", "mine", {"objective": {"n": 20}}))
+    return str(is_claimed(folder / "study", "mine"))
 
 
 OF_A_RUN = (reported, evaluated, recorded, gone_on, reproduced, confirmed)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from helpers.support import ROOT
 
-MOST = 106
+MOST = 95
 
 COUNTED = """
 import runpy, sys, threading

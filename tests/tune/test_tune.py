@@ -12,6 +12,7 @@ import sys
 import time
 from pathlib import Path
 
+import optuna
 import pytest
 from helpers.support import CONF, ROOT, script, start
 from optuna.trial import TrialState, create_trial
@@ -20,13 +21,12 @@ from gridworld.commands import report as report_command
 from gridworld.commands import tune as tune_command
 from gridworld.errors import InputError
 from gridworld.storage.sealed_json import sealed
-from gridworld.tune.search.objective import ERROR
-from gridworld.tune.search.worker import StudyContext
+from gridworld.tune.study_folder import at_work_in
 
 QUICK = (
     *("agent=q_learning", "total_timesteps=1500", "recording.gif=false", "recording.learning=false"),
     *("tune.seeds=2", "tune.finalists=2", "tune.final_seeds=1", "tune.confirm_seeds=2"),
-    *("tune.folder=study", "tune.workers=1", "tune.heartbeat=1"),
+    *("tune.folder=study", "tune.workers=1"),
 )
 
 
@@ -98,7 +98,7 @@ def test_damaged_runs_of_the_confirmation_are_run_again(studied: Path, tmp_path:
     assert again.returncode == 0, again.stderr
     for file in harmed:
         (told,) = [line for line in again.stderr.splitlines() if f"{file.parent.name}/{file.name}: " in line]
-        assert told.endswith("; it is run again" if file != harmed[0] else ".state")  # a checkpoint's copy
+        assert told.endswith("; it is run again")
     confirmed = json.loads((tmp_path / "study" / "study.json").read_text())["confirmation"]
     assert "left out" not in confirmed["sentence"]
     report_command.main([str(tmp_path / "study"), "--formats"])
@@ -123,7 +123,7 @@ def test_a_changed_study_is_reported_as_damaged(studied: Path, tmp_path: Path) -
     (tmp_path / "trials.csv").write_bytes((studied / "study" / "trials.csv").read_bytes())
     for content, words in (
         (study, "study.json: was changed or damaged, its seal is not that of its content"),
-        (sealed(study), "study.json: has no search that came to an end, or was changed"),
+        (sealed(study), "study.json: is not a finished study, or was changed"),
     ):
         (tmp_path / "study.json").write_text(json.dumps(content))
         found, problems = find_tunings([tmp_path])
@@ -158,14 +158,13 @@ def test_a_folder_of_another_study_is_refused(
     shutil.copytree(studied / "study", tmp_path / "study")
     told = refusal(monkeypatch, tmp_path, *QUICK, "agent=sarsa", "total_timesteps=50", "tune.trials=2")
     assert "study: is the folder of the study tune_q_learning_classic; choose another tune.folder" in told
-    for name in ("search.json", "study.json"):  # either of them tells
-        (tmp_path / "study" / "study.db").unlink(missing_ok=True)
-        before = sorted(tmp_path.rglob("*"))
-        told = refusal(monkeypatch, tmp_path, *QUICK)
-        assert "study: is of the study tune_q_learning_classic, which sqlite:////" in told
-        assert "study.db does not have; bring its database back" in told
-        assert sorted(tmp_path.rglob("*")) == before
-        (tmp_path / "study" / name).unlink()
+    (tmp_path / "study" / "study.db").unlink()
+    before = sorted(tmp_path.rglob("*"))
+    told = refusal(monkeypatch, tmp_path, *QUICK)
+    assert "study.db: does not have the study tune_q_learning_classic, which has begun; bring" in told
+    assert sorted(tmp_path.rglob("*")) == before
+    with at_work_in(tmp_path / "study"):
+        assert "another process is at work in it" in refusal(monkeypatch, tmp_path, *QUICK)
 
 
 def refusal(monkeypatch: pytest.MonkeyPatch, folder: Path, *arguments: str) -> str:
@@ -180,11 +179,10 @@ def refusal(monkeypatch: pytest.MonkeyPatch, folder: Path, *arguments: str) -> s
 def test_a_search_that_comes_to_nothing_is_no_mistake_of_the_command_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def all_fail(main: object, context: StudyContext, *more: object) -> None:
-        study = context.storage.load()
-        study.add_trial(create_trial(state=TrialState.FAIL, user_attrs={ERROR: "training diverged"}))
+    def all_fail(spec: object, study: optuna.Study, *more: object) -> None:
+        study.add_trial(create_trial(state=TrialState.FAIL, user_attrs={"error": "training diverged"}))
 
-    monkeypatch.setattr("gridworld.tune.study.run_workers", all_fail)
+    monkeypatch.setattr("gridworld.tune.study.search", all_fail)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [str(ROOT / "scripts" / "tune.py"), *QUICK])
     with pytest.raises(SystemExit) as ended:
@@ -209,11 +207,23 @@ FLOAT = "agent.learning_rate: {type: float, low: 1e-3, high: 1e-2}"
             "# @package tune.space\nagent.gamma: {type: float, lo: 0}",
             "Key 'lo' not in 'DimensionConfig'",
         ),
-        ("# @package tune.space\nagent.gamma: {type: float, low: 1, high: 0}", "the first below the second"),
-        ("# @package tune.space\nagent.gamma: {type: float, low: 0, high: 1, log: true}", "a positive low"),
-        ("# @package tune.space\nagent.gamma: {type: float, low: 0, high: 1, step: 0.3}", "must lead from"),
-        ("# @package tune.space\nagent.gamma: {type: categorical, choices: [0.9, 0.9]}", "different values"),
-        ("# @package tune.space\nagent.gamma: {type: categorical, low: 1}", "must be a list"),
+        (
+            "# @package tune.space\nagent.gamma: {type: float, low: 1, high: 0}",
+            "takes two numbers, low=1.0 below high=0.0",
+        ),
+        (
+            "# @package tune.space\nagent.gamma: {type: float, low: 0, high: 1, log: true}",
+            "`low > 0` must hold",
+        ),
+        (
+            "# @package tune.space\nagent.gamma: {type: float, low: 0, high: 1, step: 0.3}",
+            "is not divisible by `step`",
+        ),
+        (
+            "# @package tune.space\nagent.gamma: {type: categorical, choices: [0.9, 0.9]}",
+            "a list of different values",
+        ),
+        ("# @package tune.space\nagent.gamma: {type: categorical, low: 1}", "a list of different values"),
         ("# @package tune.space\nn_envs: {type: int, low: 1.5, high: 3}", "takes whole numbers"),
         ("# @package tune.space\nn_envs: {type: categorical, choices: [many]}", "n_envs=many"),
         (
@@ -245,7 +255,7 @@ def test_a_search_space_that_makes_no_sense(
 ) -> None:
     (tmp_path / "tune").mkdir()
     (tmp_path / "tune" / "bad.yaml").write_text(yaml)
-    monkeypatch.setattr("gridworld.tune.search.search_space._CORNERS", 5)  # it goes with none of them
+    monkeypatch.setattr("gridworld.tune.search_space._CORNERS", 5)  # it goes with none of them
     told = refusal(monkeypatch, tmp_path, "agent=q_learning", "tune=bad", "--config-dir", ".")
     assert sentence in told
     assert "\n" not in told
@@ -263,12 +273,9 @@ def test_a_search_space_that_makes_no_sense(
         (["tune.together=0"], "tune.together=0: must be at least 1"),
         (["tune.pruner=axe"], "tune.pruner=axe: must be median, hyperband or none"),
         (["tune.storage=nonsense"], "tune.storage=nonsense: is no URL of a database"),
-        (["tune.storage=sqlite://"], "tune.storage=sqlite://: is a database in the memory of one process"),
-        (
-            ["tune.storage=sqlite:///:memory:"],
-            "where no worker finds it; name a file, e.g. sqlite:////shared",
-        ),
-        (["tune.storage='sqlite:///file:x?mode=memory&uri=true'"], "in the memory of one process"),
+        (["tune.storage=sqlite://"], "tune.storage=sqlite://: is a database in memory; name a file"),
+        (["tune.storage=sqlite:///:memory:"], "in memory; name a file, e.g. sqlite:////shared"),
+        (["tune.storage='sqlite:///file:x?mode=memory&uri=true'"], "is a database in memory"),
         (["tune.storage=sqlite:////no/such/x.db"], "cannot be reached (unable to open database file)"),
         (["tune.storage=postgresql://me:secret@127.0.0.1:1/x"], "tune.storage=postgresql://me:***@127.0.0.1"),
         (["tune.study=a/b"], "tune.study=a/b: must be of letters"),
@@ -292,29 +299,29 @@ def test_without_optuna_it_says_what_to_install(tmp_path: Path, monkeypatch: pyt
 
 
 LONG = (
-    "total_timesteps=20000",  # so that a trial outlasts the time between two tables in a fork, 0.3 seconds
-    "tune.pruner=none",
-    "tune.stop_after=null",
-    "tune.trials=3",
-    "tune.workers=2",
+    *("total_timesteps=40000", "env=river_swim", "tune.pruner=none", "tune.stop_after=null"),
+    *("tune.trials=3", "tune.workers=2"),
 )
 
 
-def running(folder: Path) -> list[int]:
-    """The processes that are in a trial."""
-    if not (folder / "study" / "trials.csv").exists():
-        return []
-    found = [row["worker"] for row in rows(folder) if row["status"] == "running" and row["worker"]]
-    return [int(worker.split(":")[1]) for worker in found]
+def workers_of(process: int) -> list[int]:
+    """The processes that it has started and that are at work, not in reserve."""
+    found = []
+    for file in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            name, fields = file.parent.name, file.read_text().rpartition(")")[2].split()
+            if int(fields[1]) == process and fields[0] != "Z" and int(fields[11]) >= 5:  # hundredths
+                found.append(int(name))
+    return found
 
 
-def wait_for_a_trial(folder: Path) -> list[int]:
+def wait_for_workers(process: int, count: int, but: int = 0) -> list[int]:
     end = time.monotonic() + 60
     while time.monotonic() < end:
-        if found := running(folder):
+        if len(found := [worker for worker in workers_of(process) if worker != but]) >= count:
             return found
-        time.sleep(0.05)
-    raise AssertionError("no trial began")
+        time.sleep(0.02)
+    raise AssertionError("no worker is at work")
 
 
 def is_alive(process: int) -> bool:
@@ -326,42 +333,32 @@ def is_alive(process: int) -> bool:
 
 def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path: Path) -> None:
     with start("tune.py", *QUICK, *LONG, cwd=tmp_path) as process:
-        killed = wait_for_a_trial(tmp_path)[0]
+        killed = wait_for_workers(process.pid, 2)[0]
         os.kill(killed, signal.SIGKILL)
         told = next(line for line in process.stderr if "lost" in line)
-        assert told.strip() == "a worker was lost to SIGKILL; its trial is run again"
-        end = time.monotonic() + 60
-        while not (others := [worker for worker in running(tmp_path) if worker != killed]):
-            assert time.monotonic() < end, "no other trial begins"
-            time.sleep(0.05)
+        assert told.strip() == "a worker was lost to SIGKILL; its task is run again"
+        others = wait_for_workers(process.pid, 2, but=killed)
         process.send_signal(signal.SIGINT)
         told = process.stderr.read()  # until the last worker has let go of it
     assert process.returncode == 130
     assert "stopped by SIGINT; nothing that ended is lost; go on with: python" in told
     assert not any(map(is_alive, others))
-    ended = [row for row in rows(tmp_path) if row["status"] == "done"]
+    ended = rows(tmp_path)
 
     again = script("tune.py", *QUICK, *LONG, cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     found = rows(tmp_path)
-    assert [row for row in found if row in ended] == ended
-    lost = [row for row in found if row["status"] == "lost"]
-    assert killed in [int(row["worker"].split(":")[1]) for row in lost]
-    assert [row["status"] for row in found if row not in lost] == ["done"] * 3
-    keys = [key for key in found[0] if key.startswith("agent.")]
-    for row in lost:
-        repeated = next(other for other in found if other["repeats"] == row["trial"])
-        chosen = [key for key in keys if row[key]]  # the worker may have been lost before it chose all
-        assert [repeated[key] for key in chosen] == [row[key] for key in chosen]
+    assert found[: len(ended)] == ended
+    assert [row["status"] for row in found] == ["done"] * 3
 
 
 def test_a_search_of_one_worker_is_the_same_however_it_is_killed(tmp_path: Path) -> None:
-    words = [*QUICK, "env=river_swim", "total_timesteps=6000", "tune.trials=5", "tune.heartbeat=60"]
+    words = [*QUICK, "env=river_swim", "total_timesteps=20000", "tune.trials=4"]
 
     def outcome(folder: Path) -> tuple[list[dict[str, str]], object]:
-        found = [row for row in rows(folder) if row["status"] != "lost"]
+        found = rows(folder)
         for row in found:
-            del row["trial"], row["worker"], row["seconds"], row["repeats"]
+            del row["worker"], row["seconds"]
         study = json.loads((folder / "study" / "study.json").read_text())
         return found, (study["winner"]["values"], study["confirmation"])
 
@@ -369,38 +366,29 @@ def test_a_search_of_one_worker_is_the_same_however_it_is_killed(tmp_path: Path)
         (tmp_path / name).mkdir()
         for ended in range(kills):
             with start("tune.py", *words, cwd=tmp_path / name) as process:
-                database = tmp_path / name / "study" / "study.db"
-                worker = under_way(database, ended)
+                wait_for_trials(tmp_path / name / "study" / "study.db", ended)
+                worker = wait_for_workers(process.pid, 1)[0]
                 os.kill(worker, signal.SIGKILL)
-                under_way(database, ended, after=worker)
+                wait_for_workers(process.pid, 1, but=worker)
                 process.kill()
                 process.stderr.read()  # until the last worker has let go of it
         done = script("tune.py", *words, cwd=tmp_path / name)
         assert done.returncode == 0, done.stderr
     assert outcome(tmp_path / "killed") == outcome(tmp_path / "calm")
-    assert [row["status"] for row in rows(tmp_path / "killed")].count("lost") >= 1
 
 
-def under_way(database: Path, ended: int, after: int = 0) -> int:
-    """The process that is in a trial, after so many have ended, and is another than `after`."""
-    found = "SELECT value_json FROM trials JOIN trial_user_attributes USING (trial_id) WHERE key = 'worker' "
+def wait_for_trials(database: Path, count: int) -> None:
     end = time.monotonic() + 60
     while time.monotonic() < end:
-        if not database.exists():
-            continue
         with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(database)) as study:
-            states = [state for (state,) in study.execute("SELECT state FROM trials")]
-            workers = study.execute(f"{found} AND state = 'RUNNING' ORDER BY number DESC").fetchall()
-            if sum(state in ("COMPLETE", "PRUNED") for state in states) >= ended and workers:
-                worker = int(json.loads(workers[0][0]).split(":")[1])
-                if worker != after:
-                    return worker
-    raise AssertionError("no such trial began")
+            if len(study.execute("SELECT * FROM trials").fetchall()) >= count:
+                return
+    raise AssertionError("no such trial ended")
 
 
-def test_a_database_that_disappears_is_one_sentence(tmp_path: Path) -> None:
+def test_a_database_that_disappears_is_one_sentence_and_no_worker_is_left(tmp_path: Path) -> None:
     with start("tune.py", *QUICK, *LONG, cwd=tmp_path) as process:
-        wait_for_a_trial(tmp_path)
+        workers = wait_for_workers(process.pid, 2)
         (tmp_path / "study" / "study.db").unlink()
         told = process.stderr.read().splitlines()
     assert process.returncode == 1
@@ -408,11 +396,12 @@ def test_a_database_that_disappears_is_one_sentence(tmp_path: Path) -> None:
     assert len(errors) == 1
     assert errors[0].startswith("error: tune.storage=sqlite:////")
     assert not [line for line in told if "Traceback" in line or "Error" in line]
+    assert not any(map(is_alive, workers))
 
 
 def test_no_worker_outlives_a_search_that_is_killed(tmp_path: Path) -> None:
     with start("tune.py", *QUICK, *LONG, cwd=tmp_path) as process:
-        workers = wait_for_a_trial(tmp_path)
+        workers = wait_for_workers(process.pid, 2)
         process.kill()
         process.stderr.read()  # until the last worker has let go of it
     assert not any(map(is_alive, workers))

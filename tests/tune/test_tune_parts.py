@@ -11,37 +11,45 @@ import os
 import shutil
 import sqlite3
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import optuna
 import pytest
 from helpers.hostile import seal
 from helpers.runs_folder import Maker
-from helpers.support import CONF, configure
+from helpers.support import CONF, SHORT, configure
+from helpers.worker_tasks import Killed, fail
 from hypothesis import given
 from hypothesis import strategies as st
-from optuna.trial import create_trial
+from optuna.trial import FrozenTrial, TrialState, create_trial
 
-from gridworld.config.tune import DimensionConfig, TuneConfig
+from gridworld.config.tune import DimensionConfig
 from gridworld.errors import InputError
 from gridworld.report import statistics
 from gridworld.storage.sealed_json import sealed
 from gridworld.training.setup import check_settings
 from gridworld.training.together import run_alone
-from gridworld.tune import finalists
+from gridworld.tune import objective as objective_module
 from gridworld.tune.confirmation import HeldOutResults, held_out_runs, read_results, verdict_on
-from gridworld.tune.existing_study import check_study, legible
-from gridworld.tune.search import storage, worker
-from gridworld.tune.search.objective import Objective, SeedScore, Stopped, score
-from gridworld.tune.search.search_space import SearchSpace, with_values
-from gridworld.tune.search.storage import StudyStorage, count_trials, is_lost
-from gridworld.tune.search.worker import StudyContext, search
-from gridworld.tune.search.worker_pool import StorageLostError
-from gridworld.tune.study_folder import SEARCH_JSON, is_claimed, write_trials
-from gridworld.tune.study_spec import ConfFolders, compose_study
+from gridworld.tune.finalists import choose_finalists, rank_finalists
+from gridworld.tune.objective import (
+    FinalRuns,
+    Objective,
+    Outcome,
+    Report,
+    SeedScore,
+    Trials,
+    learning,
+    score,
+    with_values,
+)
+from gridworld.tune.search import in_reach, open_study, search
+from gridworld.tune.search_space import SearchSpace
+from gridworld.tune.study_folder import SEARCH_JSON, is_claimed
+from gridworld.tune.study_spec import ConfFolders, StudySpec, compose_study
+from gridworld.tune.workers import SearchError, Workers
 
 SPACES = sorted(file.stem for file in (CONF / "tune").glob("*.yaml"))
 FOLDERS = ConfFolders(CONF)
@@ -66,9 +74,7 @@ def test_the_score_ranks_by_certificates_first_and_by_steps_then(
     scores = [score(seeds, TOTAL, 3) for seeds in (first, second)]
     assert all(0 <= value <= 1 for value in scores)
     (missed, steps), (other_missed, other_steps) = rank(first), rank(second)
-    if missed < other_missed:
-        assert scores[0] < scores[1]
-    if missed == other_missed == 0 and steps < other_steps:
+    if missed < other_missed or (missed == other_missed == 0 and steps < other_steps):
         assert scores[0] < scores[1]
 
 
@@ -81,19 +87,15 @@ def test_the_score_of_known_seeds() -> None:
 
 
 @pytest.mark.parametrize("name", SPACES)
-def test_a_shipped_space_holds_the_shipped_settings(name: str) -> None:
+def test_a_shipped_space_holds_the_shipped_settings_and_suggests_what_can_train(name: str) -> None:
     asked = compose_study(FOLDERS, [f"agent={name}"])
     first = asked.space.parameters_of(asked.base)
     assert first is not None
     assert with_values(asked.base, asked.space.values(first)) == asked.base
-
-
-@pytest.mark.parametrize("name", SPACES)
-def test_what_a_shipped_space_suggests_can_train(name: str) -> None:
-    asked = compose_study(FOLDERS, [f"agent={name}"])
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     for _ in range(20):
-        check_settings(with_values(asked.base, asked.space.suggest(study.ask())))
+        suggested = asked.space.values(study.ask(asked.space.distributions).params)
+        check_settings(with_values(asked.base, suggested))
 
 
 def test_every_batch_of_ppo_divides_every_rollout() -> None:
@@ -124,8 +126,8 @@ def test_lists_and_arguments_of_a_class_can_be_searched() -> None:
     space = SearchSpace({"agent.policy_kwargs.net_arch": nets}, "own")
     base = configure("agent=ppo")
     space.check(base, check_settings(base))
-    values = space.suggest(optuna.create_study().ask())
-    assert with_values(configure("agent=ppo"), values).agent.policy_kwargs.net_arch in nets.choices  # type: ignore[attr-defined, operator]
+    values = space.values(optuna.create_study().ask(space.distributions).params)
+    assert with_values(base, values).agent.policy_kwargs.net_arch in nets.choices  # type: ignore[attr-defined, operator]
     space = SearchSpace({"agent.arguments.gae_lambda": DimensionConfig("float", low=0.5, high=1)}, "own")
     config = with_values(configure("agent=a2c"), space.values({"agent.arguments.gae_lambda": 0.123456}))
     assert config.agent.arguments["gae_lambda"] == 0.5  # type: ignore[attr-defined]  # never below the range
@@ -146,290 +148,258 @@ def test_lists_and_arguments_of_a_class_can_be_searched() -> None:
 def test_what_is_off_the_grid_is_outside(
     key: str, dimension: DimensionConfig, value: float, is_inside: bool
 ) -> None:
-    found = SearchSpace({key: dimension}, "own").parameters_of(
-        configure("agent=q_learning", f"{key}={value}")
-    )
+    space = SearchSpace({key: dimension}, "own")
+    found = space.parameters_of(configure("agent=q_learning", f"{key}={value}"))
     assert found == ({key: value} if is_inside else None)
 
 
-def small(*words: str) -> Objective:
-    asked = compose_study(FOLDERS, ["agent=q_learning", "total_timesteps=1500", "tune.seeds=2", *words])
-    return Objective(asked.measured, asked.space, asked.seeds, asked.settings.reports, 2)
+@pytest.mark.parametrize(
+    ("words", "together"),
+    [
+        (["agent=ppo", "tune.workers=1"], 1),
+        (["agent=ppo", "tune.workers=1", "tune.together=5"], 5),
+        (["agent=ppo", "tune.workers=2"], 4),
+        (["agent=dqn", "tune.workers=16"], 1),
+        (["agent=q_learning", "tune.workers=2", "tune.together=5"], 1),
+    ],
+)
+def test_how_many_trials_train_together(words: list[str], together: int) -> None:
+    assert compose_study(FOLDERS, words).settings.together == together
 
 
-def test_optuna_is_told_the_same_points_of_every_trial() -> None:
-    objective = small("tune.reports=7")
-    study = optuna.create_study(pruner=optuna.pruners.NopPruner())
-    study.optimize(lambda trial: objective(trial, lambda: False), n_trials=3)
-    for trial in study.trials:
-        assert sorted(trial.intermediate_values) == list(range(14))
-        assert trial.intermediate_values[13] == pytest.approx(trial.value)
-        assert [seed["seed"] for seed in trial.user_attrs["seeds"]] == [0, 1]
+RATES = (0.01, 0.02, 1e30, 0.005, 0.003)
+ENDS = {1: 1, 3: 5, 4: 8}  # of these trials: in the first seed, in the second, at the beginning of the third
 
 
-class AfterOneSeed(optuna.pruners.BasePruner):
-    """Ends a trial between its seeds."""
+def reported(objective: Objective, rates: dict[int, float]) -> tuple[list[Outcome], list[Report]]:
+    """How trials end that are behind at some point, and what was reported of them, in order."""
+    reports: list[Report] = []
 
-    def prune(self, study: optuna.Study, trial: optuna.trial.FrozenTrial) -> bool:
-        return trial.last_step is not None and trial.last_step >= 9
+    def answer(report: Report) -> bool:
+        reports.append(report)
+        return report.can_prune and report.step >= ENDS.get(report.trial, 99)
 
-
-def test_a_pruned_trial_spares_its_other_seeds() -> None:
-    objective = small()
-    study = optuna.create_study(pruner=AfterOneSeed())
-    study.optimize(lambda trial: objective(trial, lambda: False), n_trials=1)
-    assert study.trials[0].state == optuna.trial.TrialState.PRUNED
-    assert max(study.trials[0].intermediate_values) == 9
+    trials = Trials(objective, {number: {"agent.learning_rate": rate} for number, rate in rates.items()})
+    return trials(answer), sorted(reports, key=lambda report: (report.trial, report.step))
 
 
-@dataclass
-class Plain:
-    """An objective that trains nothing: a function of the trial."""
+def test_trials_and_seeds_that_train_together_are_those_that_train_one_by_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    base = configure(*SHORT["ppo"], "total_timesteps=1024", "evaluation.every=256")
+    objective = Objective(base, (0, 1, 2), 4, None)
+    outcomes, reports = reported(objective, dict(enumerate(RATES)))
+    assert [len(outcome.seeds) for outcome in outcomes] == [3, 0, 0, 1, 2]
+    assert [outcome.value is None for outcome in outcomes] == [False, True, True, True, True]
+    assert ["diverged" in outcome.error for outcome in outcomes] == [False, False, True, False, False]
+    whole = [report for report in reports if report.trial == 0]
+    assert [report.step for report in whole] == list(range(12))
+    assert whole[-1].value == pytest.approx(outcomes[0].value)
+    monkeypatch.setattr(objective_module, "run_together", lambda tasks: [run_alone(task()) for task in tasks])
+    alone = [reported(objective, {number: rate}) for number, rate in enumerate(RATES)]
+    assert [outcome for found, _ in alone for outcome in found] == outcomes
+    assert [report for _, found in alone for report in found] == reports
 
-    function: Callable[[optuna.Trial, Any], float]
-    trial: Any = None
 
-    def begin(self, trial: optuna.Trial) -> Plain:
-        return Plain(self.function, trial)
+def test_final_runs_that_train_together_are_those_alone() -> None:
+    base = configure(*SHORT["ppo"], "total_timesteps=512")
+    objective = Objective(base, (0,), 4, None)
+    runs: dict[str, Any] = {
+        f"{rate} {seed}": ({"agent.learning_rate": rate}, seed) for rate in (0.01, 0.02) for seed in (7, 8)
+    }
+    runs["fails"] = {"agent.learning_rate": 1e30}, 7
+    found = FinalRuns(objective, runs)(lambda message: None)
+    assert "diverged" in str(found.pop("fails"))
+    for name, result in found.items():
+        values, seed = runs[name]
+        assert result == run_alone(learning(objective.config(values), seed))
 
-    def trainings(self, is_stopped: object) -> list[Any]:
-        return [[]]
 
-    def score(self) -> float:
-        return self.function(self.trial, None)
+class Inline(Workers):
+    """Runs tasks in this process; in place of trials, a function of their values where there is one."""
+
+    def __init__(self, function: Callable[[Any, Callable[[Any], bool]], Outcome] | None = None) -> None:
+        super().__init__(1)
+        self._function = function
+
+    def run(
+        self,
+        next_task: Any,
+        on_end: Any,
+        answer: Any = lambda message: None,
+        on_tick: Any = lambda: None,
+    ) -> None:
+        while (task := next_task()) is not None:
+            if self._function is None:
+                on_end(task, task(answer))
+                continue
+            on_end(
+                task,
+                [self._function(values, answer_of(answer, number)) for number, values in task.values.items()],
+            )
 
 
-def study_of(
-    folder: Path, objective: Any, trials: int, sampler: str = "tpe"
-) -> tuple[optuna.Study, StudyContext]:
-    settings = TuneConfig(trials=trials, heartbeat=1, sampler=sampler)
-    url = f"sqlite:///{folder / 'study.db'}"
-    storage = StudyStorage(url, "one", settings)
-    storage.begin({})
-    own: Any = objective if isinstance(objective, Objective) else Plain(objective)
-    return storage.load(), StudyContext(folder, storage, own, math.inf)
+def answer_of(answer: Callable[[Report], bool], number: int) -> Callable[[Any], bool]:
+    return lambda point: answer(Report(number, *point, can_prune=True))
+
+
+def asked(folder: Path, *words: str) -> tuple[StudySpec, optuna.Study]:
+    """A search, and its study, which is begun or continued."""
+    base = ("agent=q_learning", "total_timesteps=1500", "tune.seeds=2", "tune.workers=1")
+    spec = compose_study(FOLDERS, [*base, f"tune.folder={folder}", *words])
+    folder.mkdir(exist_ok=True)
+    return spec, open_study(f"sqlite:///{folder / 'study.db'}", "one", {}, spec.space)
+
+
+def outcome(value: float | None = None, error: str = "") -> Outcome:
+    return Outcome(value, error, [SeedScore(0, 1, 0.0)])
 
 
 def test_what_fails_is_a_trial_with_its_reason_and_the_study_goes_on(tmp_path: Path) -> None:
-    answers = iter(
-        [0.5, math.nan, InputError("agent.gamma=2: must be from 0 to 1"), ZeroDivisionError("x"), 0.25]
-    )
+    answers = iter([outcome(0.5), outcome(error="too\nlarge"), None, outcome(0.25)])
 
-    def objective(trial: optuna.Trial, is_stopped: object) -> float:
-        answer = next(answers)
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
+    class Failing(Inline):
+        def run(self, next_task: Any, on_end: Any, *more: Any) -> None:
+            while (task := next_task()) is not None:
+                answer = next(answers)
+                on_end(task, answer and [answer])
 
-    study, context = study_of(tmp_path, objective, 5)
-    search(study, context)
-    now = count_trials(study)
-    assert (now.complete, now.failed, now.ended) == (2, 3, 5)
-    assert study.best_value == 0.25
-    write_trials(tmp_path, study, SearchSpace({"n_envs": DimensionConfig("int", low=1, high=2)}, "own"))
+    spec, study = asked(tmp_path, "tune.trials=4")
+    search(spec, study, Failing())
+    states = [TrialState.COMPLETE, TrialState.FAIL, TrialState.FAIL, TrialState.COMPLETE]
+    assert [trial.state for trial in study.trials] == states
     table = (tmp_path / "trials.csv").read_text()
-    for reason in ("the objective is NaN", "agent.gamma=2: must be from 0 to 1", "ZeroDivisionError: x"):
-        assert reason in table
+    assert "too large" in table
+    assert "the workers that ran it were killed" in table
 
 
-def test_the_pruner_sees_at_once_what_its_process_has_ended(tmp_path: Path) -> None:
+def test_a_trial_that_is_worse_than_the_median_is_pruned(tmp_path: Path) -> None:
     values = iter([0.5, 0.4, 0.6, 0.3, 0.7, 0.45, 0.55, 0.2, 0.46, 0.44])
 
-    def objective(trial: optuna.Trial, is_stopped: object) -> float:
+    def function(_: Any, is_behind: Callable[[Any], bool]) -> Outcome:
         value = next(values)
-        for step in range(10):
-            trial.report(value, step)
-            if trial.should_prune():
-                raise optuna.TrialPruned
-        return value
+        return outcome(None if max(is_behind((step, value)) for step in range(10)) else value)
 
-    study, context = study_of(tmp_path, objective, 10)
-    search(study, context)
-    pruned = [trial.number for trial in study.trials if trial.state == optuna.trial.TrialState.PRUNED]
+    spec, study = asked(tmp_path, "tune.trials=10")
+    search(spec, study, Inline(function))
+    pruned = [trial.number for trial in study.trials if trial.state == TrialState.PRUNED]
     assert pruned == [6, 8]  # the medians before them are 0.475 and 0.45
+    assert all(len(trial.intermediate_values) == 10 for trial in study.trials)
 
 
-@pytest.mark.filterwarnings("ignore:Heartbeat of storage")  # of `ask`
-def test_a_trial_whose_worker_is_lost_before_its_first_sign_of_life_is_run_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("words", [["tune.sampler=tpe"], ["tune.sampler=random"], ["tune.pruner=hyperband"]])
+@pytest.mark.parametrize("killed", [(0,), (0, 1, 1), (3, 11)])
+def test_a_search_of_one_worker_is_the_same_however_it_was_stopped(
+    words: list[str], killed: tuple[int, ...], tmp_path: Path
 ) -> None:
-    study, context = study_of(tmp_path, lambda trial, is_stopped: 0.0, 1)
-    lost = study.ask()  # and nothing more: Optuna takes it for alive
-    monkeypatch.setattr(worker._stopped, "wait", lambda seconds: None)
-    for _ in range(3):
-        assert worker._begin(study, context) == ([], False)  # it may still be about to begin
-    assert [trial.number for trial in study.trials] == [lost.number]
-    monkeypatch.setattr(storage, "_SILENT_BEATS", 0)
-    search(study, context)
-    states = optuna.trial.TrialState
-    assert [trial.state for trial in study.trials] == [states.FAIL, states.COMPLETE]
-    assert is_lost(study.trials[0])
-
-
-def test_who_runs_a_trial_is_known_after_a_sign_of_life(tmp_path: Path) -> None:
-    def objective(trial: optuna.Trial, is_stopped: object) -> float:
-        with contextlib.closing(sqlite3.connect(tmp_path / "study.db")) as database:
-            return float(database.execute("SELECT COUNT(*) FROM trial_heartbeats").fetchone()[0])
-
-    study, context = study_of(tmp_path, objective, 1)
-    search(study, context)
-    assert study.best_value == 1
-    assert study.trials[0].user_attrs.keys() >= {"worker"}
-
-
-@pytest.mark.parametrize("sampler", ["tpe", "random"])
-def test_a_study_gone_on_with_chooses_as_an_undisturbed_one(tmp_path: Path, sampler: str) -> None:
-    def objective(trial: optuna.Trial, is_stopped: object) -> float:
-        return trial.suggest_float("x", -1, 1) ** 2
-
-    chosen = []
-    for name, parts in (("calm", [14]), ("halting", [3, 12, 14])):
-        (tmp_path / name).mkdir()
-        for trials in parts:
-            study, context = study_of(tmp_path / name, objective, trials, sampler)
-            search(study, context)
-        chosen.append([trial.params["x"] for trial in study.trials])
-    assert len(set(chosen[0])) == 14
-    assert chosen[0] == chosen[1]
-
-
-@pytest.mark.parametrize("sampler", ["tpe", "random"])
-def test_trials_that_are_cut_short_do_not_change_what_is_chosen(tmp_path: Path, sampler: str) -> None:
-    calls = itertools.count()
-
-    def chosen(name: str, stops: Sequence[int]) -> list[tuple[float, float]]:
-        def objective(trial: optuna.Trial, is_stopped: object) -> float:
-            place = next(calls)
-            value = trial.suggest_float("x", -1, 1) ** 2 + trial.suggest_float("y", -1, 1) ** 2
-            if place in stops:
-                raise Stopped
-            return value
-
-        nonlocal calls
+    def searched(name: str, kills: Sequence[int]) -> list[tuple[Any, ...]]:
         calls = itertools.count()
-        (tmp_path / name).mkdir()
-        study, context = study_of(tmp_path / name, objective, 14, sampler)
-        for _ in range(1 + len(stops)):
-            try:
-                search(study, context)
-            except Stopped:
-                study, context = study_of(tmp_path / name, objective, 14, sampler)
-        assert len(study.trials) == 14 + len(stops)
-        return [(trial.params["x"], trial.params["y"]) for trial in study.trials if not is_lost(trial)]
 
-    assert chosen("calm", []) == chosen("stopped", [0, 4, 5, 13])
+        def function(values: Any, is_behind: Callable[[Any], bool]) -> Outcome:
+            rate = values["agent.learning_rate"]
+            if max(is_behind((step, rate + step / 100)) for step in range(10)):
+                return outcome()
+            if next(calls) in kills:
+                raise KeyboardInterrupt
+            return outcome(error="too large") if rate > 0.9 else outcome(rate)
 
-
-MOMENTS = ("before its draw", "half drawn", "drawn", "on its way", "failed")
-
-
-@pytest.mark.filterwarnings("ignore:Heartbeat of storage")  # of `ask`
-@pytest.mark.parametrize("moment", MOMENTS)
-@pytest.mark.parametrize("killed", [(0,), (0, 0, 1), (3, 11)])
-def test_a_killed_search_of_one_worker_goes_on_as_if_it_had_not_been(
-    moment: str, killed: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(worker._stopped, "wait", lambda seconds: pytest.fail("it waits for a dead worker"))
-    keys = ("x", "y", "z")
-
-    def objective(trial: optuna.Trial, is_stopped: object) -> float:
-        value = sum(trial.suggest_float(key, -1, 1) ** 2 for key in keys)
-        if trial.params["x"] > 0.8:
-            raise ValueError("too far")
-        for step in range(10):
-            trial.report(value + step, step)
-            if trial.should_prune():
-                raise optuna.TrialPruned
-        return value
-
-    def die(study: optuna.Study, context: StudyContext) -> None:
-        """What a worker leaves that is killed in its next trial."""
-        draw = storage.next_draw(study)
-        if draw == 0 and not count_trials(study).waiting:
-            study.enqueue_trial(context.first or {})
-        storage.seed_sampler(study, context.storage.settings, draw, "")
-        trial = study.ask()
-        if moment != "before its draw":
-            storage.sign_on(trial, draw, "here:1")
-            for key in keys[: 2 if moment == "half drawn" else 3]:
-                trial.suggest_float(key, -1, 1)
-        if moment == "on its way":
-            trial.report(0.0, 9)
-        if moment == "failed" and trial.params["x"] > 0.8:
-            trial.set_user_attr("error", "ValueError: too far")
-
-    def searched(name: str, killed: Sequence[int]) -> list[tuple[object, ...]]:
-        (tmp_path / name).mkdir()
-        for ended in (*killed, 14):
-            study, context = study_of(tmp_path / name, objective, 14)
-            context = dataclasses.replace(context, first={"x": 0.25, "y": -0.5, "z": 0.75})
-            with worker.among_workers(study, context):
-                while count_trials(study).ended < ended:
-                    worker._run(worker._begin(study, context)[0], context)
-                if ended < 14:
-                    die(study, context)
-        found = [trial for trial in study.trials if not is_lost(trial)]
-        return [(trial.state, trial.params, trial.value, trial.intermediate_values) for trial in found]
+        for _ in range(len(kills) + 1):
+            spec, study = asked(tmp_path / name, "tune.trials=14", *words)
+            with contextlib.suppress(KeyboardInterrupt):
+                search(spec, study, Inline(function))
+        return [told(trial) for trial in study.trials]
 
     calm = searched("calm", ())
-    assert calm[0][1] == {"x": 0.25, "y": -0.5, "z": 0.75}
+    assert len(calm) == 14
+    assert len({str(trial[1]) for trial in calm}) == 14
     assert searched("killed", killed) == calm
 
 
-@pytest.mark.filterwarnings("ignore:Heartbeat of storage")  # of `ask`
-def test_only_who_is_alone_gives_up_what_runs(tmp_path: Path) -> None:
-    study, context = study_of(tmp_path, lambda trial, is_stopped: 0.0, 1)
-    named = dataclasses.replace(context.storage.settings, storage="postgresql://elsewhere/db")
-    elsewhere = dataclasses.replace(context, storage=dataclasses.replace(context.storage, settings=named))
-    study.ask()
-    with worker.among_workers(study, elsewhere), worker.among_workers(study, context):
-        assert count_trials(study).running == 1
-    with worker.among_workers(study, context):
-        assert count_trials(study).running == 0
+def told(trial: FrozenTrial) -> tuple[Any, ...]:
+    return trial.state, trial.params, trial.values, trial.intermediate_values, trial.user_attrs.get("seeds")
 
 
-@pytest.mark.filterwarnings("ignore:Heartbeat of storage")  # of `ask`
-def test_settings_that_kill_their_worker_again_and_again_are_left_out(tmp_path: Path) -> None:
-    study, _ = study_of(tmp_path, None, 1)
-    for draw in (0, 0, 0, 0, 1):
-        assert storage.next_draw(study) == draw
-        storage.sign_on(study.ask(), draw, "here:1")
-        storage.give_up_running(study)
-    for _ in range(5):  # being stopped is no reason
-        assert storage.next_draw(study) == 1
-        trial = study.ask()
-        storage.sign_on(trial, 1, "here:1")
-        trial.set_user_attr("stopped", True)
-        storage.give_up_running(study)
+def test_machines_that_share_a_study_know_of_each_others_trials(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec, study = asked(
+        tmp_path, "tune.trials=6", "tune.sampler=random", f"tune.storage=sqlite:///{tmp_path}/study.db"
+    )
+    turns = itertools.count()
+
+    def function(values: Any, is_behind: object) -> Outcome:
+        if next(turns) == 2:
+            monkeypatch.setattr("socket.gethostname", lambda: "another")
+            search(spec, study, Inline(lambda values, _: outcome(values["agent.learning_rate"])))
+        return outcome(values["agent.learning_rate"])
+
+    search(spec, study, Inline(function))
+    assert len(study.trials) == 7  # one ran here while the other machine came to six
+    assert len({str(trial.params) for trial in study.trials}) == 7
+    assert len({trial.user_attrs["worker"] for trial in study.trials}) == 2
+    assert max(trial.number for trial in choose_finalists(study, spec)) < 6
 
 
-def test_a_storage_that_goes_away_is_told_in_a_sentence(tmp_path: Path) -> None:
-    study, context = study_of(tmp_path, None, 3)
+def test_a_final_run_that_fails_is_named_and_counted_as_failed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec, study = asked(tmp_path, "tune.trials=1", "tune.final_seeds=3")
+    search(spec, study, Inline(lambda values, _: outcome(0.1)))
+
+    class Results(Inline):
+        def run(self, next_task: Any, on_end: Any, *more: Any) -> None:
+            results: list[Any] = ["training diverged", SeedScore(3, 100, 0.0), None]
+            while (task := next_task()) is not None:
+                result = results.pop(0)
+                on_end(task, result and dict.fromkeys(task.runs, result))
+
+    (finalist,) = rank_finalists(spec, study, choose_finalists(study, spec), Results())
+    error = capsys.readouterr().err
+    assert "trial=0,seed=2 failed, and counts as not certified: training diverged\n" in error
+    assert (
+        "trial=0,seed=4 failed, and counts as not certified: the workers that ran it were killed\n" in error
+    )
+    assert (finalist.certified, finalist.seeds, finalist.failed) == (2, 4, 2)
+    assert rank_finalists(spec, study, study.trials, Results()) == [finalist]  # nothing is run again
+
+
+def test_a_task_whose_worker_is_killed_is_run_again_until_it_has_killed_four(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tasks = [Killed("never", 0, tmp_path), Killed("once", 1, tmp_path), Killed("ever", 9, tmp_path)]
+    found = {}
+    with Workers(2) as workers:
+        workers.run(
+            lambda: tasks.pop(0) if tasks else None,
+            lambda task, result: found.update({task.name: result}),
+            lambda message: f"heard {message}",
+        )
+        assert found == {"never": "never heard never", "once": "once heard once", "ever": None}
+        assert capsys.readouterr().err.count("a worker was lost to SIGKILL; its task is run again\n") == 5
+        tasks = [fail]  # type: ignore[list-item]
+        with pytest.raises(SearchError, match="a worker failed, with the reason above"):
+            workers.run(lambda: tasks.pop(0) if tasks else None, lambda task, result: None)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 40])
+@pytest.mark.parametrize("can_join", [True, False])
+def test_workers_share_all_runs(count: int, can_join: bool) -> None:
+    shares = list(Workers(count).shares(range(60), can_join))
+    assert [run for share in shares for run in share] == list(range(60))
+    assert max(map(len, shares)) == (min(32, math.ceil(60 / count)) if can_join else 1)
+
+
+def test_a_database_that_goes_away_is_one_sentence(tmp_path: Path) -> None:
+    _, study = asked(tmp_path)
     (tmp_path / "study.db").unlink()
-    with (
-        pytest.raises(StorageLostError, match=r"study\.db: the study cannot be"),
-        context.storage.in_reach(),
-    ):
+    url = f"sqlite:///{tmp_path / 'study.db'}"
+    with pytest.raises(SearchError, match=r"study\.db: the study cannot be"), in_reach(url):
         study.set_user_attr("x", 1)
-    with pytest.raises(StorageLostError, match="has no study one"), context.storage.in_reach():
-        context.storage.load()
-    with pytest.raises(ZeroDivisionError), context.storage.in_reach():
+    with pytest.raises(ZeroDivisionError), in_reach(url):
         _ = 1 / 0
 
 
-def test_training_that_diverges_is_such_a_failure(tmp_path: Path) -> None:
-    asked = compose_study(
-        FOLDERS, ["agent=ppo", "agent.learning_rate=1e30", "total_timesteps=9000", "tune.seeds=1"]
-    )
-    space = SearchSpace({"agent.clip_range": DimensionConfig("float", low=0.1, high=0.3)}, "own")
-    study, context = study_of(tmp_path, Objective(asked.measured, space, asked.seeds, 10, 2), 1)
-    search(study, context)
-    assert "diverged" in study.trials[0].user_attrs["error"]
-
-
 def results(*steps: float) -> HeldOutResults:
-    import numpy as np
-
     found = np.array(steps, dtype=np.float64)
     certified = int(np.isfinite(found).sum())
     return HeldOutResults(statistics.share(certified, len(found)), found, TOTAL)
@@ -453,26 +423,22 @@ def around(certified: int, step: int) -> list[float]:
     return [*spread[:certified], *[math.inf] * (20 - certified)]
 
 
+UNCLEAR = "cannot be told apart from"
+
+
 @pytest.mark.parametrize(
     ("winner", "began_from", "verdict"),
     [
         ((100, 110, 120, 130, 140, 150), (500, 510, 520, 530, 540, math.inf), "beats"),
         ((500, 510, 520, 530, 540, math.inf), (100, 110, 120, 130, 140, 150), "does not beat"),
-        (
-            (10, 10, 10, 10, 10, 10, 10, math.inf),
-            (80, 80, 80, 80, 80, 80, 80, 80),
-            "cannot be told apart from",
-        ),
-        ((100, 200, 300, 400), (110, 190, 310, 390), "cannot be told apart from"),
-        ((math.inf, math.inf), (math.inf, math.inf), "cannot be told apart from"),
+        ((*[10] * 7, math.inf), [80] * 8, UNCLEAR),
+        ((100, 200, 300, 400), (110, 190, 310, 390), UNCLEAR),
+        ((math.inf, math.inf), (math.inf, math.inf), UNCLEAR),
         # A share that is surely greater decides, whoever is sooner.
         (around(20, 550), around(10, 250), "beats"),
         (around(10, 250), around(20, 550), "does not beat"),
-        # Newcombe's interval of 20 / 20 less 16 / 20 is [-0.0005, 0.416], of 15 / 20 it lies above 0.
-        (around(20, 550), around(16, 250), "cannot be told apart from"),
-        (around(20, 550), around(15, 250), "beats"),
-        # One seed does not outweigh being much sooner, nor does being sooner outweigh it.
-        (around(19, 110), around(20, 850), "cannot be told apart from"),
+        # One that may be as great leaves the decision to time, unless it leans the other way.
+        (around(19, 110), around(20, 850), UNCLEAR),
         (around(19, 850), around(20, 110), "does not beat"),
         (around(20, 110), around(19, 850), "beats"),
         (around(20, 110), around(20, 850), "beats"),
@@ -516,24 +482,7 @@ def test_the_verdict_says_which_runs_it_is_without(tmp_path: Path) -> None:
         read_results(winner)
 
 
-def test_a_final_run_that_fails_is_told_and_counted_as_failed(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def diverge(*arguments: object) -> None:
-        raise InputError("training diverged")
-
-    monkeypatch.setattr(finalists, "learning", diverge)
-    study = optuna.create_study()
-    score = dataclasses.asdict(SeedScore(0, 100, 0.0))
-    study.add_trial(create_trial(value=0.1, user_attrs={"seeds": [score]}))
-    objective = SimpleNamespace(config=lambda values: None)
-    run_alone(finalists._run(objective, study, 0, {}, 7))  # type: ignore[arg-type]
-    told = "trial 0 on the final seed 7 failed, and counts as not certified: training diverged\n"
-    assert capsys.readouterr().err == told
-    (finalist,) = finalists.ranking(study, study.trials, [7], TOTAL)
-    assert (finalist.certified, finalist.seeds, finalist.failed) == (1, 2, 1)
-
-
+TRIALS, ATTRIBUTES = "UPDATE trials SET", "UPDATE trial_user_attributes SET value_json ="
 SQL = {
     "a score that is no number": "UPDATE trial_values SET value = NULL",
     "an infinite score": "UPDATE trial_values SET value = 9e999",
@@ -543,16 +492,12 @@ SQL = {
     "a parameter of another name": "UPDATE trial_params SET param_name = 'agent.' || param_id",
     "no parameter": "DELETE FROM trial_params",
     "a distribution that is no JSON": "UPDATE trial_params SET distribution_json = '{'",
-    "a distribution that there is not": 'UPDATE trial_params SET distribution_json = \'{"name": "x"}\'',
-    "an attribute that is no JSON": "UPDATE trial_user_attributes SET value_json = '['",
-    "seeds that are no list": "UPDATE trial_user_attributes SET value_json = '1'",
-    "seeds that are none": "UPDATE trial_user_attributes SET value_json = '[{\"seed\": 0}]'",
-    "a seed with a regret beyond all numbers": "UPDATE trial_user_attributes SET value_json = "
-    '\'[{"seed": 0, "certified_since": null, "regret": 1' + 400 * "0" + "}]'",
+    "seeds that are no JSON": f"{ATTRIBUTES} '['",
+    "seeds that are no list": f"{ATTRIBUTES} '1'",
+    "seeds without a regret": f"{ATTRIBUTES} '[{{\"seed\": 0}}]'",
     "no seeds": "DELETE FROM trial_user_attributes",
-    "a state that there is not": "UPDATE trials SET state = 'x'",
-    "a date that is none": "UPDATE trials SET datetime_start = 'x'",
-    "what it is about, no JSON": "UPDATE study_user_attributes SET value_json = '{'",
+    "a state that there is not": f"{TRIALS} state = 'x'",
+    "a date that is none": f"{TRIALS} datetime_start = 'x'",
     "what it is about, no object": "UPDATE study_user_attributes SET value_json = '[1]'",
     "what it is about, nested as deep as Python goes": "UPDATE study_user_attributes SET value_json = '"
     + 10**5 * "["
@@ -560,36 +505,9 @@ SQL = {
     "final seeds that are none": "INSERT INTO study_user_attributes (study_id, key, value_json) "
     "VALUES (1, 'final trial=0,seed=9', '3')",
     "another direction": "UPDATE study_directions SET direction = 'MAXIMIZE'",
-    "a direction that there is not": "UPDATE study_directions SET direction = 'x'",
     "a table less": "DROP TABLE trial_values",
     "a database of nothing": "DROP TABLE studies",
-    "a draw that is none": "INSERT INTO trial_user_attributes (trial_id, key, value_json) "
-    "VALUES (1, 'draw', '\"x\"')",
 }
-
-
-@pytest.fixture(scope="module")
-def sqlite_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """With two complete trials."""
-    file = tmp_path_factory.mktemp("study") / "study.db"
-    study = StudyStorage(f"sqlite:///{file}", "mine", TuneConfig()).begin(ABOUT)
-    for number in (0, 1):
-        seeds = [dataclasses.asdict(SeedScore(seed, 500, 0.25)) for seed in (0, 1)]
-        study.add_trial(
-            optuna.trial.create_trial(
-                params={"agent.gamma": 0.9, "agent.learning_rate": 0.5},
-                distributions={
-                    "agent.gamma": optuna.distributions.CategoricalDistribution([0.9, 0.99]),
-                    "agent.learning_rate": optuna.distributions.FloatDistribution(0.1, 0.9),
-                },
-                value=0.25 + number,
-                user_attrs={"seeds": seeds},
-            )
-        )
-    check_study(study, TWO)
-    return file
-
-
 ABOUT = {"objective": {"seeds": [0, 1]}}
 TWO = SearchSpace(
     {
@@ -600,6 +518,24 @@ TWO = SearchSpace(
 )
 
 
+@pytest.fixture(scope="module")
+def sqlite_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With two complete trials."""
+    file = tmp_path_factory.mktemp("study") / "study.db"
+    study = open_study(f"sqlite:///{file}", "mine", ABOUT, TWO)
+    for number in (0, 1):
+        seeds = [dataclasses.asdict(SeedScore(seed, 500, 0.25)) for seed in (0, 1)]
+        params = {"agent.gamma": 0.9, "agent.learning_rate": 0.5}
+        attributes = {"seeds": seeds}
+        study.add_trial(
+            create_trial(
+                params=params, distributions=TWO.distributions, value=0.25 + number, user_attrs=attributes
+            )
+        )
+    open_study(f"sqlite:///{file}", "mine", ABOUT, TWO)
+    return file
+
+
 @pytest.mark.parametrize("what", SQL)
 def test_a_study_whose_database_was_altered_is_refused_in_a_sentence(
     what: str, sqlite_study: Path, tmp_path: Path
@@ -607,20 +543,17 @@ def test_a_study_whose_database_was_altered_is_refused_in_a_sentence(
     shutil.copy(sqlite_study, tmp_path / "study.db")
     with contextlib.closing(sqlite3.connect(tmp_path / "study.db")) as database, database:
         database.execute(SQL[what])
-    url = f"sqlite:///{tmp_path / 'study.db'}"
-    with pytest.raises(InputError, match=r"^tune\.(storage|study)=.*") as caught, legible(url):
-        check_study(StudyStorage(url, "mine", TuneConfig()).begin(ABOUT), TWO)
+    with pytest.raises(InputError, match=r"^tune\.(storage|study)=.*") as caught:
+        open_study(f"sqlite:///{tmp_path / 'study.db'}", "mine", ABOUT, TWO, must_exist=True)
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "content", [b"", b"{", b"[1]", b"\xff", b'{"study": 3}', b'{"study": "mine", "about": 3}']
-)
+@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"\xff", b'{"study": 3}'])
 def test_a_folder_that_does_not_say_whose_it_is_is_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / SEARCH_JSON).write_bytes(content)
     with pytest.raises(InputError):
-        is_claimed(tmp_path, "mine", ABOUT)
+        is_claimed(tmp_path, "mine")
     (tmp_path / SEARCH_JSON).unlink()
     os.mkfifo(tmp_path / SEARCH_JSON)
     with pytest.raises(InputError, match=r"search\.json: is no ordinary file"):
-        is_claimed(tmp_path, "mine", ABOUT)
+        is_claimed(tmp_path, "mine")

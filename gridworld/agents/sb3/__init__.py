@@ -1,4 +1,4 @@
-"""Algorithms of Stable-Baselines3, of sb3-contrib and of one's own, which learn on the native batch.
+"""Algorithms of Stable-Baselines3, of sb3-contrib and custom ones, which learn on the native batch.
 
 Settings are checked without importing torch, as far as they can be; building an agent imports it.
 """
@@ -51,14 +51,11 @@ def on_processor(device: str) -> bool:
 
 def build(config: AgentConfig, context: TrainingContext) -> Agent:
     """See `gridworld.agents.Family.build`."""
-    from gridworld.agents.sb3.agent import SB3Agent
-    from gridworld.agents.sb3.engine_agent import EngineAgent
+    from gridworld.agents.sb3.agent import EngineAgent, SB3Agent
     from gridworld.agents.sb3.settings.engine import learns_in_engine
 
     assert isinstance(config, SB3Config)
-    if learns_in_engine(config, context):
-        return EngineAgent(config, context)
-    return SB3Agent(config, context)
+    return EngineAgent(config, context) if learns_in_engine(config, context) else SB3Agent(config, context)
 
 
 def weights(path: Path, most: int) -> dict[str, NDArray[Any]]:

@@ -1,4 +1,4 @@
-"""An SB3 model behind the `Agent` protocol."""
+"""An SB3 model behind the `Agent` protocol, in SB3's own loop or in `gridworld.engine`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import io
 import time
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +15,24 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.save_util import recursive_getattr
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 
-from gridworld.agents import PolicySnapshot, TrainingContext, WriteScalars
-from gridworld.agents.sb3.callbacks import RunCallback, check_finite, diverged, make_callbacks
-from gridworld.agents.sb3.factory import UnfitError, cannot_update, make_model
-from gridworld.agents.sb3.falling_setting import falling_settings
+from gridworld.agents import Learning, PolicySnapshot, TrainingContext, WriteScalars
+from gridworld.agents.sb3.callbacks import RunCallback, check_finite, diverged, falling_settings
+from gridworld.agents.sb3.factory import UnfitError, cannot_update, make_callbacks, make_model
+from gridworld.agents.sb3.features import FIXED, LEARNED
 from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters, reason
-from gridworld.agents.sb3.policy_outputs import Reading, epsilon_greedy, read, read_states, why_no_table
-from gridworld.agents.sb3.settings.schemas import SB3Config, reward_scale
+from gridworld.agents.sb3.policy_outputs import explored, read_table, why_no_table
+from gridworld.agents.sb3.settings.schemas import SB3Config, counts_transitions, reward_scale
 from gridworld.agents.sb3.state import class_without_state
+from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.bounds import Bounds
-from gridworld.config.agents import AgentConfig
+from gridworld.engine.population import train
+from gridworld.engine.sb3_format import Kind, algorithm_of, make_run, model_file, put_weights
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State, StateError
-from gridworld.world.mdp import FloatArray, IntArray
+from gridworld.world.exact.markov_chain import one_hot_policy
+from gridworld.world.mdp import FloatArray
 
 # A model file holds the optimiser's numbers beside every weight, and what SB3 pickles: the last
 # observations, say.
@@ -38,15 +42,9 @@ _FIRST_YEAR = 1980  # of the zip format
 
 
 class SB3Agent:
-    """One SB3 model.
+    """One SB3 model, which learns in SB3's own loop."""
 
-    Args:
-        config: its settings.
-        context: what it learns on.
-    """
-
-    def __init__(self, config: AgentConfig, context: TrainingContext, with_buffers: bool = True) -> None:
-        assert isinstance(config, SB3Config)
+    def __init__(self, config: SB3Config, context: TrainingContext, with_buffers: bool = True) -> None:
         if (today := time.localtime()).tm_year < _FIRST_YEAR:
             raise InputError(
                 f"the clock says {time.strftime('%Y-%m-%d', today)}, and SB3's model.zip can have no date "
@@ -88,12 +86,10 @@ class SB3Agent:
         state: State | None = None,
     ) -> None:
         """See `gridworld.agents.Agent.learn`."""
-        falling = falling_settings(self.config)
-        self._callback = RunCallback(
-            on_step, on_safe_point, state, self.config.log_interval, self._callbacks, falling
-        )
+        interval, falling = self.config.log_interval, falling_settings(self.config)
+        self._callback = RunCallback(on_step, on_safe_point, state, interval, self._callbacks, falling)
         try:
-            self._model.learn(total_timesteps, callback=self._callback, log_interval=self.config.log_interval)
+            self._model.learn(total_timesteps, callback=self._callback, log_interval=interval)
         except FloatingPointError as error:
             raise diverged(self._model, str(error)) from None
         except (InputError, OSError, StateError):
@@ -101,15 +97,12 @@ class SB3Agent:
         except Exception as error:
             if isinstance(error, ValueError):  # torch's distributions refuse NaN, which SB3 lets through
                 check_finite(self._model)
-            if self._refuses_settings(error):
+            is_update = any(frame.name == "train" for frame in traceback.extract_tb(error.__traceback__))
+            library = type(self._model).__module__.partition(".")[0]
+            is_known = library in ("stable_baselines3", "sb3_contrib")  # a custom class may have a bug
+            if is_update and is_known and not self._model._n_updates:
                 raise cannot_update(self.config, error) from error
             raise
-
-    def _refuses_settings(self, error: Exception) -> bool:
-        """Whether an error is of the first update of a library's class; one of somebody's own has a bug."""
-        is_update = any(frame.name == "train" for frame in traceback.extract_tb(error.__traceback__))
-        library = type(self._model).__module__.partition(".")[0]
-        return is_update and not self._model._n_updates and library in ("stable_baselines3", "sb3_contrib")
 
     def class_without_state(self) -> str | None:
         """See `gridworld.agents.Agent.class_without_state`."""
@@ -121,16 +114,19 @@ class SB3Agent:
 
     def snapshot(self) -> PolicySnapshot:
         """See `gridworld.agents.Agent.snapshot`."""
-        values, probabilities, q = read_states(self.observation.num_states, self._read)
+        return self._snapshot(*read_table(self._model.policy, self.observation))
+
+    def _snapshot(
+        self, values: FloatArray, probabilities: FloatArray | None, q: FloatArray | None
+    ) -> PolicySnapshot:
         if probabilities is not None:
             return PolicySnapshot(np.argmax(probabilities, axis=1), probabilities, values)
-        return self._of_q(values, q)
-
-    def _of_q(self, values: FloatArray, q: FloatArray | None) -> PolicySnapshot:
         assert q is not None
         if (scale := reward_scale(self.config)) != 1:
             values, q = values / scale, q / scale
-        return PolicySnapshot(np.argmax(q, axis=1), epsilon_greedy(q, self._exploration_rate()), values, q)
+        greedy = np.argmax(q, axis=1)
+        sampled = explored(one_hot_policy(greedy, q.shape[1]), self._exploration_rate())
+        return PolicySnapshot(greedy, sampled, values, q)
 
     def _exploration_rate(self) -> float:
         """That of DQN; SB3 acts at random until learning starts, while its own attribute still says 0."""
@@ -139,10 +135,6 @@ class SB3Agent:
             return 1.0
         return float(getattr(self._model, "exploration_rate", 0.0))
 
-    def _read(self, states: IntArray) -> Reading:
-        observations, _ = self._model.policy.obs_to_tensor(self.observation.rows(states))
-        return read(self._model.policy, observations)
-
     def model_file(self) -> bytes:
         """See `gridworld.agents.Agent.model_file`."""
         content = io.BytesIO()
@@ -150,10 +142,7 @@ class SB3Agent:
         return content.getvalue()
 
     def load(self, path: Path) -> None:
-        """See `gridworld.agents.Agent.load`.
-
-        Reads tensors and one number: nothing in the file is unpickled as SB3 would, or run.
-        """
+        """See `gridworld.agents.Agent.load`: nothing in the file is unpickled as SB3 would, or run."""
         own = self._model.get_parameters()
         modules = [name for name in own if isinstance(recursive_getattr(self._model, name), torch.nn.Module)]
         expected = flat({name: own[name] for name in modules})
@@ -175,8 +164,91 @@ class SB3Agent:
             self._model.exploration_rate = rate  # type: ignore[attr-defined]
 
 
+class EngineAgent(SB3Agent):
+    """One SB3 model, which learns in the engine."""
+
+    def __init__(self, config: SB3Config, context: TrainingContext) -> None:
+        super().__init__(config, context, with_buffers=False)
+        algorithm = algorithm_of(type(self._model))
+        assert algorithm is not None
+        self._algorithm, self._is_only_asked = algorithm, context.only_asked
+        self.run = make_run(
+            self._model,
+            context.observation,
+            context.envs,
+            context.seed,
+            extractors_kind(self._model),
+            reward_scale(config),
+            falling_settings(config, all_of_them=True),
+            config.log_interval,
+        )
+        self.run.counts_transitions = counts_transitions(vars(config) | vars(config).get("arguments", {}))
+        self._algorithm([self.run], [None])
+
+    @property
+    def model(self) -> BaseAlgorithm:
+        """SB3's own object, with what was learnt so far; it can learn on, unless it is only asked."""
+        if self._is_only_asked:
+            put_weights(self.run)
+            return self._model
+        file = io.BytesIO(self.model_file())
+        envs = GridWorldVecEnv(self._envs, self.observation, reward_scale(self.config))
+        return type(self._model).load(file, env=envs, device=self._model.device)
+
+    def learn(
+        self,
+        total_timesteps: int,
+        on_step: Callable[[int], int],
+        on_safe_point: Callable[[int], None] | None = None,
+        state: State | None = None,
+    ) -> None:
+        """See `gridworld.agents.Agent.learn`."""
+        (error,) = self.learn_together([Learning(self, total_timesteps, on_step, on_safe_point, state)])
+        if error is not None:
+            raise error
+
+    def learn_together(self, learnings: Sequence[Learning]) -> list[BaseException | None]:
+        """See `gridworld.agents.learn_together`."""
+        agents = [learning.agent for learning in learnings if isinstance(learning.agent, EngineAgent)]
+        for agent, learning in zip(agents, learnings, strict=True):
+            agent.run.begin(learning.total_timesteps)
+            agent.run.on_step, agent.run.on_safe_point = learning.on_step, learning.on_safe_point
+        train([agent.run for agent in agents], [learning.state for learning in learnings])
+        for agent in agents:
+            if agent.run.failed_update is not None and not agent.run.model._n_updates:
+                agent.run.error = cannot_update(agent.config, agent.run.failed_update)
+        return [agent.run.error for agent in agents]
+
+    def get_state(self) -> State:
+        """See `gridworld.agents.Agent.get_state`."""
+        return self.run.population.get_state(self.run)
+
+    def snapshot(self) -> PolicySnapshot:
+        """See `gridworld.agents.Agent.snapshot`."""
+        return self._snapshot(*self.run.population.snapshot(self.run))
+
+    def model_file(self) -> bytes:
+        """See `gridworld.agents.Agent.model_file`."""
+        return model_file(self.run)
+
+    def load(self, path: Path) -> None:
+        """See `gridworld.agents.Agent.load`."""
+        super().load(path)
+        self._algorithm([self.run], [None])
+
+
+def extractors_kind(model: Any) -> Kind:
+    """Of a model's features extractors, see `engine.sb3_format.Inputs`."""
+    kinds = {type(each) for each in model.policy.modules() if isinstance(each, BaseFeaturesExtractor)}
+    if kinds == {FlattenExtractor}:
+        return "flat"
+    if kinds <= {FlattenExtractor, *FIXED}:
+        return "fixed"
+    return "patches" if kinds <= set(LEARNED) else "any"
+
+
 class _ScalarsOnly(KVWriter):
-    """Hands SB3's numbers on to the run's one event file."""
+    """Passes SB3's numbers on to the run's one event file."""
 
     def __init__(self, write_scalars: WriteScalars) -> None:
         self._write_scalars = write_scalars
@@ -184,15 +256,15 @@ class _ScalarsOnly(KVWriter):
     def write(
         self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
     ) -> None:
-        self._write_scalars(
-            {
-                key: float(value)
-                for key, value in key_values.items()
-                if isinstance(value, int | float | np.number)
-                and "tensorboard" not in (key_excluded[key] or ())
-            },
-            step,
-        )
+        numbers = {
+            key: value for key, value in key_values.items() if isinstance(value, int | float | np.number)
+        }
+        wanted = {
+            key: float(value)
+            for key, value in numbers.items()
+            if "tensorboard" not in (key_excluded[key] or ())
+        }
+        self._write_scalars(wanted, step)
 
     def close(self) -> None:
         """Nothing of its own to close."""

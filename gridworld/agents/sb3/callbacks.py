@@ -1,4 +1,4 @@
-"""What calls the hooks of a run while SB3's own `learn` is at work, and the user's callbacks.
+"""What calls the hooks of a run while SB3's own `learn` is at work, and settings that fall over training.
 
 SB3 calls `on_step` before it has stored the transition. A rollout's start is where nothing is half done: the
 transitions are stored, the update is made. What was saved is put back when training starts, after SB3 has
@@ -8,7 +8,6 @@ reset everything that it resets then.
 from __future__ import annotations
 
 import contextlib
-import inspect
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -18,27 +17,22 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.utils import FloatSchedule
 
-from gridworld.agents.sb3.factory import said
-from gridworld.agents.sb3.settings.constructor_arguments import import_class
+from gridworld.agents.sb3.factory import first_line
+from gridworld.agents.sb3.settings.schemas import SB3Config
+from gridworld.agents.sb3.settings.validation import FALLING, SCHEDULES
 from gridworld.agents.sb3.state import get_state, set_state
+from gridworld.config.agents import Decay, falls, parse_schedule
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import tell
 from gridworld.storage.serialization import State, fitting
 
-_TARGET = "_target_"
-
 
 class RunCallback(BaseCallback):
-    """Calls `on_step` after every step and `on_safe_point` at rollouts' starts, and other callbacks.
+    """Calls `on_step` after every step and `on_safe_point` at rollouts' starts, as `Agent.learn` has them.
 
-    Args:
-        on_step: takes the steps so far; training ends when it returns 0.
-        on_safe_point: takes the steps so far; None: nothing is to be saved.
-        state: of `get_state`, to continue from; None: from the start.
-        log_interval: as SB3's `learn` takes it.
-        others: callbacks of the user's.
-        schedules: callbacks without a state, which set settings before rollouts or updates, before `others`.
+    Settings that are `falling` are set before `others` are called, the user's callbacks.
     """
 
     def __init__(
@@ -47,12 +41,13 @@ class RunCallback(BaseCallback):
         on_safe_point: Callable[[int], None] | None,
         state: State | None,
         log_interval: int,
-        others: Sequence[BaseCallback] = (),
-        schedules: Sequence[BaseCallback] = (),
+        others: Sequence[BaseCallback],
+        falling: dict[str, Decay],
     ) -> None:
         super().__init__()
         self._hook, self._on_safe_point, self._state = on_step, on_safe_point, state
-        self._log_interval, self._others, self._schedules = log_interval, others, schedules
+        self._log_interval, self._others = log_interval, others
+        self._schedules = [FallingSetting(name, each.initial, each.power) for name, each in falling.items()]
         self._continues = True
 
     def _init_callback(self) -> None:
@@ -87,20 +82,14 @@ class RunCallback(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         check_finite(self.model)
-        if self._on_safe_point is not None and self._is_aligned():
+        rollouts = 0
+        if isinstance(self.model, OnPolicyAlgorithm):
+            rollouts = self.model.num_timesteps // (self.model.n_steps * self.model.n_envs)
+        # SB3 counts rollouts from its `learn` on: only here would it log again as it does from the start.
+        if self._on_safe_point is not None and rollouts % self._log_interval == 0:
             self._on_safe_point(self.model.num_timesteps)
         for other in (*self._schedules, *self._others):
             other.on_rollout_start()
-
-    def _is_aligned(self) -> bool:
-        """Whether SB3 would log after as many rollouts from here as from the start.
-
-        It counts rollouts in a variable of its `learn`.
-        """
-        if not isinstance(self.model, OnPolicyAlgorithm):
-            return True
-        rollouts = self.model.num_timesteps // (self.model.n_steps * self.model.n_envs)
-        return rollouts % self._log_interval == 0
 
     def _on_rollout_end(self) -> None:
         for other in (*self._schedules, *self._others):
@@ -122,6 +111,57 @@ class RunCallback(BaseCallback):
         return get_state(self.model, self._others)
 
 
+class FallingSetting(BaseCallback):
+    """Sets a number of a model of SB3's as training goes on; usable in SB3's own `learn()`.
+
+    An entropy bonus that is large enough to keep a policy trying aims at a policy that goes on trying.
+    Falling to 0, it ends at the world's own optimum. Generalised advantages with a λ near 1 are close to
+    returns, by which the values follow the policy soon; with a small one they have less noise.
+
+    Args:
+        name: `ent_coef` or `learning_rate`, set before each update, or `gae_lambda`, set before each rollout.
+        initial: what it falls from, to 0 at the end of training.
+        power: 1 lets it fall linearly, 2 with the square of what is left of training.
+    """
+
+    def __init__(self, name: str, initial: float, power: float = 1.0) -> None:
+        super().__init__()
+        self._name, self._decay = name, Decay(initial, power)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        if self._name == "gae_lambda":
+            self._set()
+
+    def _on_rollout_end(self) -> None:
+        if self._name != "gae_lambda":
+            self._set()
+
+    def _set(self) -> None:
+        model: Any = self.model
+        value = self._decay.at(min(model.num_timesteps / model._total_timesteps, 1.0))
+        if self._name == "learning_rate":  # SB3's own, so that its `load` reads the model's file anywhere
+            model.lr_schedule = FloatSchedule(value)
+            return
+        setattr(model, self._name, value)
+        if self._name == "gae_lambda":
+            model.rollout_buffer.gae_lambda = value
+        model.logger.record(f"train/{self._name}", value)
+
+
+def falling_settings(config: SB3Config, all_of_them: bool = False) -> dict[str, Decay]:
+    """An agent's settings that fall over training, or only those for which SB3 has no schedule."""
+    given = vars(config) | vars(config).get("arguments", {})
+    found = {name: parse_schedule(name, given[name]) for name in FALLING if falls(given.get(name))}
+    return {
+        name: decay
+        for name, decay in found.items()
+        if all_of_them or not (name in SCHEDULES and decay.power == 1)
+    }
+
+
 def _name(index: int, other: BaseCallback) -> str:
     kind = type(other)
     return f"callbacks[{index}]: {kind.__module__}.{kind.__qualname__}"
@@ -134,7 +174,7 @@ def _beginning(index: int, other: BaseCallback) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:  # the class may be anybody's
-        raise InputError(f"{_name(index, other)} cannot begin: {said(error)}") from error
+        raise InputError(f"{_name(index, other)} cannot begin: {first_line(error)}") from error
 
 
 def check_finite(model: BaseAlgorithm) -> None:
@@ -154,36 +194,3 @@ def diverged(model: BaseAlgorithm, what: str) -> InputError:
         f"training diverged at update {model._n_updates:,}, after {model.num_timesteps:,} steps: {what}; "
         "try a smaller learning rate"
     )
-
-
-def make_callbacks(entries: Sequence[Any]) -> list[BaseCallback]:
-    """Import the classes and build an object of each.
-
-    Args:
-        entries: a mapping each, of `_target_` and the class's arguments; such mappings among these, and in
-            lists, are built first, as the callback of SB3's `EveryNTimesteps`.
-    """
-    return [_make(f"callbacks[{index}]", entry, BaseCallback) for index, entry in enumerate(entries)]
-
-
-def _make(where: str, entry: dict[str, Any], kind: type) -> Any:
-    path = entry[_TARGET]
-    found = import_class(f"{where}.{_TARGET}", path, kind)
-    arguments = {name: _value(f"{where}.{name}", value) for name, value in entry.items() if name != _TARGET}
-    try:
-        inspect.signature(found).bind(**arguments)
-    except TypeError as error:
-        known = ", ".join(inspect.signature(found).parameters)
-        raise InputError(f"{where}: {path} {error}; its arguments are {known}") from None
-    except ValueError:  # it has no signature that could be read
-        pass
-    try:
-        return found(**arguments)
-    except Exception as error:  # the class may be anybody's
-        raise InputError(f"{where}: {path} cannot be built: {said(error)}") from error
-
-
-def _value(where: str, value: Any) -> Any:
-    if isinstance(value, list):
-        return [_value(f"{where}[{index}]", item) for index, item in enumerate(value)]
-    return _make(where, value, object) if isinstance(value, dict) and _TARGET in value else value

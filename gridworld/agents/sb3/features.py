@@ -25,7 +25,16 @@ from gridworld.errors import InputError
 _FEATURES, _MOST_FEATURES = 144, 4096
 
 
-class FourierFeatures(BaseFeaturesExtractor):
+class _Extractor(BaseFeaturesExtractor):
+    """One that is printed with its settings, by which networks are told apart."""
+
+    def extra_repr(self) -> str:
+        """See `torch.nn.Module.extra_repr`."""
+        given = {name: vars(self).get(name) for name in ("orders", "cell_size", "length")}
+        return ", ".join(f"{name}={value}" for name, value in given.items() if value is not None)
+
+
+class FourierFeatures(_Extractor):
     """The Fourier cosine basis of coordinates x in [0, 1]^d.
 
     The features are the products of cos(pi c_i x_i), c_i = 0, ..., n_i, divided by the length of all. Factors
@@ -41,9 +50,6 @@ class FourierFeatures(BaseFeaturesExtractor):
         observation_space: a Box of shape (d,).
         orders: n_i of each coordinate; None: the largest with which there are at most 144 features, the same
             for each. For two coordinates it is 11, enough for grids of 12 x 12.
-
-    Raises:
-        InputError: another space, other orders, or more features than 4096.
     """
 
     def __init__(self, observation_space: spaces.Space[Any], orders: Sequence[int] | None = None) -> None:
@@ -78,12 +84,8 @@ class FourierFeatures(BaseFeaturesExtractor):
             features = (features[:, :, None] * waves[:, None]).flatten(1)
         return normalize(features) * (observations >= 0).all(dim=1, keepdim=True)
 
-    def extra_repr(self) -> str:
-        """Its settings, by which networks are told apart."""
-        return f"orders={self.orders}"
 
-
-class AgentByColour(BaseFeaturesExtractor):
+class AgentByColour(_Extractor):
     """The brightest colours of an image's squares, nearly where the agent stands: nothing is learned.
 
     What counts of a pixel is by how much red, green or blue exceeds the other two: white and greys are 0. The
@@ -92,9 +94,6 @@ class AgentByColour(BaseFeaturesExtractor):
     Args:
         observation_space: of images, (3, height, width), channels first.
         cell_size: side of a square, in pixels.
-
-    Raises:
-        InputError: another space, or squares that are larger than the image.
     """
 
     def __init__(self, observation_space: spaces.Space[Any], cell_size: int = IMAGE_CELL_SIZE) -> None:
@@ -108,12 +107,8 @@ class AgentByColour(BaseFeaturesExtractor):
         cells = max_pool2d((observations - others).clamp_min(0), self.cell_size)
         return normalize(cells.flatten(1))
 
-    def extra_repr(self) -> str:
-        """Its settings, by which networks are told apart."""
-        return f"cell_size={self.cell_size}"
 
-
-class PixelCNN(BaseFeaturesExtractor):
+class PixelCNN(_Extractor):
     """A small convolutional network that learns from an image's pixels.
 
     Two convolutions, of squares of pixels side by side and of one square's channels. Each channel of each is
@@ -131,9 +126,6 @@ class PixelCNN(BaseFeaturesExtractor):
         cell_size: side of a square, in pixels; sides that are no multiples of it are padded with black.
         channels: of the two convolutions.
         length: of a feature vector. With 1, values as large as -100 are learned too slowly.
-
-    Raises:
-        InputError: another space, or squares that are larger than the image.
     """
 
     def __init__(
@@ -163,22 +155,13 @@ class PixelCNN(BaseFeaturesExtractor):
         return cut.permute(0, 2, 4, 1, 3, 5).reshape(len(images), self.rows * self.cols, -1)
 
     def learn(self, patches: Tensor, where: Tensor | None = None) -> Tensor:
-        """The features (n, m) of images.
-
-        Args:
-            patches: their squares, (n, P, k); or (D, k), the distinct ones.
-            where: (n, P), integers: which of D each square is.
-        """
+        """The features (n, m) of squares (n, P, k), or of distinct ones (D, k) that are at `where` (n, P)."""
         hidden = self.first(patches)
         if where is not None:
             hidden = embedding(where, hidden)
         hidden = _standing_out(hidden.transpose(1, 2))
         hidden = _standing_out(self.second(hidden.transpose(1, 2)).transpose(1, 2))
         return self.length * normalize((hidden**3).flatten(1))
-
-    def extra_repr(self) -> str:
-        """Its settings, by which networks are told apart."""
-        return f"cell_size={self.cell_size}, length={self.length:g}"
 
 
 def _standing_out(channels: Tensor) -> Tensor:
@@ -199,6 +182,5 @@ def _image_shape(name: str, space: spaces.Space[Any], cell_size: int) -> tuple[i
     return shape[0], shape[1], shape[2]
 
 
-ImageCells = AgentByColour  # as it was called in runs of before
 FIXED = (FourierFeatures, AgentByColour)  # functions of an observation alone, which never change
 LEARNED = (PixelCNN,)  # functions of an observation and of parameters, of nothing else

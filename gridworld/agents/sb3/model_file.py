@@ -13,7 +13,6 @@ import io
 import pickletools
 import re
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -46,14 +45,7 @@ class DamagedError(Exception):
 
 
 def read_parameters(path: Path, most: int) -> tuple[Parameters, float | None]:
-    """Read a model file.
-
-    Args:
-        path: the file.
-        most: bytes; a larger file is refused.
-
-    Returns:
-        The tensors by module; the exploration rate, where there is one.
+    """Read a model file of at most `most` bytes: the tensors by module, and DQN's exploration rate.
 
     Raises:
         InputError: the file may not be opened.
@@ -68,75 +60,51 @@ def read_parameters(path: Path, most: int) -> tuple[Parameters, float | None]:
     return parameters, None if rate is None else float(rate.group(1))
 
 
-def flatten(content: Any, name: str = "", depth: int = 0) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Flatten nested tensors and plain values.
-
-    Returns:
-        (dotted name, array) of each; a plain value is an array of its text.
-
-    Raises:
-        DamagedError: anything else is in it.
-    """
-    if depth > _DEEPEST:
-        raise DamagedError(f"{name[:80]} is nested too deeply")
-    if isinstance(content, dict):
-        items = [(str(key), value) for key, value in content.items()]
-    elif isinstance(content, list | tuple):
-        items = [(str(index), value) for index, value in enumerate(content)]
-    elif isinstance(content, torch.Tensor):
-        if content.layout != torch.strided or content.is_quantized or content.device.type != "cpu":
-            raise DamagedError(f"{name[:80]} is no plain tensor")
-        yield name, content.detach().numpy()
-        return
-    elif content is None or isinstance(content, bool | int | float | str):
-        yield name, np.asarray(str(content))
-        return
-    else:
-        raise DamagedError(f"{name[:80]} is a {type(content).__name__}")
-    for key, value in items:
-        yield from flatten(value, f"{name}.{key}" if name else key, depth + 1)
-
-
 def flat(content: Any) -> Weights:
-    """`flatten` as a dictionary.
-
-    Raises:
-        DamagedError: as `flatten`, or too many values.
-    """
+    """Nested tensors and plain values as arrays by their dotted names; a value is an array of its text."""
     found: Weights = {}
-    for name, value in flatten(content):
+
+    def add(node: Any, name: str, depth: int) -> None:
+        if depth > _DEEPEST:
+            raise DamagedError(f"{name[:80]} is nested too deeply")
+        if isinstance(node, dict | list | tuple):
+            for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+                add(value, f"{name}.{key}" if name else str(key), depth + 1)
+            return
         if len(found) == _MOST_VALUES:
             raise DamagedError(f"it holds more than {_MOST_VALUES:,} values")
-        found[name] = value
+        if isinstance(node, torch.Tensor):
+            if node.layout != torch.strided or node.is_quantized or node.device.type != "cpu":
+                raise DamagedError(f"{name[:80]} is no plain tensor")
+            found[name] = node.detach().numpy()
+        elif node is None or isinstance(node, bool | int | float | str):
+            found[name] = np.asarray(str(node))
+        else:
+            raise DamagedError(f"{name[:80]} is a {type(node).__name__}")
+
+    add(content, "", 0)
     return found
 
 
 def check_weights(found: Weights, expected: Weights) -> None:
-    """Check that names, types and shapes agree and that all numbers are finite.
-
-    Raises:
-        DamagedError: they do not.
-    """
+    """Check that names, types and shapes agree and that all numbers are finite."""
     if found.keys() != expected.keys():
         odd = sorted(found.keys() ^ expected.keys())[0]
         raise DamagedError(f"{odd[:80]} is {'missing' if odd in expected else 'not part of it'}")
     for name, like in expected.items():
         array = found[name]
         if (array.dtype, array.shape) != (like.dtype, like.shape):
-            raise DamagedError(
-                f"{name} is {array.dtype} {_shape(array)}, it must be {like.dtype} {_shape(like)}"
+            is_now, must_be = (
+                f"{each.dtype} {' x '.join(map(str, each.shape)) or 'a single number'}"
+                for each in (array, like)
             )
+            raise DamagedError(f"{name} is {is_now}, it must be {must_be}")
         if array.dtype.kind in "fc" and not np.isfinite(array).all():
             raise DamagedError(f"{name} holds numbers that are not finite")
 
 
 def read_weights(path: Path, most: int) -> Weights:
-    """Read all that training changed: the weights and the optimiser's state.
-
-    Args:
-        path: the model file.
-        most: bytes; a larger file is refused.
-    """
+    """Read the weights and the optimiser's state of a file of at most `most` bytes."""
     try:
         return flat(read_parameters(path, most)[0])
     except InputError:
@@ -153,15 +121,15 @@ def reason(error: Exception) -> str:
 def _members(archive: zipfile.ZipFile, most: int) -> set[str]:
     """Names, once it is clear that they can be read: none compressed, all of them together no larger."""
     infos = archive.infolist()
-    if len(infos) > _MOST_MEMBERS:
-        raise DamagedError(f"it has more than {_MOST_MEMBERS:,} members")
-    if any(info.compress_type != zipfile.ZIP_STORED for info in infos):
-        raise DamagedError("it has compressed members, a model file has none")
-    if sum(info.file_size for info in infos) > most:
-        raise DamagedError("its members are larger than itself")
     names = {info.filename for info in infos}
-    if len(names) != len(infos):
-        raise DamagedError("it has two members of one name")
+    for is_wrong, what in (
+        (len(infos) > _MOST_MEMBERS, f"it has more than {_MOST_MEMBERS:,} members"),
+        (any(info.compress_type for info in infos), "it has compressed members, a model file has none"),
+        (sum(info.file_size for info in infos) > most, "its members are larger than itself"),
+        (len(names) != len(infos), "it has two members of one name"),
+    ):
+        if is_wrong:
+            raise DamagedError(what)
     return names
 
 
@@ -170,18 +138,10 @@ def _tensors(content: bytes) -> Any:
         pickles = [name for name in _members(archive, len(content)) if name.endswith(".pkl")]
         if len(pickles) != 1 or archive.getinfo(pickles[0]).file_size > _LARGEST_PICKLE:
             raise DamagedError("it holds no tensors as torch writes them")
-        _check_pickle(archive.read(pickles[0]))
+        for code, argument, _ in pickletools.genops(archive.read(pickles[0])):  # which does not run it
+            is_name = code.name in ("GLOBAL", "STACK_GLOBAL", "INST", "EXT1", "EXT2", "EXT4")
+            if is_name and not (code.name == "GLOBAL" and _NAMED.fullmatch(str(argument))):
+                raise DamagedError(
+                    f"its pickle asks for {str(argument)[:80]}, which is not read from a model"
+                )
     return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-
-
-def _check_pickle(content: bytes) -> None:
-    """Looks at the pickle without running it."""
-    for code, argument, _ in pickletools.genops(content):
-        if code.name == "GLOBAL" and _NAMED.fullmatch(str(argument)):
-            continue
-        if code.name in ("GLOBAL", "STACK_GLOBAL", "INST", "EXT1", "EXT2", "EXT4"):
-            raise DamagedError(f"its pickle asks for {str(argument)[:80]}, which is not read from a model")
-
-
-def _shape(array: NDArray[Any]) -> str:
-    return " x ".join(map(str, array.shape)) or "a single number"

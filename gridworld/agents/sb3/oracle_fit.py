@@ -1,20 +1,18 @@
 """The oracle ablation: a model's network fitted to the exact answer by supervised learning.
 
 What keeps failing is the network itself, since nothing else of reinforcement learning is left: no
-exploration, no bootstrapping, no moving target.
+exploration, no bootstrapping, no moving target. A network that is too large to be fitted in about a second
+is not judged: the answer is None.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from stable_baselines3.common.policies import BasePolicy
 from torch import Tensor
 
 from gridworld.agents import Agent
@@ -32,7 +30,7 @@ _WORK = 6e8  # weights times states times steps: about a second
 def oracle_fit(
     agent: Agent, best: Solution, states: IntArray, is_optimal: Callable[[IntArray], bool], fresh: bool
 ) -> bool | None:
-    """Fit a copy of a model's network to the optimum.
+    """Whether greedy actions become optimal where a copy of a model's network is fitted to the optimum.
 
     Args:
         agent: an `SB3Agent`; stays as it is.
@@ -40,13 +38,8 @@ def oracle_fit(
         states: (n,), those to fit: that an episode can come to.
         is_optimal: judges greedy actions (S,).
         fresh: whether to begin with new weights, not those that the model has learnt.
-
-    Returns:
-        Whether the greedy actions became optimal; None: the network is too large to say in time.
     """
-    fit = _Fit.of(agent, best, states, advantages=True)
-    if fit is None:
-        return None
+    fit = _Fit(agent, best, states, advantages=True)
     elsewhere = np.argmax(best.q, axis=1)
 
     def is_done(found: IntArray) -> bool:
@@ -54,6 +47,8 @@ def oracle_fit(
         actions[states] = found
         return is_optimal(actions)
 
+    if fit.steps < _FEWEST:
+        return None
     return fit.run(lambda found: fit.error(found, slice(None)), is_done, fresh)
 
 
@@ -65,19 +60,9 @@ class OneState(NamedTuple):
 
 
 def one_state_fit(agent: Agent, best: Solution, states: IntArray, state: int) -> OneState | None:
-    """Fit a copy of a model's network, from its own weights, to the optimum in one state.
-
-    Args:
-        agent: an `SB3Agent`; stays as it is.
-        best: the optimum under the agent's own discount.
-        states: (n,), those that an episode can come to.
-        state: one of them, where it errs.
-
-    Returns:
-        What came of it; None: the network is too large to say in time.
-    """
-    fit = _Fit.of(agent, best, states, advantages=False)
-    if fit is None:
+    """Fit a copy of a model's network, with its own weights, to the optimum in one state; see above."""
+    fit = _Fit(agent, best, states, advantages=False)
+    if fit.steps < _FEWEST:
         return None
     here, rows, right = int(np.flatnonzero(states == state)[0]), np.arange(len(states)), best.optimal[states]
     with torch.no_grad():
@@ -110,79 +95,58 @@ def narrowest_layer(agent: Agent) -> int:
     return min((each.out_features for each in hidden), default=0)
 
 
-@dataclass(frozen=True, eq=False)
 class _Fit:
-    """Supervised fits of one network to the exact answer of n states.
+    """Supervised fits of copies of one network to the exact answer of n states.
 
-    Attributes:
-        policy: it; every fit takes a copy.
-        observations: of the states.
-        q: (n, A); or advantages, in units of their deviation: a scale that no network finds hard.
-        optimal: (n, A), 1 for the optimal actions.
-        steps: of a fit.
+    The answer is Q (n, A), or advantages in units of their deviation: a scale that no network finds hard.
     """
 
-    policy: BasePolicy
-    observations: Any
-    q: Tensor
-    optimal: Tensor
-    steps: int
-
-    @classmethod
-    def of(cls, agent: Agent, best: Solution, states: IntArray, advantages: bool) -> _Fit | None:
-        """Prepare them; None: the network is too large to be fitted in time."""
+    def __init__(self, agent: Agent, best: Solution, states: IntArray, advantages: bool) -> None:
         assert isinstance(agent, SB3Agent)
-        policy = agent.model.policy
-        weights = sum(each.numel() for each in policy.parameters())
-        steps = int(min(_STEPS, _WORK / (weights * len(states))))
-        if steps < _FEWEST:
-            return None
-        observations, _ = policy.obs_to_tensor(agent.observation.rows(states))
+        self.policy = agent.model.policy
+        weights = sum(each.numel() for each in self.policy.parameters())
+        self.steps = int(min(_STEPS, _WORK / (weights * len(states))))
+        self.observations, _ = self.policy.obs_to_tensor(agent.observation.rows(states))
         q = best.q[states] - (best.v[states][:, None] if advantages else 0.0)
         q = np.where(np.isfinite(q), q, 0.0)
-        tables = (q / (max(float(q.std()), 1e-12) if advantages else 1.0), best.optimal[states])
-        scaled, optimal = (torch.tensor(table, dtype=torch.float32) for table in tables)
-        return cls(policy, observations, scaled, optimal, steps)
+        scale = max(float(q.std()), 1e-12) if advantages else 1.0
+        self._q = torch.tensor(q / scale, dtype=torch.float32)
+        self._optimal = torch.tensor(best.optimal[states], dtype=torch.float32)
 
     def error(self, found: Reading, where: Any) -> Tensor:
         """How far an answer is from the exact one in some of the states."""
         if found.probabilities is not None:
-            right = (found.probabilities * self.optimal)[where].sum(dim=1).clamp_min(1e-12)
+            right = (found.probabilities * self._optimal)[where].sum(dim=1).clamp_min(1e-12)
             return -right.log().mean()
         assert found.q is not None
-        return ((found.q - self.q)[where] ** 2).mean()
+        return ((found.q - self._q)[where] ** 2).mean()
 
     def run(
         self, loss: Callable[[Reading], Tensor], is_done: Callable[[IntArray], bool], fresh: bool = False
     ) -> bool:
         """Descend a loss until the greedy actions (n,) will do; False: they never did."""
-        with torch.random.fork_rng(devices=[]), _one_thread():
-            torch.manual_seed(0)
-            policy = copy.deepcopy(self.policy)
-            if fresh:
-                _renew(policy)
-            for weights in policy.parameters():
-                weights.requires_grad_(True)
-            optimizer = torch.optim.Adam(policy.parameters(), lr=_RATE)
-            for step in range(self.steps + 1):
-                found = read(policy, self.observations)
-                if step % _EVERY == 0 and is_done(_greedy(found)):
-                    return True
-                optimizer.zero_grad()
-                loss(found).backward()  # type: ignore[no-untyped-call]
-                optimizer.step()
-        return False
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """For networks as small as these: threads would wait for each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)  # in networks as small as these threads would wait for each other
+        try:
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(0)
+                policy = copy.deepcopy(self.policy)
+                for module in policy.modules() if fresh else ():
+                    if callable(reset := getattr(module, "reset_parameters", None)):
+                        reset()
+                for weights in policy.parameters():
+                    weights.requires_grad_(True)
+                optimizer = torch.optim.Adam(policy.parameters(), lr=_RATE)
+                for step in range(self.steps + 1):
+                    found = read(policy, self.observations)
+                    if step % _EVERY == 0 and is_done(_greedy(found)):
+                        return True
+                    optimizer.zero_grad()
+                    loss(found).backward()  # type: ignore[no-untyped-call]
+                    optimizer.step()
+            return False
+        finally:
+            torch.set_num_threads(threads)
 
 
 def _greedy(found: Reading) -> IntArray:
@@ -198,9 +162,3 @@ def _moved(found: Reading, before: Reading) -> Tensor:
     assert found.q is not None
     assert before.q is not None
     return ((found.q - before.q) ** 2).mean()
-
-
-def _renew(policy: BasePolicy) -> None:
-    for module in policy.modules():
-        if callable(reset := getattr(module, "reset_parameters", None)):
-            reset()

@@ -1,12 +1,11 @@
 """Outputs of an SB3 policy for given observations: action probabilities or Q values, and values.
 
-Asked for by what a policy can do, not by its class: an actor-critic has a distribution and values,
-a value-based one has a network of Q values, or of their quantiles, whose mean they are.
+They are found by what a policy can do, not by its class: an actor-critic has a distribution and values, a
+value-based one has a network of Q values, or of their quantiles, whose mean they are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -14,11 +13,10 @@ import torch
 from stable_baselines3.common.policies import BasePolicy
 from torch import Tensor, nn
 
-from gridworld.agents.sb3.memory_size import CHUNK
 from gridworld.envs.observations import ObservationTable
-from gridworld.world.exact.markov_chain import one_hot_policy
-from gridworld.world.mdp import FloatArray, IntArray
+from gridworld.world.mdp import BoolArray, FloatArray
 
+CHUNK = 4096  # states a forward pass
 _ASKED = 512  # states
 _PART = 3
 
@@ -29,6 +27,14 @@ class Reading(NamedTuple):
     values: Tensor  # (n,)
     probabilities: Tensor | None  # (n, A), of an actor-critic
     q: Tensor | None  # (n, A), of a value-based agent
+
+
+class Outputs(NamedTuple):
+    """A `Reading` of all S states, as float64."""
+
+    values: FloatArray  # (S,)
+    probabilities: FloatArray | None  # (S, A)
+    q: FloatArray | None  # (S, A)
 
 
 def why_unreadable(policy: BasePolicy) -> str | None:
@@ -48,11 +54,7 @@ def why_unreadable(policy: BasePolicy) -> str | None:
 
 
 def why_no_table(policy: BasePolicy, observation: ObservationTable) -> str | None:
-    """Why a policy's outputs are no function of the state, as asking it twice, and for fewer states, shows.
-
-    Returns:
-        The reason; None: they are one, as far as it shows.
-    """
+    """Why outputs are no function of the state, as asking twice, and for fewer states, shows; or None."""
     states = np.arange(min(observation.num_states, _ASKED))
     with torch.no_grad():
         once, again, part = (
@@ -71,7 +73,7 @@ def why_no_table(policy: BasePolicy, observation: ObservationTable) -> str | Non
     return None
 
 
-def read(policy: BasePolicy, observations: Any, masks: Any = None) -> Reading:
+def read(policy: BasePolicy, observations: Any, masks: BoolArray | None = None) -> Reading:
     """Ask a policy about a batch of n observations, tensors of its own making; `masks`: allowed actions."""
     policy.set_training_mode(False)
     if _is_actor_critic(policy):
@@ -80,48 +82,32 @@ def read(policy: BasePolicy, observations: Any, masks: Any = None) -> Reading:
         distribution = asked.get_distribution(observations, **allowed).distribution
         return Reading(asked.predict_values(observations)[:, 0], distribution.probs, None)
     if hasattr(policy, "quantile_net"):
-        return of_q(cast(nn.Module, policy.quantile_net)(observations).mean(dim=1))
-    return of_q(cast(nn.Module, policy.q_net)(observations))
+        q = cast(nn.Module, policy.quantile_net)(observations).mean(dim=1)
+    else:
+        q = cast(nn.Module, policy.q_net)(observations)
+    return Reading(torch.max(q, dim=1).values, None, q)
 
 
-class Outputs(NamedTuple):
-    """A `Reading` of all S states, as float64."""
-
-    values: FloatArray  # (S,)
-    probabilities: FloatArray | None  # (S, A)
-    q: FloatArray | None  # (S, A)
-
-
-def read_states(num_states: int, ask: Callable[[IntArray], Reading]) -> Outputs:
-    """Read all states, in batches and without gradients.
-
-    Args:
-        num_states: S.
-        ask: reads the states of the numbers that it is given.
-    """
-    states = np.arange(num_states)
+def read_table(policy: BasePolicy, observation: ObservationTable, masks: BoolArray | None = None) -> Outputs:
+    """Ask a policy about all states, in batches and without gradients; `masks`: allowed actions (S, A)."""
+    parts = []
     with torch.no_grad():
-        parts = [ask(states[start : start + CHUNK]) for start in range(0, num_states, CHUNK)]
-    values, probabilities, q = (_joined(part) for part in zip(*parts, strict=True))
+        for start in range(0, observation.num_states, CHUNK):
+            states = np.arange(start, min(start + CHUNK, observation.num_states))
+            rows, _ = policy.obs_to_tensor(observation.rows(states))
+            parts.append(read(policy, rows, None if masks is None else masks[states]))
+    values, probabilities, q = (
+        None if of_all[0] is None else torch.cat(of_all).cpu().numpy().astype(np.float64)
+        for of_all in zip(*parts, strict=True)
+    )
     assert values is not None
     return Outputs(values, probabilities, q)
 
 
-def _joined(parts: tuple[Tensor | None, ...]) -> FloatArray | None:
-    tensors = [part for part in parts if part is not None]
-    return torch.cat(tensors).cpu().numpy().astype(np.float64) if tensors else None
-
-
-def epsilon_greedy(q: FloatArray, epsilon: float) -> FloatArray:
-    """(S, A), the action probabilities of SB3's exploration with Q values (S, A)."""
-    actions = q.shape[1]
-    mixed: FloatArray = (1 - epsilon) * one_hot_policy(np.argmax(q, axis=1), actions) + epsilon / actions
+def explored(greedy: FloatArray, epsilon: float) -> FloatArray:
+    """(S, A), the action probabilities of SB3's exploration around a greedy policy (S, A)."""
+    mixed: FloatArray = (1 - epsilon) * greedy + epsilon / greedy.shape[1]
     return mixed
-
-
-def of_q(q: Tensor) -> Reading:
-    """The reading of Q values (n, A)."""
-    return Reading(torch.max(q, dim=1).values, None, q)
 
 
 def _is_actor_critic(policy: BasePolicy) -> bool:

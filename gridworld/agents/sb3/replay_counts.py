@@ -1,9 +1,9 @@
 """A replay buffer for finite worlds: how often each transition was met.
 
-A finite world has few transitions, and a buffer holds each again and again. Here each stands once, with a
-count, so nothing is forgotten, in little memory. A minibatch is drawn by systematic sampling: of a transition
-with the share p of all that was met, it has B p, rounded up or down by chance. The mean is that of uniform
-sampling, the noise far smaller. It works in any model of Stable-Baselines3 that replays single steps:
+A finite world has few transitions, and a buffer holds each again and again. Here each is there once, with a
+count, so nothing is forgotten, in little memory. A minibatch is drawn by systematic sampling, see
+`engine.replay.systematic_sample`: the mean is that of uniform sampling, the noise far smaller. It works in
+any model of Stable-Baselines3 that replays single steps:
 
     DQN("MlpPolicy", env, replay_buffer_class=ReplayCounts)
 """
@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
@@ -31,9 +30,7 @@ _COLUMNS = ("observations", "next_observations", "actions", "rewards", "dones", 
 class ReplayCounts(ReplayBuffer):
     """SB3's replay buffer with counts of distinct transitions; their rewards count as a part of them.
 
-    Args:
-        buffer_size: has no effect.
-        observation_space: SB3's, as all the others.
+    Its arguments are SB3's; `buffer_size` has no effect.
     """
 
     def __init__(
@@ -60,34 +57,21 @@ class ReplayCounts(ReplayBuffer):
         self.counts[:] = 0
         self._rows = {}
 
-    def add(
-        self,
-        obs: NDArray[Any],
-        next_obs: NDArray[Any],
-        action: NDArray[Any],
-        reward: NDArray[Any],
-        done: NDArray[Any],
-        infos: list[dict[str, Any]],
-    ) -> None:
+    def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: Any) -> None:
         """See SB3's `ReplayBuffer.add`."""
         for index, info in enumerate(infos):
-            truncated = self.handle_timeout_termination and info.get("TimeLimit.truncated", False)
-            ends = done[index] and not truncated
-            self._make_room()
+            if self.pos == self.buffer_size:
+                self.buffer_size *= 2
+                for name in _COLUMNS:
+                    array = getattr(self, name)
+                    setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
             for name, number in zip(_COLUMNS, (obs, next_obs, action, reward), strict=False):
                 getattr(self, name)[self.pos, 0] = number[index]
-            self.dones[self.pos, 0] = ends
+            truncated = self.handle_timeout_termination and info.get("TimeLimit.truncated", False)
+            self.dones[self.pos, 0] = done[index] and not truncated
             row = self._rows.setdefault(self._key(self.pos), self.pos)
             self.pos = len(self._rows)
             self.counts[row] += 1
-
-    def _make_room(self) -> None:
-        if self.pos < self.buffer_size:
-            return
-        self.buffer_size *= 2
-        for name in _COLUMNS:
-            array = getattr(self, name)
-            setattr(self, name, np.concatenate([array, np.zeros_like(array)]))
 
     def _key(self, row: int) -> bytes:
         return b"".join(getattr(self, name)[row].tobytes() for name in _COLUMNS[:-1])
@@ -97,11 +81,7 @@ class ReplayCounts(ReplayBuffer):
         return {name: getattr(self, name)[: self.pos] for name in _COLUMNS}
 
     def set_state(self, state: State) -> None:
-        """Go on with what `get_state` said.
-
-        Raises:
-            StateError: it is of other transitions.
-        """
+        """Mirrors `get_state`."""
         count = len(state["counts"])
         for name in _COLUMNS:
             now = getattr(self, name)

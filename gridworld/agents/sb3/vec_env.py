@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import time
 from collections.abc import Sequence
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -12,12 +14,14 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from gridworld.envs.observations import ObservationTable
+from gridworld.envs.observations import IMAGE_CELL_SIZE, ObservationTable, make_observation
 from gridworld.envs.vector_env import GridWorldVectorEnv, StateArray
 from gridworld.errors import InputError
 from gridworld.storage.serialization import independent_generator
+from gridworld.world.layout import CLASSIC, Layout
 
 _MASKS = "action_masks"  # asked for by agents that respect them; here nothing is ever forbidden
+_NOT_OF_THE_WORLD = {"self", "num_envs", "layout", "autoreset_mode", "cell_size"}
 
 
 class GridWorldVecEnv(VecEnv):
@@ -115,3 +119,49 @@ class GridWorldVecEnv(VecEnv):
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
         """True for Monitor, whose `episode` entries are written here."""
         return [wrapper_class is Monitor] * len(list(self._get_indices(indices)))
+
+
+def make_vec_env(
+    layout: str | PathLike[str] | Layout = CLASSIC,
+    n_envs: int = 64,
+    observation: str = "one_hot",
+    seed: int | None = 0,
+    cell_size: int = IMAGE_CELL_SIZE,
+    **world: Any,
+) -> GridWorldVecEnv:
+    """Make a batch of GridWorlds for a model of SB3: one native batch, not `n_envs` environments.
+
+    Args:
+        layout: the name of a map, its file, or a `Layout`.
+        n_envs: how many environments step together.
+        observation: `one_hot`, `coordinates`, `image` (for CnnPolicy), `own` or `none` (the state's number).
+        seed: of the starts and slips, unless the model has a seed, which SB3 gives to its environments; None:
+            another one at every call.
+        cell_size: pixels a cell, of the images.
+        world: other arguments of `GridWorldVectorEnv`: `slip`, `step_reward`, `goal_reward`, `trap_reward`,
+            `max_episode_steps`, `num_rows`, `num_cols`, `mdp`, `render_mode`, `stratified`.
+
+    Returns:
+        An SB3 `VecEnv`, which reports episodes as SB3's `Monitor` does.
+
+    Raises:
+        InputError: an argument that makes no world or no batch.
+
+    Example:
+        >>> from stable_baselines3 import PPO
+        >>> model = PPO("MlpPolicy", make_vec_env("four_rooms", n_envs=8, slip=0.1))
+    """
+    known = [
+        name
+        for name in inspect.signature(GridWorldVectorEnv.__init__).parameters
+        if name not in _NOT_OF_THE_WORLD
+    ]
+    for name in world:
+        if name not in known:
+            raise InputError(
+                f"{name}={world[name]!r}: is no argument of a world; there are {', '.join(known)}"
+            )
+    envs = GridWorldVectorEnv(n_envs, layout=layout, autoreset_mode=AutoresetMode.SAME_STEP, **world)
+    batch = GridWorldVecEnv(envs, make_observation(envs.mdp, observation, cell_size))
+    batch.seed(seed)
+    return batch

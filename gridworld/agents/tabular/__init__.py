@@ -1,17 +1,13 @@
 """Tabular agents: Q-learning, SARSA, expected SARSA, and the exact optimum.
 
-An algorithm is one module in `algorithms`, found by its name; see there. Nothing here needs more than numpy:
-a run of these agents never imports torch.
+Nothing here needs more than numpy: a run of these agents never imports torch.
 """
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gridworld.agents.tabular import algorithms
 from gridworld.agents.tabular.settings import TabularConfig
 from gridworld.errors import InputError
 
@@ -22,13 +18,12 @@ if TYPE_CHECKING:
     from gridworld.config.agents import AgentConfig
     from gridworld.config.train import TrainConfig
 
-__all__ = ["build", "check", "import_for", "on_processor", "schemas", "weights"]
-
 
 def schemas() -> dict[str, type[AgentConfig]]:
     """The schema of each algorithm by the algorithm's name."""
-    names = (module.name for module in pkgutil.iter_modules(algorithms.__path__))
-    return {name: _algorithm(name).SCHEMA for name in names}
+    from gridworld.agents.tabular.algorithms import ALGORITHMS
+
+    return {name: schema for name, (schema, _) in ALGORITHMS.items()}
 
 
 def check(config: TrainConfig) -> None:
@@ -60,16 +55,14 @@ def on_processor(device: str) -> bool:
 
 def build(config: AgentConfig, context: TrainingContext) -> Agent:
     """See `gridworld.agents.Family.build`."""
-    agent: Agent = _algorithm(config.algorithm).AGENT(config, context)
+    from gridworld.agents.tabular.algorithms import ALGORITHMS
+
+    agent: Agent = ALGORITHMS[config.algorithm][1](config, context)
     return agent
 
 
 def weights(path: Path, most: int) -> dict[str, NDArray[Any]]:
     """See `gridworld.agents.Family.weights`."""
-    from gridworld.agents.tabular.model_file import read_arrays
+    from gridworld.agents.tabular.td_control import read_arrays
 
     return read_arrays(path, most)
-
-
-def _algorithm(name: str) -> Any:
-    return importlib.import_module(f"{algorithms.__name__}.{name}")

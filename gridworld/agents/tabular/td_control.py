@@ -5,8 +5,7 @@ algorithm's own estimate. Q of a terminal state is 0 and stays 0, so that nothin
 that the step limit cuts off is no end: its target looks at the state where it was cut.
 
 An algorithm defines `state_values`. By default its target is taken from them, and the next actions are drawn
-after the update, as in the book; SARSA overrides both. `gridworld.agents.tabular.batch_update` says how a
-batch of environments updates one table.
+after the update, as in the book; SARSA overrides both.
 
 Reference: R. Sutton and A. Barto, Reinforcement Learning, 2nd ed., 2018, chapter 6.
 """
@@ -14,22 +13,23 @@ Reference: R. Sutton and A. Barto, Reinforcement Learning, 2nd ed., 2018, chapte
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot, TrainingContext
-from gridworld.agents.tabular.batch_update import StepSize, update
-from gridworld.agents.tabular.epsilon_greedy import draw_actions, epsilon_greedy, rows_of
-from gridworld.agents.tabular.model_file import model_bytes, read_model
 from gridworld.agents.tabular.settings import TabularConfig
-from gridworld.agents.tabular.training_log import TrainingLog
+from gridworld.bounds import Bounds
 from gridworld.config.agents import MOST_KEPT, Schedule, parse_schedule
 from gridworld.config.fields import Effect, affects, bounds, rate
 from gridworld.errors import InputError
+from gridworld.process.user_input import npz_arrays, npz_bytes
+from gridworld.storage.safe_read import read_bytes
 from gridworld.storage.serialization import (
     State,
     fill,
@@ -42,6 +42,9 @@ from gridworld.world.mdp import LEAST_REWARD, MOST_REWARD, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from gridworld.envs.vector_env import Ended
+
+_BELOW_ONE = 1 - 2**-53  # replaces a step of 1, after which nothing of the past is left
+_SPARE_BYTES = 2**20  # of a model file, for the frames around its arrays
 
 
 @dataclass
@@ -86,7 +89,9 @@ class TabularControl(ABC):
         self._random = independent_generator(context.seed)  # the environments take the seed's own
         self._steps = 0
         self._actions: IntArray = np.zeros(context.envs.num_envs, dtype=np.int64)  # chosen, not yet taken
-        self._log = TrainingLog(config.stats_window_size, config.log_interval, context.write_scalars)
+        self._episodes, self._next_log = 0, config.log_interval  # that have ended, and that are logged next
+        self._last: deque[tuple[float, int]] = deque(maxlen=config.stats_window_size)  # (return, length)
+        self._error, self._updates = 0.0, 0  # since the last log
 
     @property
     def model(self) -> FloatArray:
@@ -95,18 +100,11 @@ class TabularControl(ABC):
 
     @abstractmethod
     def state_values(self, q: FloatArray) -> FloatArray:
-        """V of the policy whose Q the table is.
-
-        Args:
-            q: (n, A), rows of the table.
-
-        Returns:
-            (n,), their values.
-        """
+        """(n,), V of the policy whose Q the table is, from rows (n, A) of the table."""
 
     def _values_ahead(self, reached: IntArray) -> FloatArray:
-        """(num_envs,), what the update takes the values of the states reached for, (num_envs,)."""
-        rows, index = rows_of(self.q, reached)
+        """What the update takes the values (num_envs,) of the states reached for."""
+        rows, index = _rows_of(self.q, reached)
         return self.state_values(rows)[index]
 
     def _next_actions(self, states: IntArray, ended: Ended | None) -> IntArray:
@@ -121,7 +119,7 @@ class TabularControl(ABC):
         state: State | None = None,
     ) -> None:
         """See `gridworld.agents.Agent.learn`."""
-        envs, gamma = self._context.envs, self.config.gamma
+        envs, config = self._context.envs, self.config
         q, visits = self.q.reshape(-1), self.visits.reshape(-1)  # flat views
         states, _ = envs.reset(seed=self._context.seed)
         self._steps, self._actions = 0, self._act(states)
@@ -129,29 +127,50 @@ class TabularControl(ABC):
             with fitting():
                 self._set_state(state)
             states = envs.states
-        goes_on = True
-        while goes_on and self._steps < total_timesteps:
-            step_size = self._step_size(self._steps / total_timesteps)
+        start, final = config.exploration_initial_eps, config.exploration_final_eps
+        should_continue = True
+        while should_continue and self._steps < total_timesteps:
+            rate = self._rate.at(self._steps / total_timesteps)
             pairs = states * self.q.shape[1] + self._actions
             states, rewards, _, _, ended = envs.advance(self._actions)
             self._steps = steps = self._steps + envs.num_envs
-            self.exploration_rate = self._epsilon(steps / total_timesteps)
+            explored = min(steps / total_timesteps / config.exploration_fraction, 1.0)
+            self.exploration_rate = start + (final - start) * explored
             reached = states if ended is None else ended.states  # before the reset of what is over
-            error = update(q, visits, pairs, rewards + gamma * self._values_ahead(reached), step_size)
+            targets = rewards + config.gamma * self._values_ahead(reached)
+            error = update(q, visits, pairs, targets, rate, config.learning_rate_power)
             if not error < np.inf:
                 raise InputError(
-                    f"agent={self.config.name}: training diverged at step {steps:,}, the error of its update "
+                    f"agent={config.name}: training diverged at step {steps:,}, the error of its update "
                     "is no finite number; try a smaller learning rate"
                 )
             self._actions = self._next_actions(states, ended)
-            rates = {
-                "rollout/exploration_rate": self.exploration_rate,
-                "train/learning_rate": step_size.rate,
-            }
-            self._log.add(ended, error, rates, steps)
-            goes_on = on_step(steps) > 0
-            if on_safe_point is not None and goes_on:
+            self._log(ended, error, rate)
+            should_continue = on_step(steps) > 0
+            if on_safe_point is not None and should_continue:
                 on_safe_point(steps)
+
+    def _log(self, ended: Ended | None, error: float, rate: float) -> None:
+        """Count an update, and write means, under SB3's names, if enough episodes have ended."""
+        if ended is not None:
+            self._episodes += len(ended.which)
+            self._last.extend(zip(ended.returns.tolist(), ended.lengths.tolist(), strict=True))
+        self._error += error
+        self._updates += 1
+        write = self._context.write_scalars
+        if write is None or self._episodes < self._next_log:
+            return
+        self._next_log = self._episodes + self.config.log_interval
+        episode_return, length = np.mean(self._last, axis=0).tolist()
+        scalars = {
+            "rollout/ep_rew_mean": episode_return,
+            "rollout/ep_len_mean": length,
+            "rollout/exploration_rate": self.exploration_rate,
+            "train/learning_rate": rate,
+            "train/loss": self._error / self._updates,
+        }
+        write(scalars, self._steps)
+        self._error, self._updates = 0.0, 0
 
     def class_without_state(self) -> None:
         """See `gridworld.agents.Agent.class_without_state`."""
@@ -167,7 +186,13 @@ class TabularControl(ABC):
             "exploration_rate": self.exploration_rate,
             "steps": self._steps,
             "actions": self._actions.copy(),
-            "log": self._log.get_state(),
+            "log": {
+                "finished": self._episodes,
+                "last": [list(episode) for episode in self._last],
+                "next": self._next_log,
+                "error": self._error,
+                "updates": self._updates,
+            },
         }
 
     def _set_state(self, state: State) -> None:
@@ -179,18 +204,14 @@ class TabularControl(ABC):
         self.exploration_rate = float(state["exploration_rate"])
         self._steps = int(state["steps"])
         fill(self._actions, state["actions"], "actions")
-        self._log.set_state(state["log"])
+        log = state["log"]
+        self._episodes, self._next_log = int(log["finished"]), int(log["next"])
+        self._error, self._updates = float(log["error"]), int(log["updates"])
+        self._last.clear()
+        self._last.extend((float(total), int(length)) for total, length in log["last"])
 
     def _act(self, states: IntArray) -> IntArray:
         return draw_actions(self.q, self.exploration_rate, states, self._random.random(len(states)))
-
-    def _epsilon(self, progress: float) -> float:
-        """ε after that share of training: linear over the configured fraction of it, then the final one."""
-        start, end = self.config.exploration_initial_eps, self.config.exploration_final_eps
-        return start + (end - start) * min(progress / self.config.exploration_fraction, 1.0)
-
-    def _step_size(self, progress: float) -> StepSize:
-        return StepSize(self._rate.at(progress), self.config.learning_rate_power)
 
     def snapshot(self) -> PolicySnapshot:
         """Of equally good actions, the first is the greedy one; the sampled policy takes any of them."""
@@ -201,18 +222,115 @@ class TabularControl(ABC):
             q=self.q.copy(),
         )
 
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        return {"q": self.q, "visits": self.visits, "exploration_rate": np.array(self.exploration_rate)}
+
     def model_file(self) -> bytes:
         """See `gridworld.agents.Agent.model_file`."""
-        return model_bytes(
-            self.config.algorithm,
-            {"q": self.q, "visits": self.visits, "exploration_rate": np.array(self.exploration_rate)},
-        )
+        return model_bytes(self.config.algorithm, self._arrays())
 
     def load(self, path: Path) -> None:
         """See `gridworld.agents.Agent.load`."""
-        like = {"q": self.q, "visits": self.visits, "exploration_rate": np.array(0.0)}
-        arrays = read_model(path, self.config.algorithm, like)
+        arrays = read_model(path, self.config.algorithm, self._arrays())
         epsilon = float(arrays["exploration_rate"])
-        if not 0 <= epsilon <= 1:
-            raise InputError(f"{path}: exploration_rate={epsilon}: must be from 0 to 1")
+        Bounds(0, 1).check(f"{path}: exploration_rate", epsilon)
         self.q, self.visits, self.exploration_rate = arrays["q"], arrays["visits"], epsilon
+
+
+def update(
+    q: FloatArray, visits: IntArray, pairs: IntArray, targets: FloatArray, rate: float, power: float = 0.0
+) -> float:
+    """Update a flat table with a batch of transitions, in place; returns their mean squared error before.
+
+    With one environment it is the textbook's Q(s, a) ← Q(s, a) + α [y - Q(s, a)], where at the n-th visit of
+    (s, a) α = rate · n^-power (with 1/2 < power <= 1 as Robbins and Monro, 1951, ask of it). With more, all
+    targets y come from the table as it was, and the transitions are taken in the order of their environments.
+    Where k of them are at the same (s, a), with step sizes α_1, ..., α_k, these k steps come to
+
+        Q(s, a) ← Q(s, a) + Σ_j w_j [y_j - Q(s, a)],    w_j = α_j Π_(l > j) (1 - α_l)
+
+    with Q on the right as it was before: a sum over the batch. So α is a step per transition, whatever the
+    number of environments. Plain addition of the errors would overshoot as soon as k α > 2, and their mean
+    make k transitions count as one. Targets may be a batch old: J. N. Tsitsiklis, Asynchronous stochastic
+    approximation and Q-learning, 1994, allows for outdated values.
+
+    `q` and `visits`, which counts updates, are (S * A,); `pairs`, s * A + a, and `targets` y are (n,).
+    """
+
+    def sizes_at(visit: IntArray) -> FloatArray:
+        return rate * visit.astype(np.float64) ** -power if power else np.full(len(visit), rate)
+
+    errors = targets - q[pairs]
+    if len(pairs) == 1:  # nothing to share
+        visits[pairs] += 1
+        q[pairs] += sizes_at(visits[pairs]) * errors
+    else:
+        order = np.argsort(pairs, kind="stable")  # brings equal pairs together, first come first
+        arranged = pairs[order]
+        starts = np.flatnonzero(np.concatenate([[True], arranged[1:] != arranged[:-1]]))
+        lengths = np.diff(starts, append=len(pairs))
+        where, last = arranged[starts], np.repeat(starts + lengths - 1, lengths)
+        # The n-th visit: those before the batch, and those in the batch up to this one.
+        sizes = sizes_at(np.repeat(visits[where] - starts + 1, lengths) + np.arange(len(pairs)))
+        kept = np.log1p(-np.minimum(sizes, _BELOW_ONE)).cumsum()
+        weights = sizes * np.exp(kept[last] - kept)
+        q[where] += np.add.reduceat(weights * errors[order], starts)
+        visits[where] += lengths
+    return float(errors @ errors) / len(errors)
+
+
+def epsilon_greedy(q: FloatArray, epsilon: float) -> FloatArray:
+    """π(a | s) (..., A) of values Q (..., A): with probability ε any action, else one of the best."""
+    best = q == q.max(axis=-1, keepdims=True)
+    policy: FloatArray = epsilon / q.shape[-1] + (1 - epsilon) * best / best.sum(axis=-1, keepdims=True)
+    return policy
+
+
+def draw_actions(q: FloatArray, epsilon: float, states: IntArray, draws: FloatArray) -> IntArray:
+    """Draw ε-greedy actions (n,): each the first whose cumulative probability exceeds its draw in [0, 1)."""
+    rows, index = _rows_of(q, states)
+    thresholds = epsilon_greedy(rows, epsilon)[:, :-1].cumsum(axis=1)
+    actions = np.zeros(len(states), dtype=np.int64)
+    for threshold in thresholds.T:
+        actions += draws >= threshold[index]
+    return actions
+
+
+def _rows_of(q: FloatArray, states: IntArray) -> tuple[FloatArray, IntArray | slice]:
+    """The rows of Q to compute with, the whole table if that is less, and where in them `states` are."""
+    return (q, states) if len(q) <= len(states) else (q[states], slice(None))
+
+
+def model_bytes(algorithm: str, arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """The content of a model file: an .npz of the arrays and the algorithm's name."""
+    return npz_bytes({"algorithm": np.array(algorithm), **arrays})
+
+
+def read_model(path: Path, algorithm: str, like: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Read an algorithm's model file; its arrays must have the names, types and shapes of `like`."""
+    most = _SPARE_BYTES + sum(array.nbytes for array in like.values())
+    found = read_arrays(path, most, algorithm)
+    if found.keys() != {"algorithm", *like}:
+        raise InputError(
+            f"{path}: not a model of {algorithm}: must hold {sorted(['algorithm', *like])}, "
+            f"holds {sorted(found)[:8]}"
+        )
+    written_by = str(found.pop("algorithm"))
+    if written_by != algorithm:
+        raise InputError(f"{path}: not a model of {algorithm} but of {written_by[:50]}")
+    for name, expected in like.items():
+        array = found[name]
+        if (array.dtype, array.shape) != (expected.dtype, expected.shape):
+            raise InputError(
+                f"{path}: {name} is {array.dtype} {array.shape}; "
+                f"{algorithm} in this world has {expected.dtype} {expected.shape}"
+            )
+        if not np.isfinite(array).all():
+            raise InputError(f"{path}: {name} holds numbers that are not finite")
+    return found
+
+
+def read_arrays(path: Path, most: int, algorithm: str = "a table") -> dict[str, NDArray[Any]]:
+    """Read all arrays of a model file of at most `most` bytes."""
+    content = read_bytes(path, most, copies=3)  # beside it a member and the array in it
+    return npz_arrays(path, content, f"a model of {algorithm}")

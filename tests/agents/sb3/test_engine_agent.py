@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.support import DEEP, SHORT, configure, train_in
+from helpers.support import SHORT, configure
 from sb3_contrib import QRDQN, TRPO
 from stable_baselines3 import A2C, DQN, PPO
 
 from gridworld.agents import Agent, TrainingContext, family
 from gridworld.agents.sb3 import check
-from gridworld.agents.sb3.agent import SB3Agent
-from gridworld.agents.sb3.engine_agent import EngineAgent
+from gridworld.agents.sb3.agent import EngineAgent, SB3Agent
 from gridworld.agents.sb3.factory import UnfitError
 from gridworld.agents.sb3.settings.engine import ACTIVATIONS
 from gridworld.envs.observations import make_observation
@@ -53,16 +52,6 @@ def test_the_model_is_sb3s_own_and_learns_on(agent: str, tmp_path: Path) -> None
         before = each.num_timesteps
         each.learn(100, reset_num_timesteps=False)
         assert each.num_timesteps >= before + 100
-
-
-@pytest.mark.parametrize("agent", [*DEEP, "a2c", "qrdqn", "trpo"])
-def test_both_engines_train_and_leave_the_same_kind_of_run(agent: str, tmp_path: Path) -> None:
-    runs = [
-        train_in(tmp_path / engine, *SHORT[agent], f"agent.engine={engine}")
-        for engine in ("stock", "tabulated")
-    ]
-    assert runs[0].keys() == runs[1].keys()
-    assert runs[0]["timesteps"] == runs[1]["timesteps"]
 
 
 OWN_MODULES = """
@@ -136,11 +125,15 @@ def test_what_it_does_not_cover_falls_back_and_says_why(
         [],
         ["agent.policy_kwargs.activation_fn=torch.nn.modules.activation.GELU"],
         ["agent.policy_kwargs.optimizer_class=torch.optim.adamw.AdamW", "agent.policy_kwargs.net_arch=[]"],
+        ["agent.policy=stable_baselines3.POLICY"],
     ],
 )
-@pytest.mark.parametrize("agent", ["dqn", "ppo"])
-def test_what_is_known_is_covered(agent: str, settings: list[str]) -> None:
-    assert type(built(f"agent={agent}", *settings)) is EngineAgent
+@pytest.mark.parametrize(
+    ("agent", "policy"), [("dqn", "dqn.policies.DQNPolicy"), ("ppo", "common.policies.ActorCriticPolicy")]
+)
+def test_what_is_known_is_covered(agent: str, policy: str, settings: list[str]) -> None:
+    words = [each.replace("POLICY", policy) for each in settings]
+    assert type(built(f"agent={agent}", *words)) is EngineAgent
 
 
 @pytest.mark.parametrize("agent", ["a2c", "qrdqn", "trpo"])
@@ -159,11 +152,6 @@ def test_a_class_with_its_arguments_is_covered_as_well(
     assert f"engine: stock, since {reason}" in capsys.readouterr().err
     with pytest.raises(InputError, match=r"agent\.engine=fast: must be tabulated or stock"):
         check(configure(f"agent={agent}", "agent.engine=fast"))
-
-
-def test_a_policy_of_sb3s_by_its_path_is_covered() -> None:
-    for agent, path in (("dqn", "dqn.policies.DQNPolicy"), ("ppo", "common.policies.ActorCriticPolicy")):
-        assert type(built(f"agent={agent}", f"agent.policy=stable_baselines3.{path}")) is EngineAgent
 
 
 @pytest.mark.parametrize("kind", ACTIVATIONS)

@@ -6,7 +6,7 @@ import pytest
 from stable_baselines3 import A2C, PPO
 
 import gridworld
-from gridworld.agents.sb3.falling_setting import FallingSetting
+from gridworld.agents.sb3.callbacks import FallingSetting
 from gridworld.engine.population import Population
 
 SHORT = (

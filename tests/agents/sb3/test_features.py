@@ -17,7 +17,7 @@ from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelC
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 
-PLANE = spaces.Box(0, 1, (2,), np.float32)
+PLANE, IMAGE = spaces.Box(0, 1, (2,), np.float32), spaces.Box(0, 255, (3, 8, 9), np.uint8)
 
 
 def places(rows: int, cols: int) -> Tensor:
@@ -30,6 +30,11 @@ def test_with_the_grids_own_orders_cells_are_orthonormal(rows: int, cols: int) -
     features = FourierFeatures(PLANE, [rows - 1, cols - 1])(places(rows, cols))
     assert features.shape == (rows * cols, rows * cols)
     assert torch.allclose(features @ features.T, torch.eye(rows * cols), atol=1e-5)
+    default = FourierFeatures(PLANE)  # any function of the cells is linear in these
+    assert default.orders == [11, 11]
+    assert torch.linalg.svdvals(default(places(rows, cols)).double())[rows * cols - 1] > 0.5
+    nowhere = torch.tensor([[-1.0, -1.0], [1.0, 1.0]])  # a state without a place, and a cell
+    assert (default(nowhere).norm(dim=1) > 0).tolist() == [False, True]
 
 
 def test_they_are_products_of_cosines_of_length_one() -> None:
@@ -43,21 +48,6 @@ def test_they_are_products_of_cosines_of_length_one() -> None:
     expected = np.array(naive) * weights
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     assert np.allclose(found, expected, atol=1e-5)
-
-
-@pytest.mark.parametrize(("rows", "cols"), [(5, 6), (7, 9), (12, 12)])
-def test_by_default_any_function_of_a_grids_cells_is_linear_in_them(rows: int, cols: int) -> None:
-    basis = FourierFeatures(PLANE)
-    assert basis.orders == [11, 11]
-    features = basis(places(rows, cols)).double()
-    assert torch.linalg.svdvals(features)[-1] > 0.5  # of the table's part that is hardest to tell
-    assert FourierFeatures(spaces.Box(0, 1, (3,))).features_dim == 125  # 5 ** 3, the last below 144
-
-
-def test_a_state_without_a_place_is_none_of_the_cells() -> None:
-    shown = torch.tensor([[-1.0, -1.0], [1.0, 1.0], [0.0, 0.0], [-1.0, -1.0]])
-    features = FourierFeatures(PLANE)(shown)
-    assert torch.equal(features.norm(dim=1) > 0, torch.tensor([False, True, True, False]))
 
 
 @pytest.mark.parametrize("cell_size", [8, 16])
@@ -126,38 +116,23 @@ def test_it_learns_from_pixels(agent: str, seed: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("make", "words"),
+    ("kind", "arguments", "words"),
     [
-        (lambda: FourierFeatures(spaces.Discrete(3)), "must be coordinates, a Box of shape (d,)"),
-        (lambda: FourierFeatures(PLANE, [3, -1]), "orders=[3, -1]: must be 2 whole numbers"),
-        (
-            lambda: FourierFeatures(PLANE, [99, 99]),
-            "2 coordinates of these orders make 10000 features, more than 4096",
-        ),
-        (lambda: FourierFeatures(PLANE, [[1, 2], 3]), "orders=[[1, 2], 3]: must be 2 whole numbers"),
-        (lambda: FourierFeatures(PLANE, [True, 2]), "orders=[True, 2]: must be 2 whole numbers"),
-        (
-            lambda: AgentByColour(spaces.Box(0, 255, (3, 8, 9), np.uint8), True),
-            "cell_size=True: must be from 1",
-        ),
-        (
-            lambda: PixelCNN(PLANE),
-            "PixelCNN: the observation must be an image of shape (channels, height, width)",
-        ),
-        (
-            lambda: PixelCNN(spaces.Box(0, 255, (3, 8, 9), np.uint8), 0),
-            "PixelCNN: cell_size=0: must be from 1",
-        ),
-        (lambda: AgentByColour(PLANE), "must be an image of shape (channels, height, width)"),
-        (
-            lambda: AgentByColour(spaces.Box(0, 255, (3, 8, 9), np.uint8), 10),
-            "from 1 to the image's 8 pixels",
-        ),
+        (FourierFeatures, [spaces.Discrete(3)], "must be coordinates, a Box of shape (d,)"),
+        (FourierFeatures, [PLANE, [3, -1]], "orders=[3, -1]: must be 2 whole numbers"),
+        (FourierFeatures, [PLANE, [[1, 2], 3]], "orders=[[1, 2], 3]: must be 2 whole numbers"),
+        (FourierFeatures, [PLANE, [True, 2]], "orders=[True, 2]: must be 2 whole numbers"),
+        (FourierFeatures, [PLANE, [99, 99]], "2 coordinates of these orders make 10000 features, more than"),
+        (AgentByColour, [PLANE], "must be an image of shape (channels, height, width)"),
+        (AgentByColour, [IMAGE, True], "cell_size=True: must be from 1"),
+        (AgentByColour, [IMAGE, 10], "from 1 to the image's 8 pixels"),
+        (PixelCNN, [PLANE], "PixelCNN: the observation must be an image of shape (channels, height, width)"),
+        (PixelCNN, [IMAGE, 0], "PixelCNN: cell_size=0: must be from 1"),
     ],
 )
-def test_what_they_cannot_take(make: Any, words: str) -> None:
+def test_what_they_cannot_take(kind: Any, arguments: list[Any], words: str) -> None:
     with pytest.raises(InputError) as mistake:
-        make()
+        kind(*arguments)
     assert words in str(mistake.value)
 
 

@@ -98,7 +98,10 @@ def test_in_sb3s_own_loop_every_transition_is_counted() -> None:
     state = copy.deepcopy(buffer.get_state())
     buffer.reset()
     assert (buffer.size(), buffer.counts.sum()) == (0, 0)
-    other = ReplayCounts(1, model.observation_space, model.action_space, n_envs=NUM_ENVS)
+    other = ReplayCounts(10**9, model.observation_space, model.action_space, n_envs=NUM_ENVS)
+    assert sum(each.nbytes for each in vars(other).values() if isinstance(each, np.ndarray)) < 10**6
+    with pytest.raises(InputError, match="optimize_memory_usage=true: ReplayCounts stores each transition"):
+        ReplayCounts(1, model.observation_space, model.action_space, optimize_memory_usage=True)
     other.set_state(state)
     assert kept(other) == model.told
 
@@ -157,18 +160,6 @@ def test_a_state_of_no_transitions_of_this_world_is_refused(name: str, change: C
     with pytest.raises(StateError, match="must be"):
         replay.set_state(0, {**state, name: change(state[name])})
     replay.set_state(0, state)
-
-
-def test_it_takes_the_memory_of_the_transitions_alone() -> None:
-    buffer = ReplayCounts(10**9, spaces.Box(0, 1, (30,)), spaces.Discrete(4), n_envs=4096)
-    assert sum(each.nbytes for each in vars(buffer).values() if isinstance(each, np.ndarray)) < 10**6
-
-
-def test_sequences_are_refused() -> None:
-    with pytest.raises(
-        InputError, match="optimize_memory_usage=true: ReplayCounts stores each transition once"
-    ):
-        ReplayCounts(10, spaces.Discrete(4), spaces.Discrete(4), optimize_memory_usage=True)
 
 
 def test_a_world_with_chances_is_certified_with_it(tmp_path: Path) -> None:

@@ -77,23 +77,6 @@ def test_sb3_learns_on_it_as_it_is(algorithm: type, kind: str) -> None:
     assert -1 <= mean <= 1
 
 
-def test_a_seed_is_used_once() -> None:
-    envs = batch(4, slip=0.5)
-    actions = np.ones(4, dtype=np.int64)
-
-    def walk() -> list[np.ndarray]:
-        envs.reset()
-        return [envs.step(actions)[0] for _ in range(20)]
-
-    envs.seed(3)
-    first = walk()
-    second = walk()
-    envs.seed(3)
-    again = walk()
-    assert all(map(np.array_equal, first, again))
-    assert not all(map(np.array_equal, first, second))
-
-
 @pytest.mark.parametrize("algorithm", [DQN, PPO])
 def test_environments_and_exploration_draw_from_different_streams(algorithm: type) -> None:
     """A PCG64 generator's increment is the number of its stream."""

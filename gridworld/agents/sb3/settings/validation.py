@@ -22,7 +22,7 @@ from gridworld.config.worlds import EnvConfig
 from gridworld.errors import InputError
 
 SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")  # what SB3 has a linear schedule for
-FALLING = ("ent_coef", "gae_lambda", "learning_rate")  # see `agents.sb3.falling_setting` for all other ones
+FALLING = ("ent_coef", "gae_lambda", "learning_rate")  # see `agents.sb3.callbacks` for all other ones
 ENGINES = ("tabulated", "stock")
 _LEAST_REWARD = 1e-30  # in networks' 32 bits
 # By their names in SB3 and sb3-contrib: counts that neither DQN nor PPO has, and what these two have.

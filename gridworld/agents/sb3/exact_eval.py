@@ -1,0 +1,335 @@
+"""Any model of SB3 scored exactly, whoever trained it: its policy over the states of a world, and a callback.
+
+The greedy policy is what `predict` does on what the environment shows of each state, with the action masks of
+that environment. What it explores with is read from its network.
+"""
+
+from __future__ import annotations
+
+import inspect
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped, sync_envs_normalization
+
+from gridworld.agents.sb3.policy_outputs import CHUNK, explored, read_table, why_no_table, why_unreadable
+from gridworld.bounds import Bounds, discount
+from gridworld.envs.inspection import Task, observation_like, tabulated, task_of
+from gridworld.envs.observations import KINDS, ObservationTable
+from gridworld.errors import InputError, in_short
+from gridworld.run.folder import BEST_MODEL, EVALUATIONS
+from gridworld.run.writer import write_evaluations
+from gridworld.storage.atomic_write import replacing
+from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.exact.markov_chain import one_hot_policy
+from gridworld.world.mdp import FloatArray, IntArray
+from gridworld.world.metrics import numbers
+from gridworld.world.sources.pure_functions import same
+from gridworld.world.sources.snapshots import random_states
+from gridworld.world.sources.wrappers import is_discrete
+
+_LIBRARIES = ("stable_baselines3.", "sb3_contrib.", "gridworld.")
+_ONE_BY_ONE = 512  # states in which `predict` is asked alone, too
+_OFTEN = 100  # times, where `predict` is a custom one
+_PREDICTS = ("predict", "_predict")  # what decides an action, of a model or a policy
+_KINDS: dict[str, type] = {"step": np.int64, "certified": np.bool_}
+
+
+class Tables(NamedTuple):
+    """A model's policies, and what they are of; (S, A), float64, each."""
+
+    greedy: FloatArray  # action probabilities
+    sampled: FloatArray | None  # the same; None: a custom `predict` decides, which shows no probabilities
+    outputs: FloatArray  # action probabilities of an actor-critic, Q values of others
+
+
+class ForeignPolicy:
+    """A model's policy in a task.
+
+    Args:
+        model: an SB3 model, or its policy.
+        task: the task, whose observations are asked for anew at every reading, since statistics may change.
+    """
+
+    def __init__(self, model: Any, task: Task) -> None:
+        policy = model if isinstance(model, BasePolicy) else getattr(model, "policy", None)
+        if not isinstance(policy, BasePolicy):
+            raise InputError(f"{type(model).__name__}: is neither a model of Stable-Baselines3 nor a table")
+        self._model, self._task, self._policy = model, task, policy
+        self._guess_is_fine = False
+        if not is_discrete(policy.action_space, task.mdp.num_actions):
+            raise InputError(
+                f"the model acts in {policy.action_space}; "
+                f"{task.mdp.name} has Discrete({task.mdp.num_actions})"
+            )
+        if (reason := why_unreadable(policy)) is not None:
+            raise InputError(f"the model {reason}")
+        predicts = (model.predict, policy.predict)
+        takes_masks = any("action_masks" in inspect.signature(each).parameters for each in predicts)
+        self._masks = task.masks() if takes_masks else None
+        self._is_known = self._is_of_a_library()  # so that its network says how it explores
+        self._check_is_a_table(self._observation())
+
+    def tables(self) -> Tables:
+        """Ask it about every state. It is left as it was."""
+        observation, was_training = self._observation(), self._policy.training
+        _, probabilities, q = read_table(self._policy, observation, self._masks)
+        outputs = q if probabilities is None else probabilities
+        assert outputs is not None
+        if not np.isfinite(outputs).all():
+            raise InputError("the model's outputs are no finite numbers; its training has diverged")
+        greedy = one_hot_policy(self._predicted(observation), outputs.shape[1])
+        self._policy.set_training_mode(was_training)
+        epsilon = float(getattr(self._model, "exploration_rate", 0.0))
+        sampled = outputs if q is None else explored(greedy, epsilon)
+        return Tables(greedy, sampled if self._is_known else None, outputs)
+
+    def _observation(self) -> ObservationTable:
+        """What it sees of each state: what the task shows, or the world's own observation with its space."""
+        seen, wanted = None if self._task.seen is None else self._task.seen(), self._policy.observation_space
+        if seen is not None and seen.space != wanted and _is_transposed(seen.space, wanted):
+            return tabulated(wanted, seen.table().transpose(0, 3, 1, 2), seen.num_states)
+        if seen is not None and seen.space == wanted:
+            if isinstance(seen.stored, dict):
+                raise InputError(
+                    "env: its observations are a Dict; take one entry, as VecExtractDictObs does"
+                )
+            return seen
+        if seen is not None and seen.kind not in KINDS:
+            raise InputError(
+                f"the model sees {wanted}, and the environment shows {seen.space}; give the environment that "
+                "the model was trained on, as model.get_env() has it"
+            )
+        guess = observation_like(self._task.mdp, wanted)
+        self._check_guess(guess)
+        return guess
+
+    def _check_guess(self, guess: ObservationTable) -> None:
+        """Refuse an observation that only has the right space, where the model was shown another one."""
+        env = getattr(self._model, "get_env", lambda: None)()
+        if env is None or self._guess_is_fine:
+            return
+        try:
+            task = task_of(env)
+            shown = None if task.seen is None else task.seen()
+        except InputError as error:
+            raise InputError(
+                "the model: what it was shown in training is not known, so it cannot be scored on an "
+                f"environment that shows something else; give one that shows the same ({error})"
+            ) from None
+        is_ours = shown is not None and shown.kind in KINDS
+        alike = shown is not None and shown.space == guess.space and same(shown.table(), guess.table())
+        if not is_ours and not alike:
+            raise InputError(
+                f"the model was shown observations of its own in training, and {guess.kind} of this world "
+                "only has the same space; give an environment with the wrappers that it was trained on"
+            )
+        self._guess_is_fine = True
+
+    def _predicted(self, observation: ObservationTable) -> IntArray:
+        """(S,), the actions that `predict` takes, asked in batches."""
+        parts = [
+            self._predict(observation, np.arange(start, min(start + CHUNK, observation.num_states)))
+            for start in range(0, observation.num_states, CHUNK)
+        ]
+        return np.concatenate(parts)
+
+    def _predict(self, observation: ObservationTable, states: IntArray) -> IntArray:
+        """(n,), the actions of some states; `states` is one number to ask as for a single environment."""
+        masks = {} if self._masks is None else {"action_masks": self._masks[states]}
+        try:
+            found = self._model.predict(observation.rows(states), deterministic=True, **masks)
+            actions, state = np.asarray(found[0]), found[1]
+        except Exception as error:  # it may be anybody's own
+            raise InputError(f"the model: its predict() raised {in_short(error)}") from error
+        if state is not None:
+            raise InputError(
+                "the model: its predict() gives a state to give back, so what it does is not a function of "
+                "the observation, and no table of it can be evaluated exactly"
+            )
+        fits = actions.shape == np.shape(states) and actions.dtype.kind in "iu"
+        if not fits or not np.isin(actions, np.arange(self._task.mdp.num_actions)).all():
+            raise InputError(
+                f"the model: its predict() gave {str(actions)[:60]} for {np.size(states)} states; must be an "
+                f"action of each, {self._task.mdp.action_choices()}"
+            )
+        return actions
+
+    def _check_is_a_table(self, observation: ObservationTable) -> None:
+        was_training, before = self._policy.training, random_states()
+        reached = np.flatnonzero(self._task.mdp.acting)[:_ONE_BY_ONE]
+        together = self._predicted(observation)[reached]
+        rounds = [np.array([self._predict(observation, state) for state in reached])]
+        rounds += [self._predicted(observation)[reached] for _ in range(1 if self._is_known else _OFTEN)]
+        reason = why_no_table(self._policy, observation)
+        self._policy.set_training_mode(was_training)
+        if reason is None and random_states() != before:
+            reason = "draws random numbers for its best action, so no table of it can be evaluated exactly"
+        if reason is None and any((each != together).any() for each in rounds):
+            reason = (
+                "does not always take the same action in the same state, asked alone and with others, so no "
+                "table of it can be evaluated exactly"
+            )
+        if reason is not None:
+            raise InputError(f"the model {reason}")
+
+    def _is_of_a_library(self) -> bool:
+        """Whether no custom layer or `predict` decides on an action."""
+        modules = [type(each).__module__ for each in self._policy.modules()]
+        for thing in (self._model, self._policy):
+            found = {name: getattr(type(thing), name, None) for name in _PREDICTS}
+            modules += [method.__module__ for method in found.values() if method is not None]
+            modules += ["custom" for name in _PREDICTS if name in vars(thing)]
+        return all(module.startswith((*_LIBRARIES, "torch.")) for module in modules)
+
+
+def tables_of(model: Any, task: Task) -> Tables:
+    """Read a model's policies once; see `ForeignPolicy`."""
+    return ForeignPolicy(model, task).tables()
+
+
+def _is_transposed(shown: Any, wanted: Any) -> bool:
+    """Whether images are shown with their channels last, which `predict` takes too."""
+    shape: tuple[int, ...] = shown.shape or ()
+    is_image = len(shape) == 3 and shown.dtype == wanted.dtype == np.uint8
+    return is_image and (shape[2], *shape[:2]) == wanted.shape
+
+
+class ExactEvalCallback(BaseCallback):
+    """Evaluates the greedy policy exactly before, during and after training.
+
+    Goes to SB3's own logger, and so to its TensorBoard, CSV or standard output: `eval/regret`, `eval/value`,
+    `eval/certified`, `eval/goal_probability`, ..., and by SB3's names `eval/mean_reward`,
+    `eval/mean_ep_length` and `eval/success_rate`. Nothing is sampled: no random number is drawn, no
+    environment is stepped, and training goes on as without the callback.
+
+    Attributes:
+        evaluator: scores policies of the world; None before training begins.
+        best_regret: the lowest regret so far.
+        stopped_at: the step at which `stop_after` ended training; None: it did not.
+
+    Example:
+        >>> from stable_baselines3 import DQN
+        >>> import gridworld, gymnasium as gym
+        >>> callback = gridworld.ExactEvalCallback(every=500)
+        >>> model = DQN("MlpPolicy", gym.make("GridWorld-v0")).learn(50_000, callback=callback)
+        >>> callback.evaluations["regret"][-1]
+    """
+
+    def __init__(
+        self,
+        env: Any = None,
+        every: int = 1000,
+        best_model_save_path: str | PathLike[str] | None = None,
+        log_path: str | PathLike[str] | None = None,
+        stop_after: int | None = None,
+        gamma: float = 0.99,
+        max_episode_steps: int | None = None,
+        verbose: int = 0,
+    ) -> None:
+        """Set up; nothing is read or written before training begins.
+
+        Args:
+            env: what to evaluate on, as for `gridworld.evaluate`; None: what the model is trained on.
+            every: environment steps between two evaluations.
+            best_model_save_path: a folder for `best_model.zip`, the model of the lowest exact regret, the
+                first of equals.
+            log_path: a folder for `evaluations.npz`: `timesteps`, `results`, `ep_lengths` and `successes` as
+                SB3's `EvalCallback` writes them, and the columns of `evaluations`.
+            stop_after: end training at so many certificates of optimality in a row, each of another policy;
+                None: never.
+            gamma: discount of value and regret.
+            max_episode_steps: step limit of an episode; None: the environment's own.
+            verbose: 1 prints a line at every new best model.
+
+        Raises:
+            InputError: an argument out of its bounds, or an environment that is no GridWorld.
+        """
+        super().__init__(verbose)
+        Bounds(1).check("every", every)
+        discount("gamma", gamma)
+        if stop_after is not None:
+            Bounds(1).check("stop_after", stop_after)
+        self.evaluator: Evaluator | None = None
+        self.best_regret = np.inf
+        self.stopped_at: int | None = None
+        self._every, self._gamma, self._limit = every, gamma, max_episode_steps
+        self._best_path = None if best_model_save_path is None else Path(best_model_save_path)
+        self._log_path = None if log_path is None else Path(log_path)
+        self._stop_after = stop_after
+        self._rows: list[dict[str, float]] = []
+        self._streak = 0  # certificates in a row
+        self._newest: NDArray[Any] | None = None  # the outputs that were evaluated last
+        self._next = 0
+        self._env, self._task = env, None if env is None else self._evaluate_on(env)
+
+    @property
+    def evaluations(self) -> dict[str, NDArray[Any]]:
+        """{name: (evaluations,)}: `step`, and every metric of `RunResult.curve` of the greedy policy."""
+        names = self._rows[0] if self._rows else {}
+        table = {name: np.array([row[name] for row in self._rows]) for name in names}
+        return table | {name: table[name].astype(kind) for name, kind in _KINDS.items() if name in table}
+
+    def _evaluate_on(self, env: Any) -> Task:
+        task = task_of(env, self._limit)
+        self.evaluator = Evaluator(task.mdp, self._gamma, task.max_episode_steps)
+        return task
+
+    def _on_training_start(self) -> None:
+        task = self._task or self._evaluate_on(self.training_env)
+        self._policy = ForeignPolicy(self.model, task)  # refuses what has no table
+        self._evaluate()
+
+    def _on_step(self) -> bool:
+        # The last step is left to the end of training, since an update may still follow it.
+        if self._next <= self.num_timesteps < self.model._total_timesteps:
+            self._evaluate()
+        if self._stop_after is not None and self._streak >= self._stop_after:
+            self.stopped_at = self.num_timesteps
+            return False
+        return True
+
+    def _on_training_end(self) -> None:
+        self._evaluate()
+
+    def _evaluate(self) -> None:
+        """Score the policy as it is now, and write what comes of it; once a step and policy."""
+        assert self.evaluator is not None
+        if isinstance(self._env, VecEnv) and is_vecenv_wrapped(self._env, VecNormalize):
+            sync_envs_normalization(self.training_env, self._env)  # as SB3's EvalCallback does
+        step = self.num_timesteps
+        self._next = (step // self._every + 1) * self._every
+        tables = self._policy.tables()
+        is_new = self._newest is None or not np.array_equal(self._newest, tables.outputs)
+        if not is_new and self._rows[-1]["step"] == step:
+            return
+        self._newest = tables.outputs
+        score = self.evaluator.score(tables.greedy)
+        self._rows.append({"step": step, **numbers(score)})
+        self._streak = self._streak + is_new if score.certified else 0
+        by_sb3_names = {
+            "mean_reward": score.outcome.expected_return,
+            "mean_ep_length": score.outcome.expected_length,
+            "success_rate": score.outcome.goal,
+        }
+        for name, number in (numbers(score) | by_sb3_names).items():
+            self.logger.record(f"eval/{name}", float(number))
+        self.logger.record("time/total_timesteps", step, exclude="tensorboard")
+        self.logger.dump(step)
+        if score.shortfall < self.best_regret:
+            self.best_regret = score.shortfall
+            if self.verbose >= 1:
+                print(f"step {step:,}: new best model, exact regret {self.best_regret:.3g}")
+            if self._best_path is not None:
+                self._best_path.mkdir(parents=True, exist_ok=True)
+                with replacing(self._best_path / BEST_MODEL) as part, part.open("wb") as file:
+                    self.model.save(file)
+        if self._log_path is not None:
+            table = self.evaluations
+            self._log_path.mkdir(parents=True, exist_ok=True)
+            write_evaluations(self._log_path / EVALUATIONS, table, **table)

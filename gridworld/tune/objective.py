@@ -1,0 +1,261 @@
+"""The objective of a search: what one trial's settings come to on several seeds, as one number in [0, 1].
+
+The number, the trial's score, is minimised: first the share of seeds that are certified counts, then how
+soon. Of n seeds, m missed the certificate; seed i costs
+
+    c_i = t_i / 2T                     certified since step t_i of T
+    c_i = 1/2 + ρ_i / 2(1 + ρ_i)       not certified, with regret ρ_i at the end
+
+and the score is (m + mean c) / (n + 1). One certified seed more always counts for more than all steps
+together, since the mean is at most 1. Where the share is the same, fewer steps win; where no seed is
+certified yet, less regret, so that a search has something to follow.
+
+Seeds are trained in memory, together where they can. They are reported one after the other: after every
+tenth or so of a seed's budget, the score as it would be if each seed, the present one included, stayed as it
+is. So a pruner compares trials at the same point of the same seed, and decides as if the seeds trained one
+after the other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from omegaconf import OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
+
+from gridworld.agents import Learning, family
+from gridworld.config.composition.compose import to_config
+from gridworld.config.train import TrainConfig
+from gridworld.envs.observations import make_observation
+from gridworld.errors import InputError, reason
+from gridworld.training.learning_curve import LearningCurve
+from gridworld.training.setup import check_settings, make_context
+from gridworld.training.together import Training, run_together
+from gridworld.tune.workers import Ask
+from gridworld.world.exact.evaluation import Evaluator
+
+SEEDS, ERROR, WORKER, DRAW = "seeds", "error", "worker", "draw"  # attributes of a trial in the study
+_MOST_STEPS = 2**63
+
+Values = Mapping[str, Any]  # {"agent.learning_rate": 0.01, ...}
+
+
+@dataclass(frozen=True)
+class SeedScore:
+    """What one seed of a trial has come to so far."""
+
+    seed: int
+    certified_since: int | None  # environment steps
+    regret: float
+
+    def cost(self, total: int) -> float:
+        """The cost c_i in [0, 1], for a budget of `total` environment steps."""
+        if self.certified_since is not None:
+            return 0.5 * min(self.certified_since / total, 1.0)
+        return 0.5 + 0.5 * (1.0 - 1.0 / (1.0 + max(self.regret, 0.0)))
+
+
+def read_score(content: Any) -> SeedScore:
+    """A seed's score from the study's storage. Raises `ValueError` or `TypeError` for anything else."""
+    found = SeedScore(**content)
+    since = found.certified_since
+    if type(found.regret) is not float or not (since is None or 0 <= int(since) < _MOST_STEPS):
+        raise ValueError(f"{str(content)[:80]} is not the score of a seed")
+    return found
+
+
+def score(seeds: Sequence[SeedScore], total: int, of: int) -> float:
+    """The score of a trial on `of` seeds by the first few of them, whose missed share stands for the rest."""
+    missed = sum(seed.certified_since is None for seed in seeds)
+    mean_cost = sum(seed.cost(total) for seed in seeds) / len(seeds)
+    return (of * missed / len(seeds) + mean_cost) / (of + 1)
+
+
+def with_values(config: TrainConfig, values: Values) -> TrainConfig:
+    """The configuration with these values in it. Raises `InputError` where one does not fit its schema."""
+    node = OmegaConf.structured(config)
+    for key, value in values.items():
+        try:
+            with open_dict(node):
+                OmegaConf.update(node, key, value)
+        except OmegaConfBaseException as error:
+            raise InputError(f"{key}={value}: {str(error).splitlines()[0]}") from None
+    return to_config(node)
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The function that a search minimises."""
+
+    base: TrainConfig
+    seeds: tuple[int, ...]
+    reports: int  # to the pruner, per seed
+    stop_after: int | None
+
+    def config(self, values: Values) -> TrainConfig:
+        """The configuration of a run with these values, on the first seed."""
+        base = self.base
+        evaluation = base.evaluation
+        if evaluation.stop_after is None:
+            evaluation = dataclasses.replace(evaluation, stop_after=self.stop_after)
+        quiet = dataclasses.replace(base.logging, progress=False, tensorboard=False)
+        return with_values(dataclasses.replace(base, evaluation=evaluation, logging=quiet), values)
+
+
+@dataclass(frozen=True)
+class Report:
+    """A trial's score at some point of its way; the answer is whether the trial is to end there."""
+
+    trial: int
+    step: int
+    value: float
+    can_prune: bool
+
+
+@dataclass
+class Outcome:
+    """How a trial ended: its score, or that it was pruned, or why it failed."""
+
+    value: float | None = None
+    error: str = ""
+    seeds: list[SeedScore] = dataclasses.field(default_factory=list)  # that have ended, in order
+
+
+@dataclass(frozen=True)
+class Trials:
+    """A worker's task: trials, which train together where they can. Returns their outcomes."""
+
+    objective: Objective
+    values: Mapping[int, Values]  # by the trial's number
+
+    def __call__(self, ask: Ask) -> list[Outcome]:
+        places = range(len(self.objective.seeds))
+        trials = [_Trial(self.objective, number, values, ask) for number, values in self.values.items()]
+        run_together([partial(trial.training, place) for trial in trials for place in places])
+        return [trial.outcome or Outcome() for trial in trials]
+
+
+class _EndedError(Exception):
+    """The trial has ended without this seed."""
+
+
+class _Trial:
+    """A trial while its seeds train. Each is reported when those before it have ended."""
+
+    def __init__(self, objective: Objective, number: int, values: Values, ask: Ask) -> None:
+        self.outcome: Outcome | None = None
+        self._objective, self._number, self._values, self._ask = objective, number, values, ask
+        self._standings: list[list[SeedScore]] = [[] for _ in objective.seeds]  # at each report that is due
+        self._results: list[SeedScore | Exception | None] = [None for _ in objective.seeds]
+        self._ended: list[SeedScore] = []  # seeds that are reported to their end
+        self._reported = 0  # points of the next one
+
+    def training(self, place: int) -> Training[None]:
+        """Train the seed at this place, unless the trial ends without it."""
+        try:
+            self._check()
+            config, seed = self._objective.config(self._values), self._objective.seeds[place]
+            result = yield from learning(config, seed, partial(self._note, place))
+            self._results[place] = result
+            self._note(place, 1.0, result)
+        except _EndedError:
+            pass
+        except Exception as error:
+            self._results[place] = error
+            self._report()
+
+    def _check(self) -> None:
+        if self.outcome is not None:
+            raise _EndedError
+
+    def _note(self, place: int, share: float, standing: SeedScore) -> None:
+        """Note a seed's score after a share of its budget, also at points skipped, so that all have all."""
+        due = min(math.floor(share * self._objective.reports + 1e-9), self._objective.reports)
+        self._standings[place] += [standing] * (due - len(self._standings[place]))
+        self._report()
+        self._check()
+
+    def _report(self) -> None:
+        """Report what is due, the seeds in order, as far as they have come."""
+        reports, of = self._objective.reports, len(self._objective.seeds)
+        total = self._objective.base.total_timesteps
+        while self.outcome is None and len(self._ended) < of:
+            place, point = len(self._ended), self._reported
+            standings, result = self._standings[place], self._results[place]
+            if point < len(standings):
+                self._reported += 1
+                step, is_skipped = (
+                    place * reports + point,
+                    any(standings[point] is later for later in standings[point + 1 :]),
+                )
+                value = score([*self._ended, standings[point]], total, of)
+                is_behind = self._ask(Report(self._number, step, value, not is_skipped))
+                if is_behind and step + 1 < of * reports:
+                    self.outcome = Outcome(seeds=self._ended)
+            elif isinstance(result, Exception):
+                self.outcome = Outcome(None, reason(result), self._ended)
+            elif result is None:
+                return
+            else:
+                self._ended.append(result)
+                self._reported = 0
+        if self.outcome is None:
+            value = score(self._ended, total, of)
+            is_number = not math.isnan(value)
+            error = "" if is_number else "the objective is NaN"
+            self.outcome = Outcome(value if is_number else None, error, self._ended)
+
+
+@dataclass(frozen=True)
+class FinalRuns:
+    """A worker's task: runs by name, of values on a seed. Returns the score of each, or why it failed."""
+
+    objective: Objective
+    runs: Mapping[str, tuple[Values, int]]
+
+    def __call__(self, ask: Ask) -> dict[str, SeedScore | str]:
+        found = run_together([partial(self._run, *run) for run in self.runs.values()])
+        told = [reason(result) if isinstance(result, Exception) else result for result in found]
+        return dict(zip(self.runs, told, strict=True))
+
+    def _run(self, values: Values, seed: int) -> Training[SeedScore]:
+        return (yield from learning(self.objective.config(values), seed))
+
+
+def learning(
+    config: TrainConfig,
+    seed: int,
+    on_evaluation: Callable[[float, SeedScore], None] = lambda share, seed: None,
+) -> Training[SeedScore]:
+    """Train and evaluate as a run would, and keep nothing but the end."""
+    config = dataclasses.replace(config, seed=seed)
+    mdp = check_settings(config)
+    observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
+    evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
+    context = make_context(config, mdp, observation)
+    agent = family(config.agent).build(config.agent, context)
+    curve = LearningCurve(evaluator, agent, config, envs=context.envs)
+    steps = 0
+
+    def standing() -> SeedScore:
+        assert curve.newest is not None
+        return SeedScore(config.seed, curve.certificate.certified_since_step, curve.newest.greedy.regret)
+
+    def on_step(done: int) -> int:
+        nonlocal steps
+        steps = done
+        before = curve.newest
+        next_call = curve.on_step(done)
+        if curve.newest is not None and curve.newest is not before:
+            on_evaluation(curve.newest.step / config.total_timesteps, standing())
+        return next_call
+
+    curve.evaluate(0)
+    yield Learning(agent, config.total_timesteps, on_step)
+    curve.evaluate(steps)
+    return standing()

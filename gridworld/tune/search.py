@@ -1,0 +1,293 @@
+"""The search: Optuna chooses the settings of trials, workers train them, and what has ended is stored.
+
+The study in the database has only trials that have ended. Those that run are in a study in memory, which
+begins with a copy of them. So nothing is to be cleaned up after a kill: a trial that was cut short has left
+nothing, and is drawn again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+import json
+import math
+import os
+import socket
+import sys
+import time
+import warnings
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import optuna
+from optuna.exceptions import ExperimentalWarning, OptunaError
+from optuna.trial import TrialState
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import SQLAlchemyError
+
+from gridworld.errors import InputError
+from gridworld.process.console.command_line import program
+from gridworld.process.console.progress import ProgressLine, time_left
+from gridworld.sweep.console import shell_path
+from gridworld.sweep.job_table import one_line
+from gridworld.tune.finalists import FINAL
+from gridworld.tune.objective import (
+    DRAW,
+    ERROR,
+    SEEDS,
+    WORKER,
+    Outcome,
+    Report,
+    Trials,
+    Values,
+    read_score,
+)
+from gridworld.tune.search_space import SearchSpace
+from gridworld.tune.study_folder import write_trials
+from gridworld.tune.study_spec import StudySpec
+from gridworld.tune.workers import SearchError, Workers
+
+# Attributes of the study.
+ABOUT = "gridworld"  # what makes its trials comparable
+
+_CONNECT_SECONDS = 10
+_LOCKED_SECONDS = 60  # to wait for others at an SQLite file
+_EXAMPLES = "sqlite:////shared/study.db or postgresql://user@host/name"
+_SECONDS_BETWEEN_TABLES = 2.0
+_DAMAGE = (
+    *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, AssertionError),
+    *(SQLAlchemyError, OptunaError),
+)
+
+
+def study_url(spec: StudySpec) -> str:
+    """Where the study's database is."""
+    return spec.settings.storage or f"sqlite:///{spec.folder.absolute() / 'study.db'}"
+
+
+def _shown(url: str) -> str:
+    """The URL without its password."""
+    return f"tune.storage={make_url(url).render_as_string(hide_password=True)}"
+
+
+def _connect(url: str) -> optuna.storages.RDBStorage:
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    try:
+        parsed = make_url(url)
+    except SQLAlchemyError:
+        raise InputError(f"tune.storage={url}: is no URL of a database, e.g. {_EXAMPLES}") from None
+    is_sqlite = parsed.drivername.startswith("sqlite")
+    if is_sqlite and (parsed.database in (None, "", ":memory:", "file::memory:") or "mode" in parsed.query):
+        raise InputError(f"{_shown(url)}: is a database in memory; name a file, e.g. {_EXAMPLES}")
+    options = {"timeout": _LOCKED_SECONDS} if is_sqlite else {"connect_timeout": _CONNECT_SECONDS}
+    try:
+        return optuna.storages.RDBStorage(url, engine_kwargs={"connect_args": options})
+    except ImportError as error:
+        cause, driver = error.__cause__ or error, parsed.drivername
+        raise InputError(f"{_shown(url)}: {cause}; pip install the driver for {driver}") from None
+    except (SQLAlchemyError, OptunaError, RuntimeError) as error:
+        raise InputError(f"{_shown(url)}: cannot be reached ({_first_line(error)})") from None
+
+
+def open_study(
+    url: str, name: str, about: Mapping[str, Any], space: SearchSpace, must_exist: bool = False
+) -> optuna.Study:
+    """Make the study, or check that the one there is of the same search and can be read."""
+    is_file = url.startswith("sqlite:///")
+    is_gone = must_exist and is_file and not Path(url.removeprefix("sqlite:///")).exists()
+    try:
+        storage = None if is_gone else _connect(url)
+        if storage is None or (must_exist and name not in optuna.get_all_study_names(storage)):
+            raise InputError(
+                f"{_shown(url)}: does not have the study {name}, which has begun; bring its database back, "
+                "or choose another tune.folder"
+            )
+        study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True)
+        trials, attributes = study.get_trials(deepcopy=False), study.user_attrs
+        if ABOUT not in attributes:
+            if trials:
+                raise InputError(
+                    f"tune.study={name}: is there, but not of {program('tune')}; choose another tune.study"
+                )
+            study.set_user_attr(ABOUT, about)
+        _check_same(name, attributes.get(ABOUT, about), about)
+        _check_readable(study, space)
+    except InputError:
+        raise
+    except _DAMAGE as error:
+        raise InputError(
+            f"{_shown(url)}: cannot be read as a study, it was changed or damaged "
+            f"({type(error).__name__}: {_first_line(error)[:200]}); put back a good copy"
+        ) from None
+    return study
+
+
+def _check_same(name: str, before: Mapping[str, Any], about: Mapping[str, Any]) -> None:
+    """Refuse to continue the study with the first difference between what it was begun with, and now."""
+    for part, now in json.loads(json.dumps(about)).items():
+        was = dict(before[part])
+        for key in sorted({*was, *now}):
+            if was.get(key) != now.get(key):
+                told = [json.dumps(each.get(key)) for each in (was, now)]
+                raise InputError(
+                    f"tune.study={name}: was begun with another {part}: {key} was {told[0]}, now it is "
+                    f"{told[1]}; choose another tune.study, or set it back"
+                )
+
+
+def _check_readable(study: optuna.Study, space: SearchSpace) -> None:
+    """Raise one of `_DAMAGE` for a study from which a search could not be continued."""
+    scratch = optuna.create_study()
+    if study.directions != scratch.directions:
+        raise ValueError("it does not minimise")
+    for trial in study.get_trials(deepcopy=False):
+        scratch.add_trial(trial)  # which validates it
+        int(trial.user_attrs.get(DRAW, 0))
+        seeds = [read_score(seed) for seed in trial.user_attrs.get(SEEDS, [])]
+        if trial.state != TrialState.FAIL and trial.distributions != space.distributions:
+            raise ValueError(f"trial {trial.number} is of another search space")
+        if trial.state == TrialState.COMPLETE and not (seeds and math.isfinite(trial.value or 0.0)):
+            raise ValueError(f"trial {trial.number} has no score")
+    for key, value in study.user_attrs.items():
+        if key.startswith(FINAL):
+            read_score(value)
+
+
+@contextlib.contextmanager
+def in_reach(url: str) -> Iterator[None]:
+    """Raise `SearchError`, in a sentence, for what a database that goes away in the block causes."""
+    try:
+        yield
+    except (SQLAlchemyError, OptunaError) as error:
+        raise SearchError(
+            f"{_shown(url)}: the study cannot be reached any more ({_first_line(error)}); bring the database "
+            "back, with what has ended in it, and run the command again"
+        ) from None
+
+
+def _first_line(error: BaseException) -> str:
+    lines = str(getattr(error, "orig", None) or error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
+
+
+def search(spec: StudySpec, study: optuna.Study, workers: Workers) -> None:
+    """Run trials until there are enough or it is time to end; keeps trials.csv up to date."""
+    run, line = Search(spec, study), ProgressLine(spec.base.logging.progress)
+    asked, begun, before = spec.settings.trials, time.monotonic(), len(study.get_trials(deepcopy=False))
+    wrote = begun
+
+    def text() -> str:
+        states = [trial.state for trial in study.get_trials(deepcopy=False)]
+        text = f"tune: {len(states)} of {asked} trials, {states.count(TrialState.PRUNED)} pruned"
+        text += f", {len(run.running)} running"
+        if failed := states.count(TrialState.FAIL):
+            text += f", {failed} failed"
+        if TrialState.COMPLETE in states:
+            text += f", best score {study.best_value:.4f}"
+        return text + time_left(len(states) - before, asked - len(states), time.monotonic() - begun)
+
+    def on_tick() -> None:
+        nonlocal wrote
+        if time.monotonic() - wrote >= _SECONDS_BETWEEN_TABLES:
+            wrote = time.monotonic()
+            write_trials(spec.folder, study, spec.space)
+            line.show(text)
+
+    try:
+        if before < asked:
+            more = f", {before} of them there already" if before else ""
+            print(
+                f"study {spec.name} in {shell_path(spec.folder)}: {asked} trials of {spec.settings.seeds} "
+                f"seeds{more}, {workers.count * (spec.settings.together or 1)} at once",
+                file=sys.stderr,
+                flush=True,
+            )
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", ExperimentalWarning)  # of multivariate sampling
+                warnings.filterwarnings("ignore", "The reported value is ignored")  # of a trial run again
+                workers.run(run.next, run.end, run.answer, on_tick)
+    finally:
+        line.clear()
+        write_trials(spec.folder, study, spec.space, durable=True)
+
+
+class Search:
+    """The trials that run, and what is to run next."""
+
+    def __init__(self, spec: StudySpec, study: optuna.Study) -> None:
+        self.running: dict[int, optuna.Trial] = {}
+        self._spec, self._settings, self._study = spec, spec.settings, study
+        self._objective, self._first = spec.objective, spec.space.parameters_of(spec.base)
+        self._deadline = time.monotonic() + (spec.settings.timeout or math.inf)
+        self._memory = optuna.create_study(study_name=study.study_name, pruner=self._pruner())
+        before = study.get_trials(deepcopy=False)
+        self._memory.add_trials(before)
+        self._seen = len(before)  # trials of the study that are in memory
+        self._name = f"{socket.gethostname()}:{os.getpid()}"
+
+    def next(self) -> Trials | None:
+        """As many trials as train at once, or are missing."""
+        begun: dict[int, Values] = {}
+        while len(begun) < (self._settings.together or 1) and time.monotonic() < self._deadline:
+            ended = self._study.get_trials(deepcopy=False)
+            if len(ended) + len(self.running) >= self._settings.trials:
+                break
+            for trial in ended[self._seen :]:
+                if trial.user_attrs.get(WORKER) != self._name:  # it is of another process or machine
+                    self._memory.add_trial(trial)
+            self._seen = len(ended)
+            taken = {int(trial.user_attrs.get(DRAW, trial.number)) for trial in ended}
+            taken |= {running.user_attrs[DRAW] for running in self.running.values()}
+            draw = next(number for number in itertools.count() if number not in taken)
+            if draw == 0 and self._first is not None:
+                self._memory.enqueue_trial(self._first)
+            self._memory.sampler = self._sampler(draw)
+            new = self._memory.ask(self._spec.space.distributions)
+            new.set_user_attr(DRAW, draw)
+            new.set_user_attr(WORKER, self._name)
+            begun[new.number] = self._spec.space.values(new.params)
+            self.running[new.number] = new
+        return Trials(self._objective, begun) if begun else None
+
+    def answer(self, report: Report) -> bool:
+        """Note a trial's score on its way; returns whether it is to end."""
+        trial = self.running[report.trial]
+        trial.report(report.value, report.step)
+        return report.can_prune and trial.should_prune()
+
+    def end(self, trials: Trials, outcomes: Sequence[Outcome] | None) -> None:
+        """Store how trials ended; None where they have killed too many workers."""
+        killed = Outcome(error="the workers that ran it were killed")
+        for number, outcome in zip(trials.values, outcomes or [killed] * len(trials.values), strict=True):
+            trial = self.running.pop(number)
+            if outcome.seeds:
+                trial.set_user_attr(SEEDS, [dataclasses.asdict(seed) for seed in outcome.seeds])
+            if outcome.error:
+                trial.set_user_attr(ERROR, one_line(outcome.error))
+            states = TrialState.FAIL if outcome.error else TrialState.PRUNED
+            state = states if outcome.value is None else None
+            self._study.add_trial(self._memory.tell(trial, outcome.value, state))
+
+    def _sampler(self, draw: int) -> optuna.samplers.BaseSampler:
+        """Give a draw a random stream of its own, whenever it is drawn; machines differ in theirs.
+
+        So one worker's study is the same whether it was interrupted or not.
+        """
+        place = f"{socket.gethostname()}:{self._spec.folder.absolute()}" if self._settings.storage else ""
+        seed = zlib.crc32(repr((self._settings.sampler_seed, draw, place)).encode())
+        if self._settings.sampler == "random":
+            return optuna.samplers.RandomSampler(seed=seed)
+        return optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True)
+
+    def _pruner(self) -> optuna.pruners.BasePruner:
+        reports = self._settings.reports
+        if self._settings.pruner == "none":
+            return optuna.pruners.NopPruner()
+        if self._settings.pruner == "hyperband":
+            most = reports * self._settings.seeds
+            return optuna.pruners.HyperbandPruner(min_resource=reports, max_resource=most)
+        # Half a seed's budget is given to everybody: until then most have learnt nothing yet.
+        return optuna.pruners.MedianPruner(n_warmup_steps=reports // 2)
