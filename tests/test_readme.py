@@ -44,7 +44,7 @@ def test_the_main_job_prints_what_the_readme_shows(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("word", "extra"),
     [
-        *(("scripts/tune.py", "tune"), ("launcher=joblib", "sweep")),
+        *(("scripts/tune.py", "tune")),
         *(("launcher=slurm", "slurm"), ("launcher=ray", "ray")),
     ],
 )

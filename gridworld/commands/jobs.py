@@ -24,13 +24,13 @@ def main(arguments: Sequence[str]) -> None:
     folder = open_sweep(options.sweep)
     table = JobTable(folder.path)
     entries = folder.entries.values()
-    may_write = os.access(folder.path, os.W_OK)
     with telling_if_slow(f"reading the jobs of {options.sweep}"):
-        rows = table.repair(entries) if may_write else table.inspect(entries)
+        rows = table.inspect(entries, table.read())
+        if os.access(folder.path, os.W_OK):
+            table.write(rows)
     shown = [row for row in rows.values() if options.status in (None, row.status)]
     with_error = {row.job for row in shown if row.error}
-    failed = [entry for entry in entries if entry.job in with_error]
-    verified = table.inspect(failed, by_folders_alone=True)
+    verified = table.inspect([entry for entry in entries if entry.job in with_error], {})
     cells = [_cells(row, verified.get(row.job)) for row in shown]
     for line in aligned(cells, ("<0", "<12", ">9", "<0")):
         print(printable(line))

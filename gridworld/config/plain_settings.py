@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gridworld.config.agents import MISSING, AgentConfig, agent_schemas
-from gridworld.config.composition.setting_names import settings_of_a_run
+from gridworld.config.composition.words import settings_of_a_run
 from gridworld.config.fields import LIBRARIES, Effect, Text
 from gridworld.config.settings import NEWER, effect_of
 from gridworld.config.train import TrainConfig

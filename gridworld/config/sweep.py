@@ -1,4 +1,4 @@
-"""Settings of sweeps and of their launchers: `hydra.sweeper` and `hydra.launcher` on the command line."""
+"""Settings of sweeps and of where their jobs run: `hydra.sweeper` and `hydra.launcher`."""
 
 from __future__ import annotations
 
@@ -20,23 +20,21 @@ class SweepConfig:
     params: dict[str, Any] = field(default_factory=dict)  # settings and their values, as on a command line
     paired: list[Any] = field(default_factory=list)  # swept settings that vary together, or lists of such
     population: Optional[Union[int, str]] = "auto"  # noqa: UP007, UP045  # runs that train as one; 1: each alone
-    together: list[str] = field(default_factory=list)  # the sweeper's own: the jobs of a population
-    in_fork: bool = False  # the sweeper's own: these may run in a fork
 
 
 @dataclass
 class ForksConfig:
-    """`hydra/launcher=forks`, the default: populations side by side in forks of one process, on Linux."""
+    """`hydra/launcher=forks`, the default: populations in forks of the sweep's process, on Linux."""
 
-    _target_: str = "hydra_plugins.gridworld_sweeper.ForksLauncher"
+    _target_: str = "gridworld.sweep.launchers.forks"
     n_jobs: int = -1
 
 
 @dataclass
 class JoblibConfig:
-    """`hydra/launcher=joblib`: a sweep's jobs side by side on this machine; `hydra.launcher` there."""
+    """`hydra/launcher=joblib`: populations in new processes on this machine, on any system."""
 
-    _target_: str = "hydra_plugins.gridworld_sweeper.JoblibLauncher"
+    _target_: str = "gridworld.sweep.launchers.joblib"
     n_jobs: int = -1
 
 
@@ -44,7 +42,7 @@ class JoblibConfig:
 class SlurmConfig:
     """`hydra/launcher=slurm`; all but the first two are submitit's, by its names."""
 
-    _target_: str = "hydra_plugins.gridworld_sweeper.SlurmLauncher"
+    _target_: str = "gridworld.sweep.launchers.slurm"
     jobs_per_task: int = 1
     array_parallelism: int = 256
     timeout_min: int = 60
@@ -63,7 +61,7 @@ class SlurmConfig:
 class RayConfig:
     """`hydra/launcher=ray`."""
 
-    _target_: str = "hydra_plugins.gridworld_sweeper.RayLauncher"
+    _target_: str = "gridworld.sweep.launchers.ray"
     init: dict[str, Any] = field(default_factory=dict)
     remote: dict[str, Any] = field(default_factory=dict)
 

@@ -34,10 +34,7 @@ def sample_episodes(evaluator: Evaluator, policy: FloatArray, episodes: int, see
     """Estimate the scores of a policy (S, A) from episodes; its draws are independent of `seed`."""
     policy = check_policy(evaluator.mdp, policy)
     envs = GridWorldVectorEnv(
-        episodes,
-        max_episode_steps=evaluator.max_episode_steps,
-        autoreset_mode="Disabled",
-        mdp=evaluator.mdp,
+        episodes, max_episode_steps=evaluator.max_episode_steps, autoreset_mode="Disabled", mdp=evaluator.mdp
     )
     actions = independent_generator(seed)  # the environments take the seed's own
     cumulative = policy.cumsum(axis=1)

@@ -62,10 +62,12 @@ def noted(path: Path) -> Iterator[None]:
     """Let `check_ours` look after the folder of a lock's file that exists; nobody is kept out."""
     where = Path(os.path.abspath(path))
     before = _held.get(where)
-    _held[where] = os.lstat(path).st_ino
+    file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)  # while it is open, no other file gets its inode
+    _held[where] = os.fstat(file).st_ino
     try:
         yield
     finally:
+        os.close(file)
         if before is None:
             del _held[where]
 

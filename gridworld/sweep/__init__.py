@@ -1,17 +1,16 @@
-"""Sweeps: many runs by one command line, in one folder, which the same command line goes on with.
+"""Sweeps: many runs by one command line, in one folder, which the same command line resumes.
 
-    plan.py          a command line -> its jobs, each with a folder's name and a hash of its settings
-    config_loader.py composes the jobs' configurations
-    folder.py        the sweep's folder: sweep.json, and the lock of the process that runs the sweep
-    job_table.py     jobs.csv: how each job stands, repaired by the jobs' own folders
-    job.py           one job, in the process that the launcher runs it in
-    console.py       terminal output at the start and at the end
-    progress.py      the progress line on the terminal
-    sweeper.py       a sweep from its command line to its exit code
-    population.py    the jobs that train together, or in forks
-    launchers/       which launcher runs the jobs (select.py); on_forks.py, on_joblib.py, ...; worker.py
-    hydra_plugin.py  the plugins for Hydra
+    plan.py            a command line -> its jobs, each with a folder's name and a hash of its settings
+    configurations.py  the jobs' configurations
+    folder.py          the sweep's folder: sweep.json, and the lock of the process that runs the sweep
+    job_table.py       jobs.csv, made of the jobs' folders
+    sweeper.py         a sweep from its command line to its exit code
+    grouping.py        which jobs train together
+    launchers/         where they run: local.py, slurm.py, ray.py
+    worker.py, job.py  a population, and one job, in the process that they run in
+    console.py         terminal output; results.py: its table of results
+    hydra_plugin.py    the plugin for Hydra
 
 The jobs' folders decide: a run's manifest says how it ended, and a lock that ends with its process says that
-it is running. The table follows from these, so that it can be repaired after a kill.
+it is running. The table follows from these.
 """

@@ -1,31 +1,26 @@
-"""jobs.csv: a row per job. Whoever starts or ends a job rewrites the table, whole and under a lock.
-
-A process that is killed cannot write its last row; so the table is repaired, by the jobs' manifests and
-locks, whenever a sweep starts or ends and whenever it is shown.
-"""
+"""jobs.csv: a row per job, made of the jobs' own folders: their manifests and locks."""
 
 from __future__ import annotations
 
 import csv
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from gridworld.errors import InputError
-from gridworld.run.folder import LOCK
+from gridworld.run.folder import ERROR_FILE, LOCK
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import RunReader, find_run
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.csv_text import csv_rows, csv_text
-from gridworld.storage.file_lock import is_locked, locked
-from gridworld.storage.safe_read import read_table
+from gridworld.storage.file_lock import is_locked
+from gridworld.storage.safe_read import LARGEST_JSON, read_bytes, read_table
 from gridworld.sweep.folder import JobEntry
 
 JOBS_CSV = "jobs.csv"
-TABLE_LOCK = ".jobs.lock"
 PENDING, RUNNING, DONE, FAILED, INTERRUPTED = STATUSES = (
     "pending",
     "running",
@@ -38,7 +33,7 @@ _OF_A_RUN = {"finished": DONE, "failed": FAILED}  # by the manifest's status; an
 
 @dataclass(frozen=True)
 class JobRow:
-    """How a job stands, as jobs.csv has it."""
+    """A job's row in jobs.csv."""
 
     job: str  # its folder
     overrides: str
@@ -46,6 +41,9 @@ class JobRow:
     seconds: str = ""
     objective: str = ""  # the final greedy policy's regret
     error: str = ""  # why it failed, in one line
+
+
+_COLUMNS = [field.name for field in dataclasses.fields(JobRow)]
 
 
 class JobTable:
@@ -65,56 +63,29 @@ class JobTable:
             return {}
         return {line[0]: JobRow(*line) for line in lines[1:] if len(line) == len(_COLUMNS)}
 
-    def row(self, job: str) -> JobRow | None:
-        """The job's row in the file."""
-        found = self._find(job)
-        return self.read().get(job) if found is None else found[1]
+    def row(self, job: str) -> JobRow:
+        """The row of one job as its folder has it."""
+        return self._inspect(JobEntry(job, "", ()), None)
 
-    def set(self, job: str, **changes: str) -> None:
-        """Change fields of a job's row. Other rows are copied unread: reading ten thousand takes 0.1 s."""
-        with locked(self.folder / TABLE_LOCK):
-            found = self._find(job)
-            if found is not None:
-                text, row, place = found
-                line = csv_text([dataclasses.astuple(dataclasses.replace(row, **changes))])
-                write_text(self.file, text[: place.start] + line + text[place.stop :])
-                return
-            rows = self.read()
-            rows[job] = dataclasses.replace(rows.get(job, JobRow(job, "")), **changes)
-            self._write(rows.values())
-
-    def _find(self, job: str) -> tuple[str, JobRow, slice] | None:
-        """(the file's text, the job's row, where in the text its line is); None if it is not that simple."""
-        try:
-            text = read_table(self.file)
-            start = text.find("\n" + csv_text([[job, ""]])[:-1]) + 1
-            stop = text.find("\n", start) + 1
-            fields = next(csv_rows(text[start:stop]), [])
-        except (InputError, csv.Error):
-            return None
-        if not start or not stop or not text.startswith(csv_text([_COLUMNS])) or len(fields) != len(_COLUMNS):
-            return None
-        return text, JobRow(*fields), slice(start, stop)
-
-    def repair(self, entries: Iterable[JobEntry]) -> dict[str, JobRow]:
-        """Write the rows of these jobs anew, as `inspect` returns them."""
-        with locked(self.folder / TABLE_LOCK):
-            rows = self.inspect(entries)
-            self._write(rows.values(), durable=True)
-        return rows
-
-    def inspect(self, entries: Iterable[JobEntry], by_folders_alone: bool = False) -> dict[str, JobRow]:
+    def inspect(
+        self,
+        entries: Iterable[JobEntry],
+        before: Mapping[str, JobRow],
+        ended: Mapping[str, JobRow] | None = None,
+    ) -> dict[str, JobRow]:
         """The rows as they should be.
 
         Args:
             entries: the jobs.
-            by_folders_alone: leave out what only the file says, such as the error of a job that never began.
-
-        Returns:
-            Each job's row, by its folder's name.
+            before: rows with reasons that no folder has: of a mistake in the settings, or of a full disk.
+            ended: rows that cannot change any more.
         """
-        before = {} if by_folders_alone else self.read()
-        return {entry.job: self._inspect(entry, before.get(entry.job)) for entry in entries}
+        known = ended or {}
+        return {e.job: known.get(e.job) or self._inspect(e, before.get(e.job)) for e in entries}
+
+    def write(self, rows: Mapping[str, JobRow]) -> None:
+        """Write the file anew."""
+        write_text(self.file, csv_text([_COLUMNS, *map(dataclasses.astuple, rows.values())]))
 
     def _inspect(self, entry: JobEntry, before: JobRow | None) -> JobRow:
         folder = self.folder / entry.job
@@ -124,27 +95,22 @@ class JobTable:
             status = PENDING if run is None else _OF_A_RUN.get(run.manifest["status"], INTERRUPTED)
             if status in (PENDING, INTERRUPTED) and is_locked(folder / LOCK):
                 return dataclasses.replace(row, status=RUNNING)
-            if run is not None:
-                row = dataclasses.replace(row, status=status, **outcome(run))
-            elif before is not None and before.status == FAILED:  # it never came to a manifest
-                return dataclasses.replace(row, status=FAILED, seconds=before.seconds, error=before.error)
-            if status == DONE and run is not None and (error := _other_job(run.manifest, entry)):
-                return dataclasses.replace(row, status=FAILED, objective="", error=error)
-        except InputError as error:  # a damaged file counts as a failed run's
-            return dataclasses.replace(row, status=FAILED, error=one_line(error))
-        if before is not None and before.status == status and not row.error:
-            return dataclasses.replace(row, error=before.error)  # the disk was too full for the manifest
-        return row
-
-    def _write(self, rows: Iterable[JobRow], durable: bool = False) -> None:
-        write_text(self.file, csv_text([_COLUMNS, *map(dataclasses.astuple, rows)]), durable)
+            if run is None:
+                reason = _first_line(folder / ERROR_FILE)
+                if before is not None and not reason and before.status in (FAILED, PENDING):
+                    return dataclasses.replace(row, status=before.status, error=before.error)
+                return dataclasses.replace(row, status=FAILED if reason else PENDING, error=reason)
+            row = dataclasses.replace(row, status=status, **_outcome(run))
+            if status == DONE and (other := _other_job(run.manifest, entry)):
+                return dataclasses.replace(row, status=FAILED, objective="", error=other)
+        except InputError as damage:  # a damaged file counts as a failed run's
+            return dataclasses.replace(row, status=FAILED, error=one_line(damage))
+        keeps = before is not None and before.status == status and not row.error
+        return dataclasses.replace(row, error=before.error) if before is not None and keeps else row
 
 
-_COLUMNS = [field.name for field in dataclasses.fields(JobRow)]
-
-
-def outcome(run: RunReader) -> dict[str, str]:
-    """The seconds, objective and error of a run that ended, as far as it has them, for its row."""
+def _outcome(run: RunReader) -> dict[str, str]:
+    """The seconds, objective and error of a run that ended, as far as it has them."""
     found = {"error": one_line(run.manifest.get("error", ""))}
     try:
         started, ended = (datetime.fromisoformat(run.manifest[key]) for key in ("started", "ended"))
@@ -161,13 +127,19 @@ def outcome(run: RunReader) -> dict[str, str]:
 def _other_job(manifest: dict[str, Any], entry: JobEntry) -> str:
     """Why a finished run in the job's folder is not the job's result; "" if it is."""
     try:
-        if settings_hash(manifest["config"], "\n".join(manifest["layout"])) == entry.hash:
+        if entry.hash in ("", settings_hash(manifest["config"], "\n".join(manifest["layout"]))):
             return ""
         lengths = [again["total_timesteps"] for again in manifest["resumed"] if "total_timesteps" in again]
     except (KeyError, TypeError, AttributeError):
         lengths = []
     what = f"was made {lengths[-1]} steps long" if lengths else "has other settings than the job"
     return f"the run in {entry.job} {what}, so that it is not this job's result; move it to keep it"
+
+
+def _first_line(file: Path) -> str:
+    if not file.exists():
+        return ""
+    return one_line(read_bytes(file, LARGEST_JSON).decode(errors="replace").partition("\n")[0])
 
 
 def run_status(folder: Path) -> str:

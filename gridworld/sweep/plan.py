@@ -43,7 +43,7 @@ class Job:
     swept: tuple[str, ...]  # those of the overrides that were given several values
     hash: str  # of the settings that matter
     mistake: str | None  # what is wrong with the settings, as far as it is known before training
-    progress: bool  # whether its settings ask for a progress line
+    config: TrainConfig
     shape: str | None = None  # equal for jobs that can train as one population; None: it trains alone
     memory: int = 0  # bytes, about, that it takes while it trains
     in_fork: bool = False  # whether it may run in a fork of the process that plans it
@@ -53,16 +53,15 @@ class Job:
 def expand(
     words: Sequence[str], loader: ConfigLoader, most: int, paired: Sequence[Any] = ()
 ) -> list[tuple[list[str], list[str]]]:
-    """Expand a command line into the overrides of every job.
+    """Expand a command line to (overrides, the swept ones among them) of every job.
+
+    The last key changes fastest.
 
     Args:
         words: the command line's overrides.
         loader: Hydra's, which knows the groups that `glob` chooses from.
         most: how many jobs are allowed.
         paired: keys whose values vary together, or groups of such keys.
-
-    Returns:
-        (overrides, the swept ones among them) of every job, the last key changing fastest.
     """
     columns: dict[str, tuple[bool, list[str]]] = {}
     for override in OverridesParser.create(config_loader=loader).parse_overrides(list(words)):
@@ -136,18 +135,7 @@ def _values(override: Override) -> list[str]:
 def plan(
     jobs: Iterable[tuple[list[str], list[str]]], configure: Callable[[Sequence[str]], TrainConfig]
 ) -> list[Job]:
-    """Compose and check the jobs.
-
-    Args:
-        jobs: (overrides, the swept ones among them) of each.
-        configure: composes overrides to a configuration.
-
-    Returns:
-        The jobs, each once, with their hashes and mistakes.
-
-    Raises:
-        Exception: what `configure` raises.
-    """
+    """Compose and check the jobs, each once; `jobs` has (overrides, the swept ones among them) of each."""
     worlds: dict[str, Mdp] = {}
 
     def world(env: EnvConfig) -> Mdp:
@@ -165,46 +153,36 @@ def plan(
         return known.get(key, ())
 
     planned: dict[str, Job] = {}
-    for overrides, swept in jobs:
-        config, overrides = _configured(overrides, configure, world)
-        told: tuple[str, ...] = ()
+    for given, swept in jobs:
+
+        def compose(words: list[str], given: list[str] = given) -> TrainConfig:
+            return configure([*given, *words])
+
+        config, chosen = with_preset(compose([]), given, compose, world)
+        said: tuple[str, ...] = ()
         mistake, layout, memory = None, "", 0
         try:
             mdp = check_settings(config, world)
-            layout, memory = (
-                mdp.text(),
-                config.agent.memory(mdp.num_states, config.n_envs, config.total_timesteps),
-            )
-            told = noted(config, mdp)
+            layout, said = mdp.text(), noted(config, mdp)
+            memory = config.agent.memory(mdp.num_states, config.n_envs, config.total_timesteps)
         except InputError as error:
             mistake = str(error)
         digest = settings_hash(dataclasses.asdict(config), layout)
-        progress = config.logging.progress
-        job = Job(
-            tuple(overrides),
-            tuple(swept),
+        planned.setdefault(
             digest,
-            mistake,
-            progress,
-            shape=shape(config),
-            memory=memory,
-            in_fork=_in_fork(config),
-            notes=told,
+            Job(
+                overrides=(*given, *chosen),
+                swept=tuple(swept),
+                hash=digest,
+                mistake=mistake,
+                config=config,
+                shape=shape(config),
+                memory=memory,
+                in_fork=_in_fork(config),
+                notes=said,
+            ),
         )
-        planned.setdefault(digest, job)
     return list(planned.values())
-
-
-def _configured(
-    overrides: list[str], configure: Callable[[Sequence[str]], TrainConfig], world: Callable[[EnvConfig], Mdp]
-) -> tuple[TrainConfig, list[str]]:
-    """A job's configuration, and its overrides with the preset that its world asks for."""
-
-    def compose(words: list[str]) -> TrainConfig:
-        return configure([*overrides, *words])
-
-    config, chosen = with_preset(configure(overrides), overrides, compose, world)
-    return config, [*overrides, *chosen]
 
 
 def _in_fork(config: TrainConfig) -> bool:
@@ -218,16 +196,8 @@ def shape(config: TrainConfig) -> str | None:
     """What must be equal for runs to train as one population; None: it trains alone."""
     if config.agent.shape is None or has_own_code(config.callbacks):
         return None
-    return repr(
-        (
-            config.agent.shape,
-            config.n_envs,
-            config.device,
-            config.threads,
-            config.observation,
-            config.callbacks,
-        )
-    )
+    same = (config.n_envs, config.device, config.threads, config.observation, config.callbacks)
+    return repr((config.agent.shape, *same))
 
 
 def folder_name(job: Job, taken: Collection[str], common: Collection[str] = ()) -> str:

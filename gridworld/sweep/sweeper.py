@@ -1,66 +1,53 @@
-"""A sweep from its command line to its exit code, around whichever of Hydra's launchers runs the jobs."""
+"""A sweep from its command line to its exit code."""
 
 from __future__ import annotations
 
-import errno
+import contextlib
 import os
 import signal
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 
-from hydra.core.utils import JobReturn, JobStatus
-from hydra.plugins.launcher import Launcher
+from hydra.types import HydraContext
 from omegaconf import DictConfig
 
-from gridworld.config.composition.words import with_whole_numbers
+from gridworld.config.composition.words import prepared
 from gridworld.config.sweep import SweepConfig
-from gridworld.errors import EXIT_CODE, FolderLostError, InputError, reason
+from gridworld.errors import EXIT_CODE, FolderLostError, InputError
+from gridworld.process.console.progress import ProgressLine, time_left
 from gridworld.process.console.terminal import tell, tell_error
+from gridworld.process.parallel.machine import worker_count
+from gridworld.process.parallel.processes import LostError
 from gridworld.process.signals import exiting, signal_name
+from gridworld.run.folder import MANIFEST
 from gridworld.sweep import console
-from gridworld.sweep.config_loader import Configurations, SweepLoader
-from gridworld.sweep.folder import JobEntry, SweepFolder
+from gridworld.sweep.configurations import Configurations
+from gridworld.sweep.folder import STOP, SweepFolder
+from gridworld.sweep.grouping import populations, runs_in_turn
 from gridworld.sweep.job import StopSweep, mark_failed
-from gridworld.sweep.job_table import (
-    DONE,
-    FAILED,
-    INTERRUPTED,
-    PENDING,
-    RUNNING,
-    JobRow,
-    JobTable,
-    one_line,
-    run_status,
-)
+from gridworld.sweep.job_table import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, JobRow, JobTable
+from gridworld.sweep.launchers import Group, Launch, launcher_settings, local
 from gridworld.sweep.plan import Job, expand, plan
-from gridworld.sweep.population import lines, may_fork, populations
-from gridworld.sweep.progress import sweep_progress
+from gridworld.sweep.worker import SweepJob, Worker, shared_part
 
 _ORPHANS_END_WITHIN = 5.0  # seconds; workers of a sweep that was killed
-_STOPPED_END_WITHIN = 2.5  # seconds; those of one that is being stopped
 _POLL_SECONDS = 0.1
+_SECONDS_BETWEEN_LOOKS = 0.5
 _MOST_NOTES = 4  # that are printed before the jobs begin
-_STOP_WITHIN = 4.0  # seconds after a signal
-_DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT)
+_OURS = 1  # of Hydra's callbacks
+_SHARE_OF_TIME = 30  # looking after the jobs takes at most one thirtieth of it
 
 
-def run_sweep(
-    words: list[str],
-    loader: SweepLoader,
-    launcher: Launcher,
-    master: DictConfig,
-    settings: SweepConfig,
-) -> None:
+def run_sweep(words: list[str], context: HydraContext, master: DictConfig, settings: SweepConfig) -> None:
     """Run the jobs that are asked for and not done yet.
 
     Args:
         words: the command line's overrides.
-        loader: composes the jobs' configurations.
-        launcher: runs the jobs.
+        context: Hydra's.
         master: the configuration of the sweep itself.
         settings: how to run it.
 
@@ -69,15 +56,17 @@ def run_sweep(
         SystemExit: not all jobs are done.
     """
     folder = SweepFolder(Path(master.hydra.sweep.dir))
-
-    def divided(by_name: dict[str, Job], to_do: list[JobEntry]) -> list[list[JobEntry]]:
-        return populations([(entry, by_name[entry.job]) for entry in to_do], settings, master.hydra)
-
+    launcher, own = launcher_settings(master)
+    divide = partial(populations, settings=settings, launcher=launcher, own=own, hydra=master.hydra)
+    divide([])  # finds a mistake
     words = [*_of_yaml(settings), *words]  # a word of the command line comes later, and counts
+    loader = context.config_loader
     jobs = plan(expand(words, loader, settings.max_jobs, settings.paired), Configurations(loader, master))
-    _refuse_mistakes(jobs, settings)
+    mistaken = [job for job in jobs if job.mistake is not None]
+    if len(mistaken) == len(jobs) or (mistaken and settings.stop_at_first_failure):
+        share = f" ({len(mistaken)} of {len(jobs)} jobs cannot run)" if len(jobs) > 1 else ""
+        raise InputError(f"{mistaken[0].mistake}{share}")
     folder.check(jobs, settings.extend)
-    populations([], settings, master.hydra)  # finds a mistake
     counts = Counter(note for job in jobs for note in job.notes)
     for note, count in counts.most_common(_MOST_NOTES):
         tell(f"{note} ({count} of {len(jobs)} jobs)")
@@ -85,12 +74,26 @@ def run_sweep(
         tell(f"and {len(counts) - _MOST_NOTES} more notes on other jobs")
     try:
         with folder.at_work():
-            entries = folder.add(jobs, words)
-            mistakes = {e.job: job.mistake for e, job in zip(entries, jobs, strict=True) if job.mistake}
-            by_name = {entry.job: job for entry, job in zip(entries, jobs, strict=True)}
-            in_fork = may_fork(zip(entries, jobs, strict=True), settings, master.hydra)
-            sweep = _Sweep(folder, entries, launcher, partial(divided, by_name), in_fork)
-            code = sweep.run(mistakes, settings.retry_failed, any(job.progress for job in jobs))
+            callbacks = context.callbacks if len(master.hydra.callbacks) > _OURS else None
+            here = folder.path.absolute()
+            worker = Worker(here, os.getcwd(), shared_part(master, here), callbacks)
+            in_turn = callbacks is not None or runs_in_turn(settings, master.hydra)
+            in_processes = launcher == "joblib" and not settings.stop_at_first_failure
+            may_fork = {job.hash for job in jobs if job.in_fork and not in_turn and launcher == "forks"}
+
+            def run(launch: Launch, is_second: bool) -> None:
+                if launcher in ("slurm", "ray"):
+                    import_module(f"gridworld.sweep.launchers.{launcher}").run(launch, own)
+                    return
+                local.run(
+                    launch,
+                    worker_count(own.get("n_jobs", 1)),
+                    launcher == "forks",
+                    lambda group: in_processes or group[0].hash in may_fork,
+                    least=1 if is_second or in_processes else 2,
+                )
+
+            code = _Sweep(folder, jobs, words, worker).run(run, divide, settings.retry_failed)
     except ConnectionError:
         raise  # from a cluster, not from a disk
     except OSError as error:
@@ -110,148 +113,138 @@ def _of_yaml(settings: SweepConfig) -> list[str]:
             raise InputError(
                 f"hydra.sweeper.params.{key}: must be text as on the command line, such as 0,1 or range(3)"
             )
-    return with_whole_numbers([f"{key}={value}" for key, value in settings.params.items()])
-
-
-def _refuse_mistakes(jobs: Sequence[Job], settings: SweepConfig) -> None:
-    mistaken = [job for job in jobs if job.mistake is not None]
-    if len(mistaken) == len(jobs) or (mistaken and settings.stop_at_first_failure):
-        count = f" ({len(mistaken)} of {len(jobs)} jobs cannot run)" if len(jobs) > 1 else ""
-        raise InputError(f"{mistaken[0].mistake}{count}")
+    return prepared([f"{key}={value}" for key, value in settings.params.items()])
 
 
 class _Sweep:
-    """The jobs that are asked for in this folder, and the launcher that runs them."""
+    """The jobs that are asked for in this folder, and what is known of them."""
 
     def __init__(
-        self,
-        folder: SweepFolder,
-        entries: list[JobEntry],
-        launcher: Launcher,
-        divided: Callable[[list[JobEntry]], list[list[JobEntry]]],
-        in_fork: set[str],
+        self, folder: SweepFolder, jobs: Sequence[Job], words: Sequence[str], worker: Worker
     ) -> None:
         self._folder = folder
-        self._entries = entries
-        self._launcher = launcher
-        self._divided = divided  # into populations
-        self._in_fork = in_fork  # the jobs that may run in a fork
+        self._jobs = jobs
+        self._worker = worker
+        self._names = {entry.hash: entry.job for entry in folder.add(jobs, words)}
         self._table = JobTable(folder.path)
-        self._launcher_failed = False  # before any job had begun
+        self._line = ProgressLine(any(job.config.logging.progress for job in jobs))
+        self._rows: dict[str, JobRow] = {}
+        # Rows with what no folder says: mistakes in the settings, a full disk.
+        self._before = {job: row for job, row in self._table.read().items() if row.status == FAILED}
+        for job in jobs:
+            if job.mistake:
+                self._before[self._names[job.hash]] = JobRow("", "", FAILED, error=job.mistake)
+        self._lost: dict[str, str] = {}  # why a process was lost, by the hashes of its jobs
+        self._begun = 0
+        self._started = self._due = time.monotonic()
+        self._ended_before = 0
 
-    def _to_do(self, mistakes: dict[str, str], retry_failed: bool) -> list[JobEntry]:
-        """The jobs to run now. Those with a mistake are noted as failed."""
-        rows = self._repair()
-        for job, mistake in mistakes.items():
-            if rows[job].status != DONE:
-                self._table.set(job, status=FAILED, error=mistake)
+    def run(
+        self,
+        run: Callable[[Launch, bool], None],
+        divide: Callable[[Sequence[Job]], list[list[Job]]],
+        retry_failed: bool,
+    ) -> int:
+        """Run the jobs to do, and print how they ended; returns the exit code."""
+        self._look(_ORPHANS_END_WITHIN)
         statuses = {PENDING, INTERRUPTED} | ({FAILED} if retry_failed else set())
-        return [e for e in self._entries if rows[e.job].status in statuses and e.job not in mistakes]
-
-    def run(self, mistakes: dict[str, str], retry_failed: bool, progress: bool) -> int:
-        """Launch the jobs to do, and print how they ended; returns the exit code."""
-        to_do = self._to_do(mistakes, retry_failed)
-        started = time.monotonic()
-        names = [entry.job for entry in self._entries]
-        rows = self._table.inspect(self._entries)
-        console.tell_start(self._folder.path, [rows[name] for name in names], len(to_do))
+        to_do = [job for job in self._jobs if not job.mistake and self._row(job).status in statuses]
+        self._ended_before = len(self._jobs) - len(to_do)
+        console.tell_start(self._folder.path, [self._row(job) for job in self._jobs], len(to_do))
         stopped, code = "", 0
         received: list[int] = []  # signals; Ray may change the exception that one raises
-
-        def end_soon(number: int) -> None:
-            received.append(number)
-            _exit_within(_STOP_WITHIN, 128 + number)
-
         try:
-            with (
-                exiting(signal.SIGINT, signal.SIGTERM, first=end_soon),
-                sweep_progress(self._table, names, len(names) - len(to_do), progress),
-            ):
-                self._launch(to_do)
+            with exiting(signal.SIGINT, signal.SIGTERM, first=received.append):
+                if to_do:
+                    run(self._launch(divide(to_do)), False)
+                if self._lost:
+                    self._run_lost(run, to_do)
         except StopSweep:
             stopped = "stopped at the first failure"
         except SystemExit as end:
             code = 128 + received[0] if received else end.code if isinstance(end.code, int) else 1
             stopped = f"stopped by {signal_name(code - 128)}" if code > 128 else "stopped"
-            _exit_within(_STOP_WITHIN, code)
-        rows = self._repair(_STOPPED_END_WITHIN if stopped else _ORPHANS_END_WITHIN)
-        asked = [rows[name] for name in names]
-        console.tell_end(self._folder.path, asked, time.monotonic() - started, stopped, mistakes)
-        return code or int(any(row.status != DONE for row in asked))
+        finally:
+            self._line.clear()
+        self._look(_ORPHANS_END_WITHIN)
+        rows = {self._names[job.hash]: self._row(job) for job in self._jobs}
+        seconds = time.monotonic() - self._started
+        mistaken = [self._names[job.hash] for job in self._jobs if job.mistake]
+        console.tell_end(self._folder.path, list(rows.values()), seconds, stopped, mistaken)
+        return code or int(any(row.status != DONE for row in rows.values()))
 
-    def _launch(self, to_do: list[JobEntry]) -> None:
-        """Run the jobs; where the launcher loses one's process, it is launched again for the others."""
-        batches, count = [to_do], 0
-        while batches:
-            batch = batches.pop(0)
-            if not batch:
-                continue
-            groups = self._divided(batch)
-            try:
-                jobs = lines(self._folder.path, groups, count, self._in_fork)
-                results = self._launcher.launch(jobs, count)
-            except Exception as error:
-                batches = self._after_a_crash(batch, error) + batches
-            else:
-                self._settle(groups, results)
-            count += len(batch)
+    def _run_lost(self, run: Callable[[Launch, bool], None], to_do: Sequence[Job]) -> None:
+        """Run again, each by itself, what was at work in a lost process; what is lost again has failed."""
+        self._look(_ORPHANS_END_WITHIN)
+        lost, self._lost = self._lost, {}
+        again = [job for job in to_do if job.hash in lost and self._row(job).status in (PENDING, INTERRUPTED)]
+        run(self._launch([[job] for job in again]), True)
+        self._look(_ORPHANS_END_WITHIN)
+        for job in again:
+            if job.hash in self._lost and self._row(job).status in (PENDING, INTERRUPTED):
+                why = f"its process was lost ({self._lost[job.hash]})"
+                mark_failed(self._folder.path / self._names[job.hash], why)
 
-    def _after_a_crash(self, batch: list[JobEntry], error: Exception) -> list[list[JobEntry]]:
-        """The batches left to launch: first what had not begun, then, one by one, what was running.
+    def _launch(self, groups: Sequence[Sequence[Job]]) -> Launch:
+        folder = self._folder.path.absolute()
+        found: list[list[SweepJob]] = []
+        for group in groups:
+            found.append([])
+            for job in group:
+                row = self._rows.pop(self._names[job.hash])
+                self._before.pop(row.job, None)
+                replaces = row.status == FAILED
+                path = folder / row.job
+                own = SweepJob(path, self._begun, job.hash, job.config, job.overrides, replaces)
+                found[-1].append(own)
+                self._begun += 1
+        return Launch(self._worker, found, folder / STOP, self._note, self._tick)
 
-        One of the latter ended its process, and perhaps the others'. Run alone, it shows which.
-        """
-        rows = self._repair()
-        pending = [entry for entry in batch if rows[entry.job].status == PENDING]
-        died = [entry for entry in batch if rows[entry.job].status == INTERRUPTED]
-        if isinstance(error, OSError) and error.errno in _DISK_IS_FULL:
-            raise error
-        if len(batch) == 1:
-            for entry in pending + died:
-                self._fail(entry, f"its process was lost ({type(error).__name__})")
-            return []
-        if len(pending) == len(batch):
-            if self._launcher_failed or isinstance(error, InputError):
-                raise error  # the launcher itself does not work
-            self._launcher_failed = True  # perhaps one worker was killed before its first job
-            return [pending]
-        return [pending, *([entry] for entry in died)]
+    def _note(self, jobs: Group, errors: list[str] | LostError) -> None:
+        if isinstance(errors, LostError):
+            self._lost |= dict.fromkeys([job.hash for job in jobs], str(errors))
+            return
+        for job, error in zip(jobs, errors, strict=False):  # there are fewer where it was told to stop
+            if error:
+                status = INTERRUPTED if (job.folder / MANIFEST).exists() else PENDING
+                self._before[job.folder.name] = JobRow("", "", status, error=error)
 
-    def _settle(self, groups: list[list[JobEntry]], results: Sequence[JobReturn]) -> None:
-        """Note the launcher's results of jobs that could write none themselves.
+    def _row(self, job: Job) -> JobRow:
+        return self._rows[self._names[job.hash]]
 
-        A job that was told to stop, or did not come to its turn, stays as it is for the next start.
-        """
-        rows = self._repair()  # the table itself may have been edited meanwhile, or deleted
-        of_jobs = ((entry, result) for group, result in zip(groups, results, strict=True) for entry in group)
-        for entry, result in of_jobs:
-            row = rows[entry.job]
-            if row.status not in (PENDING, INTERRUPTED):
-                continue
-            if isinstance(result._return_value, OSError):
-                self._table.set(entry.job, error=one_line(reason(result._return_value)))
-            elif result.status is not JobStatus.UNKNOWN:
-                if not row.error:
-                    self._fail(entry, f"it did not run ({result._return_value})")
-            elif run_status(self._folder.path / entry.job) == "running":
-                self._fail(entry, f"its process was lost ({result._return_value})")
-
-    def _fail(self, entry: JobEntry, reason: str) -> None:
-        mark_failed(self._folder.path / entry.job, reason)
-        self._table.set(entry.job, status=FAILED, error=reason)
-
-    def _repair(self, within: float = _ORPHANS_END_WITHIN) -> dict[str, JobRow]:
-        """Repair the table once workers that lost their sweep have ended, `within` so many seconds."""
+    def _look(self, within: float) -> None:
+        """Write the table once workers that lost their sweep have ended, `within` so many seconds."""
         end = time.monotonic() + within
-        entries = self._folder.entries.values()
         while True:
-            rows = self._table.repair(entries)
-            if time.monotonic() >= end or all(row.status != RUNNING for row in rows.values()):
-                return rows
+            self._rows = self._table.inspect(self._folder.entries.values(), self._before)
+            if time.monotonic() >= end or all(row.status != RUNNING for row in self._rows.values()):
+                break
             time.sleep(_POLL_SECONDS)
+        self._table.write(self._rows)
 
+    def _tick(self) -> None:
+        """Write the table anew, and the line on the terminal, once in a while."""
+        began = time.monotonic()
+        if began < self._due:
+            return
+        ended = {job: row for job, row in self._rows.items() if row.status in (DONE, FAILED)}
+        with contextlib.suppress(OSError, FolderLostError):
+            rows = self._table.inspect(self._folder.entries.values(), self._before, ended)
+            if rows != self._rows:
+                self._table.write(rows)
+            self._rows = rows
+            counts = Counter(self._row(job).status for job in self._jobs)
+            self._line.show(lambda: self._text(counts))
+        self._due = time.monotonic() + max(
+            _SECONDS_BETWEEN_LOOKS, _SHARE_OF_TIME * (time.monotonic() - began)
+        )
 
-def _exit_within(seconds: float, code: int) -> None:
-    timer = threading.Timer(seconds, os._exit, (code,))
-    timer.daemon = True
-    timer.start()
+    def _text(self, counts: Counter[str]) -> str:
+        ended = counts[DONE] + counts[FAILED]
+        failed = f", {counts[FAILED]} failed" if counts[FAILED] else ""
+        left = time_left(
+            ended - self._ended_before, len(self._jobs) - ended, time.monotonic() - self._started
+        )
+        return (
+            f"sweep: {counts[DONE]} of {len(self._jobs)} jobs done, {counts[RUNNING]} running{failed}{left}"
+        )

@@ -12,6 +12,7 @@ from typing import Any
 import optuna
 from optuna.trial import FrozenTrial
 
+from gridworld.config.composition.compose import search_path
 from gridworld.config.composition.recipe_file import TRUST, overrides
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
@@ -37,7 +38,7 @@ from gridworld.tune.objective import ERROR, with_values
 from gridworld.tune.recipe import write_recipe
 from gridworld.tune.search import in_reach, open_study, search, study_url
 from gridworld.tune.study_folder import at_work_in, check_study_folder, claim, is_claimed, write_study
-from gridworld.tune.study_spec import StudySpec, search_path
+from gridworld.tune.study_spec import StudySpec
 from gridworld.tune.workers import SearchError, Workers
 
 

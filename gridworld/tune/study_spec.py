@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-import hydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
@@ -23,9 +21,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from gridworld.config.composition.compose import register_schemas, slug, without_hydra
+from gridworld.config.composition.compose import (
+    compose_whole,
+    register_schemas,
+    search_path,
+    slug,
+    without_hydra,
+)
 from gridworld.config.composition.hydra_errors import sentence
-from gridworld.config.composition.loader import composing_from
 from gridworld.config.composition.recipe_file import CHOSEN, with_recipe
 from gridworld.config.train import AUTO, TrainConfig, check_bounds
 from gridworld.config.tune import TuneConfig
@@ -39,7 +42,6 @@ from gridworld.tune.search_space import SearchSpace
 _KNOWN = {"sampler": ("tpe", "random"), "pruner": ("median", "hyperband", "none")}
 _LARGEST_SEED = 2**32
 _TRIALS_AT_ONCE = 8  # over all workers; the sampler knows nothing of those that have not ended
-_PLAIN = re.compile(r"[\w./:-]+")  # what Hydra takes without quotes
 
 
 @dataclass(frozen=True)
@@ -129,19 +131,9 @@ def compose_in(folders: ConfFolders, name: str, overrides: Sequence[Override | s
     lines = [str(each.input_line) if isinstance(each, Override) else each for each in overrides]
     if folders.own:
         lines.append(search_path(folders.own))
-    with (
-        warnings.catch_warnings(),
-        composing_from(folders.conf.absolute()),
-    ):
+    with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)  # a folder that is not there
-        return hydra.compose(name, lines, return_hydra_config=True)
-
-
-def search_path(folders: Sequence[Path]) -> str:
-    """The override by which Hydra searches these folders too."""
-    places = [f"file://{folder.resolve()}" for folder in folders]
-    quoted = [place if _PLAIN.fullmatch(place) else f"'{place}'" for place in places]
-    return f"hydra.searchpath=[{','.join(quoted)}]"
+        return compose_whole(folders.conf.absolute(), name, lines)[0]
 
 
 def _divide(words: Sequence[str]) -> tuple[list[Override], list[Override]]:

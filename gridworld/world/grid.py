@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from os import PathLike
+from typing import Any
 
 import numpy as np
 
@@ -78,7 +79,11 @@ def compile_mdp(
     slip = finite("slip", slip)
     if not 0 <= slip <= 1:
         raise InputError(f"slip={slip}: must be a probability, from 0 to 1")
-    rewards = {"step_reward": step_reward, "goal_reward": goal_reward, "trap_reward": trap_reward}
+    rewards: dict[str, Any] = {
+        "step_reward": step_reward,
+        "goal_reward": goal_reward,
+        "trap_reward": trap_reward,
+    }
     rewards = {key: checked_reward(key, value) for key, value in rewards.items()}
     step_reward, goal_reward, trap_reward = rewards.values()
     if layout.cliffs and trap_reward > 0:

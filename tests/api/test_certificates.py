@@ -527,11 +527,7 @@ def test_a_predict_of_its_own_is_what_is_scored() -> None:
     assert differ
     with pytest.raises(InputError, match=r"has its own predict\(\), so the distribution"):
         gridworld.evaluate(rotating, deterministic=False)
-    for kind, told in (
-        (Whimsical, "draws random numbers"),
-        (FirstOnly, "same action"),
-        (Failing, "raised"),
-    ):
+    for kind, told in ((Whimsical, "draws random numbers"), (FirstOnly, "same action"), (Failing, "raised")):
         with pytest.raises(InputError, match=told):
             gridworld.evaluate(kind("MlpPolicy", env, buffer_size=10, seed=0))
 
@@ -760,6 +756,11 @@ class ByHelper(gym.ActionWrapper):
         return 0 if rarely() else action
 
 
+def by_generator(env: Any) -> Any:
+    ticks = (number > 10**6 for number in range(10**9))
+    return wrappers.TransformReward(env, lambda r: float(r) - next(ticks))
+
+
 class Delegating(gym.Env):
     """Not a wrapper, and turns actions."""
 
@@ -788,6 +789,7 @@ class Saving(DummyVecEnv):
     [
         *(lambda: Hurried(lake()), lambda: Late(Monitor(lake())), lambda: ByDefault(lake()), Delegating),
         *(lambda: ByClass(lake()), lambda: ByHelper(lake()), lambda: Saving([lake])),
+        lambda: by_generator(lake()),
     ],
 )
 def test_what_looks_at_time_or_remembers_elsewhere_is_refused(make: Any) -> None:

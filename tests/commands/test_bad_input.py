@@ -176,7 +176,7 @@ def test_a_sweep_is_refused_before_it_writes(line: str, words: str, tmp_path: Pa
 
 @pytest.mark.parametrize(
     ("launcher", "package", "extra"),
-    [("joblib", "joblib", "sweep"), ("slurm", "submitit", "slurm"), ("ray", "ray", "ray")],
+    [("slurm", "submitit", "slurm"), ("ray", "ray", "ray")],
 )
 def test_a_launcher_that_is_not_installed_names_its_extra(
     launcher: str, package: str, extra: str, tmp_path: Path

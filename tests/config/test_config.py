@@ -12,7 +12,7 @@ from helpers.support import CONF, DEEP, configure
 
 from gridworld.agents import family
 from gridworld.config.agents import agent_schemas
-from gridworld.config.composition.compose import pairs
+from gridworld.config.composition.words import pairs
 from gridworld.config.plain_settings import read_config
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import SOURCES
@@ -46,7 +46,9 @@ def test_every_choice_composes_and_could_train(
         terminated=np.zeros(1) < [[0, 0], [0, 1]],
         start=[1.0, 0],
     )
-    pair = next((f"env={env} agent={agent}" for env, agent in pairs() if f"{env}_{agent}" == choice), "")
+    pair = next(
+        (f"env={env} agent={agent}" for env, agent in pairs().values() if f"{env}_{agent}" == choice), ""
+    )
     config = configure(f"{group}={choice}", *pair.split(), *COMPLETED.get(choice, []))
     check(config)
     family(config.agent).check(config)

@@ -14,7 +14,7 @@ from gridworld.bounds import Bounds
 from gridworld.commands.report import main as report
 from gridworld.config.agents import agent_schemas
 from gridworld.config.composition.recipe_file import with_recipe
-from gridworld.config.composition.setting_names import settings_of_a_run
+from gridworld.config.composition.words import settings_of_a_run
 from gridworld.config.fields import BOUNDS, RATE, Text, declared
 from gridworld.config.plain_settings import foreign, texts_in
 from gridworld.config.settings import privileges

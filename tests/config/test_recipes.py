@@ -16,7 +16,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from gridworld.agents import family
 from gridworld.agents.sb3.settings.constructor_arguments import algorithm_and_arguments
 from gridworld.commands.manual import manual
-from gridworld.config.composition.compose import pairs
+from gridworld.config.composition.words import pairs
 from gridworld.config.train import check
 
 RECIPES = sorted(file.stem for file in (CONF / "tuned").glob("*.yaml") if file.stem != "none")
@@ -27,7 +27,7 @@ TRAINED = [recipe for recipe in RECIPES if not re.match("frozen_lake_v1|cliff_wa
 
 def pair(recipe: str) -> tuple[str, str]:
     """The world and the agent that a recipe is for."""
-    [found] = [(env, agent) for env, agent in pairs() if f"{env}_{agent}" == recipe]
+    [found] = [(env, agent) for env, agent in pairs().values() if f"{env}_{agent}" == recipe]
     return found
 
 
@@ -129,7 +129,7 @@ def test_the_default_settings_are_the_librarys_own(name: str) -> None:
 
 ON_POLICY = [
     f"{env}_{agent}"
-    for env, agent in pairs()
+    for env, agent in pairs().values()
     if re.fullmatch("(a2c|ppo|trpo)(_sb3_defaults)?", agent)
     and (f"{env}_{agent}" in RECIPES or env == "classic")
 ]

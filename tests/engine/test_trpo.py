@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from sb3_contrib import TRPO
-from test_populations import SMALL, Learned, alone, differences, train
+from test_populations import SMALL, Learned, alone, differences
 from test_updates import ELU, LINEAR, RELU, TWO_SIZES, samples, twins
 
 from gridworld.agents import learn_together
@@ -109,7 +109,9 @@ def test_a_population_goes_on_from_the_middle(size: int) -> None:
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_a_trust_region_that_there_is_not_ends_its_own_run() -> None:
     runs = [(*SMALL["trpo"], f"seed={seed}") for seed in range(3)]
-    runs[1] = (*runs[1], "agent.arguments.target_kl=-1")
-    found = train([Learned(words) for words in runs])
-    assert "the network's weights are no finite number" in str(found[1])
-    assert [differences(found[place], alone(runs[place])) for place in (0, 2)] == [[], []]
+    learned = [Learned(words) for words in runs]
+    learnings = [each.learning() for each in learned]
+    learned[1].agent.run.model.target_kl = -1.0  # which no settings can be
+    errors = learn_together(learnings)
+    assert "the network's weights are no finite number" in str(errors[1])
+    assert [differences(learned[place].found(), alone(runs[place])) for place in (0, 2)] == [[], []]

@@ -130,12 +130,6 @@ def test_slips_are_as_frequent_as_they_should_be(action):
         counts_agree(counts, {world.state(c): p for p, c, _, _ in world.outcomes(cell, action)}, draws)
 
 
-def test_starts_are_uniform():
-    env, draws = GridWorldEnv(layout=parse("S.S\n.G.\nS..", "map")), 6000
-    env.reset(seed=0)
-    counts_agree(Counter(env.reset()[0] for _ in range(draws)), dict.fromkeys((0, 2, 6), 1 / 3), draws)
-
-
 def test_a_wall_is_no_place_to_be():
     env = GridWorldEnv(layout=load("aima_4x3"))
     with pytest.raises(InputError, match=r"state=5.*wall"):

@@ -140,11 +140,6 @@ def test_any_kind_is_shown_by_the_generic_wrappers(kind):
     assert gym.make(env.spec).observation_space == env.observation_space
 
 
-def test_a_batch_of_another_world_is_not_wrapped():
-    with pytest.raises(InputError, match="GridWorld"):
-        gridworld.VectorOneHotObservation(gym.make_vec("FrozenLake-v1"))
-
-
 @pytest.mark.parametrize("kind", ["one_hot", "coordinates", "image"])
 def test_a_batch_may_write_to_one_array_over_and_over(kind):
     wrap = WRAPPERS[kind][1]
@@ -193,15 +188,6 @@ def test_coordinates_are_of_the_places_that_a_world_has():
     table = make_observation(world(places=places), "coordinates")
     assert table.table().tolist() == [[0, 0, 0], [1, 0.25, 0.5], [0.5, 1, 1], [0, 0.25, 0]]
     assert table.space == gym.spaces.Box(0, 1, (3,), np.float32)
-
-
-def test_coordinates_of_a_map_are_its_rows_and_columns_to_the_last_bit():
-    for mdp in (compile_mdp(classic(7, 23)), GridWorldEnv(layout="four_rooms").mdp):
-        size = np.array([mdp.layout.num_rows, mdp.layout.num_cols], dtype=np.float32)
-        cells = np.array(list(mdp.layout.cells()), dtype=np.float32)
-        table = make_observation(mdp, "coordinates").table()
-        assert table.dtype == np.float32
-        assert np.array_equal(table, cells / np.maximum(size - 1, 1))
 
 
 def test_the_environments_own_observation():

@@ -64,26 +64,6 @@ def test_every_pixel_of_the_default_world(state, size):
     assert np.array_equal(shown, np.unique([WHITE, BLACK, TRAP, GOAL, AGENT] @ places))
 
 
-def test_the_default_size_is_100_pixels_a_cell():
-    env = GridWorldEnv(render_mode="rgb_array")
-    env.reset()
-    assert env.render().shape == (700, 800, 3)
-    assert np.array_equal(env.render(), frame_of(DEFAULT_ROWS, 0, 100))
-
-
-def test_the_corners_of_the_agent():
-    frame = frame_of(DEFAULT_ROWS, 6 * 1 + 2)  # row 1, column 2: from (x, y) = (320, 220), 60 pixels wide
-    assert (frame[220:280, 320:380] == AGENT).all()
-    around = frame[219:281, 319:381].copy()
-    around[1:-1, 1:-1] = WHITE
-    assert (around == WHITE).all()
-
-
-def test_the_agent_is_drawn_over_the_goal():
-    frame = frame_of(DEFAULT_ROWS, 16)
-    assert (frame[320:380, 520:580] == AGENT).all()
-
-
 def test_walls_fill_their_cells_in_a_colour_of_their_own():
     frame = frame_of(TRICKY, 0)
     [wall] = np.unique(frame[101:200, 301:400].reshape(-1, 3), axis=0)

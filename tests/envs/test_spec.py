@@ -53,11 +53,6 @@ def test_the_tutorials_attributes(env):
         }
 
 
-def test_metadata():
-    assert GridWorldEnv.metadata["render_modes"][:2] == ["human", "rgb_array"]
-    assert GridWorldEnv.metadata["render_fps"] == 20
-
-
 @pytest.mark.parametrize(("num_rows", "num_cols"), [(4, 3), (5, 3), (4, 4), (7, 9), (12, 5), (9, 4)])
 def test_other_sizes_follow_the_formula(num_rows, num_cols):
     env = GridWorldEnv(num_rows, num_cols)
@@ -101,13 +96,6 @@ def test_stepping_on_after_the_end_changes_nothing(env, state):
         assert result == (state, 0.0, True, False, {})
         assert [type(value) for value in result] == [int, float, bool, bool, dict]
     assert env.state == state
-
-
-def test_state_can_be_set(env):
-    env.reset()
-    env.state = np.int64(17)
-    assert env.state == 17
-    assert env.step(LEFT) == (16, 1.0, True, False, {})
 
 
 @pytest.mark.parametrize("state", [-1, 30, 1.0, "3", None, True])

@@ -49,13 +49,6 @@ def test_a_part_of_the_interval_gets_its_share_of_a_group_rounded_down_or_up(
         assert math.floor(share - 1e-9) <= met <= math.ceil(share + 1e-9)
 
 
-def test_nobody_draws_nothing() -> None:
-    rng = np.random.default_rng(0)
-    before = rng.bit_generator.state
-    assert stratified_numbers(np.empty(0, dtype=np.int64), rng).shape == (0,)
-    assert rng.bit_generator.state == before
-
-
 def test_the_numbers_of_a_place_are_uniform_and_independent() -> None:
     """Whatever the groups are: of 400 places, as many fail a test as should."""
     rng, draws = np.random.default_rng(5), np.random.default_rng(6)
@@ -70,52 +63,10 @@ def test_the_numbers_of_a_place_are_uniform_and_independent() -> None:
         assert stats.binomtest(int((values < 0.05).sum()), 400, 0.05).pvalue > 1e-3
 
 
-@pytest.mark.parametrize("slip", [0.0, 0.1, 0.7])
-def test_a_batch_of_one_takes_the_single_environments_walk(slip: float) -> None:
-    single = GridWorldEnv(slip=slip)
-    batch = GridWorldVectorEnv(
-        1, slip=slip, autoreset_mode="Disabled", max_episode_steps=None, stratified=True
-    )
-    actions = np.random.default_rng(0).integers(0, 4, 300)
-    state, _ = single.reset(seed=3)
-    states, _ = batch.reset(seed=3)
-    for action in actions:
-        assert states[0] == state
-        state, reward, terminated, truncated, _ = single.step(int(action))
-        states, *found, _ = batch.step(np.array([action]))
-        assert [each[0] for each in found] == [reward, terminated, truncated]
-        if terminated or truncated:
-            state, _ = single.reset()
-            states, _ = batch.reset()
-
-
 @pytest.mark.parametrize("value", ["false", None, 2])
 def test_another_value_than_true_or_false_is_refused(value: object) -> None:
     with pytest.raises(InputError, match=rf"stratified={value!r}: must be True or False"):
         GridWorldVectorEnv(2, stratified=value)  # type: ignore[arg-type]
-
-
-def outcomes(stratified: bool, steps: int, num_envs: int) -> tuple[IntArray, IntArray]:
-    """Where steps led to that all environments began in one state, (steps, num_envs)."""
-    envs = GridWorldVectorEnv(num_envs, slip=0.2, autoreset_mode="Disabled", stratified=stratified)
-    envs.reset(seed=1)
-    start, _, _ = envs.episode_state
-    start = start.copy()
-    led = np.empty((steps, num_envs), dtype=np.int64)
-    for step in range(steps):
-        envs.set_episode_state(start, np.zeros(num_envs, dtype=np.int64), np.zeros(num_envs))
-        led[step] = envs.step(np.full(num_envs, 2))[0]
-    return start, led
-
-
-def test_the_shares_of_a_batch_have_hardly_any_noise_and_the_same_mean() -> None:
-    _, even = outcomes(True, 2000, 25)
-    _, independent = outcomes(False, 2000, 25)
-    for state in np.unique(independent):
-        counts, others = (even == state).sum(axis=1), (independent == state).sum(axis=1)
-        share = others.mean()
-        assert np.ptp(counts) <= 2 < np.ptp(others)  # a state that two outcomes lead to rounds twice
-        assert abs(counts.mean() - share) < 5 * others.std() / math.sqrt(len(others))
 
 
 def test_the_starts_are_spread_over_the_states() -> None:

@@ -23,7 +23,9 @@ from pathlib import Path
 from typing import Any
 
 _SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-_FRESH = os.environ | {"PYTHONPATH": str(_SCRIPTS.parent)}  # this tree's package, wherever one is installed
+# This tree's package, wherever one is installed.
+_PATHS = [*filter(None, [os.environ.get("PYTHONPATH")]), str(_SCRIPTS.parent)]
+_FRESH = os.environ | {"PYTHONPATH": os.pathsep.join(_PATHS)}
 
 
 @dataclass(frozen=True)

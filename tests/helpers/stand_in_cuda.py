@@ -29,8 +29,8 @@ def stand_in(patch: Callable[[Any, str, Any], None] = setattr) -> None:
 
 
 class StandIn(Callback):
-    """Does so in whatever process a sweep's job runs in."""
+    """Does so in the process of a sweep, in which all jobs run where there is a callback of the user's."""
 
-    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Before the job, or the population that it stands for."""
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Called by Hydra before the sweep."""
         stand_in()

@@ -18,10 +18,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from gridworld.config.composition.compose import register_schemas, to_config
+from gridworld.config.composition.compose import register_schemas
 from gridworld.config.composition.presets import with_preset
 from gridworld.config.train import TrainConfig
-from gridworld.sweep.config_loader import SweepLoader
+from gridworld.sweep.configurations import Configurations
 from gridworld.training.train import train
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -64,18 +64,19 @@ def configure(*overrides: str) -> TrainConfig:
     """The configuration that the command line would give to a run.
 
     Composed as a sweep composes its jobs: the files of each choice are read once. It comes to the same, see
-    tests/sweep/test_config_loader.py, in 3 ms instead of 100.
+    tests/sweep/test_configurations.py, in 3 ms instead of 100.
     """
     return copy.deepcopy(_composed(overrides))
 
 
 @functools.lru_cache(maxsize=500)
 def _composed(overrides: tuple[str, ...]) -> TrainConfig:
-    loader, sweep = _loader()
+    configurations, master = _configurations()
+    HydraConfig.instance().set_config(master)
     try:
 
         def compose(chosen: list[str]) -> TrainConfig:
-            return to_config(loader.load_settings(sweep, [*overrides, *chosen]))
+            return configurations([*overrides, *chosen])
 
         return with_preset(compose([]), overrides, compose)[0]
     finally:
@@ -83,12 +84,13 @@ def _composed(overrides: tuple[str, ...]) -> TrainConfig:
 
 
 @functools.cache
-def _loader() -> tuple[SweepLoader, DictConfig]:
+def _configurations() -> tuple[Configurations, DictConfig]:
     compose_quickly()
     register_schemas()
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         loader = GlobalHydra.instance().config_loader()
-        return SweepLoader(loader), loader.load_configuration("train", [], run_mode=RunMode.MULTIRUN)
+        master = loader.load_configuration("train", [], run_mode=RunMode.MULTIRUN)
+        return Configurations(loader, master), master
 
 
 def train_in(folder: Path, *overrides: str) -> dict[str, object]:

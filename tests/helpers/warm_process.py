@@ -65,14 +65,13 @@ _WORDS = (
 # What is imported only once it is needed.
 _LATE = (
     *("sb3_contrib", "torch.utils.tensorboard", "torch.utils.serialization", "torch._dynamo", "av"),
-    *("optuna.storages._rdb.storage", "optuna.storages._rdb.models", "sqlalchemy.orm", "joblib"),
+    *("optuna.storages._rdb.storage", "optuna.storages._rdb.models", "sqlalchemy.orm"),
     *("sqlalchemy.dialects.sqlite.pysqlite", "alembic.command", "alembic.config", "alembic.migration"),
-    "joblib.externals.loky.backend.synchronize",
     "optuna.importance._fanova",
     *("hydra._internal.hydra", "hydra._internal.logging_config", "hydra.core.plugins", "encodings.cp437"),
     *("matplotlib.backends.backend_svg", "matplotlib.backends.backend_pdf", "fontTools.subset"),
 )
-_NOT_FOR_FORKS = ".on_ray"  # Ray has threads as soon as it is imported
+_NOT_FOR_FORKS = ".launchers.ray"  # Ray has threads as soon as it is imported
 _IN_RESERVE = 6  # two workers, joblib's watch over resources, and some for workers that are killed
 _WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 
@@ -89,8 +88,8 @@ def _import_everything() -> None:
 
 def _wait_less_for_slurm() -> None:
     """It runs on this machine: it may be asked more often, and files are not late."""
-    if launcher := sys.modules.get("gridworld.sweep.launchers.on_slurm"):  # an extra
-        vars(launcher).update(_POLL_SECONDS=0.2, _FILES_ARRIVE_WITHIN=1.0)
+    if launcher := sys.modules.get("gridworld.sweep.launchers.slurm"):  # an extra
+        vars(launcher).update(_POLL_SECONDS=0.2, _SECONDS_BETWEEN_QUESTIONS=1.0, _FILES_ARRIVE_WITHIN=1.0)
 
 
 def _end_without_finalizers() -> None:

@@ -23,6 +23,7 @@ from gridworld.run.provenance import Source
 from gridworld.storage.append_log import AppendLog
 from gridworld.storage.atomic_write import write_json
 from gridworld.storage.file_lock import locked
+from gridworld.storage.sealed_json import sealed
 from gridworld.storage.serialization import decode, encode
 from gridworld.sweep.job import run_in_sweep
 from gridworld.training.together import run_alone
@@ -349,7 +350,7 @@ def test_an_interrupted_job_of_a_sweep_goes_on(tmp_path: Path) -> None:
     begin(tmp_path / "calm", *words)
     folder = tmp_path / "sweep" / "seed=1"
     stopped_after(2, folder, *words)
-    write_json(folder / "manifest.json", {**manifest(folder), "status": "running"})
+    write_json(folder / "manifest.json", sealed({**manifest(folder), "status": "running"}))
     run_alone(run_in_sweep(configure(*words), folder, words, stop_at_failure=False))
     assert manifest(folder)["resumed"]
     assert differences(left_behind(folder), left_behind(tmp_path / "calm")) == []

@@ -13,24 +13,19 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pytest
 from helpers.pages import NO_PICTURES
 from helpers.support import ROOT, configure, script, start, train_on_full_disk
-from hypothesis import given
-from hypothesis import strategies as st
 
 from gridworld.commands import jobs as jobs_command
 from gridworld.errors import InputError
-from gridworld.process.console.progress import duration
 from gridworld.run.reader import read_run
 from gridworld.run.writer import RunWriter
 from gridworld.storage.append_log import AppendLog
 from gridworld.storage.file_lock import is_locked, locked
 from gridworld.sweep.job import JobError, run_in_sweep
-from gridworld.sweep.job_table import JobRow, JobTable
-from gridworld.sweep.progress import sweep_line
+from gridworld.sweep.job_table import JobTable
 from gridworld.sweep.results import results_lines
 from gridworld.training.together import run_alone
 
@@ -148,8 +143,8 @@ def test_a_failure_stops_no_other_job(launcher: str, tmp_path: Path) -> None:
     assert sorted(statuses(tmp_path / "sweep").values()) == ["done"] * 4 + ["failed"] * 2
     assert [row[2] for row in results(done.stdout)] == ["learning_rate=0.1", "learning_rate=0.2"]
     row = table(tmp_path / "sweep")["agent.learning_rate=2,seed=0"]
-    assert row["error"].startswith("agent.learning_rate=2: a step towards the target must be")
-    assert done.stderr.count("agent.learning_rate=2: a step towards the target must be") == 2
+    assert row["error"].startswith("agent.learning_rate=2: must be above 0 and at most 1")
+    assert done.stderr.count("agent.learning_rate=2: must be above 0 and at most 1") == 2
     assert "retry_failed" not in done.stderr  # it would fail again
 
 
@@ -242,7 +237,7 @@ def test_a_worker_that_is_killed_takes_no_other_job_along(tmp_path: Path) -> Non
     assert done.returncode == 1, done.stderr
     rows = table(tmp_path / "sweep").values()
     assert [row["status"] for row in rows] == ["failed", "done"]
-    assert {row["error"] for row in rows} == {"its process was lost (TerminatedWorkerError)", ""}
+    assert {row["error"] for row in rows} == {"its process was lost (exit code -9)", ""}
     again = with_own_classes(*words, cwd=tmp_path)
     assert "0 to run" in again.stderr  # what failed is remembered
 
@@ -321,24 +316,11 @@ def test_a_job_that_a_full_disk_ended_goes_on_from_its_checkpoint(
     monkeypatch.setattr(AppendLog, "append", fill)
     with pytest.raises(JobError, match="No space left on device"):
         run_alone(run_in_sweep(configure(*words), folder, list(words), stop_at_failure=False))
-    assert statuses(tmp_path) == {"seed=0": "interrupted"}
+    assert JobTable(tmp_path).row("seed=0").status == "interrupted"
     monkeypatch.setattr(AppendLog, "append", append)
     assert run_alone(run_in_sweep(configure(*words), folder, list(words), stop_at_failure=False)) >= 0
-    assert statuses(tmp_path) == {"seed=0": "done"}
+    assert JobTable(tmp_path).row("seed=0").status == "done"
     assert json.loads((folder / "manifest.json").read_text())["resumed"][0]["step"] > 0
-
-
-def test_a_table_that_cannot_be_written_is_no_fault_of_the_job(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*arguments: object, **changes: str) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    (tmp_path / "seed=0").mkdir()
-    monkeypatch.setattr(JobTable, "set", fail)
-    with pytest.raises(OSError, match="No space left on device"):
-        run_alone(run_in_sweep(configure(*QUICK), tmp_path / "seed=0", [], stop_at_failure=False))
-    assert not (tmp_path / "seed=0" / "manifest.json").exists()
 
 
 def with_own_classes(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -461,36 +443,13 @@ def test_a_table_that_was_damaged_or_lost_is_made_again(swept: Path) -> None:
         assert file.read_text() == before
 
 
-@given(st.lists(st.text('ab,"= 1é', min_size=1, max_size=5), min_size=1, max_size=4, unique=True), st.data())
-def test_a_row_is_changed_and_the_others_are_left_alone(jobs: list[str], data: st.DataObject) -> None:
-    """By the quick way, as the slow one would have it: reading all, and writing all."""
-    texts = st.text('ab,"= é', max_size=5)
-    with TemporaryDirectory() as folder:
-        sweep = JobTable(Path(folder))
-        expected: dict[str, JobRow] = {}
-        for _ in range(6):
-            job, error = data.draw(st.sampled_from(jobs)), data.draw(texts)
-            sweep.set(job, status="failed", error=error)
-            expected[job] = JobRow(job, "", "failed", error=error)
-            assert sweep.read() == expected
-
-
 def test_the_jobs_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sweep("seed=0,-1,1", cwd=tmp_path)
     jobs_command.main([str(tmp_path / "sweep")])
     *rows, total = capsys.readouterr().out.splitlines()
     assert [row.split()[0] for row in rows] == ["seed=0", "seed=-1", "seed=1"]
     assert [row.split()[1] for row in rows] == ["done", "failed", "done"]
-    assert rows[1].endswith("seed=-1: must be at least 0 (says jobs.csv alone)")
+    assert rows[1].endswith("seed=-1: must be from 0 to 4294967295 (says jobs.csv alone)")
     assert total == "3 jobs: 2 done, 1 failed"
     jobs_command.main([str(tmp_path / "sweep"), "--status", "failed"])
     assert len(capsys.readouterr().out.splitlines()) == 2
-
-
-def test_the_line_of_a_sweep_says_how_far_it_is() -> None:
-    assert sweep_line(Counter(done=1, pending=3), 4, 1, 10) == "sweep: 1 of 4 jobs done, 0 running"
-    assert sweep_line(Counter(done=2, running=1, failed=1), 4, 1, 60) == (
-        "sweep: 2 of 4 jobs done, 1 running, 1 failed, about 30 s left"
-    )
-    assert [duration(seconds) for seconds in (0.4, 59.4, 61)] == ["0 s", "59 s", "1 min 1 s"]
-    assert duration(3700) == "1 h 1 min"

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from helpers.support import CONF, script
 from hydra import initialize_config_dir
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 
 from gridworld.config.composition.compose import register_schemas
@@ -18,12 +18,12 @@ from gridworld.sweep.plan import expand
 GRID = """\
 # @package _global_
 defaults: [{override /agent: q_learning}]
-total_timesteps: 3e2
+total_timesteps: 300
 recording: {frames: false, gif: false, learning: false}
 hydra:
   mode: MULTIRUN
   sweeper:
-    params: {seed: range(2), agent.learning_rate: "0.1,0.2", env: "classic,cliff", n_envs: 4.0}
+    params: {seed: range(2), agent.learning_rate: "0.1,0.2", env: "classic,cliff", n_envs: 4}
     paired: [agent.learning_rate, env]
 """
 OTHER = "# @package _global_\nhydra: {sweeper: {params: {seed: '0,1'}}}\n"
@@ -31,10 +31,10 @@ NO_TEXT = "# @package _global_\nhydra: {sweeper: {params: {seed: [0, 1]}}}\n"
 
 
 @pytest.fixture
-def loader() -> Iterator[ConfigLoaderImpl]:
+def loader() -> Iterator[ConfigLoader]:
     register_schemas()
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        yield GlobalHydra.instance().hydra.config_loader  # type: ignore[union-attr]
+        yield GlobalHydra.instance().config_loader()
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_a_yaml_says_what_is_swept_and_that_it_is_a_sweep(conf: Path, tmp_path: 
     ("words", "told"),
     [
         ("experiment=grid env=maze", "[agent.learning_rate,env]: env has no list of values; give it one"),
-        ("experiment=other,maze_dqn", "hydra.sweeper.params: stands in a file that only some of the jobs"),
+        ("experiment=other,maze_dqn", "hydra.sweeper: is set in a file that only some of the jobs choose"),
         ("experiment=no_text", "hydra.sweeper.params.seed: must be text as on the command line, such as 0,1"),
     ],
 )
@@ -77,7 +77,7 @@ def test_a_yaml_that_cannot_be_swept_is_refused(words: str, told: str, conf: Pat
     assert list(tmp_path.rglob("*.*")) == []
 
 
-def test_lists_that_vary_together(loader: ConfigLoaderImpl) -> None:
+def test_lists_that_vary_together(loader: ConfigLoader) -> None:
     words = ["agent=dqn,ppo", "device=cpu", "seed=0,1", "+n_envs=2,4", "threads=3,4"]
 
     def lines(*paired: object) -> list[str]:
@@ -114,6 +114,6 @@ def test_lists_that_vary_together(loader: ConfigLoaderImpl) -> None:
         ([1, 2], "[1,2]: 1 has no list of values"),
     ],
 )
-def test_pairs_that_cannot_be_are_refused(loader: ConfigLoaderImpl, paired: list[object], told: str) -> None:
+def test_pairs_that_cannot_be_are_refused(loader: ConfigLoader, paired: list[object], told: str) -> None:
     with pytest.raises(InputError, match=re.escape(f"hydra.sweeper.paired={told}")):
         expand(["agent=dqn,ppo", "env=maze,cliff", "n_envs=3", "seed=0,1,2"], loader, 100, paired)

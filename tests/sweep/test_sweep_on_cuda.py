@@ -25,14 +25,14 @@ from omegaconf import OmegaConf
 from gridworld.agents import family
 from gridworld.commands import reproduce as command
 from gridworld.config.sweep import SweepConfig
+from gridworld.config.train import TrainConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.process.parallel.together import mixing
 from gridworld.restore.reproduce import population
 from gridworld.run.reader import read_run
-from gridworld.sweep.folder import JobEntry
+from gridworld.sweep.grouping import populations
 from gridworld.sweep.plan import Job
-from gridworld.sweep.population import populations
 from gridworld.training.setup import check_settings, make_context
 
 SMALL = (
@@ -201,14 +201,11 @@ def test_a_run_that_went_on_says_with_whom_and_cannot_be_repeated(tmp_path: Path
     ("population", "in_fork", "sizes"), [(8, False, [5, 5]), ("auto", False, [4, 3, 3]), (8, True, [4, 3, 3])]
 )
 def test_runs_that_no_fork_takes_are_not_divided_among_forks(
-    population: int | str, in_fork: bool, sizes: list[int], monkeypatch: pytest.MonkeyPatch
+    population: int | str, in_fork: bool, sizes: list[int]
 ) -> None:
-    monkeypatch.setattr("gridworld.sweep.population.can_fork", lambda: True)
-    job = Job((), (), "", None, False, shape="", in_fork=in_fork)
-    jobs = [(JobEntry(str(number), "", ()), job) for number in range(10)]
-    launcher = {"_target_": "ForksLauncher", "n_jobs": 4}
-    hydra = OmegaConf.create({"launcher": launcher, "job": {"chdir": None, "env_set": {}}})
-    groups = populations(jobs, SweepConfig(population=population), hydra)
+    jobs = [Job((), (), str(n), None, TrainConfig(), shape="", in_fork=in_fork) for n in range(10)]
+    hydra = OmegaConf.create({"job": {"chdir": None}})
+    groups = populations(jobs, SweepConfig(population=population), "forks", {"n_jobs": 4}, hydra)
     assert sorted(map(len, groups), reverse=True) == sizes
 
 

@@ -21,13 +21,13 @@ from helpers.sweeps import differing, logged, rows
 from omegaconf import OmegaConf
 
 from gridworld.config.sweep import SweepConfig
+from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console.terminal import TOLD
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.claim import claimed
 from gridworld.storage.append_log import AppendLog
-from gridworld.sweep import population
-from gridworld.sweep.folder import JobEntry
+from gridworld.sweep import grouping
 from gridworld.sweep.plan import Job
 from gridworld.training.learning_curve import LearningCurve
 
@@ -63,11 +63,6 @@ def test_each_run_is_the_run_alone(words: tuple[str, ...], alone: Path, tmp_path
     assert rows(together) == rows(alone)
     assert len(rows(together)) == 6
     assert {path.name for path in together.iterdir()} == {path.name for path in alone.iterdir()}
-    numbers = {
-        re.findall(r"num: (\d+)", (run / ".hydra" / "hydra.yaml").read_text())[0]
-        for run in (together / job for job in rows(together))
-    }
-    assert numbers == set("012345")
 
 
 @pytest.mark.parametrize("value", ["0", "-1", "foo", "1.5", "null"])
@@ -80,13 +75,6 @@ def test_a_mistaken_size_is_refused_before_anything_is_written(value: str, tmp_p
         r"most, 1 for each by itself, or auto|Value .* is incompatible with type hint .*)\n",
         done.stderr,
     )
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_sweepers_own_key_is_refused(tmp_path: Path) -> None:
-    done = sweep("new", *JOBS, "hydra.sweeper.together=[x]", cwd=tmp_path)
-    assert done.returncode == 2
-    assert re.fullmatch(r"error: hydra\.sweeper\.together: .*; leave it out, and set .*\n", done.stderr)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -264,29 +252,26 @@ def test_a_run_has_as_many_files_open_as_a_population_reckons_with(
     monkeypatch.setattr(LearningCurve, "evaluate", counted)
     with claimed(tmp_path / "run"):
         begin(tmp_path / "run", "agent=dqn", *SMALL)
-    assert max(most) == population.RUNS_FILES
+    assert max(most) == grouping.RUNS_FILES
 
 
 @pytest.mark.parametrize(("files", "largest"), [(10, 1), (79, 5), (94, 10), (sys.maxsize, 10)])
 def test_a_population_has_no_more_runs_than_files_can_be_open(
     files: int, largest: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(population, "file_limit", lambda: files)
-    job = Job((), (), "", None, False, shape="")
-    jobs = [(JobEntry(str(number), "", ()), job) for number in range(10)]
-    hydra = OmegaConf.create(
-        {"launcher": {"_target_": "BasicLauncher"}, "job": {"chdir": None, "env_set": {}}}
-    )
-    groups = population.populations(jobs, SweepConfig(population=10), hydra)
+    monkeypatch.setattr(grouping, "file_limit", lambda: files)
+    jobs = [Job((), (), str(number), None, TrainConfig(), shape="") for number in range(10)]
+    hydra = OmegaConf.create({"job": {"chdir": None}})
+    groups = grouping.populations(jobs, SweepConfig(population=10), "basic", {}, hydra)
     assert max(map(len, groups)) == largest
-    assert [entry for group in groups for entry in group] == [entry for entry, _ in jobs]
+    assert [job for group in groups for job in group] == jobs
 
 
 _WITH_FEW_FILES = """
 import os, resource, runpy, sys
 del sys.argv[0]
-from gridworld.sweep import population
-population.file_limit = lambda: sys.maxsize
+from gridworld.sweep import grouping
+grouping.file_limit = lambda: sys.maxsize
 resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 18, 10**4))
 runpy.run_path(sys.argv[0], run_name="__main__")
 """

@@ -1,4 +1,4 @@
-"""The cliff that sends back to the start is Gymnasium's CliffWalking, and so Sutton & Barto's example 6.6."""
+"""Gymnasium's CliffWalking (Sutton & Barto's example 6.6) and FrozenLake are maps of ours, row by row."""
 
 import gymnasium as gym
 import numpy as np
@@ -10,7 +10,6 @@ from gridworld.world.exact.markov_chain import Chain, one_hot_policy
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import parse
 
-GOAL = 47
 UP, RIGHT, DOWN, LEFT = range(4)
 
 
@@ -26,13 +25,22 @@ def safe_way():
 
 
 @pytest.mark.parametrize("slippery", [False, True])
-def test_every_row_of_gymnasiums_table(slippery):
-    table = gym.make("CliffWalking-v1", is_slippery=slippery).unwrapped.P
-    mdp = cliff(2 / 3 if slippery else 0.0)
+@pytest.mark.parametrize(
+    ("env", "env_id", "order", "settings"),
+    [
+        ("cliff_walking", "CliffWalking-v1", (UP, RIGHT, DOWN, LEFT), {}),
+        ("frozen_lake_4x4", "FrozenLake-v1", (LEFT, DOWN, RIGHT, UP), {"map_name": "4x4"}),
+        ("frozen_lake_8x8", "FrozenLake-v1", (LEFT, DOWN, RIGHT, UP), {"map_name": "8x8"}),
+    ],
+)
+def test_every_row_of_gymnasiums_table(env, env_id, order, settings, slippery):
+    table = gym.make(env_id, is_slippery=slippery, **settings).unwrapped.P
+    rewards = [] if env == "cliff_walking" else ["env.trap_reward=0"]
+    mdp = configure(f"env={env}", f"env.slip={2 / 3 if slippery else 0.0}", *rewards).env.compile()
     assert len(table) == mdp.num_states
-    for state in range(GOAL):  # its goal has rows as if it were floor; nobody plays on there
-        for action in range(4):
-            row = state, action
+    for state in np.flatnonzero(~mdp.terminal).tolist():  # nobody plays on where it is over
+        for action, ours_of in enumerate(order):
+            row = state, ours_of
             ours, theirs = {}, {}
             for p, following, reward in zip(
                 mdp.probability[row], mdp.next_state[row].tolist(), mdp.reward[row].tolist(), strict=True

@@ -126,41 +126,6 @@ def two_states(**changed):
     return Outcomes(**{**table, **changed})
 
 
-@pytest.mark.parametrize(
-    ("changed", "told"),
-    [
-        ({"next_state": np.full((2, 2, 1), 2)}, "next_state of state 0, action 0 is 2, must be from 0 to 1"),
-        ({"next_state": np.zeros((2, 2, 1))}, "next_state is float64, must be an array of whole numbers"),
-        ({"next_state": [[0]]}, "next_state is list"),
-        ({"probability": np.ones((2, 2))}, "probability has shape"),
-        ({"probability": np.full((2, 2, 1), 0.9)}, ".*with sum 0.9; must be probabilities"),
-        ({"probability": np.full((2, 2, 1), np.nan)}, ".*must be probabilities"),
-        ({"reward": np.full((2, 2, 1), np.nan)}, "reward of state 0, action 0=nan: must be a finite number"),
-        ({"reward": np.full((2, 2, 1), 1e200)}, "reward of state 0"),
-        ({"terminated": np.zeros((2, 2, 1))}, "terminated is float64, must be an array of booleans"),
-        ({"start": np.ones(3) / 3}, "start has shape"),
-        ({"start": np.zeros(2)}, "start is .*with sum 0"),
-    ],
-)
-def test_what_makes_no_world_is_refused(changed, told):
-    with pytest.raises(InputError, match=f"^lamps: {told}"):
-        mdp_from_outcomes("lamps", two_states(**changed))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        ({"action_names": ["a"]}, "1 action_names for 2 actions"),
-        ({"places": np.zeros((2, 2), dtype=int)}, "places is"),
-        ({"max_episode_steps": 0}, "max_episode_steps=0"),
-        ({"own_observation": np.zeros(3)}, "own_observation has shape"),
-    ],
-)
-def test_what_does_not_fit_the_tables_is_refused(arguments, told):
-    with pytest.raises(InputError, match=told):
-        mdp_from_outcomes("lamps", two_states(), **arguments)
-
-
 def test_worlds_that_are_too_large_are_refused_with_what_they_would_take():
     many = np.broadcast_to(np.int64(0), (600_000, 2, 1))
     with pytest.raises(InputError, match="600,000 states and 2 actions are too many"):

@@ -4,11 +4,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from helpers.oracle import MOVES, World, maps, policies, worlds
-from hypothesis import given, settings
+from helpers.oracle import MOVES, World, policies, worlds
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gridworld import InputError
@@ -87,45 +86,6 @@ def test_the_textbook_world_of_russell_and_norvig():
     assert solution.optimal[~(mdp.terminal | mdp.wall)].tolist() == arrows
 
 
-@pytest.mark.parametrize("size", ["4x4", "8x8"])
-@pytest.mark.parametrize("slippery", [True, False])
-@pytest.mark.parametrize("gamma", [0.9, 0.99])
-def test_frozen_lake_equals_gymnasiums_table(size, slippery, gamma):
-    lake = gym.make("FrozenLake-v1", map_name=size, is_slippery=slippery).unwrapped.P  # actions: l, d, r, u
-    values = np.zeros(len(lake))
-    for _ in range(3000):
-        q = [[sum(p * (r + gamma * values[s] * (not e)) for p, s, r, e in row[a]) for a in range(4)]
-             for row in lake.values()]  # fmt: skip
-        change, values = np.abs(np.max(q, axis=1) - values).max(), np.max(q, axis=1)
-        if change < 1e-13:
-            break
-    mdp = compile_mdp(load(f"frozen_lake_{size}"), slip=2 / 3 if slippery else 0.0, trap_reward=0.0)
-    solution = solve.value_iteration(mdp, gamma)
-    assert solution.v == pytest.approx(values, abs=1e-9)
-    assert solution.q == pytest.approx(np.array(q)[:, [3, 2, 1, 0]], abs=1e-9)
-
-
-@given(maps(), st.sampled_from([0.0, 0.2, 0.6]))
-def test_without_discount_and_without_costs_the_optimum_equals_brute_force(rows, slip):
-    world = World(rows, slip=slip)
-    best = world.optimal_values(1, tolerance=1e-13)
-    solution = solve.value_iteration(compiled(world), 1)
-    assert solution.v == pytest.approx(np.array([best[cell] for cell in world.cells]), abs=1e-9)
-
-
-@settings(max_examples=15)
-@given(worlds(max_side=3).filter(lambda world: world.settings["step_reward"] < 0))
-def test_without_discount_and_with_costs_the_optimum_is_that_of_a_long_horizon(world):
-    mdp = compiled(world)
-    solution = solve.value_iteration(mdp, 1)
-    greedy = one_hot_policy(np.argmax(solution.q, axis=1), 4)
-    walked = Chain(mdp, greedy).value(1)
-    assert walked == pytest.approx(solution.v, abs=1e-9)
-    ends = np.isfinite(solution.v)
-    assert (solution.v[ends] >= Chain(mdp, np.full((mdp.num_states, 4), 0.25)).value(1)[ends] - 1e-9).all()
-    assert solution.v[ends] == pytest.approx(solve.value_iteration(mdp, 1 - 1e-9).v[ends], abs=1e-5)
-
-
 def test_without_discount_a_positive_step_reward_has_no_optimum():
     mdp = made("S.G", step_reward=0.1)
     with pytest.raises(InputError, match=r"gamma=1 with step_reward=0.1"):
@@ -152,14 +112,6 @@ def test_without_discount_a_chance_of_never_ending_counts():
     assert Chain(made(ways), policy).value(1)[2] == pytest.approx(0.5)
     assert Chain(made(ways, step_reward=-1), policy).value(1)[2] == -np.inf
     assert Chain(made(ways), policy).endless_states().tolist() == [1]
-
-
-def test_without_discount_a_cell_that_cannot_end_is_lost():
-    walled_in = made("S.G\n###\n..#", step_reward=-0.5)
-    values = solve.value_iteration(walled_in, 1).v
-    assert values[[6, 7]].tolist() == [-np.inf, -np.inf]
-    assert values[[0, 1]] == pytest.approx([0, 0.5])
-    assert not solve.value_iteration(made("S.G\n###\n..#"), 1).v[[6, 7]].any()
 
 
 @pytest.mark.parametrize(

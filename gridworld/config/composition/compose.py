@@ -7,27 +7,35 @@ import functools
 import re
 import secrets
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.types import RunMode
 from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from gridworld.config.agents import MISSING, agent_schemas
-from gridworld.config.composition.conf_folder import conf_folder
+from gridworld.config.agents import agent_schemas
+from gridworld.config.composition.conf_folder import is_override, own_conf_folders
 from gridworld.config.composition.hydra_errors import refuse_added_keys
-from gridworld.config.composition.loader import composing_from
+from gridworld.config.composition.presets import may_need_preset, with_preset
+from gridworld.config.composition.words import prepared
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.config.tune import SearchConfig
 from gridworld.config.worlds import SOURCES, EnvConfig
 
+VERSION_BASE = "1.3"
 _LONGEST_NAME = 100  # characters of a job's folder
 _ONE_AT_A_TIME = threading.RLock()  # Hydra composes with variables of the process
+_NO_SINGLE_RUN = {  # with these of Hydra's options, a command line is not that of a run in the shipped `conf`
+    *("-m", "--multirun", "--hydra-help", "--info", "-i", "--shell-completion", "-sc"),
+    *("--config-name", "-cn", "--config-path", "-cp", "--experimental-rerun"),
+}
+_PLAIN = re.compile(r"[\w./:-]+")  # what Hydra takes without quotes
 
 
 def compose(conf: Path, overrides: list[str]) -> TrainConfig:
@@ -41,9 +49,48 @@ def compose(conf: Path, overrides: list[str]) -> TrainConfig:
     """
     with _leaving_hydra_as_it_was():
         _store_schemas()
-        with composing_from(conf):
-            settings = hydra.compose(config_name="train", overrides=overrides)
-    return to_config(settings)
+        return without_hydra(compose_whole(conf, "train", overrides)[0])
+
+
+def compose_whole(conf: Path, name: str, overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:
+    """Compose `name` with Hydra's own part, and with the preset that a run's world needs.
+
+    Returns:
+        The composition; the words that chose the preset.
+    """
+    words = prepared(overrides)
+
+    def again(more: list[str]) -> DictConfig:
+        return hydra.compose(name, [*words, *more], return_hydra_config=True)
+
+    with hydra.initialize_config_dir(version_base=VERSION_BASE, config_dir=str(conf)):
+        found = again([])
+        if name != "train" or found.hydra.mode is RunMode.MULTIRUN:
+            return found, []
+        return with_preset(found, words, again)
+
+
+def completed(words: Sequence[str], conf: Path) -> list[str]:
+    """A command line as Hydra takes it, with the words that choose the preset that a single run needs."""
+    own = list(own_conf_folders(words))
+    found = prepared(words, own)
+    places = [number for number, _ in enumerate(found) if is_override(found, number)]
+    values = [found[number] for number in places]
+    if {word.partition("=")[0] for word in found} & _NO_SINGLE_RUN or not (own or may_need_preset(values)):
+        return found
+    folders = [search_path([conf])] if own else []
+    with contextlib.suppress(Exception):  # Hydra composes again, and says what is wrong
+        chosen = compose_whole([*own, conf][0], "train", [*folders, *values])[1]
+        end = places[-1] + 1 if places else len(found)
+        return [*found[:end], *chosen, *found[end:]]  # options may follow
+    return found
+
+
+def search_path(folders: Sequence[Path]) -> str:
+    """The override by which Hydra searches these folders too."""
+    places = [f"file://{folder.resolve()}" for folder in folders]
+    quoted = [place if _PLAIN.fullmatch(place) else f"'{place}'" for place in places]
+    return f"hydra.searchpath=[{','.join(quoted)}]"
 
 
 @contextlib.contextmanager
@@ -64,9 +111,14 @@ def _leaving_hydra_as_it_was() -> Iterator[None]:
 
 def without_hydra(whole: DictConfig) -> TrainConfig:
     """Convert a composition that has Hydra's own part too, which is deleted from it. See `to_config`."""
+    return to_config(drop_hydra(whole))
+
+
+def drop_hydra(whole: DictConfig) -> DictConfig:
+    """Delete Hydra's own part from a composition."""
     with read_write(whole), open_dict(whole):
         del whole["hydra"]
-    return to_config(whole)
+    return whole
 
 
 def to_config(settings: DictConfig) -> TrainConfig:
@@ -85,7 +137,6 @@ def register_schemas() -> None:
 
 @functools.cache  # they stay in Hydra's store
 def _store_schemas() -> None:
-    """Register the schemas with Hydra."""
     store = ConfigStore.instance()
     store.store(name="train_schema", node=TrainConfig(env=EnvConfig()))
     store.store(name="tune_schema", node=SearchConfig)
@@ -95,20 +146,10 @@ def _store_schemas() -> None:
     for name, schema in agent_schemas().items():
         store.store(group="agent/schema", name=name, node=schema)
     for name, source in SOURCES.items():
-        store.store(group="env/schema", name=name, node=_open(source))
-    studies = {file.stem for file in (conf_folder() / "experiment").glob("*.yaml")}
-    for env, agent in pairs():  # as a recipe was called before an agent in a world chose it by itself
-        if (name := f"{env}_{agent}") not in studies:
-            chosen = {"defaults": [{"override /env": env}, {"override /agent": agent}]}
-            store.store(group="experiment", name=name, package="_global_", node=chosen)
-
-
-def pairs() -> list[tuple[str, str]]:
-    """Every shipped world with every shipped agent, by the names of their files in `conf`."""
-    conf = conf_folder()
-    envs = [file for file in sorted((conf / "env").glob("*.yaml")) if MISSING not in file.read_text("utf-8")]
-    agents = sorted((conf / "agent").glob("*.yaml"))
-    return [(env.stem, agent.stem) for env in envs for agent in agents]
+        node = cast(DictConfig, OmegaConf.structured(source))
+        if "kwargs" in node:
+            OmegaConf.set_struct(node.kwargs, False)  # which takes any name without a plus
+        store.store(group="env/schema", name=name, node=node)
 
 
 def _world_name(env: DictConfig) -> str:
@@ -118,19 +159,7 @@ def _world_name(env: DictConfig) -> str:
     return schema(**cast(dict[str, Any], plain)).name
 
 
-def _open(source: type[EnvConfig]) -> DictConfig:
-    """A source's schema whose `kwargs`, if it has them, take any name without a plus."""
-    node = cast(DictConfig, OmegaConf.structured(source))
-    if "kwargs" in node:
-        OmegaConf.set_struct(node.kwargs, False)
-    return node
-
-
 def slug(text: Any) -> str:
-    """Make a folder's name of a setting's value.
-
-    Returns:
-        Letters, digits and a few safe signs, of bounded length.
-    """
+    """A folder's name made of a setting's value: letters, digits and a few safe signs."""
     name = re.sub(r"[^A-Za-z0-9_.,=+-]+", "-", Path(str(text)).stem if "/" in str(text) else str(text))
     return name.strip("-.")[:_LONGEST_NAME] or "run"

@@ -1,7 +1,7 @@
 """Hydra's error messages about a command line, each in one sentence.
 
 Hydra says what went wrong over several lines and advises to append an unknown key with `+`, which the
-schema would refuse as well. What is kept is the fact; what is added is what would have been right.
+schema would refuse as well. The fact is kept; what would have been right is added.
 """
 
 from __future__ import annotations
@@ -9,20 +9,15 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import re
-import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from hydra.errors import OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from yaml import MarkedYAMLError, YAMLError
 
-from gridworld.config import sweep, train, tune, worlds
-from gridworld.config.agents import AgentConfig, agent_schemas
-from gridworld.config.composition.setting_names import settings_of_a_run
-from gridworld.config.composition.words import OF_THE_COMMAND
-from gridworld.config.worlds import EnvConfig
+from gridworld.config.composition.words import OF_THE_COMMAND, pairs, settings_of_a_run
+from gridworld.config.sweep import SweepConfig
 from gridworld.errors import InputError, failure
 
 _LISTED = 24  # choices of a group that are listed at most; of more, those with a similar name
@@ -61,47 +56,41 @@ def sentence(error: BaseException) -> str:
     override = getattr(error, "override", None)
     if isinstance(error, OverrideParseException) and override and override not in facts[0]:
         facts.insert(0, override)
-    return ": ".join(fact.strip().rstrip(".:") for fact in facts) + _suggestion(" ".join(facts))
+    return ": ".join(fact.strip().rstrip(".:") for fact in facts) + _suggestion(" ".join(facts), message)
 
 
 def unreadable_file(error: Exception, folders: Iterable[Path]) -> str | None:
-    """Find the yaml file that an exception is about, which Hydra does not name.
+    """A sentence on the first yaml file for which reading raises an error like this one; None: there is none.
 
     Args:
-        error: a `UnicodeDecodeError` or a `RecursionError`.
+        error: a `UnicodeDecodeError` or a `RecursionError`, for which Hydra does not name the file.
         folders: of the yaml files.
-
-    Returns:
-        A sentence on the first file that raises such an error; None: there is none.
     """
     for file in sorted(file for folder in folders for file in folder.rglob("*.yaml")):
         try:
             OmegaConf.load(file)
-        except (UnicodeDecodeError, RecursionError) as found:
-            if isinstance(found, UnicodeDecodeError) and isinstance(error, UnicodeDecodeError):
+        except UnicodeDecodeError as found:
+            if isinstance(error, UnicodeDecodeError):
                 return f"{file}: byte {found.start + 1} is no UTF-8"
-            if isinstance(found, RecursionError) and isinstance(error, RecursionError):
+        except RecursionError:
+            if isinstance(error, RecursionError):
                 return f"{file}: is nested too deeply, or contains itself"
         except (OSError, YAMLError):
             continue  # these name their file themselves
     return None
 
 
-def refuse_added_keys(settings: DictConfig) -> None:
+def refuse_added_keys(settings: DictConfig, prefix: str = "") -> None:
     """Refuse keys that `+key=value` added, which gets past the schema while Hydra composes."""
-    _refuse(settings, "")
-
-
-def _refuse(node: DictConfig, prefix: str) -> None:
-    schema = OmegaConf.get_type(node)
+    schema = OmegaConf.get_type(settings)
     known = {field.name for field in dataclasses.fields(schema)} if dataclasses.is_dataclass(schema) else None
-    for key in map(str, node):
+    for key in map(str, settings):
         if known is not None and key not in known:
-            hint = _closest(key, sorted(known))
-            raise InputError(f"{prefix}{key}: there is no such key{hint}")
-        child = node._get_node(key)
-        if isinstance(child, DictConfig) and not child._is_none() and not child._is_missing():
-            _refuse(child, f"{prefix}{key}.")
+            raise InputError(f"{prefix}{key}: there is no such key{_meant(key, sorted(known))}")
+        if OmegaConf.is_missing(settings, key) or OmegaConf.is_interpolation(settings, key):
+            continue
+        if isinstance(child := settings[key], DictConfig):
+            refuse_added_keys(child, f"{prefix}{key}.")
 
 
 def _unknown_choice(message: str) -> str:
@@ -110,6 +99,8 @@ def _unknown_choice(message: str) -> str:
     assert missing is not None
     choices = group.group(2).split() if group else []
     where, _, name = missing.group(1).rpartition("/")
+    if where == "experiment":
+        choices = sorted({*choices, *pairs()})
     fact = f"{where}={name}: there is no such choice"
     if len(choices) <= _LISTED:
         return f"{fact}; there are {', '.join(choices)}{_meant(name, choices)}"
@@ -119,7 +110,7 @@ def _unknown_choice(message: str) -> str:
     return f"{fact}{hint}; --help lists them all"
 
 
-def _suggestion(facts: str) -> str:
+def _suggestion(facts: str, message: str) -> str:
     if "Ambiguous value" in facts:
         return "; to run one job for each of the values, add -m"
     if added := re.search(r"Could not override '([^']*)'.*Key '([^']*)' is not in struct", facts, re.DOTALL):
@@ -128,45 +119,30 @@ def _suggestion(facts: str) -> str:
         return f"; a new entry of a dictionary needs a plus: +{entry}=..."
     if "Could not append to config" in facts:
         return "; leave out the plus"
-    unknown = re.search(r"Key '([^']*)' not in '([^']*)'", facts)
-    schema = _schemas().get(unknown.group(2)) if unknown else None
-    if unknown is None or not isinstance(schema, type) or not dataclasses.is_dataclass(schema):
-        return ""
-    known = [field.name for field in dataclasses.fields(schema)]
-    return _closest(unknown.group(1), known, _elsewhere(unknown.group(1), schema))
+    if re.search(r"'\d+\.0' of type 'float' could not be converted to Integer", facts):
+        return "; in a yaml, write a whole number without point and exponent"
+    if unknown := re.search(r"Key '([^']*)' not in '\w+'", facts):
+        place = re.search(r"full_key: (\S+)", message + str(facts)) or re.search(r"override '([^']*)'", facts)
+        return _alike(place.group(1) if place else unknown.group(1), unknown.group(1))
+    return ""
 
 
-def _schemas() -> dict[str, Any]:
-    """All schemas by the names of their classes, beside what else their modules hold."""
-    modules = [
-        train,
-        worlds,
-        sweep,
-        tune,
-        *(sys.modules[schema.__module__] for schema in agent_schemas().values()),
-    ]
-    return {name: value for module in modules for name, value in vars(module).items()}
-
-
-def _elsewhere(key: str, schema: type) -> list[str]:
-    """What `key` may be instead: a word that is no setting, or the dotted name of one in another section."""
-    words = difflib.get_close_matches(key, OF_THE_COMMAND, n=1) if schema is train.TrainConfig else []
-    # Another agent's or source's settings are of no use.
-    own = "agent." if issubclass(schema, AgentConfig) else "env." if issubclass(schema, EnvConfig) else "."
-    last = {name: name.rpartition(".")[2] for name in settings_of_a_run() if not name.startswith(own)}
+def _alike(name: str, key: str) -> str:
+    """The settings in the section of `name` that look like `key`, or else those in other sections."""
+    sweepers = [f"hydra.sweeper.{field.name}" for field in dataclasses.fields(SweepConfig)]
+    known = {*settings_of_a_run(), *sweepers, *OF_THE_COMMAND} - {name}
+    section = name.rpartition(".")[0]
+    own = [each[len(section) + bool(section) :] for each in known if each.startswith(section)]
+    if near := _meant(key, sorted({each.partition(".")[0] for each in own} - {key})):
+        return near
+    last = {each: each.rpartition(".")[2] for each in known if each.partition(".")[0] != section}
     alike = difflib.get_close_matches(key, set(last.values()), n=1, cutoff=0.8)
-    return words or sorted(name for name, part in last.items() if [part] == alike)
+    return _or(sorted(each for each, part in last.items() if [part] == alike)) or "; --cfg job shows all keys"
 
 
-def _closest(key: str, known: list[str], elsewhere: Sequence[str] = ()) -> str:
-    return _meant(key, known) or _or(elsewhere) or f"; there are {', '.join(known)}"
+def _meant(key: str, known: list[str]) -> str:
+    return _or(difflib.get_close_matches(key, known, n=3))
 
 
-def _meant(key: str, known: Sequence[str]) -> str:
-    """The names that `key` looks like, or is the initials of, as a question; "" if there is none."""
-    initials = [name for name in known if "_" in name and "".join(w[:1] for w in name.split("_")) == key]
-    return _or(initials or difflib.get_close_matches(key, known, n=3))
-
-
-def _or(names: Sequence[str]) -> str:
+def _or(names: list[str]) -> str:
     return f"; did you mean {' or '.join(names)}?" if names else ""

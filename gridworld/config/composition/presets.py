@@ -1,7 +1,7 @@
 """`preset=auto`: settings for worlds that the agents' own numbers are not made for, chosen by one rule.
 
 The agents' yaml files are made for the default world. `conf/preset/settings` has plain numbers of some agents
-for stochastic and for larger worlds. Where `preset` is `auto`, which is the default, it comes to
+for stochastic and for larger worlds. Where `preset` is `auto`, which is the default, it becomes
 
 1. `none` where the command line or an experiment gives `total_timesteps` or `n_envs`, which a preset's
    numbers rest on, or chooses a recipe by `tuned=`; and where Stable-Baselines3's own loop trains, for which
@@ -12,7 +12,7 @@ for stochastic and for larger worlds. Where `preset` is `auto`, which is the def
 4. `large` where there are more states than in the default world, and no recipe;
 5. `none`.
 
-What is chosen becomes a word of the run's command line, as if it had been typed.
+The choice becomes a word of the run's command line, as if it had been typed.
 """
 
 from __future__ import annotations
@@ -40,9 +40,15 @@ _WITHOUT_RECIPE = "tuned=none"
 _DEFAULT_STATES = 30  # of the default world
 _ENGINE = "tabulated"  # the only one for which the numbers are made
 _SIZE = ("total_timesteps", "n_envs")
-_CHOSEN_BY_HAND = re.compile(rf"\+*({'|'.join(_SIZE)}|tuned)=")
+_CHOSEN_BY_HAND = re.compile(rf"\+*({'|'.join(_SIZE)}|tuned)=|preset=(?!auto$)")
+_OF_A_WORLD = re.compile(r"[+~]*(env|experiment|hydra)\b")
 
 Settings = TypeVar("Settings", TrainConfig, DictConfig)
+
+
+def may_need_preset(words: Sequence[str]) -> bool:
+    """Whether a command line may choose another world than the default one, and leaves the preset open."""
+    return not any(map(_CHOSEN_BY_HAND.match, words)) and any(map(_OF_A_WORLD.match, words))
 
 
 def with_preset(
@@ -51,13 +57,13 @@ def with_preset(
     compose: Callable[[list[str]], Settings],
     world: Callable[[EnvConfig], Mdp] = compiled,
 ) -> tuple[Settings, list[str]]:
-    """Compose a command line again with the preset that `preset=auto` comes to.
+    """Compose a command line again with the preset that `preset=auto` becomes.
 
     Args:
         config: what the command line composes to, as dataclasses or as Hydra has it.
         words: the command line.
         compose: composes it with further words.
-        world: makes the configured world, or returns one that there is.
+        world: makes the configured world, or returns an existing one.
 
     Returns:
         The settings; the words that were added, none where no preset is needed.
@@ -81,15 +87,10 @@ def with_preset(
 
 
 def fitting_preset(config: TrainConfig | DictConfig, world: Callable[[], Mdp | None]) -> str | None:
-    """The preset that is made for a world.
+    """The name of the preset that is made for a world.
 
-    Args:
-        config: the settings, as dataclasses or as Hydra has them.
-        world: makes the world; None: it is not known before the run.
-
-    Returns:
-        Its name; None: the agent's own settings are made for the world, the agent has no such preset, or the
-        settings make no world, which the check before training says.
+    None: `world` returns none, as it is not known before the run; the agent's own settings are made for it,
+    or the agent has no such preset; or the settings make no world, which the check before training says.
     """
     callbacks = config.callbacks
     plain = OmegaConf.to_container(callbacks) if OmegaConf.is_config(callbacks) else callbacks
@@ -106,7 +107,7 @@ def fitting_preset(config: TrainConfig | DictConfig, world: Callable[[], Mdp | N
 
 
 def is_recipe_for(recipe: str, agent: str, env: EnvConfig) -> bool:
-    """Whether a recipe was made for a world, which of one's own recipes nobody can tell."""
+    """Whether a recipe was made for a world; of a user's own recipe it is assumed."""
     name = recipe.removesuffix(f"_{agent}")
     return is_world(env, name) or not (conf_folder() / "env" / f"{name}.yaml").is_file()
 
@@ -123,7 +124,7 @@ def is_world(env: EnvConfig, name: str) -> bool:
 
 
 def _numbers(agent: str, preset: str) -> dict[str, Any]:
-    """What the preset says of the agent; nothing where it says nothing."""
+    """The preset's settings of the agent, if it has any; the agent's name may be a stranger's."""
     files = {file.stem: file for file in (conf_folder() / "preset" / "settings").glob("*.yaml")}
     file = files.get(f"{agent}_{preset}")
     return {} if file is None else dict(yaml.safe_load(file.read_text("utf-8")))

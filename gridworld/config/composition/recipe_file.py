@@ -18,6 +18,7 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import OmegaConf
 
 from gridworld.config.agents import MISSING
+from gridworld.config.composition.conf_folder import is_override
 from gridworld.config.composition.words import as_whole
 from gridworld.config.plain_settings import check_foreign, fits, foreign, shown
 from gridworld.config.settings import alternatives
@@ -40,18 +41,10 @@ _BARE = re.compile(
     r"(?!(?:true|false|null|nan|inf)$)[a-z_][\w.-]*", re.ASCII | re.IGNORECASE
 )  # text as it is
 _NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
-_WITH_VALUE = (  # Hydra's options that the next word belongs to
-    *("--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp", "--package", "-p"),
-    *("--cfg", "-c", "--info", "-i", "--experimental-rerun"),
-)
 
 
 def with_recipe(words: Sequence[str]) -> list[str]:
-    """Replace `recipe=FILE` in a command line by what the recipe says, before the user's own overrides.
-
-    Args:
-        words: the command line.
-    """
+    """Replace `recipe=FILE` in a command line by what the recipe says, before the user's own overrides."""
     given = [word for word in words if word.startswith(f"{KEY}=")]
     if not given:
         return list(words)
@@ -65,12 +58,8 @@ def with_recipe(words: Sequence[str]) -> list[str]:
     if not set(truths) <= {f"{TRUST}=true", f"{TRUST}=false"}:
         raise InputError(f"{truths[0]}: must be true or false")
     rest = [word for word in rest if word not in truths]
-    at = next((i for i, _ in enumerate(rest) if _is_override(rest, i)), len(rest))
+    at = next((i for i, _ in enumerate(rest) if is_override(rest, i)), len(rest))
     return [*rest[:at], *overrides(_file(given[0]), f"{TRUST}=true" in truths), *rest[at:]]
-
-
-def _is_override(words: Sequence[str], index: int) -> bool:
-    return not words[index].startswith("-") and (index == 0 or words[index - 1] not in _WITH_VALUE)
 
 
 def _file(word: str) -> Path:
@@ -86,15 +75,7 @@ def _file(word: str) -> Path:
 
 
 def overrides(path: Path, trust: bool = False) -> list[str]:
-    """Read a recipe.
-
-    Args:
-        path: its file.
-        trust: whether to allow what runs code or reads files.
-
-    Returns:
-        Overrides: choices first, then values.
-    """
+    """The overrides of a recipe, choices first; with `trust` it may run code and read files."""
     content = _read(path)
     if not isinstance(content, dict):
         raise InputError(f"{path}: holds no settings")
@@ -170,19 +151,15 @@ def _values(schemas: Sequence[type], content: dict[Any, Any], path: Path, sectio
             # What is in no schema has no entry yet that could be changed.
             yield f"{'++' if isinstance(value, dict) else ''}{name}={literal(value, f'{path}: {name}')}"
         else:
-            wanted = "settings" if kinds else " or ".join(sorted(set(map(_type_name, hints))))
+            types = (h.__name__ if isinstance(h, type) else str(h).replace("typing.", "") for h in hints)
+            wanted = "settings" if kinds else " or ".join(sorted(set(types)))
             raise InputError(f"{path}: {name}={shown(value)}: must be {wanted}")
 
 
 def harmless_words(words: Sequence[str], config: TrainConfig) -> Iterator[str]:
     """What a stranger's command line changed: choices, and settings with the values that `config` has.
 
-    Args:
-        words: the command line, which may be anything.
-        config: the settings that it is said to have led to, checked.
-
-    Yields:
-        Overrides. What is no setting, or would run code or read a file elsewhere, is left out.
+    What is not a setting, or would run code or read a file elsewhere, is left out.
     """
     settings = dataclasses.asdict(config)
     for word in words:
@@ -204,17 +181,8 @@ def harmless_words(words: Sequence[str], config: TrainConfig) -> Iterator[str]:
             yield f"{sign}{key}={literal(place, key)}"
 
 
-def _type_name(hint: Any) -> str:
-    return hint.__name__ if isinstance(hint, type) else str(hint).replace("typing.", "")
-
-
 def literal(value: Any, where: str) -> str:
-    """Write a plain value in Hydra's grammar of overrides.
-
-    Args:
-        value: text, a number, a boolean, None, or a list or dictionary of such.
-        where: it stands, for the message.
-    """
+    """Write a plain value in Hydra's grammar of overrides; `where` is for the message."""
     if isinstance(value, dict):
         for key in value:
             if not isinstance(key, str) or not _NAME.fullmatch(key):

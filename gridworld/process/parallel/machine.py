@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
+import resource
 import sys
 from pathlib import Path
-
-_USUAL_FILES = 512  # of Windows
-_USUAL_MEMORY = 4 * 2**30  # bytes, where the system does not tell
 
 
 def core_count() -> int:
@@ -24,20 +21,14 @@ def worker_count(asked: int) -> int:
 
 def file_limit() -> int:
     """How many files this process may have open at once."""
-    try:
-        import resource
-    except ImportError:
-        return _USUAL_FILES
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     return sys.maxsize if limit == resource.RLIM_INFINITY else limit
 
 
 def free_memory() -> int:
-    """Bytes that programs can still have; half of all where the system does not tell."""
-    with contextlib.suppress(OSError):
-        known = re.search(r"^MemAvailable:\s*(\d+) kB", Path("/proc/meminfo").read_text(), re.MULTILINE)
-        if known is not None:
-            return 1024 * int(known[1])
-    with contextlib.suppress(OSError, ValueError, AttributeError):
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
-    return _USUAL_MEMORY
+    """Bytes that programs can still have; half of all where the system does not say."""
+    meminfo = Path("/proc/meminfo")
+    known = re.search(r"MemAvailable:\s*(\d+) kB", meminfo.read_text() if meminfo.exists() else "")
+    if known is not None:
+        return 1024 * int(known[1])
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2

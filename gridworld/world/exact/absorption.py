@@ -95,10 +95,7 @@ def factor(weights: Any, leak: FloatArray) -> Callable[[FloatArray], FloatArray]
     matrix = diags_array(leak + weights.sum(axis=1), format="csr") - weights
     try:
         factors = splu(
-            matrix.tocsc(),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
+            matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
         is_accurate = np.abs(factors.solve(leak) - 1).max() <= _ACCURACY
     except RuntimeError:  # rounding has made it singular

@@ -54,11 +54,7 @@ _KEPT = 1e-10  # relative; a policy that loses more was no improvement
 
 
 def backup(
-    mdp: Mdp,
-    v: FloatArray,
-    gamma: float,
-    states: IntArray | slice = slice(None),
-    magnitude: bool = False,
+    mdp: Mdp, v: FloatArray, gamma: float, states: IntArray | slice = slice(None), magnitude: bool = False
 ) -> FloatArray:
     """Q(s, a) = Σ_k p_k [ r_k + γ v(next_k) ] (n, A) of `states` (n,); `magnitude` takes |r_k| for r_k."""
     reward = np.abs(mdp.reward[states]) if magnitude else mdp.reward[states]

@@ -25,7 +25,6 @@ A run's world holds the fields of an `Mdp` as they are.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import os
 from collections.abc import Callable, Mapping
 from os import PathLike, fspath
@@ -144,10 +143,10 @@ def _check_names(where: str, arrays: Mapping[str, Any]) -> None:
             raise InputError(f"{where}: has no {key}, must hold {', '.join(_NEEDED)}")
     for key in arrays:
         if key not in _NEEDED + _OPTIONAL:
-            near = difflib.get_close_matches(str(key), _OPTIONAL, n=1)
-            listed = f"{', '.join(_OPTIONAL[:-1])} and {_OPTIONAL[-1]}"
-            told = f"did you mean {near[0]}?" if near else f"beside what is needed it may hold {listed}"
-            raise InputError(f"{where}: {str(key)[:50]} is no array of a world; {told}")
+            raise InputError(
+                f"{where}: {str(key)[:50]} is no array of a world; beside what is needed it may hold "
+                f"{', '.join(_OPTIONAL)}"
+            )
 
 
 def _array(where: str, key: str, value: Any) -> NDArray[Any]:

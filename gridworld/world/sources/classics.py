@@ -173,7 +173,12 @@ def _world(
     **settings: Any,
 ) -> Mdp:
     """The world of next states, rewards and ends, (N, A) or with `probability` (N, A, K)."""
-    given = {"next_state": tables[0], "reward": tables[1], "terminated": tables[2], "success": success}
+    given: dict[str, Any] = {
+        "next_state": tables[0],
+        "reward": tables[1],
+        "terminated": tables[2],
+        "success": success,
+    }
     if probability is None:
         given = {key: None if table is None else table[:, :, None] for key, table in given.items()}
         probability = np.ones((*tables[0].shape, 1))

@@ -12,7 +12,6 @@ be an outcome of its row, and as frequent as the row says, as far as that can be
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 from gridworld.errors import InputError
 from gridworld.world.mdp import IntArray, Mdp, grid_places
 from gridworld.world.outcomes import Outcomes, check_size, mdp_from_outcomes
-from gridworld.world.sources.making import make_env, told
+from gridworld.world.sources.making import make_env, short_reason
 from gridworld.world.sources.table_walk import walk
 from gridworld.world.sources.wrappers import copied, refuse_transformed, step_limit
 
@@ -143,33 +142,18 @@ def _table(name: str, real: Any) -> Outcomes:
 
 def _rows(name: str, table: Any, states: int, actions: int) -> tuple[NDArray[np.float64], IntArray]:
     """All outcomes (M, 4) in the order of states and actions, and how many each of these has (S * A,)."""
-    pairs = list(itertools.product(range(states), range(actions)))
     try:
-        of_pairs = [table[state][action] for state, action in pairs]
+        of_pairs = [table[state][action] for state in range(states) for action in range(actions)]
         rows = np.array([outcome for row in of_pairs for outcome in row], dtype=np.float64)
         counts = np.array([len(row) for row in of_pairs])
         if (counts > 0).all() and _are_outcomes(rows, states):
             return rows, counts
     except (KeyError, IndexError, TypeError, ValueError, OverflowError):
         pass
-    for state, action in pairs:  # the first row that is no row
-        try:
-            row = table[state][action]
-        except (KeyError, IndexError, TypeError):
-            raise InputError(
-                f"{name}: P has no state {state} with action {action}, must have {states} states with "
-                f"{actions} actions each"
-            ) from None
-        try:
-            good = _are_outcomes(np.array(list(row), dtype=np.float64), states)
-        except (TypeError, ValueError, OverflowError):
-            good = False
-        if not good:
-            raise InputError(
-                f"{name}: P[{state}][{action}] is {str(row)[:100]}, must be a list of (probability, next "
-                f"state from 0 to {states - 1}, reward, terminated)"
-            )
-    raise InputError(f"{name}: P is no table of {states} states and {actions} actions")
+    raise InputError(
+        f"{name}: its table P must have for each of {states} states and {actions} actions a list of "
+        f"(probability, next state from 0 to {states - 1}, reward, terminated)"
+    )
 
 
 def _are_outcomes(rows: NDArray[np.float64], states: int) -> bool:
@@ -193,7 +177,7 @@ def _check_steps(mdp: Mdp, table: Outcomes, env: gym.Env[Any, Any]) -> str:
     except InputError as error:
         mistake = error
     except Exception as error:  # an environment of the user's own may raise anything
-        raise InputError(f"{mdp.name}: cannot be stepped ({told(error)})") from error
+        raise InputError(f"{mdp.name}: cannot be stepped ({short_reason(error)})") from error
     if _differ(table, _table(mdp.name, real)):
         raise InputError(
             f"{mdp.name}: its table P changes when it is reset or stepped, so no exact truth is known; must "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import inspect
 from collections.abc import Mapping
 from typing import Any
 
@@ -35,11 +34,11 @@ def make_env(
                 needed = f"needs the package {package}; install it with {install_command(package)}"
                 raise InputError(f"env.id={env_id}: {needed}") from None
     try:
-        spec = gym.spec(registered)
+        gym.spec(registered)
     except Exception as error:  # an id may name a module, which may raise anything
         raise InputError(
-            f"env.id={str(env_id)[:80]}: is no environment that Gymnasium knows ({told(error)}); give a "
-            "registered id, e.g. FrozenLake-v1"
+            f"env.id={str(env_id)[:80]}: is no environment that Gymnasium knows ({short_reason(error)}); "
+            "give a registered id, e.g. FrozenLake-v1"
         ) from None
     try:
         with np.errstate(all="ignore"):
@@ -47,28 +46,12 @@ def make_env(
     except Exception as error:  # as above
         shown = ", ".join(f"{key}: {value}" for key, value in arguments.items())[:100]
         given = f"env.kwargs={{{shown}}}: {env_id}" if arguments else f"env.id={env_id}:"
-        takes = _arguments(spec) if arguments else ""
-        raise InputError(f"{given} cannot be made ({told(error)}){takes}") from None
+        raise InputError(f"{given} cannot be made ({short_reason(error)})") from None
 
 
-def told(error: BaseException) -> str:
+def short_reason(error: BaseException) -> str:
     """What an exception says, in short."""
     return in_short(error).split(" was raised from the environment creator")[0].rstrip(" .")
-
-
-def _arguments(spec: Any) -> str:
-    """What an environment can be made with, as the end of a sentence."""
-    from gymnasium.envs.registration import load_env_creator
-
-    try:
-        point = spec.entry_point
-        parameters = inspect.signature(
-            load_env_creator(point) if isinstance(point, str) else point
-        ).parameters
-    except Exception:
-        return "; see its documentation"
-    names = [name for name in parameters if name not in ("self", "render_mode")]
-    return f"; it takes {', '.join(names)}" if names else "; it takes no arguments"
 
 
 def _import_module(env_id: str, module: str) -> None:
@@ -76,7 +59,7 @@ def _import_module(env_id: str, module: str) -> None:
     try:
         importlib.import_module(module)
     except (Exception, SystemExit) as error:  # it may raise anything
-        reason = f"the module {module} cannot be imported ({told(error)})"
+        reason = f"the module {module} cannot be imported ({short_reason(error)})"
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing and f"{module}.".startswith(f"{missing}."):
             reason = f"there is no module {missing}; install it, or name its folder in PYTHONPATH"

@@ -18,7 +18,7 @@ import sys
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
 from enum import Enum
-from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
+from types import BuiltinFunctionType, CodeType, FunctionType, GeneratorType, MethodType, ModuleType
 from typing import Any
 
 import gymnasium as gym
@@ -28,7 +28,15 @@ GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
 _SPEC = gym.envs.registration.EnvSpec
 _KEPT = (gym.Space, _SPEC, FunctionType, BuiltinFunctionType, ModuleType, *GENERATORS)
 _PLAIN = frozenset({int, float, complex, str, bool, bytes, type(None)})
-_REDUCED = (*_PLAIN - {type(None)}, list, tuple, dict, set, frozenset, deque, bytearray, functools.partial)
+_NUMBERS_AND_TEXTS: tuple[type, ...] = (
+    int,
+    float,
+    complex,
+    str,
+    bytes,
+    bytearray,
+)  # and classes made of them
+_REDUCED = (*_NUMBERS_AND_TEXTS, list, tuple, dict, set, frozenset, deque, functools.partial)
 _OF_ITS_RANDOMNESS = ("_np_random", "_np_random_seed")
 _SHORT = 16  # numbers; a position is the same whether it is a tuple or an array
 _MOST_READ = 20_000  # objects that a deep reader follows
@@ -203,11 +211,15 @@ class Reader:
             objects = value.dtype.hasobject
             label = value.dtype.str, value.shape, b"" if objects else value.tobytes()
             return label, (value.tolist(),) if objects else ()
-        if isinstance(value, FunctionType | ModuleType | type):
-            of_kind = {FunctionType: _of_function, ModuleType: _of_module}.get(
-                kind, lambda each: vars(each).values()
-            )
-            return value.__name__, () if _is_library(value) else list(of_kind(value))
+        if isinstance(value, FunctionType):
+            return value.__qualname__, () if _is_library(value) else list(_of_function(value))
+        if isinstance(value, GeneratorType):
+            frame = value.gi_frame
+            return name, () if frame is None else (frame.f_lasti, dict(frame.f_locals))
+        if isinstance(value, ModuleType):
+            return value.__name__, () if _is_library(value) else list(_of_module(value))
+        if isinstance(value, type):
+            return value.__qualname__, () if _is_library(value) else list(vars(value).values())
         if kind in (dict, set, frozenset):  # in their own order, which may be a memory too
             return name, [part for each in value.items() for part in each] if kind is dict else list(value)
         for kinds, references in _REFERENCES.items():
@@ -282,5 +294,5 @@ def _globals_of(code: CodeType) -> set[str]:
 def _of_module(module: ModuleType) -> Iterator[Any]:
     """Its data: what it imports and defines may be anything."""
     for value in list(vars(module).values()):
-        if isinstance(value, int | float | str | list | dict | set | np.ndarray | GENERATORS):
+        if isinstance(value, (int, float, str, list, dict, set, np.ndarray, *GENERATORS)):
             yield value if not isinstance(value, dict) or "__name__" not in value else None

@@ -180,7 +180,7 @@ def test_every_class_of_torch_is_taken_or_refused_in_a_sentence(
 @pytest.mark.parametrize(
     ("agent", "word", "sentence"),
     [
-        ("trpo", "agent.arguments.target_kl=-1", "no finite number"),
+        ("trpo", "agent.arguments.target_kl=-1", "agent.arguments.target_kl=-1: must be above 0"),
         (
             "a2c",
             "+agent.arguments._init_setup_model=false",

@@ -70,7 +70,6 @@ def test_everything_optional(tmp_path):
     ("changed", "told"),
     [
         ({"start": None}, "has no start, must hold next_state, reward, terminated, start"),
-        ({"probabilty": [1.0]}, "probabilty is no array of a world; did you mean probability"),
         ({"nonsense": [1.0]}, "nonsense is no array of a world; beside what is needed it may hold"),
         ({"reward": [0.0, 1.0]}, r"reward has shape \(2,\), next_state has \(2, 2\)"),
         ({"reward": [["a", "b"], ["a", "b"]]}, "reward is <U1, must be an array of numbers"),

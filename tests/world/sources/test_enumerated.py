@@ -216,15 +216,6 @@ def test_a_step_count_that_is_left_out(variant: str, limit: int | None) -> None:
     assert (mdp.own_observation is None) == (variant == "text")
 
 
-def test_an_end_may_be_called_a_truncation_too() -> None:
-    assert enumerate_env("Corridor-v0", {"variant": "both"}, ignore=["steps"]).terminal.sum() == 1
-
-
-def test_what_is_paid_after_the_step_limit_does_not_count() -> None:
-    mdp = enumerate_env("ShortCorridor-v0", {"variant": "decay", "max_episode_steps": 3})
-    assert Evaluator(mdp, 1.0, 3).optimal_value == 0
-
-
 @pytest.mark.parametrize(
     ("variant", "limit", "what"),
     [("once", 60, "reward"), ("decay", 20, "reward"), ("gate", 20, "reward"), ("toll", 25, "reward")],
@@ -307,12 +298,6 @@ def test_an_attribute_that_is_left_out_must_be_there() -> None:
         InputError, match=r"env.ignore=\['step'\]: Corridor-v0 has no attribute step; it has .*steps"
     ):
         enumerate_env("Corridor-v0", ignore=["step"])
-
-
-def test_states_too_far_away_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(enumerated, "_DEEPEST", 100)
-    with pytest.raises(InputError, match="after 100 steps there are still new states, since its steps keeps"):
-        enumerate_env("Corridor-v0")
 
 
 class Counted(Corridor):

@@ -1,0 +1,72 @@
+"""Tasks in processes: what comes back, in what order, and what a killed process or a signal leaves."""
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gridworld.process.parallel.processes import LostError, run_in_processes
+
+
+def run(tasks: Sequence[Callable[[], Any]], count: int = 2, forks: bool = True) -> list[Any]:
+    found: dict[int, Any] = {}
+    run_in_processes(tasks, count, forks, lambda number, result: found.update({number: result}))
+    return [found[number] for number in range(len(tasks))]
+
+
+def write(folder: Path, number: int) -> int:
+    (folder / f"{number}").write_text(f"{os.getpid()}")
+    return number
+
+
+def is_killed() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.parametrize("forks", [True, False])
+def test_each_task_has_its_result_and_all_processes_end(forks: bool, tmp_path: Path) -> None:
+    assert run([partial(write, tmp_path, number) for number in range(7)], 2, forks) == list(range(7))
+    processes = {path.read_text() for path in tmp_path.iterdir()}
+    assert len(processes) <= 2
+    assert str(os.getpid()) not in processes
+    for process in processes:
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(process), 0)
+
+
+def test_a_killed_process_takes_no_other_task_along(tmp_path: Path) -> None:
+    lost, *others = run([is_killed, *(partial(write, tmp_path, number) for number in range(3))])
+    assert isinstance(lost, LostError)
+    assert str(lost) == "exit code -9"
+    assert others == [0, 1, 2]
+
+
+def works(folder: Path, number: int) -> None:
+    (folder / f"begun {number}").touch()
+    try:
+        time.sleep(30)
+    except SystemExit:
+        time.sleep(0.2)  # a second signal would end this too
+        (folder / f"closed {number}").touch()
+        raise
+
+
+def test_a_signal_is_passed_on_once_and_all_processes_end_first(tmp_path: Path) -> None:
+    def interrupt() -> None:
+        while len(list(tmp_path.glob("begun *"))) < 2:
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    with pytest.raises(SystemExit) as ended:
+        run([partial(works, tmp_path, number) for number in range(3)])
+    thread.join()
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert {path.name for path in tmp_path.glob("closed *")} == {"closed 0", "closed 1"}
