@@ -144,7 +144,11 @@ def refused(*given: Any, **named: Any) -> str:
         (([4] * 30, "classic"), {}, "state 0 has the action 4; must be 0 (up)"),
         (([0.5] * 30, "classic"), {}, "state 0 has the action 0.5"),
         ((np.ones((30, 4)), "classic"), {}, "not probabilities, at least 0 with sum 1; give Q values as q="),
-        ((), {"q": [1] * 30, "env": "classic"}, "q: has shape (30,); this world has 30 states and 4 actions, so it must be (30, 4)"),
+        (
+            (),
+            {"q": [1] * 30, "env": "classic"},
+            "q: has shape (30,); this world has 30 states and 4 actions, so it must be (30, 4)",
+        ),
         ((), {"q": np.full((30, 4), np.nan), "env": "classic"}, "q: has NaN"),
         ((), {"env": "classic"}, "give one of a model or table"),
         (("abc", "classic"), {}, "str is neither a model nor a table of numbers"),
