@@ -6,6 +6,7 @@ followed, so that a report covers what is in the folder, and the search ends.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import dataclasses
 import json
@@ -151,6 +152,11 @@ def read(folder: Path) -> Evidence | Unusable:
         why = f": {' '.join(cause.split())[:300]}" if cause else ""
         why = ": it is still running, or was killed" if status == "running" else why
         told = f"{folder}: this run is {status!r}, not finished{why}"
+        with contextlib.suppress(InputError):
+            steps = int(_read_curve(run)["step"][-1])
+            told += (
+                f" (last evaluated after {steps:,} steps, says {CURVE}, which is not verified before the end)"
+            )
         return dataclasses.replace(unusable, reasons=(told,), state=_printable(status))
     damaged = run.damage()
     try:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from gridworld.config.worlds import EnvConfig, MapConfig
 from gridworld.errors import InputError
+from gridworld.process.user_input import COPIES
 from gridworld.run.folder import CHECKED, MANIFEST, PICTURES, RunFolder
 from gridworld.run.manifest import read_manifest
 from gridworld.storage.safe_read import LARGEST_JSON, as_object, file_sha256, read_bytes, sha256
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from gridworld.world.mdp import Mdp
 
 LARGEST_RESULT = 2**30  # bytes of a file
-_COPIES = 3  # of a world: the file, its arrays, and what is computed while they are checked
 
 
 class RunReader(RunFolder):
@@ -159,7 +159,7 @@ def stored_world(run: RunReader, env: EnvConfig) -> Mdp:
         layout = parse(text, f"{run.manifest_file}: layout")
         return env.compile_on(dataclasses.replace(layout, name=env.layout))
     is_noted = run.world_file.name in run.manifest.get("sha256", {})  # not of an unfinished run
-    content = (run.read if is_noted else read_bytes)(run.world_file, LARGEST_RESULT, _COPIES)
+    content = (run.read if is_noted else read_bytes)(run.world_file, LARGEST_RESULT, COPIES)
     mdp = world_from_bytes(content, str(run.world_file))
     if mdp.text() != text:
         raise InputError(

@@ -552,7 +552,7 @@ def map_of_a_million_cells(run: Path, base: Path) -> None:
     manifest(run, lambda content: content.update(layout=["S" + "." * 998 + "G"] * 1000))
 
 
-@hostile("n_envs=1000000000000: must be at most")
+@hostile("n_envs=1000000000000: must be from 1 to")
 def a_trillion_environments(run: Path, base: Path) -> None:
     manifest(run, lambda content: content["config"].update(n_envs=10**12))
 
@@ -567,7 +567,7 @@ def a_network_of_a_trillion_weights(run: Path, base: Path) -> None:
     manifest(run, lambda c: c["config"]["agent"]["policy_kwargs"].update(net_arch=[10**6, 10**6]))
 
 
-@hostile("env.max_episode_steps=1000000000000: must be at most")
+@hostile("env.max_episode_steps=1000000000000: must be from 1 to")
 def an_episode_of_a_trillion_steps(run: Path, base: Path) -> None:
     manifest(run, lambda content: content["config"]["env"].update(max_episode_steps=10**12))
 

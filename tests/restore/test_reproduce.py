@@ -325,7 +325,7 @@ def test_changes_since_the_commit_are_kept_and_can_be_applied(tmp_path: Path) ->
     git(tree, "commit", "-m", "first")
     clean = source_of(tree)
     assert clean is not None
-    assert clean.told() == {"commit": clean.commit, "dirty": False}
+    assert clean.manifest_entry() == {"commit": clean.commit, "dirty": False}
 
     (tree / "notes.txt").write_text("changed\n")
     assert source_of(tree) == clean
@@ -333,8 +333,8 @@ def test_changes_since_the_commit_are_kept_and_can_be_applied(tmp_path: Path) ->
     (tree / "gridworld" / "new.py").write_text("b = 3\n")
     dirty = source_of(tree)
     assert dirty is not None
-    assert dirty.told()["dirty"]
-    assert dirty.told()["diff"]["bytes"] == len(dirty.diff)
+    assert dirty.manifest_entry()["dirty"]
+    assert dirty.manifest_entry()["diff"]["bytes"] == len(dirty.diff)
     (tmp_path / "diff").write_bytes(dirty.diff)
     git(tmp_path, "clone", "tree", "copy")
     git(tmp_path / "copy", "apply", str(tmp_path / "diff"))
