@@ -382,7 +382,7 @@ def test_a_lock_is_seen_and_ends_with_its_block(tmp_path: Path) -> None:
 
 def test_a_file_system_without_locks_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(file: int, operation: int) -> None:
-        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr(fcntl, "flock", refuse)
     with pytest.raises(InputError, match="no locks"), locked(tmp_path / "lock"):
