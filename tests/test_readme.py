@@ -43,10 +43,7 @@ def test_the_main_job_prints_what_the_readme_shows(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("word", "extra"),
-    [
-        *(("scripts/tune.py", "tune")),
-        *(("launcher=slurm", "slurm"), ("launcher=ray", "ray")),
-    ],
+    [("scripts/tune.py", "tune"), ("launcher=slurm", "slurm"), ("launcher=ray", "ray")],
 )
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_an_optional_part_is_installed_on_the_page_that_needs_it(page: Path, word: str, extra: str) -> None:
