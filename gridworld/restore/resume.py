@@ -18,6 +18,7 @@ from gridworld.config.agents import falls
 from gridworld.config.plain_settings import foreign
 from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
+from gridworld.config.worlds import BuiltConfig, GymnasiumConfig
 from gridworld.errors import InputError
 from gridworld.process.console.progress import telling_if_slow
 from gridworld.process.console.terminal import printable, tell
@@ -173,7 +174,7 @@ class Unfinished:
     def _tell_if_world_changed(self) -> None:
         env = self.config.env
         is_foreign = not self.is_trusted and any(foreign({"env": dataclasses.asdict(env)}))
-        if is_foreign or not env.compiles_quickly:  # which may run the user's code
+        if is_foreign or isinstance(env, BuiltConfig | GymnasiumConfig):  # which would run their code
             return
         try:
             changed = env.compile().text() != self.mdp.text()
