@@ -13,6 +13,7 @@ import sys
 import termios
 import time
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 import pytest
@@ -220,15 +221,15 @@ def test_record_says_where_it_cannot_write(
             record_command.main([*line, str(tmp_path / "below")])
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
-    def refuse(path: os.PathLike[str], flags: int, *more: object, **named: object) -> int:
-        if flags & os.O_CREAT:
+    def refuse(path: Path, mode: str = "r", *more: Any, **named: Any) -> IO[Any]:
+        if "w" in mode:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), os.fspath(path))
-        return os_open(path, flags, *more, **named)
+        return path_open(path, mode, *more, **named)
 
-    os_open = os.open
+    path_open = Path.open
     out = tmp_path / "below"
     monkeypatch.setattr(sys, "argv", ["record.py", *line, str(out)])
-    monkeypatch.setattr(os, "open", refuse)  # as a file server may, whatever the permissions say
+    monkeypatch.setattr(Path, "open", refuse)  # as a file server may, whatever the permissions say
     with pytest.raises(SystemExit) as ended:
         run(record_command.main)
     assert ended.value.code == 2

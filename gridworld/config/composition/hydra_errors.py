@@ -18,6 +18,7 @@ from yaml import MarkedYAMLError, YAMLError
 
 from gridworld.config.composition.words import OF_THE_COMMAND, pairs, settings_of_a_run
 from gridworld.config.sweep import SweepConfig
+from gridworld.config.tune import TuneConfig
 from gridworld.errors import InputError, failure
 
 _LISTED = 24  # choices of a group that are listed at most; of more, those with a similar name
@@ -129,8 +130,9 @@ def _suggestion(facts: str, message: str) -> str:
 
 def _alike(name: str, key: str) -> str:
     """The settings in the section of `name` that look like `key`, or else those in other sections."""
-    sweepers = [f"hydra.sweeper.{field.name}" for field in dataclasses.fields(SweepConfig)]
-    known = {*settings_of_a_run(), *sweepers, *OF_THE_COMMAND} - {name}
+    sections = {"hydra.sweeper": SweepConfig, "tune": TuneConfig}
+    others = [f"{of}.{each.name}" for of, schema in sections.items() for each in dataclasses.fields(schema)]
+    known = {*settings_of_a_run(), *others, *OF_THE_COMMAND} - {name}
     section = name.rpartition(".")[0]
     own = [each[len(section) + bool(section) :] for each in known if each.startswith(section)]
     if near := _meant(key, sorted({each.partition(".")[0] for each in own} - {key})):
