@@ -23,9 +23,7 @@ from pathlib import Path
 from typing import Any
 
 _SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-# This tree's package, wherever one is installed.
-_PATHS = [*filter(None, [os.environ.get("PYTHONPATH")]), str(_SCRIPTS.parent)]
-_FRESH = os.environ | {"PYTHONPATH": os.pathsep.join(_PATHS)}
+_FRESH = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 
 
 @dataclass(frozen=True)

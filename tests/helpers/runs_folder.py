@@ -19,7 +19,7 @@ from gridworld.run.reader import read_run
 from gridworld.storage.safe_read import sha256
 from gridworld.storage.sealed_json import sealed
 from gridworld.sweep.folder import SweepFolder
-from gridworld.sweep.job_table import FAILED, JobTable
+from gridworld.sweep.job_table import FAILED, JobRow, JobTable
 from gridworld.sweep.plan import Job
 from gridworld.tune.study_folder import SEARCH_JSON
 from gridworld.world.exact.evaluation import Evaluator
@@ -134,8 +134,8 @@ def write_sweep(folder: Path, run: Path) -> None:
     with sweep.at_work():
         sweep.add(jobs, ["seed=0,1,2"])
     shutil.copytree(run, folder / "seed=0")
-    JobTable(sweep.path).repair(sweep.entries.values())
-    JobTable(sweep.path).set("seed=1", status=FAILED, error="agent.learning_rate=12: must be less than 10")
+    table, wrong = JobTable(sweep.path), "agent.learning_rate=12: must be less than 10"
+    table.write(table.inspect(sweep.entries.values(), {"seed=1": JobRow("", "", FAILED, error=wrong)}))
 
 
 def write_study(folder: Path) -> None:

@@ -3,7 +3,6 @@
 At every point: GRIDWORLD_POWER_CUTS=1000000 python -m pytest tests/run/test_power_cuts.py
 """
 
-import json
 import os
 import shutil
 from collections.abc import Callable
@@ -17,7 +16,7 @@ from helpers.support import SHORT, configure
 
 from gridworld.errors import InputError
 from gridworld.run.reader import read_run
-from gridworld.sweep.folder import SweepFolder, open_sweep
+from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.job import run_in_sweep
 from gridworld.sweep.job_table import DONE, FAILED, JobTable
 from gridworld.sweep.plan import plan
@@ -103,7 +102,7 @@ def run_sweep(folder: Path) -> None:
     table = JobTable(folder)
     with sweep.at_work():
         entries = sweep.add(jobs, ["seed=0,1"])
-        rows = table.repair(sweep.entries.values())
+        rows = table.inspect(sweep.entries.values(), {})
         assert {row.status for row in rows.values()}.isdisjoint({FAILED})
         for entry in entries:
             if rows[entry.job].status != DONE:
@@ -113,7 +112,7 @@ def run_sweep(folder: Path) -> None:
                         configure(*entry.overrides), folder / entry.job, list(entry.overrides), False
                     )
                 )
-        table.repair(sweep.entries.values())
+        table.write(table.inspect(sweep.entries.values(), {}))
 
 
 def test_a_sweep_goes_on_after_a_power_cut(tmp_path: Path) -> None:
@@ -182,25 +181,3 @@ def test_a_damaged_manifest_is_refused_and_nothing_is_lost(damage: str, tmp_path
     file.write_bytes(whole)
     go_on(tmp_path, 3000)
     assert is_whole(tmp_path)
-
-
-@pytest.mark.parametrize("damage", ["empty", "cut"])
-def test_a_damaged_sweep_is_made_again_from_its_jobs(
-    damage: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run_sweep(tmp_path)
-    file = tmp_path / "sweep.json"
-    before = json.loads(file.read_bytes())
-    (tmp_path / "seed=0").rename(tmp_path / "mine")  # as another name than the one that it would get
-    file.write_bytes(DAMAGES[damage](file.read_bytes()))
-    with pytest.raises(
-        InputError, match=r"sweep.json: is empty or cut off; the sweep's own command writes it again"
-    ):
-        open_sweep(tmp_path)
-    done = {path: path.read_bytes() for path in tmp_path.glob("*/manifest.json")}
-    run_sweep(tmp_path)
-    assert "written again from the jobs' folders" in capsys.readouterr().err
-    after = json.loads(file.read_bytes())
-    assert [job["hash"] for job in after["jobs"]] == [job["hash"] for job in before["jobs"]]
-    assert [job["job"] for job in after["jobs"]] == ["mine", "seed=1"]
-    assert {path: path.read_bytes() for path in tmp_path.glob("*/manifest.json")} == done  # nothing ran twice

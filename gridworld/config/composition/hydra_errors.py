@@ -143,7 +143,9 @@ def _alike(name: str, key: str) -> str:
 
 
 def _meant(key: str, known: list[str]) -> str:
-    return _or(difflib.get_close_matches(key, known, n=3))
+    """The names that `key` looks like, or is the initials of, as a question; "" if there is none."""
+    initials = [name for name in known if "_" in name and "".join(w[:1] for w in name.split("_")) == key]
+    return _or(initials or difflib.get_close_matches(key, known, n=3))
 
 
 def _or(names: list[str]) -> str:
