@@ -111,7 +111,7 @@ def _game(options: argparse.Namespace) -> Game:
     saved = SavedRun(options.agent, best=options.best)
     config, world = saved.config, saved.evaluator(options.layout).mdp
     if not isinstance(config.env, MapConfig) or not isinstance(world, GridMdp):
-        raise InputError(f"--agent {options.agent}: was trained on {config.env.name}, which is no map")
+        raise InputError(f"--agent {options.agent}: was trained on {config.env.name}, not a map")
     mdp = dataclasses.replace(config.env, **given).compile_on(world.layout)
     gamma = config.evaluation.gamma if options.gamma is None else options.gamma
     evaluator, policy = Evaluator(mdp, gamma, config.env.step_limit(mdp)), saved.snapshot().greedy_policy()

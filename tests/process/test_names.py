@@ -104,7 +104,7 @@ def test_what_is_said_of_a_sweeps_jobs(tmp_path: Path, capsys: pytest.CaptureFix
     with sweep.at_work():
         sweep.add([Job((f"env={EVIL}",), (EVIL,), "1" * 32, None, False)], [EVIL])
     (entry,) = sweep.entries.values()
-    JobTable(sweep.path).set(entry.job, status=FAILED, error=EVIL)
+    JobTable(sweep.path).write({entry.job: JobRow(entry.job, EVIL, FAILED, error=EVIL)})
     row, total = told(jobs.main, capsys, sweep.path)
     assert SHOWN in row
     assert total == "1 job: 1 failed"

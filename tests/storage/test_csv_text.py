@@ -13,7 +13,7 @@ import gridworld
 from gridworld.process.console.terminal import plain
 from gridworld.report.table import Table, to_csv
 from gridworld.storage.csv_text import csv_rows, csv_text
-from gridworld.sweep.job_table import JobTable
+from gridworld.sweep.job_table import JobRow, JobTable
 
 FORMULA = re.compile(r"[=+\-@\t\r\n]")
 TEXTS = st.text(st.sampled_from("=+-@\t\r\n',;\"a1. "), max_size=6)
@@ -45,14 +45,12 @@ def test_tables_of_reports_and_of_sweeps_have_no_formulas(tmp_path: Path) -> Non
     table = to_csv(Table("runs", "", ["-x", "n"], [[name, -1.5], ["\tq", None]]))
     assert list(csv.reader(io.StringIO(table))) == [["'-x", "n"], [f"'{name}", "-1.5"], ["\\tq", ""]]
     jobs = JobTable(tmp_path)
-    for job in (name, "+agent.x=1"):
-        jobs.set(job, status="running", error="-> it broke", objective="-0.25")
-        jobs.set(job, status="failed")
+    rows = {
+        job: JobRow(job, "", "failed", objective="-0.25", error="-> it broke") for job in (name, "+agent.x=1")
+    }
+    jobs.write(rows)
     assert jobs.file.read_text().count(",'-> it broke") == 2
-    row = jobs.row(name)
-    assert row is not None
-    assert (row.job, row.status, row.error, row.objective) == (name, "failed", "-> it broke", "-0.25")
-    assert set(jobs.read()) == {name, "+agent.x=1"}
+    assert jobs.read() == rows
 
 
 def test_only_one_module_writes_csv() -> None:
