@@ -34,7 +34,7 @@ def main(arguments: Sequence[str]) -> None:
     check_writable(options.out.parent, "--out")
     if not (_DOCS / "benchmarks").is_dir():
         raise InputError(f"{program('benchmark')}: what it measures is in docs/benchmarks of the source")
-    sys.path.append(str(_DOCS))
+    sys.path.insert(0, str(_DOCS))
     measure = import_module("benchmarks.measure")
     workload = measure.QUICK if options.quick else measure.FULL
     results: list[Any] = []

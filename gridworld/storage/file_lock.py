@@ -37,7 +37,7 @@ def locked(path: Path, wait: float | None = None) -> Iterator[bool]:
         FolderLostError: see `check_ours`.
     """
     check_ours(path)
-    lock = FileLock(path, timeout=-1 if wait is None else wait)
+    lock = FileLock(path, timeout=-1 if wait is None else wait, fallback_to_soft=False)
     try:
         lock.acquire(poll_interval=_SECONDS_BETWEEN_TRIES)
     except Timeout:

@@ -16,6 +16,7 @@ import os
 import socket
 import sys
 import time
+import uuid
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -227,6 +228,7 @@ class Search:
         self._memory.add_trials(before)
         self._seen = len(before)  # trials of the study that are in memory
         self._name = f"{socket.gethostname()}:{os.getpid()}"
+        self._stream = uuid.uuid4().hex if spec.settings.storage else ""
 
     def next(self) -> Trials | None:
         """As many trials as train at once, or are missing."""
@@ -272,12 +274,12 @@ class Search:
             self._study.add_trial(self._memory.tell(trial, outcome.value, state))
 
     def _sampler(self, draw: int) -> optuna.samplers.BaseSampler:
-        """Give a draw a random stream of its own, whenever it is drawn; machines differ in theirs.
+        """Give a draw a random stream of its own, whenever it is drawn.
 
-        So one worker's study is the same whether it was interrupted or not.
+        So one worker's study is the same whether it was interrupted or not. Commands that share a database
+        differ in theirs, or they would draw the same trials.
         """
-        place = f"{socket.gethostname()}:{self._spec.folder.absolute()}" if self._settings.storage else ""
-        seed = zlib.crc32(repr((self._settings.sampler_seed, draw, place)).encode())
+        seed = zlib.crc32(repr((self._settings.sampler_seed, draw, self._stream)).encode())
         if self._settings.sampler == "random":
             return optuna.samplers.RandomSampler(seed=seed)
         return optuna.samplers.TPESampler(seed=seed, multivariate=True, constant_liar=True)

@@ -114,7 +114,7 @@ def test_what_is_said_of_a_sweeps_jobs(tmp_path: Path, capsys: pytest.CaptureFix
         content["jobs"][0]["job"] = name
         (sweep.path / "sweep.json").write_text(json.dumps(sealed(content)))
         (line,) = told(jobs.main, capsys, sweep.path)
-        assert "is no job's folder" in line
+        assert "is not a job's folder" in line
     console.tell_end(sweep.path, [JobRow("x", EVIL, FAILED, error=EVIL)], 1, "stopped", ())
     out, err = capsys.readouterr()
     assert all(sign == "\n" or sign.isprintable() for sign in out + err)
