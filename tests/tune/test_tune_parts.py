@@ -319,7 +319,7 @@ def told(trial: FrozenTrial) -> tuple[Any, ...]:
     return trial.state, trial.params, trial.values, trial.intermediate_values, trial.user_attrs.get("seeds")
 
 
-def test_machines_that_share_a_study_know_of_each_others_trials(
+def test_commands_that_share_a_study_draw_other_trials_and_know_of_each_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spec, study = asked(
@@ -329,7 +329,7 @@ def test_machines_that_share_a_study_know_of_each_others_trials(
 
     def function(values: Any, is_behind: object) -> Outcome:
         if next(turns) == 2:
-            monkeypatch.setattr("socket.gethostname", lambda: "another")
+            monkeypatch.setattr("os.getpid", lambda: 1)  # another command, perhaps on the same machine
             search(spec, study, Inline(lambda values, _: outcome(values["agent.learning_rate"])))
         return outcome(values["agent.learning_rate"])
 
