@@ -132,6 +132,9 @@ def check(config: TrainConfig) -> None:
         )
 
 
+_INTEGERS = 2**63  # beyond, neither arrays nor the files of a run have them
+
+
 def check_bounds(section: Any, prefix: str = "") -> None:
     """Check the numbers of a section of the settings, and of those in it, against their fields' bounds."""
     schema: type = type(section)
@@ -139,6 +142,8 @@ def check_bounds(section: Any, prefix: str = "") -> None:
         key, value = prefix + name, getattr(section, name)
         if is_dataclass(value):
             check_bounds(value, f"{key}.")
+        elif isinstance(value, int) and abs(value) >= _INTEGERS:
+            raise InputError(f"{key}={value}: must be smaller than 2**63")
         elif BOUNDS in metadata and value is not None:
             is_rate = RATE in metadata
             number = parse_schedule(key, value, metadata[RATE]).initial if is_rate else value
