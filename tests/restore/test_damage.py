@@ -89,7 +89,7 @@ def confirmed(folder: Path) -> str:
 
 def listed(folder: Path) -> str:
     table, sweep = JobTable(folder / "sweep"), SweepFolder(folder / "sweep")
-    rows = table.inspect(sweep.entries.values()).values()
+    rows = table.inspect(sweep.entries.values(), {}).values()
     if any("changed" in row.error for row in rows):
         raise InputError(str(rows))
     return str(rows)
@@ -241,7 +241,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "overrides are numbers": (
         lambda sweep: in_json(sweep / "sweep.json", jobs=[JOB | {"overrides": [1]}]),
-        r"error: .*sweep.json: damaged \(overrides must be what stands on a command line\)",
+        r"error: .*sweep.json: damaged \(overrides must be a command line.s words\)",
     ),
     "jobs of one folder": (
         lambda sweep: in_json(sweep / "sweep.json", jobs=[JOB, JOB | {"hash": "2"}]),
