@@ -126,7 +126,7 @@ def check(config: TrainConfig) -> None:
     if source is not None and SOURCES.get(source) is not type(config.env):
         raise InputError(f"env.source={source}: is no setting of its own; choose a source by env=...")
     every = config.checkpoint.every
-    if not (every is None or every == AUTO or (type(every) is int and every >= 1)):
+    if not (every is None or every == AUTO or (type(every) is int and 1 <= every < _INTEGERS)):
         raise InputError(
             f"checkpoint.every={every}: must be a number of steps, {AUTO}, or null for no checkpoints"
         )
@@ -142,9 +142,9 @@ def check_bounds(section: Any, prefix: str = "") -> None:
         key, value = prefix + name, getattr(section, name)
         if is_dataclass(value):
             check_bounds(value, f"{key}.")
-        elif isinstance(value, int) and abs(value) >= _INTEGERS:
-            raise InputError(f"{key}={value}: must be smaller than 2**63")
         elif BOUNDS in metadata and value is not None:
             is_rate = RATE in metadata
             number = parse_schedule(key, value, metadata[RATE]).initial if is_rate else value
             metadata[BOUNDS].check(key, number, value)
+            if isinstance(value, int) and abs(value) >= _INTEGERS:
+                raise InputError(f"{key}={value}: must be smaller than 2**63")

@@ -104,7 +104,7 @@ def test_options_have_dashes() -> None:
     [
         ("agent=dnq", "agent=dnq: there is no such choice; there are a2c, .*; did you mean dqn\\?"),
         ("env=mazes", "did you mean maze\\?"),
-        ("agent.lr=1", "'agent.lr': Key 'lr' not in 'DQNConfig'; --cfg job shows all keys"),
+        ("agent.lr=1", "'agent.lr': Key 'lr' not in 'DQNConfig'; did you mean learning_rate?"),
         ("agnet=dqn", "did you mean agent\\?"),
         ("evaluation.evry=1", "did you mean every\\?"),
         ("experimnt=maze_dqn", "did you mean experiment\\?"),
