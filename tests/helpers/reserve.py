@@ -1,4 +1,4 @@
-"""Forks in reserve, for which multiprocessing and joblib start Python anew: workers of a search or a sweep.
+"""Forks in reserve, for which multiprocessing starts Python anew: workers of a search or a sweep.
 
 They are forked before a script runs, so that they know no more of it than a Python that is started, and wait
 for what it would be started with. Where the reserve is used up, Python is started.

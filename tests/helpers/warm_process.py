@@ -72,7 +72,7 @@ _LATE = (
     *("matplotlib.backends.backend_svg", "matplotlib.backends.backend_pdf", "fontTools.subset"),
 )
 _NOT_FOR_FORKS = ".launchers.ray"  # Ray has threads as soon as it is imported
-_IN_RESERVE = 6  # two workers, joblib's watch over resources, and some for workers that are killed
+_IN_RESERVE = 6  # two workers, multiprocessing's watch over resources, and some for workers that are killed
 _WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 
 
