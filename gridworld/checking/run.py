@@ -17,7 +17,7 @@ from gridworld.checking.settings import settings, subject
 from gridworld.checking.training import build, train
 from gridworld.config.agents import AgentConfig
 from gridworld.errors import InputError, in_short
-from gridworld.process.console.terminal import aligned
+from gridworld.process.console import aligned
 
 Outcomes = list[tuple[bool | None, str]]  # of one probe on each seed: see `Finding`
 SEEDS = 3  # of a probe that fails at first: it has failed if it fails on most of them

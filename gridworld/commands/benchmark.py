@@ -13,7 +13,7 @@ from typing import Any
 
 from gridworld.commands import parser_of
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import program
+from gridworld.process.console import program
 from gridworld.run.claim import check_inside, check_writable
 from gridworld.storage.atomic_write import write_json
 

@@ -16,7 +16,7 @@ from gridworld.checking.probes import PROBES
 from gridworld.checking.run import check
 from gridworld.checking.settings import arguments
 from gridworld.commands import parser_of, whole
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import printable
 
 _PROCESSES = 2
 _FAILED = 1  # the exit code

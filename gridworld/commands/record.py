@@ -14,8 +14,7 @@ from gridworld.commands import parser_of, whole
 from gridworld.config.pictures import PICTURES
 from gridworld.envs.rendering import frame_size
 from gridworld.envs.rollout import play
-from gridworld.process.console.progress import telling_if_slow
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import printable, telling_if_slow
 from gridworld.process.memory_budget import limited
 from gridworld.restore.saved_run import SavedRun, choose_policy, read_visits
 from gridworld.run.claim import check_inside, check_writable

@@ -18,8 +18,7 @@ from pathlib import Path
 
 from gridworld.commands import parser_of
 from gridworld.errors import InputError
-from gridworld.process.console.progress import telling_if_slow
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import printable, telling_if_slow
 from gridworld.process.memory_budget import limited
 from gridworld.process.signals import Interrupted
 from gridworld.restore.reproduce import check_whole, compare, lengths, population, repeat

@@ -23,7 +23,7 @@ from gridworld.diagnosis.causes.objective import recommended_gamma
 from gridworld.diagnosis.evidence import Evidence, RegretSplit
 from gridworld.diagnosis.finding import Finding
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import command
+from gridworld.process.console import command
 from gridworld.restore.saved_run import SavedRun
 from gridworld.world.exact.evaluation import score_of_optimum
 from gridworld.world.mdp import IntArray, Mdp

@@ -23,7 +23,7 @@ from matplotlib.patheffects import Normal
 from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
 
-from gridworld.process.console.terminal import plain
+from gridworld.process.console import plain
 
 INK, MUTED, GRID, PAPER = "#1c2430", "#5d6878", "#e3e7ed", "#ffffff"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#b8578f", "#c98500", "#3a9bd9", "#4a4f57")  # of agents

@@ -21,7 +21,7 @@ import numpy as np
 
 from gridworld.config.settings import NEWER, flat, privileges
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import printable
 from gridworld.run.folder import CURVE, MANIFEST, SUMMARY, VISITS
 from gridworld.run.reader import RunReader, read_run
 from gridworld.storage.safe_read import LARGEST_CSV, as_table

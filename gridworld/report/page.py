@@ -16,7 +16,7 @@ from markupsafe import Markup, escape
 from PIL import Image
 
 from gridworld.config.pictures import PICTURES
-from gridworld.process.console.terminal import plain
+from gridworld.process.console import plain
 from gridworld.report import table, tables
 from gridworld.report.agent_charts import overall_charts, task_charts
 from gridworld.report.analysis import Result, TaskAnalysis

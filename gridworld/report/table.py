@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from gridworld.process.console.terminal import plain
+from gridworld.process.console import plain
 from gridworld.report.statistics import Interval, Share
 from gridworld.storage.csv_text import csv_text
 

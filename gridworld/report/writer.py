@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from gridworld.errors import InputError, reason
-from gridworld.process.console.terminal import tell
+from gridworld.process.console import tell
 from gridworld.report import tables
 from gridworld.report.analysis import Band, Result, TaskAnalysis
 from gridworld.report.build import MOST_SHOWN, NothingFinishedError, Report, gather

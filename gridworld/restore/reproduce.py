@@ -28,18 +28,17 @@ from gridworld.agents import family
 from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.parallel.together import mixing
+from gridworld.process.together import mixing
 from gridworld.restore.resume import open_unfinished
 from gridworld.restore.saved_run import read_visits, settings_of
 from gridworld.run.folder import BEST_MODEL, EVENTS, MANIFEST, MODEL
-from gridworld.run.manifest import NUMBERS_DEPEND_ON
 from gridworld.run.provenance import settings_hash
-from gridworld.run.reader import LARGEST_RESULT, RunReader, read_run, stored_world
+from gridworld.run.reader import LARGEST_RESULT, NUMBERS_DEPEND_ON, RunReader, read_run, stored_world
 from gridworld.run.summary import Summary
-from gridworld.storage.event_file import read_scalars
 from gridworld.storage.safe_read import LARGEST_CSV, as_table
 from gridworld.training.session import CLOCK
 from gridworld.training.setup import without_pictures
+from gridworld.training.tensorboard import read_scalars
 from gridworld.training.together import Training, run_alone, run_together
 from gridworld.training.train import training
 from gridworld.world.mdp import Mdp

@@ -22,7 +22,7 @@ from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import MapConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import tell
+from gridworld.process.console import tell
 from gridworld.process.memory_budget import limited
 from gridworld.process.user_input import DAMAGED
 from gridworld.run.folder import shown

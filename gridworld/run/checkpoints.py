@@ -14,10 +14,9 @@ from pathlib import Path
 
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import BudgetError
-from gridworld.process.parallel.together import clock
+from gridworld.process.together import clock
 from gridworld.run.folder import CHECKPOINTS
-from gridworld.storage.atomic_write import remove_path, sync_folder, write_bytes
-from gridworld.storage.file_lock import check_ours
+from gridworld.storage.atomic_write import check_ours, remove_path, sync_folder, write_bytes
 from gridworld.storage.safe_read import check_no_link, read_bytes
 from gridworld.storage.serialization import State, StateError, decode, encode
 

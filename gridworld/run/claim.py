@@ -10,8 +10,7 @@ from pathlib import Path
 from gridworld.errors import FolderLostError, InputError
 from gridworld.run.folder import CHECKPOINTS, HYDRA, LOCK, MANIFEST, SWEEP_JSON, RunFolder, shown
 from gridworld.run.reader import read_run
-from gridworld.storage.atomic_write import make_folder, remove_inside, tidy
-from gridworld.storage.file_lock import check_ours, locked
+from gridworld.storage.atomic_write import check_ours, locked, make_folder, remove_inside, tidy
 from gridworld.storage.safe_read import check_no_link
 
 

@@ -32,8 +32,7 @@ from typing import Any
 
 from gridworld.config import pictures
 from gridworld.config.plain_settings import foreign
-from gridworld.process.console.command_line import command, users_folder
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import command, printable, users_folder
 
 MANIFEST = "manifest.json"
 SOURCE_DIFF = "source.diff"

@@ -9,9 +9,7 @@ from collections.abc import Container, Iterable, Sequence
 from pathlib import Path
 
 from gridworld.errors import reason
-from gridworld.process.console.command_line import command_line
-from gridworld.process.console.progress import duration
-from gridworld.process.console.terminal import printable, tell_error
+from gridworld.process.console import command_line, duration, printable, tell_error
 from gridworld.sweep.job_table import DONE, FAILED, INTERRUPTED, JOBS_CSV, PENDING, RUNNING, STATUSES, JobRow
 from gridworld.sweep.results import results_lines
 

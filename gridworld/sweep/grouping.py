@@ -14,11 +14,11 @@ from omegaconf import DictConfig
 
 from gridworld.config.sweep import SweepConfig
 from gridworld.errors import InputError
-from gridworld.process.parallel.machine import file_limit, free_memory, worker_count
-from gridworld.process.parallel.together import LARGEST
+from gridworld.process.processes import file_limit, free_memory, worker_count
 from gridworld.sweep.plan import Job
 
 AUTO = "auto"
+LARGEST = 32  # runs of a population unless more are asked for; larger ones train no faster
 RUNS_FILES = 5  # that a run has open: its lock, its curve, its events, its log
 _SHARE_OF_MEMORY = 4  # a population takes a fourth of what is free, shared by the workers
 _RUNS_BYTES = 16 * 2**20  # of a run beside its agent, with its pictures

@@ -16,8 +16,7 @@ from gridworld.restore.resume import unfinished_of
 from gridworld.run.folder import ERROR_FILE, LOCK, MANIFEST
 from gridworld.run.reader import find_run, is_started
 from gridworld.run.writer import clear, record_failure
-from gridworld.storage.atomic_write import write_text
-from gridworld.storage.file_lock import locked
+from gridworld.storage.atomic_write import locked, write_text
 from gridworld.sweep.job_table import one_line, run_status
 from gridworld.training.together import Training
 from gridworld.training.train import training

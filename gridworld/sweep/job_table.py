@@ -14,9 +14,8 @@ from gridworld.errors import InputError
 from gridworld.run.folder import ERROR_FILE, LOCK
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import RunReader, find_run
-from gridworld.storage.atomic_write import write_text
+from gridworld.storage.atomic_write import is_locked, write_text
 from gridworld.storage.csv_text import csv_rows, csv_text
-from gridworld.storage.file_lock import is_locked
 from gridworld.storage.safe_read import LARGEST_JSON, read_bytes, read_table
 from gridworld.sweep.folder import JobEntry
 

@@ -16,7 +16,7 @@ from gridworld.config.fields import Effect
 from gridworld.config.settings import ON_RESULT, effect_of, flat, with_effects
 from gridworld.envs.intervals import wilson_interval
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import aligned
+from gridworld.process.console import aligned
 from gridworld.run.reader import read_run
 from gridworld.run.summary import Summary
 from gridworld.sweep.job_table import DONE, JobRow

@@ -18,10 +18,8 @@ from omegaconf import DictConfig
 from gridworld.config.composition.words import prepared
 from gridworld.config.sweep import SweepConfig
 from gridworld.errors import EXIT_CODE, FolderLostError, InputError
-from gridworld.process.console.progress import ProgressLine, time_left
-from gridworld.process.console.terminal import tell, tell_error
-from gridworld.process.parallel.machine import worker_count
-from gridworld.process.parallel.processes import LostError
+from gridworld.process.console import ProgressLine, tell, tell_error, time_left
+from gridworld.process.processes import LostError, worker_count
 from gridworld.process.signals import exiting, signal_name
 from gridworld.run.folder import MANIFEST
 from gridworld.sweep import console

@@ -19,10 +19,10 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from gridworld.agents import family
 from gridworld.config.train import TrainConfig
 from gridworld.errors import reason
-from gridworld.process.console.command_line import called_from
+from gridworld.process.console import called_from
 from gridworld.process.memory_budget import collect_less_often
-from gridworld.process.parallel.together import mixing
 from gridworld.process.signals import exiting, handling, send_sigterm
+from gridworld.process.together import mixing
 from gridworld.storage.atomic_write import write_bytes
 from gridworld.sweep.folder import STOP
 from gridworld.sweep.job import StopSweep, run_in_sweep

@@ -21,7 +21,7 @@ from gridworld.agents import Agent, PolicySnapshot
 from gridworld.config.train import TrainConfig
 from gridworld.envs.statistics_env import NO_EPISODES, Returns, StatisticsVectorEnv
 from gridworld.errors import InputError
-from gridworld.process.parallel.together import clock
+from gridworld.process.together import clock
 from gridworld.storage.append_log import AppendLog
 from gridworld.storage.csv_text import csv_text
 from gridworld.storage.serialization import State
@@ -29,7 +29,7 @@ from gridworld.world.exact.evaluation import Evaluator, Score
 from gridworld.world.metrics import METRICS, TRAINING_METRICS, Metric, numbers, optimal_score
 
 if TYPE_CHECKING:
-    from gridworld.process.console.progress import Progress
+    from gridworld.process.console import Progress
     from gridworld.training.tensorboard import EventWriter
 
 # TensorBoard sorts its groups by name and opens with the first: the greedy policy's learning curve. Behind it

@@ -22,10 +22,9 @@ from gridworld.agents import Agent, Learning, TrainingContext
 from gridworld.config.settings import privileges
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.console.progress import Progress
-from gridworld.process.console.terminal import tell
-from gridworld.process.parallel.together import clock
+from gridworld.process.console import Progress, tell
 from gridworld.process.signals import StopRequest
+from gridworld.process.together import clock
 from gridworld.run.checkpoints import Checkpoints, Pace
 from gridworld.run.folder import CURVE, EVENTS
 from gridworld.run.provenance import environment, identity

@@ -14,7 +14,7 @@ from collections.abc import Callable, Generator, Sequence
 from typing import Any, Generic, TypeVar
 
 from gridworld.agents import Learning, learn_together
-from gridworld.process.parallel.together import Clock, set_clock
+from gridworld.process.together import Clock, set_clock
 
 T = TypeVar("T")
 Training = Generator[Learning, None, T]

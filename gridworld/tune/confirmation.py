@@ -19,7 +19,7 @@ import numpy as np
 
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import tell
+from gridworld.process.console import tell
 from gridworld.report import statistics
 from gridworld.report.table import number, steps_up_to
 from gridworld.run.provenance import settings_hash

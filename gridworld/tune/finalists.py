@@ -16,7 +16,7 @@ from typing import Any
 from optuna import Study
 from optuna.trial import FrozenTrial, TrialState
 
-from gridworld.process.console.terminal import tell
+from gridworld.process.console import tell
 from gridworld.tune.objective import SEEDS, FinalRuns, SeedScore, read_score, score
 from gridworld.tune.study_spec import StudySpec
 from gridworld.tune.workers import Workers

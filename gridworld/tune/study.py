@@ -16,12 +16,11 @@ from gridworld.config.composition.compose import search_path
 from gridworld.config.composition.recipe_file import TRUST, overrides
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import command
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import command, printable
 from gridworld.process.signals import StopRequest
 from gridworld.report.writer import write_over_seeds
 from gridworld.run.folder import LOCK
-from gridworld.storage.file_lock import is_locked
+from gridworld.storage.atomic_write import is_locked
 from gridworld.sweep.console import shell_path
 from gridworld.training.tensorboard import hparams
 from gridworld.tune.confirmation import (

@@ -14,7 +14,7 @@ from gridworld.envs.real_env import RealEnvFrames
 from gridworld.envs.rendering import Frame, frame_size
 from gridworld.envs.rollout import Episode, play
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import printable, tell
+from gridworld.process.console import printable, tell
 from gridworld.visualization.animation import (
     Animation,
     animation_of_cards,

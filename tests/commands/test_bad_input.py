@@ -12,7 +12,7 @@ import pytest
 from helpers.support import SHORT, configure, script, train_in
 
 from gridworld.errors import InputError
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 from gridworld.training.train import train
 
 YAMLS: dict[str, bytes] = {

@@ -30,7 +30,7 @@ from gridworld.report.table import to_captioned_markdown, to_csv
 from gridworld.report.tables import finalists_table, trials_table, winner_table
 from gridworld.report.tuning_study import TRIALS_SUM, find_tunings
 from gridworld.restore.saved_run import SavedRun
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 from gridworld.training.setup import check_settings, make_context
 from gridworld.tune.study_folder import is_claimed
 from gridworld.world.exact.evaluation import Evaluator

@@ -16,8 +16,7 @@ from helpers.support import configure
 from gridworld.report import tuning_study as tuning
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import read_run
-from gridworld.storage.safe_read import sha256
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed, sha256
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.job_table import FAILED, JobRow, JobTable
 from gridworld.sweep.plan import Job

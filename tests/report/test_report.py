@@ -28,7 +28,7 @@ from tensorboard.plugins.custom_scalar import layout_pb2
 from gridworld.commands import report as command
 from gridworld.config.pictures import PICTURES
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import plain
+from gridworld.process.console import plain
 from gridworld.report import tables
 from gridworld.report.agent_charts import overall_charts, task_charts
 from gridworld.report.analysis import Comparison, Overall, TaskAnalysis, on_grid, online_return
@@ -41,7 +41,7 @@ from gridworld.report.setting_charts import sweep_charts, sweeps
 from gridworld.report.statistics import Interval
 from gridworld.report.tuning_study import find_tunings
 from gridworld.report.writer import BANDS, MARKERS
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 from gridworld.world.exact.evaluation import Evaluator
 
 FORMATS = ("png", "pdf", "svg")  # more words of `--formats`

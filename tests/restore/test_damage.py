@@ -34,7 +34,7 @@ from gridworld.restore.reproduce import check_whole
 from gridworld.restore.resume import open_unfinished
 from gridworld.restore.saved_run import SavedRun, read_visits
 from gridworld.run.reader import read_run
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 from gridworld.storage.serialization import decode, encode
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.job_table import JobTable

@@ -21,12 +21,12 @@ from gridworld.run.folder import LOCK
 from gridworld.run.writer import RunWriter, clear
 from gridworld.storage.append_log import AppendLog
 from gridworld.storage.atomic_write import (
+    locked,
     remove_path,
     write_array,
     write_json,
     write_text,
 )
-from gridworld.storage.file_lock import locked
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.job import run_in_sweep
 from gridworld.sweep.job_table import JobTable

@@ -23,7 +23,7 @@ from gridworld.errors import InputError
 from gridworld.run.reader import read_run
 from gridworld.run.writer import RunWriter
 from gridworld.storage.append_log import AppendLog
-from gridworld.storage.file_lock import is_locked, locked
+from gridworld.storage.atomic_write import is_locked, locked
 from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.job_table import JobTable
 from gridworld.sweep.results import results_lines

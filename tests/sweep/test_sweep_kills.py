@@ -14,7 +14,7 @@ import pytest
 from helpers.support import script, start
 
 from gridworld.commands import jobs as jobs_command
-from gridworld.storage.file_lock import is_locked
+from gridworld.storage.atomic_write import is_locked
 
 KILLS = int(os.environ.get("GRIDWORLD_KILLS", "4"))
 JOBS = int(os.environ.get("GRIDWORLD_KILLED_JOBS", "12"))

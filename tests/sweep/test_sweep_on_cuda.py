@@ -28,7 +28,7 @@ from gridworld.config.sweep import SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
-from gridworld.process.parallel.together import mixing
+from gridworld.process.together import mixing
 from gridworld.restore.reproduce import population
 from gridworld.run.reader import read_run
 from gridworld.sweep.grouping import populations

@@ -23,7 +23,7 @@ from omegaconf import OmegaConf
 from gridworld.config.sweep import SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import TOLD
+from gridworld.process.console import TOLD
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.claim import claimed
 from gridworld.storage.append_log import AppendLog

@@ -13,8 +13,8 @@ import pytest
 
 from gridworld.agents import Learning
 from gridworld.process import signals
-from gridworld.process.parallel.together import clock
 from gridworld.process.signals import Interrupted, StopRequest
+from gridworld.process.together import clock
 from gridworld.training.together import Training, run_alone, run_together
 
 NAME: ContextVar[str] = ContextVar("name", default="outside")

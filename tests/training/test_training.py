@@ -18,7 +18,7 @@ from gridworld.agents import PolicySnapshot
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.restore.saved_run import SavedRun
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 from gridworld.training.learning_curve import LearningCurve
 from gridworld.training.together import run_together
 from gridworld.training.train import training

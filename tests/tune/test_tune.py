@@ -20,7 +20,7 @@ from optuna.trial import TrialState, create_trial
 from gridworld.commands import report as report_command
 from gridworld.commands import tune as tune_command
 from gridworld.errors import InputError
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 from gridworld.tune.study_folder import at_work_in
 
 QUICK = (

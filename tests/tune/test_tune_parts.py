@@ -28,7 +28,7 @@ from optuna.trial import FrozenTrial, TrialState, create_trial
 from gridworld.config.tune import DimensionConfig
 from gridworld.errors import InputError
 from gridworld.report import statistics
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 from gridworld.training.setup import check_settings
 from gridworld.training.together import run_alone
 from gridworld.tune import objective as objective_module

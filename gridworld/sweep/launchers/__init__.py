@@ -13,7 +13,7 @@ from typing import Any, Protocol
 from omegaconf import DictConfig, OmegaConf
 
 from gridworld.errors import InputError, install_command
-from gridworld.process.parallel.processes import LostError, can_fork
+from gridworld.process.processes import LostError, can_fork
 from gridworld.sweep.job import StopSweep
 from gridworld.sweep.worker import SweepJob, Worker
 

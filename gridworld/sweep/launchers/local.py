@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
-from gridworld.process.parallel.processes import run_in_processes
+from gridworld.process.processes import run_in_processes
 from gridworld.sweep.launchers import Group, Launch
 from gridworld.training.setup import import_for
 

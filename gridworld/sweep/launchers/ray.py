@@ -12,7 +12,7 @@ import ray
 from ray.exceptions import RayError, TaskCancelledError
 
 from gridworld.errors import InputError
-from gridworld.process.parallel.processes import LostError
+from gridworld.process.processes import LostError
 from gridworld.process.signals import keeping
 from gridworld.sweep.job import StopSweep
 from gridworld.sweep.launchers import Group, Launch, Task, collect

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridworld.process.console.progress import telling_if_slow
+from gridworld.process.console import telling_if_slow
 from gridworld.world.exact.markov_chain import Chain, Outcome, one_hot_policy
 from gridworld.world.exact.solver import Solution, solved
 from gridworld.world.mdp import FloatArray, Mdp

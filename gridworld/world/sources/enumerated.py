@@ -32,8 +32,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order
 
 from gridworld.errors import InputError
-from gridworld.process.console.progress import ProgressLine, telling_if_slow
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import ProgressLine, printable, telling_if_slow
 from gridworld.process.memory_budget import check_memory
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import MOST_ACTIONS, MOST_STATES, Outcomes, mdp_from_outcomes
