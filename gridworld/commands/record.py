@@ -17,7 +17,7 @@ from gridworld.envs.rollout import play
 from gridworld.process.console import printable, telling_if_slow
 from gridworld.process.memory_budget import limited
 from gridworld.restore.saved_run import SavedRun, choose_policy, read_visits
-from gridworld.run.claim import check_inside, check_writable
+from gridworld.run.folder import check_inside, check_writable
 from gridworld.storage.atomic_write import make_inside
 from gridworld.storage.safe_read import check_no_link
 from gridworld.visualization import files

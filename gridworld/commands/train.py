@@ -38,8 +38,7 @@ from gridworld.process.console import (
 )
 from gridworld.process.memory_budget import collect_less_often
 from gridworld.process.signals import at_work
-from gridworld.run.claim import claimed
-from gridworld.run.folder import SWEEP_JSON, shown
+from gridworld.run.folder import SWEEP_JSON, claimed, shown
 from gridworld.storage.safe_read import check_yaml
 
 FULL_ERROR = "HYDRA_FULL_ERROR"

@@ -169,7 +169,7 @@ def try_offers(saved: SavedRun, found: Diagnosis, folder: Path, trust: bool = Fa
     from gridworld.config.composition.compose import compose
     from gridworld.config.composition.conf_folder import conf_folder
     from gridworld.config.composition.hydra_errors import sentence
-    from gridworld.run.claim import claimed
+    from gridworld.run.folder import claimed
     from gridworld.training.train import train
 
     for words, line in zip(found.offers, found.commands, strict=True):

@@ -20,9 +20,8 @@ from gridworld.report import tables
 from gridworld.report.analysis import Band, Result, TaskAnalysis
 from gridworld.report.build import MOST_SHOWN, NothingFinishedError, Report, gather
 from gridworld.report.table import to_captioned_markdown, to_csv, to_markdown
-from gridworld.run.claim import check_writable
 from gridworld.run.folder import EVENTS as EVENT_FILE
-from gridworld.run.folder import MANIFEST
+from gridworld.run.folder import MANIFEST, check_writable
 from gridworld.storage.atomic_write import replacing_folder, write_text
 from gridworld.training.tensorboard import EventWriter
 from gridworld.world.mdp import FloatArray

@@ -15,10 +15,19 @@ from typing import TYPE_CHECKING, Any
 from gridworld.config.worlds import EnvConfig, MapConfig
 from gridworld.errors import InputError
 from gridworld.process.user_input import COPIES
-from gridworld.run.folder import CHECKED, MANIFEST, PICTURES, RunFolder
+from gridworld.run.folder import (
+    CHECKED,
+    CHECKPOINTS,
+    MANIFEST,
+    PICTURES,
+    SWEEP_JSON,
+    RunFolder,
+    check_writable,
+)
 from gridworld.storage.safe_read import (
     LARGEST_JSON,
     as_object,
+    check_no_link,
     file_sha256,
     read_bytes,
     read_sealed,
@@ -150,6 +159,29 @@ def check_is_run(folder: Path) -> None:
         raise InputError(f"{folder}: no such folder; give the folder of a run, e.g. one in runs/")
     if not os.path.lexists(folder / MANIFEST):
         raise InputError(f"{folder}: not a run's folder, it has no {MANIFEST}")
+
+
+def check_free(folder: Path, key: str = "hydra.run.dir") -> None:
+    """Refuse a folder that cannot be written, or holds a finished run, a sweep or other runs.
+
+    An unfinished run in it is accepted here: whether it is the same one is checked with the settings.
+    """
+    try:
+        is_finished = read_run(folder).is_finished
+    except InputError:  # there is none, or its manifest is damaged
+        is_finished = False
+    if is_finished:
+        longer = f", or make that run longer by {RunFolder(folder).resume_command()} total_timesteps=..."
+        can_be_longer = any(folder.glob(f"{CHECKPOINTS}/*"))
+        raise InputError(
+            f"{folder}: holds a run already; choose another folder{longer if can_be_longer else ''}"
+        )
+    if (folder / SWEEP_JSON).exists():
+        raise InputError(f"{folder}: is the folder of a sweep; choose another {key}")
+    if used := next(folder.glob(f"*/{MANIFEST}"), None):
+        raise InputError(f"{folder}: holds other runs, {used.parent} for one; name a new folder in it")
+    check_no_link(folder / CHECKPOINTS)
+    check_writable(folder, key)
 
 
 def stored_world(run: RunReader, env: EnvConfig) -> Mdp:

@@ -21,8 +21,7 @@ from typing import Any
 
 from gridworld.errors import InputError
 from gridworld.process.console import recorded_command_line
-from gridworld.run.claim import check_writable
-from gridworld.run.folder import HYDRA, LOCK, MANIFEST, SWEEP_JSON
+from gridworld.run.folder import HYDRA, LOCK, MANIFEST, SWEEP_JSON, check_writable
 from gridworld.run.provenance import versions
 from gridworld.storage.atomic_write import check_no_links, locked, make_folder, tidy, write_json
 from gridworld.storage.safe_read import read_sealed, sealed

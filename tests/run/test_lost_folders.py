@@ -16,8 +16,7 @@ from helpers.support import SHORT, configure, script, start
 
 from gridworld.errors import FolderLostError
 from gridworld.run.checkpoints import Checkpoints
-from gridworld.run.claim import alone_in
-from gridworld.run.folder import LOCK
+from gridworld.run.folder import LOCK, alone_in
 from gridworld.run.writer import RunWriter, clear
 from gridworld.storage.append_log import AppendLog
 from gridworld.storage.atomic_write import (

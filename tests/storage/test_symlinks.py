@@ -6,7 +6,7 @@ import pytest
 from helpers.support import SHORT, configure, script
 
 from gridworld.errors import InputError
-from gridworld.run.claim import check_free
+from gridworld.run.reader import check_free
 from gridworld.storage.atomic_write import check_no_links, make_inside, names_inside, remove_inside
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.plan import Job

@@ -25,7 +25,7 @@ from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console import TOLD
 from gridworld.run.checkpoints import Checkpoints
-from gridworld.run.claim import claimed
+from gridworld.run.folder import claimed
 from gridworld.storage.append_log import AppendLog
 from gridworld.sweep import grouping
 from gridworld.sweep.plan import Job
