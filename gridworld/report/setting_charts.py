@@ -22,7 +22,7 @@ from gridworld.report.analysis import Result
 from gridworld.report.chart import COLOURS, INK, MUTED, PAPER, SMALL, WIDE, Chart, clipped, house_style
 from gridworld.report.grouping import differing, learning_key
 from gridworld.report.statistics import Interval
-from gridworld.report.table import number, steps_up_to
+from gridworld.report.tables import number, steps_up_to
 from gridworld.report.tuning_study import TrialRow, TuningStudy
 from gridworld.world.mdp import FloatArray
 

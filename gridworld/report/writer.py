@@ -17,9 +17,16 @@ import numpy as np
 from gridworld.errors import InputError, reason
 from gridworld.process.console.terminal import tell
 from gridworld.report import tables
-from gridworld.report.analysis import Band, Result, TaskAnalysis
-from gridworld.report.build import MOST_SHOWN, NothingFinishedError, Report, gather
-from gridworld.report.table import to_captioned_markdown, to_csv, to_markdown
+from gridworld.report.analysis import (
+    MOST_SHOWN,
+    Band,
+    NothingFinishedError,
+    Report,
+    Result,
+    TaskAnalysis,
+    gather,
+)
+from gridworld.report.tables import to_captioned_markdown, to_csv, to_markdown
 from gridworld.run.claim import check_writable
 from gridworld.run.folder import EVENTS as EVENT_FILE
 from gridworld.run.folder import MANIFEST

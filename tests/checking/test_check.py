@@ -18,8 +18,7 @@ from gridworld.agents import PolicySnapshot
 from gridworld.checking import probes as expect
 from gridworld.checking import run, worlds
 from gridworld.checking.probes import PROBES
-from gridworld.checking.settings import arguments, settings, subject
-from gridworld.checking.training import Trained, train
+from gridworld.checking.training import Trained, arguments, settings, subject, train
 from gridworld.errors import InputError
 from gridworld.world.exact.markov_chain import one_hot_policy
 from gridworld.world.exact.solver import solved
@@ -107,7 +106,7 @@ def test_two_of_three_seeds_decide(
 ) -> None:
     rest = iter(outcomes)
     monkeypatch.setattr(run, "_once", lambda *given: [(next(rest), "found")])
-    monkeypatch.setattr(run, "_try_out", lambda *given: None)
+    monkeypatch.setattr(run, "build", lambda *given: None)
     (finding,) = gridworld.check("q_learning", probes=["choice"]).findings
     assert (finding.passed, finding.seeds) == (passed, seeds)
 

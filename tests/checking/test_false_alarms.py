@@ -18,8 +18,7 @@ import pytest
 
 from gridworld.checking import probes as expect
 from gridworld.checking.probes import PROBES, Probe
-from gridworld.checking.settings import settings, subject
-from gridworld.checking.training import Trained, train
+from gridworld.checking.training import Trained, settings, subject, train
 from gridworld.world.exact.markov_chain import Chain
 from gridworld.world.exact.solver import backup, solved
 

@@ -31,8 +31,17 @@ from gridworld.errors import InputError
 from gridworld.process.console.terminal import plain
 from gridworld.report import tables
 from gridworld.report.agent_charts import overall_charts, task_charts
-from gridworld.report.analysis import Comparison, Overall, TaskAnalysis, on_grid, online_return
-from gridworld.report.build import Reason, Report, gather, reasons
+from gridworld.report.analysis import (
+    Comparison,
+    Overall,
+    Reason,
+    Report,
+    TaskAnalysis,
+    gather,
+    on_grid,
+    online_return,
+    reasons,
+)
 from gridworld.report.chart import Chart, styles, without_shared, wrapped
 from gridworld.report.evidence import Evidence, read
 from gridworld.report.grouping import labels
