@@ -244,8 +244,8 @@ def _history(tuning: TuningStudy) -> Chart:
 def _importances(tuning: TuningStudy) -> Chart:
     ranked = sorted(tuning.importances.items(), key=lambda item: -item[1])
     shares = np.nan_to_num([share for _, share in ranked]).clip(0, 1)
-    figure, axes = chart.new_figure("Importance of each key", 26.0 * len(ranked))
-    chart.rows_on(axes, [clipped(_short(key), 25) for key, _ in ranked])
+    names = [clipped(_short(key), 25) for key, _ in ranked]
+    figure, axes, _ = chart.figure_of_rows("Importance of each key", names, 26.0, None)
     axes.set(xlim=(0, max(0.01, shares.max())), xticks=[], xlabel="share of the score's variance")
     bars = axes.barh(range(len(ranked)), shares, height=0.46, color=_DONE, clip_on=False)
     axes.bar_label(bars, [f"{share:.2f}" for _, share in ranked], padding=6, size=SMALL, color=MUTED)
