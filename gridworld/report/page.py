@@ -104,13 +104,9 @@ def render(report: Report, drawn: dict[str, list[Chart]]) -> str:
         galleries=lambda task: list(filter(None, map(_gallery, task.ranked))),
         plain=plain,
         svg=lambda chart: f"data:image/svg+xml;base64,{base64.b64encode(chart.saved_as('svg')).decode()}",
-        breakable=_breakable,
+        # A column's heading may break after "_" and "=", as labels are long.
+        breakable=lambda heading: Markup(re.sub(r"(?<=[_=])", "<wbr>", str(escape(heading)))),
     )
-
-
-def _breakable(heading: str) -> Markup:
-    """A column's heading with line breaks allowed after "_" and "=", as labels are long."""
-    return Markup(re.sub(r"(?<=[_=])", "<wbr>", str(escape(heading))))
 
 
 def _world(task: TaskAnalysis) -> str:
