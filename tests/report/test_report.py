@@ -303,29 +303,34 @@ DAMAGES: list[tuple[str, Any, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "harm", "words"), DAMAGES, ids=[words[:30] for _, _, words in DAMAGES])
-def test_a_run_that_cannot_be_used_is_named_and_the_rest_reported(
-    name: str, harm: Any, words: str, maker: Maker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_runs_that_cannot_be_used_are_named_and_the_rest_reported(
+    maker: Maker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for seed in range(3):
-        maker.write(tmp_path / f"run{seed}", seed, 8000)
-    run = tmp_path / "run1"
-    if harm is None:
-        (run / name).unlink()
-    elif isinstance(harm, dict):
-        in_json(run, name, **harm)
-    elif isinstance(harm, bytes):
-        seal(run, name, harm)
-    else:
-        change(run, name, lambda text: harm if isinstance(harm, str) else re.sub(*harm, text, count=1))
+    maker.write(tmp_path / "good", 0, 8000)
+    for number, (name, harm, _) in enumerate(DAMAGES):
+        run = maker.write(tmp_path / f"{number:02}", 1 + number, 8000)
+        if harm is None:
+            (run / name).unlink()
+        elif isinstance(harm, dict):
+            in_json(run, name, **harm)
+        elif isinstance(harm, bytes):
+            seal(run, name, harm)
+        else:
+            edit = (
+                (lambda text: harm) if isinstance(harm, str) else (lambda text: re.sub(*harm, text, count=1))
+            )
+            change(run, name, edit)
     folder = report_of(tmp_path, code=1)
-    (warning,) = capsys.readouterr().err.splitlines()
-    assert warning.startswith(f"warning: {run}")
-    assert words in warning
-    assert {row["seed"] for row in rows_of(folder / "tables" / "runs.csv")} == {"0", "2"}
-    (row,) = rows_of(folder / "tables" / "not_counted.csv")
-    assert words in row["reason"]
-    assert "1 run is in no statistic" in (folder / "report.html").read_text()
+    assert [row["seed"] for row in rows_of(folder / "tables" / "runs.csv")] == ["0"]
+    assert f"{len(DAMAGES)} runs are in no statistic" in (folder / "report.html").read_text()
+    for number, (row, (_, _, words)) in enumerate(
+        zip(rows_of(folder / "tables" / "not_counted.csv"), DAMAGES, strict=True)
+    ):
+        assert row["reason"].startswith(str(tmp_path / f"{number:02}"))
+        assert words in row["reason"]
+    warnings = capsys.readouterr().err.splitlines()
+    assert warnings[-1] == f"warning: and {len(DAMAGES) - 20} more, all in the report"
+    assert all(line.startswith(f"warning: {tmp_path}") for line in warnings[:-1])
 
 
 def test_another_version_is_named_and_its_settings_stay_as_they_are(maker: Maker, tmp_path: Path) -> None:
@@ -702,7 +707,9 @@ def test_a_readmes_table_is_replaced(maker: Maker, tmp_path: Path) -> None:
         command.main([str(tmp_path / "runs"), "--readme", str(tmp_path / "missing.md")])
 
 
-def test_only_a_report_is_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_a_report_is_replaced(
+    maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years of work")
     (tmp_path / "file").write_text("")
@@ -717,6 +724,10 @@ def test_only_a_report_is_replaced(tmp_path: Path, capsys: pytest.CaptureFixture
     with pytest.raises(SystemExit):
         command.main([str(tmp_path), "--seed", "-1"])
     assert "--seed: -1: must be at least 0" in capsys.readouterr().err
+    maker.write(tmp_path / "runs" / "one", 0, 3000)
+    monkeypatch.setattr(command.webbrowser, "open", lambda uri: False)
+    report_of(tmp_path / "runs", options=("--open",))
+    assert "--open: there is no browser here; open" in capsys.readouterr().err
 
 
 def test_the_script(maker: Maker, tmp_path: Path) -> None:
@@ -725,15 +736,6 @@ def test_the_script(maker: Maker, tmp_path: Path) -> None:
     words = ("report.py", "a", "b", "--open", "--formats")
     done = script(*words, cwd=tmp_path, BROWSER="true %s", DISPLAY="", **NO_CACHE)
     assert (done.returncode, done.stdout, done.stderr) == (0, "runs/report/report.html\n", "")
-
-
-def test_without_a_browser_a_sentence_says_so(
-    maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    maker.write(tmp_path / "one", 0, 3000)
-    monkeypatch.setattr(command.webbrowser, "open", lambda uri: False)
-    report_of(tmp_path, options=("--open",))
-    assert "--open: there is no browser here; open" in capsys.readouterr().err
 
 
 def test_pictures_are_embedded_within_bounds(maker: Maker, tmp_path: Path) -> None:
