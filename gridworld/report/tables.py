@@ -23,7 +23,7 @@ from gridworld.report.analysis import (
     TaskAnalysis,
 )
 from gridworld.report.evidence import Unusable
-from gridworld.report.grouping import Group, Study, differing, learning_key
+from gridworld.report.grouping import Study, differing, learning_key
 from gridworld.report.statistics import Interval, Share
 from gridworld.report.tuning_study import TuningStudy
 from gridworld.storage.csv_text import csv_text
@@ -192,38 +192,29 @@ def all_tables(report: Report) -> Iterator[Table]:
 def results_table(tasks: Sequence[TaskAnalysis], reasons: Reasons) -> Table:
     """The main results on all tasks; also the table for a README. `reasons` are of runs not certified."""
     shown = [("regret", "iqm"), ("steps", "median")]
-    rows: list[list[Cell]] = [
-        [
-            task.task,
-            result.group.agent,
-            result.certified,
-            result.ever,
-            *(estimate(result, *which) for which in shown),
-            *([_most_common(result.group, reasons)] if reasons else []),
-        ]
-        for task in tasks
-        for result in task.results
-    ]
     columns = ["task", "agent", "seeds certified", "ever certified", *(_HEADINGS[which] for which in shown)]
     columns += ["why not"] if reasons else []
+    rows: list[list[Cell]] = []
+    for task, result in [(each, result) for each in tasks for result in each.results]:
+        estimates = [estimate(result, *which) for which in shown]
+        rows.append([task.task, result.group.agent, result.certified, result.ever, *estimates])
+        if reasons:  # the most common cause of those that are not certified
+            runs = result.group.runs
+            causes = Counter(reasons[run.folder].cause for run in runs if run.folder in reasons)
+            most = [f"{cause} ({count} of {causes.total()})" for cause, count in causes.most_common(1)]
+            rows[-1].append("".join(most))
     caption = "Certified seeds, exact regret and steps, with 95 % intervals"
-    results = [result for task in tasks for result in task.results]
-    return _with_privileges(results, Table("results", caption, columns, rows))
+    return _table_of([result for task in tasks for result in task.results], "results", caption, columns, rows)
 
 
-def _most_common(group: Group, reasons: Reasons) -> str:
-    """The most common cause of a group's runs that are not certified, with its count."""
-    causes = Counter(reasons[run.folder].cause for run in group.runs if run.folder in reasons)
-    return "".join(f"{cause} ({count} of {causes.total()})" for cause, count in causes.most_common(1))
-
-
-def _with_privileges(results: Iterable[Result], table: Table) -> Table:
-    """The table of results, and a column of their privileges where any has some."""
+def _table_of(
+    results: Sequence[Result], name: str, caption: str, columns: list[str], rows: list[list[Cell]]
+) -> Table:
+    """A table with a row for each result, and a column of their privileges where any has some."""
     privileges = [result.group.privileges for result in results]
-    if not any(privileges):
-        return table
-    rows = [[*row, each] for row, each in zip(table.rows, privileges, strict=True)]
-    return Table(table.name, table.caption, [*table.columns, "privileges"], rows)
+    if any(privileges):
+        columns, rows = [*columns, "privileges"], [[*row, privileges[at]] for at, row in enumerate(rows)]
+    return Table(name, caption, columns, rows)
 
 
 def task_table(task: TaskAnalysis) -> Table:
@@ -233,7 +224,7 @@ def task_table(task: TaskAnalysis) -> Table:
         for result in task.results
     ]
     columns = ["agent", "certified at the end", "ever certified", *_HEADINGS.values()]
-    return _with_privileges(task.results, Table(task.task, f"Results on {task.task}", columns, rows))
+    return _table_of(task.results, task.task, f"Results on {task.task}", columns, rows)
 
 
 def scores_table(task: TaskAnalysis) -> Table:
@@ -244,15 +235,14 @@ def scores_table(task: TaskAnalysis) -> Table:
     ]
     caption = f"Means over seeds on {task.task}, of the greedy policy where nothing else is said"
     columns = ["agent", *(BY_KEY[key].title for key in keys)]
-    return _with_privileges(task.results, Table(f"{task.task} scores", caption, columns, rows))
+    return _table_of(task.results, f"{task.task} scores", caption, columns, rows)
 
 
 def estimate(result: Result, key: str, statistic: str) -> Estimate | None:
     """A statistic of a metric as a cell; None where no run has the metric."""
     found = result.estimates.get((key, statistic))
-    if found is None:
-        return None
-    return Estimate(found, steps_up_to(result.shortest_uncertified) if key == "steps" else number)
+    form = steps_up_to(result.shortest_uncertified) if key == "steps" else number
+    return None if found is None else Estimate(found, form)
 
 
 def improvement_tables(comparisons: Sequence[Comparison], name: str) -> list[Table]:
@@ -290,21 +280,12 @@ def answer_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
 
 def runs_table(study: Study) -> Table:
     """A row for each run that is counted."""
-    rows: list[list[Cell]] = [
-        [
-            group.task,
-            group.agent,
-            run.seed,
-            "yes" if run.certified else "no",
-            run.regret,
-            int(run.first_certified_step) if math.isfinite(run.first_certified_step) else None,
-            run.steps,
-            run.seconds,
-            str(run.folder),
-        ]
-        for group in study.groups
-        for run in group.runs
-    ]
+    rows: list[list[Cell]] = []
+    for group, run in [(each, run) for each in study.groups for run in each.runs]:
+        first = int(run.first_certified_step) if math.isfinite(run.first_certified_step) else None
+        certified = "yes" if run.certified else "no"
+        rows.append([group.task, group.agent, run.seed, certified, run.regret, first])
+        rows[-1] += [run.steps, run.seconds, str(run.folder)]
     columns = ["task", "agent", "seed", "certified", "regret", "first certificate", "steps", "seconds"]
     return Table("runs", "Every run that is counted", [*columns, "folder"], rows)
 

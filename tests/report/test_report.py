@@ -7,7 +7,6 @@ import math
 import os
 import re
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -96,15 +95,15 @@ def group_sizes(report: Report) -> dict[tuple[str, str], int]:
     return {(group.agent, group.task): len(group.runs) for group in report.study.groups}
 
 
-def change(folder: Path, name: str, edit: Callable[[str], str]) -> None:
+def change(folder: Path, name: str, text: str) -> None:
     """Whatever can be sealed again, is."""
-    (folder / name).write_text(edit((folder / name).read_text()))
+    (folder / name).write_text(text)
     if name != "manifest.json":
         seal(folder, name)
 
 
 def in_json(folder: Path, name: str, **values: object) -> None:
-    change(folder, name, lambda text: json.dumps(sealed(json.loads(text) | values)))
+    change(folder, name, json.dumps(sealed(json.loads((folder / name).read_text()) | values)))
 
 
 def figures_of(task: TaskAnalysis) -> dict[str, Chart]:
@@ -316,10 +315,8 @@ def test_runs_that_cannot_be_used_are_named_and_the_rest_reported(
         elif isinstance(harm, bytes):
             seal(run, name, harm)
         else:
-            edit = (
-                (lambda text: harm) if isinstance(harm, str) else (lambda text: re.sub(*harm, text, count=1))
-            )
-            change(run, name, edit)
+            text = (run / name).read_text()
+            change(run, name, harm if isinstance(harm, str) else re.sub(*harm, text, count=1))
     folder = report_of(tmp_path, code=1)
     assert [row["seed"] for row in rows_of(folder / "tables" / "runs.csv")] == ["0"]
     assert f"{len(DAMAGES)} runs are in no statistic" in (folder / "report.html").read_text()
