@@ -175,8 +175,7 @@ def try_offers(saved: SavedRun, found: Diagnosis, folder: Path, trust: bool = Fa
         except (HydraException, OmegaConfBaseException) as error:
             raise InputError(sentence(error)) from None
         config = dataclasses.replace(composed, env=saved.config.env)
-        if not trust:
-            _check_harmless(config, saved)
+        check_trusted(saved, found, trust, config)
         try:
             with claimed(place):
                 summary = train(config, place, list(words), lambda env: saved.mdp)
@@ -193,15 +192,12 @@ def trials_folder(folder: Path) -> Path:
     return folder.resolve().parent / f"{folder.resolve().name}-tried"
 
 
-def check_trusted(saved: SavedRun, found: Diagnosis, trust: bool) -> None:
-    """Check that to compose and train the offers runs no code of a stranger's choice."""
+def check_trusted(saved: SavedRun, found: Diagnosis, trust: bool, offer: TrainConfig | None = None) -> None:
+    """Check that to compose and train the offers, or this one, runs no code of a stranger's choice."""
     if found.offers and not trust:
-        _check_harmless(saved.config, saved)
-
-
-def _check_harmless(config: TrainConfig, saved: SavedRun) -> None:
-    built = {"agent": dataclasses.asdict(config.agent), "callbacks": config.callbacks}
-    check_foreign(built, str(saved.run.manifest_file), "--trust")
+        config = saved.config if offer is None else offer
+        built = {"agent": dataclasses.asdict(config.agent), "callbacks": config.callbacks}
+        check_foreign(built, str(saved.run.manifest_file), "--trust")
 
 
 def draw_diagnosis(found: Diagnosis, cell_size: int | None = None) -> Frame:

@@ -237,10 +237,7 @@ def _draw_interval(
 
 
 def overall_charts(overall: Overall, styles: Styles) -> Iterator[Chart]:
-    """A profile for each agent, and for each metric the pairs of agents, unless all of them are even.
-
-    They are as rliable has them.
-    """
+    """As rliable has them: a profile for each agent, and for each metric the pairs, unless all are even."""
     ranked = sorted(overall.profiles, key=lambda agent: -overall.optimality[agent][1].point)
     shown = ranked[:_MOST_DRAWN]
     most = f"; the {len(shown)} best of {len(ranked)}" if len(ranked) > len(shown) else ""

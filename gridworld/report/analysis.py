@@ -286,11 +286,6 @@ class Report:
     reasons: Reasons = field(default_factory=dict)  # of runs that are not certified
 
     @property
-    def complete(self) -> bool:
-        """Whether every run is counted and nothing contradicts anything."""
-        return not self.sentences()
-
-    @property
     def damage(self) -> list[str]:
         """A sentence for each damaged file of the runs."""
         counted = [sentence for group in self.study.groups for run in group.runs for sentence in run.damage]

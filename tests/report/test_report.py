@@ -177,7 +177,7 @@ def test_runs_that_differ_are_reported_apart_and_the_report_says_so(tmp_path: Pa
         "ppo on classic was run with 3 different configurations, which are reported apart; they differ in "
         "agent.learning_rate, agent.n_epochs.",
     )
-    assert report.complete
+    assert not report.sentences()
     features = "agent.policy_kwargs.features_extractor_class"  # it follows from the observation
     seen = [{features: f"features.{kind}", "observation.kind": kind} for kind in ("coordinates", "image")]
     assert labels([("ppo", each) for each in seen]) == [
@@ -383,7 +383,7 @@ def test_a_link_that_is_named_is_followed_and_others_are_not(maker: Maker, tmp_p
     for paths in ([tmp_path / "linked"], [tmp_path / "runs", run], [run, tmp_path / "linked"]):
         report = gather(paths)
         assert [found.seed for group in report.study.groups for found in group.runs] == [0]
-        assert report.complete
+        assert not report.sentences()
     assert len(gather([tmp_path / "runs" / "mine"]).study.groups[0].runs) == 1
     for study in ("mine", "runs/deep"):
         (tmp_path / study / "study.json").write_text("{}")
