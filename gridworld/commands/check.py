@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 from gridworld.checking.probes import PROBES
 from gridworld.checking.run import check
-from gridworld.checking.settings import arguments
+from gridworld.checking.training import arguments
 from gridworld.commands import parser_of, whole
 from gridworld.process.console import printable
 

@@ -21,7 +21,7 @@ from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console import tell
 from gridworld.report import statistics
-from gridworld.report.table import number, steps_up_to
+from gridworld.report.tables import number, steps_up_to
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import find_run
 from gridworld.storage.atomic_write import check_no_links, make_inside, names_inside, remove_inside

@@ -26,8 +26,7 @@ from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.report.evidence import read
 from gridworld.report.setting_charts import tuning_charts
-from gridworld.report.table import to_captioned_markdown, to_csv
-from gridworld.report.tables import finalists_table, trials_table, winner_table
+from gridworld.report.tables import finalists_table, to_captioned_markdown, to_csv, trials_table, winner_table
 from gridworld.report.tuning_study import TRIALS_SUM, find_tunings
 from gridworld.restore.saved_run import SavedRun
 from gridworld.storage.safe_read import sealed

@@ -10,7 +10,7 @@ from helpers.support import SHORT, train_in
 
 from gridworld.commands import report as command
 from gridworld.errors import InputError
-from gridworld.report.build import gather
+from gridworld.report.analysis import gather
 from gridworld.report.evidence import Evidence, Unusable, read
 from gridworld.report.writer import write_over_seeds
 from gridworld.run.folder import RESULTS, WORLD

@@ -28,7 +28,7 @@ from gridworld.commands import record as record_command
 from gridworld.config.pictures import PICTURES
 from gridworld.errors import InputError
 from gridworld.report import tuning_study as tuning
-from gridworld.report.build import gather
+from gridworld.report.analysis import gather
 from gridworld.report.page import charts, render
 from gridworld.restore.reproduce import check_whole
 from gridworld.restore.resume import open_unfinished

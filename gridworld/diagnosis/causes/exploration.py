@@ -48,15 +48,11 @@ def collapsed(run: Evidence) -> Finding | None:
 def ended_early(run: Evidence) -> Finding | None:
     """Its random steps were fewer than a random walk needs to meet the goal twice."""
     optimistic = run.setting("initial_value") >= run.own.v[run.mdp.acting].max()
-    if (
-        run.is_actor_critic
-        or optimistic
-        or _random(run) * run.config.total_timesteps >= 2 * run.steps_to_goal
-    ):
+    explored = _random(run) * run.config.total_timesteps >= 2 * run.steps_to_goal
+    if run.is_actor_critic or optimistic or explored:
         return None
-    return _exploration(
-        run, run.split.wrong, "it stopped trying other actions before their values were known"
-    )
+    why = "it stopped trying other actions before their values were known"
+    return _exploration(run, run.split.wrong, why)
 
 
 def _exploration(run: Evidence, states: BoolArray, why: str) -> Finding:
