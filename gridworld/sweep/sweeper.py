@@ -27,12 +27,10 @@ from gridworld.run.folder import MANIFEST
 from gridworld.sweep import console
 from gridworld.sweep.configurations import Configurations
 from gridworld.sweep.folder import STOP, SweepFolder
-from gridworld.sweep.grouping import populations, runs_in_turn
-from gridworld.sweep.job import StopSweep, mark_failed
+from gridworld.sweep.job import StopSweep, SweepJob, Worker, mark_failed, shared_part
 from gridworld.sweep.job_table import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, JobRow, JobTable
 from gridworld.sweep.launchers import Group, Launch, launcher_settings, local
-from gridworld.sweep.plan import Job, expand, plan
-from gridworld.sweep.worker import SweepJob, Worker, shared_part
+from gridworld.sweep.plan import Job, expand, plan, populations, runs_in_turn
 
 _ORPHANS_END_WITHIN = 5.0  # seconds; workers of a sweep that was killed
 _POLL_SECONDS = 0.1

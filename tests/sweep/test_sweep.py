@@ -24,9 +24,9 @@ from gridworld.run.reader import read_run
 from gridworld.run.writer import RunWriter
 from gridworld.storage.append_log import AppendLog
 from gridworld.storage.file_lock import is_locked, locked
+from gridworld.sweep.console import results_lines
 from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.job_table import JobTable
-from gridworld.sweep.results import results_lines
 from gridworld.training.together import run_alone
 
 QUICK = ("agent=q_learning", "total_timesteps=500", *NO_PICTURES)
@@ -127,6 +127,8 @@ def test_settings_are_told_by_the_words_that_asked_for_them(tmp_path: Path) -> N
     assert [row[2] for row in results(done.stdout)] == [
         f"env.slip={slip} observation={kind}" for slip in ("0", "0.1") for kind in ("one_hot", "image")
     ]
+    presets = script("train.py", "-m", *QUICK, "env=four_rooms", "preset=auto,none,large", cwd=tmp_path)
+    assert [row[2] for row in results(presets.stdout)] == ["preset=auto", "preset=large"]
 
 
 def test_a_setting_that_follows_from_the_seed_is_told_by_its_value(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from gridworld.process.console.terminal import TOLD
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.claim import claimed
 from gridworld.storage.append_log import AppendLog
-from gridworld.sweep import grouping
+from gridworld.sweep import plan as plan_module
 from gridworld.sweep.plan import Job
 from gridworld.training.learning_curve import LearningCurve
 
@@ -252,17 +252,17 @@ def test_a_run_has_as_many_files_open_as_a_population_reckons_with(
     monkeypatch.setattr(LearningCurve, "evaluate", counted)
     with claimed(tmp_path / "run"):
         begin(tmp_path / "run", "agent=dqn", *SMALL)
-    assert max(most) == grouping.RUNS_FILES
+    assert max(most) == plan_module.RUNS_FILES
 
 
 @pytest.mark.parametrize(("files", "largest"), [(10, 1), (90, 5), (114, 10), (sys.maxsize, 10)])
 def test_a_population_has_no_more_runs_than_files_can_be_open(
     files: int, largest: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(grouping, "file_limit", lambda: files)
+    monkeypatch.setattr(plan_module, "file_limit", lambda: files)
     jobs = [Job((), (), str(number), None, TrainConfig(), shape="") for number in range(10)]
     hydra = OmegaConf.create({"job": {"chdir": None}})
-    groups = grouping.populations(jobs, SweepConfig(population=10), "basic", {}, hydra)
+    groups = plan_module.populations(jobs, SweepConfig(population=10), "basic", {}, hydra)
     assert max(map(len, groups)) == largest
     assert [job for group in groups for job in group] == jobs
 
@@ -270,8 +270,8 @@ def test_a_population_has_no_more_runs_than_files_can_be_open(
 _WITH_FEW_FILES = """
 import os, resource, runpy, sys
 del sys.argv[0]
-from gridworld.sweep import grouping
-grouping.file_limit = lambda: sys.maxsize
+from gridworld.sweep import plan as plan_module
+plan_module.file_limit = lambda: sys.maxsize
 resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/proc/self/fd")) + 18, 10**4))
 runpy.run_path(sys.argv[0], run_name="__main__")
 """
