@@ -44,15 +44,7 @@ def tell_start(folder: Path, rows: Sequence[JobRow], to_run: int) -> None:
 def tell_end(
     folder: Path, rows: Sequence[JobRow], seconds: float, stopped: str, mistakes: Container[str]
 ) -> None:
-    """Print the results, how the jobs stand, why some did not end well, and how to go on with the rest.
-
-    Args:
-        folder: the sweep's folder.
-        rows: of the jobs that were asked for.
-        seconds: how long it took.
-        stopped: why the sweep was stopped, or "".
-        mistakes: jobs that would fail again, as their settings are wrong.
-    """
+    """Print the results, how the jobs stand, why some did not end well, and how to go on with the rest."""
     print(f"sweep {shell_path(folder)}: {counts_text(rows)}, in {duration(seconds)}")
     results = results_lines(folder, rows)
     for line in ("", *results[: _MOST_LISTED + 1], "") if results else ():
@@ -128,12 +120,7 @@ Settings = tuple[tuple[str, str], ...]  # dotted names, values as text
 
 
 def results_lines(folder: Path, rows: Sequence[JobRow]) -> list[str]:
-    """The table of the results, a line each with the headings first; empty where no job is done.
-
-    Args:
-        folder: the sweep's.
-        rows: of its jobs; those that are not done or were changed since are left out, which the headings say.
-    """
+    """The table of the results, a line each with the headings first; empty where no job is done."""
     groups: dict[tuple[str, str], dict[Settings, list[_Result]]] = defaultdict(lambda: defaultdict(list))
     lost = []
     for row in rows:

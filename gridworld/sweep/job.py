@@ -54,21 +54,6 @@ def run_in_sweep(
     """Train in the job's folder, unless that is done or another process does it.
 
     An interrupted run goes on from its checkpoint; a failed one is replaced.
-
-    Args:
-        config: the job's configuration.
-        folder: the job's, in the sweep's folder.
-        overrides: the job's, for its manifest.
-        stop_at_failure: whether a failure is to stop the sweep.
-        replaces: whether a finished run is replaced too.
-
-    Returns:
-        The final policy's regret; NaN where there was nothing to do.
-
-    Raises:
-        JobError: the job failed, or the machine has to be put right first.
-        StopSweep: the job failed, and that is to stop the sweep.
-        SystemExit: the job was interrupted.
     """
     try:
         with locked(folder / LOCK, wait=1) as is_ours:
@@ -125,27 +110,15 @@ class SweepJob:
 
 @dataclass(frozen=True)
 class Worker:
-    """Runs populations.
+    """Runs populations."""
 
-    Args:
-        sweep: the sweep's folder.
-        where: the folder that the command was typed in.
-        master: the configuration of the sweep itself.
-        callbacks: Hydra's, if some are the user's.
-    """
-
-    sweep: Path
-    where: str
-    master: DictConfig
-    callbacks: Any
+    sweep: Path  # its folder
+    where: str  # the folder that the command was typed in
+    master: DictConfig  # the configuration of the sweep itself
+    callbacks: Any  # Hydra's, if some are the user's
 
     def __call__(self, jobs: Sequence[SweepJob]) -> list[str]:
-        """Run the jobs of a population; returns the error of each, or "".
-
-        Raises:
-            SystemExit: they were interrupted.
-            StopSweep: one failed, and that is to stop the sweep.
-        """
+        """Run the jobs of a population; returns the error of each, or ""."""
         collect_less_often()
         os.environ.update(self.master.hydra.job.env_set)
         configure_log(self.master.hydra.job_logging, self.master.hydra.verbose)
@@ -157,11 +130,7 @@ class Worker:
         return [one_line(reason(result)) if isinstance(result, Exception) else "" for result in results]
 
     def on_node(self, groups: Sequence[Sequence[SweepJob]]) -> list[str]:
-        """Run populations one after the other on a node of a cluster.
-
-        Returns:
-            The error of each job, or "". There are fewer where the process or the sweep was told to stop.
-        """
+        """Run populations one after the other on a node of a cluster."""
         errors: list[str] = []
         # SIGUSR2 is Slurm's warning of its time limit. While training is on, it handles SIGTERM itself.
         warning = {signal.SIGUSR2: send_sigterm}

@@ -212,11 +212,6 @@ def folder_name(job: Job, taken: Collection[str], common: Collection[str] = ()) 
 
     It is of the swept overrides, or else of all but the common ones; where neither is short enough and free,
     it ends with a part of the hash. The seed is always in it.
-
-    Args:
-        job: the job.
-        taken: names of other folders, in lower case.
-        common: overrides that all of the sweep's jobs have.
     """
     for lines in (job.swept or job.overrides, [line for line in job.overrides if line not in common]):
         name = ",".join(map(_slug, lines)) or "job"
@@ -252,18 +247,7 @@ _FEWEST = 4  # runs of a population for which another core is taken
 def populations(
     jobs: Sequence[Job], settings: SweepConfig, launcher: str, own: Mapping[str, Any], hydra: DictConfig
 ) -> list[list[Job]]:
-    """Divide jobs into populations.
-
-    Args:
-        jobs: as they were planned.
-        settings: of the sweep.
-        launcher: where they run.
-        own: the launcher's settings.
-        hydra: Hydra's own part of the sweep's configuration.
-
-    Returns:
-        The populations, in the order of their first jobs; of one job each where they cannot train together.
-    """
+    """Divide jobs into populations."""
     workers = worker_count(own["n_jobs"]) if launcher in ("forks", "joblib") else 1
     memory = free_memory() / _SHARE_OF_MEMORY / workers
     shapes: dict[str, list[Job]] = {}

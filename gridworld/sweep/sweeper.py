@@ -41,18 +41,7 @@ _SHARE_OF_TIME = 30  # looking after the jobs takes at most one thirtieth of it
 
 
 def run_sweep(words: list[str], context: HydraContext, master: DictConfig, settings: SweepConfig) -> None:
-    """Run the jobs that are asked for and not done yet.
-
-    Args:
-        words: the command line's overrides.
-        context: Hydra's.
-        master: the configuration of the sweep itself.
-        settings: how to run it.
-
-    Raises:
-        InputError: a mistake on the command line; nothing was run or written.
-        SystemExit: not all jobs are done.
-    """
+    """Run the jobs that are asked for and not done yet."""
     folder = SweepFolder(Path(master.hydra.sweep.dir))
     launcher, own = launcher_settings(master)
     divide = partial(populations, settings=settings, launcher=launcher, own=own, hydra=master.hydra)

@@ -34,7 +34,7 @@ from gridworld.process.console.command_line import program
 from gridworld.process.console.progress import ProgressLine, time_left
 from gridworld.sweep.console import shell_path
 from gridworld.sweep.job_table import one_line
-from gridworld.tune.finalists import FINAL
+from gridworld.tune.confirmation import FINAL
 from gridworld.tune.objective import (
     DRAW,
     ERROR,

@@ -26,14 +26,16 @@ from gridworld.sweep.console import shell_path
 from gridworld.training.tensorboard import hparams
 from gridworld.tune.confirmation import (
     CONFIRM,
+    Finalist,
     HeldOutRun,
     HeldOutRuns,
+    choose_finalists,
     held_out_runs,
     prepare,
+    rank_finalists,
     read_results,
     verdict_on,
 )
-from gridworld.tune.finalists import Finalist, choose_finalists, rank_finalists
 from gridworld.tune.objective import ERROR, with_values
 from gridworld.tune.recipe import write_recipe
 from gridworld.tune.search import in_reach, open_study, search, study_url
@@ -50,8 +52,10 @@ def tune(spec: StudySpec) -> None:
         StopRequest().listening(),
         Workers(int(spec.settings.workers)) as workers,
     ):
-        url = study_url(spec)
-        study = _begin(spec, url)
+        url, about = study_url(spec), _about(spec)
+        is_begun = is_claimed(spec.folder, spec.name)
+        study = open_study(url, spec.name, about, spec.space, must_exist=is_begun)
+        claim(spec.folder, spec.name, about)
         with in_reach(url):
             search(spec, study, workers)
             trials = choose_finalists(study, spec)
@@ -60,14 +64,6 @@ def tune(spec: StudySpec) -> None:
             ranked = rank_finalists(spec, study, trials, workers)
             best = next(trial for trial in trials if trial.number == ranked[0].trial)
             _conclude(spec, study, best, ranked, workers)
-
-
-def _begin(spec: StudySpec, url: str) -> optuna.Study:
-    """Make the study, or check that the one there is of this search."""
-    about = _about(spec)
-    study = open_study(url, spec.name, about, spec.space, must_exist=is_claimed(spec.folder, spec.name))
-    claim(spec.folder, spec.name, about)
-    return study
 
 
 def _about(spec: StudySpec) -> dict[str, Any]:
