@@ -191,12 +191,9 @@ def _differences(results: Sequence[_Result]) -> list[str]:
         given = {_key(word): word for word in result.words}
         values = {key: f"{key}={value}" for key, value in result.settings}
         words = [given.get(key) or values.get(key, "") for key in keys]
-        told.append(_shortened(" ".join(word.removeprefix("agent.") for word in words if word)))
+        text = " ".join(word.removeprefix("agent.") for word in words if word)
+        told.append(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…")
     return told
-
-
-def _shortened(text: str) -> str:
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 
 def _certified(found: Sequence[Summary]) -> str:

@@ -60,7 +60,9 @@ def tune(spec: StudySpec) -> None:
             search(spec, study, workers)
             trials = choose_finalists(study, spec)
             if not trials:
-                raise SearchError(f"{shell_path(spec.folder)}: no trial came to a score; {_why(study)}")
+                errors = [error for trial in study.trials if (error := trial.user_attrs.get(ERROR))]
+                why = f"all {len(errors)} failed, the first: {errors[0]}" if errors else "there was no time"
+                raise SearchError(f"{shell_path(spec.folder)}: no trial came to a score; {why}")
             ranked = rank_finalists(spec, study, trials, workers)
             best = next(trial for trial in trials if trial.number == ranked[0].trial)
             _conclude(spec, study, best, ranked, workers)
@@ -80,12 +82,6 @@ def _about(spec: StudySpec) -> dict[str, Any]:
             "reports": spec.settings.reports,
         },
     }
-
-
-def _why(study: optuna.Study) -> str:
-    """Why no trial has a score."""
-    reasons = [trial.user_attrs[ERROR] for trial in study.trials if trial.user_attrs.get(ERROR)]
-    return f"all {len(reasons)} failed, the first: {reasons[0]}" if reasons else "there was no time"
 
 
 def _conclude(
