@@ -42,7 +42,7 @@ def _environment() -> Iterator[None]:
 
 # One after the other: clusters, browsers and kills at random moments, which want a machine for themselves.
 IN_TURN = (
-    *("sweep/test_sweep_cluster.py", "sweep/test_sweep_kills.py", "sweep/test_population_kills.py"),
+    *("sweep/test_sweep_cluster.py", "sweep/test_sweep_kills.py"),
     *("training/test_tensorboard.py", "report/test_report_page.py"),
 )
 # What takes more than five seconds of a processor, the longest first.

@@ -88,11 +88,7 @@ class SweepFolder:
             yield
 
     def add(self, jobs: Sequence[Job], words: Sequence[str]) -> list[JobEntry]:
-        """Write to sweep.json what is asked for by the overrides `words`.
-
-        Returns:
-            The jobs' entries; a new job has a folder's name of its own.
-        """
+        """Write to sweep.json what is asked for by the overrides `words`."""
         taken = {entry.job.lower() for entry in self.entries.values()}
         # Also the folders of no job.
         taken |= {file.parent.name.lower() for file in self.path.glob(f"*/{MANIFEST}")}

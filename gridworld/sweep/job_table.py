@@ -72,13 +72,7 @@ class JobTable:
         before: Mapping[str, JobRow],
         ended: Mapping[str, JobRow] | None = None,
     ) -> dict[str, JobRow]:
-        """The rows as they should be.
-
-        Args:
-            entries: the jobs.
-            before: rows with reasons that no folder has: of a mistake in the settings, or of a full disk.
-            ended: rows that cannot change any more.
-        """
+        """The rows as they should be; `before` has reasons that no folder has, `ended` what cannot change."""
         known = ended or {}
         return {e.job: known.get(e.job) or self._inspect(e, before.get(e.job)) for e in entries}
 

@@ -33,7 +33,7 @@ from gridworld.errors import InputError
 from gridworld.process.console import ProgressLine, program, time_left
 from gridworld.sweep.console import shell_path
 from gridworld.sweep.job_table import one_line
-from gridworld.tune.finalists import FINAL
+from gridworld.tune.confirmation import FINAL
 from gridworld.tune.objective import (
     DRAW,
     ERROR,

@@ -15,8 +15,8 @@ from gridworld.report.evidence import Evidence, Unusable, read
 from gridworld.report.writer import write_over_seeds
 from gridworld.run.folder import RESULTS, WORLD
 from gridworld.run.reader import read_run
+from gridworld.sweep.console import results_lines
 from gridworld.sweep.job_table import DONE, JobRow
-from gridworld.sweep.results import results_lines
 
 AGENTS = {"sarsa": SHORT["sarsa"], "dqn": SHORT["dqn"]}
 SEEDS = range(3)

@@ -31,8 +31,7 @@ from gridworld.errors import InputError
 from gridworld.process.together import mixing
 from gridworld.restore.reproduce import population
 from gridworld.run.reader import read_run
-from gridworld.sweep.grouping import populations
-from gridworld.sweep.plan import Job
+from gridworld.sweep.plan import Job, populations
 from gridworld.training.setup import check_settings, make_context
 
 SMALL = (
