@@ -12,7 +12,7 @@ from gridworld.agents import Agent, PolicySnapshot, TrainingContext, family
 from gridworld.config.agents import AgentConfig
 from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
-from gridworld.world.exact.markov_chain import one_hot_policy
+from gridworld.world.chain import one_hot_policy
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 
 _LAST = 0.6  # of training; what it does after that is its behaviour

@@ -16,7 +16,7 @@ from gridworld.process.console.terminal import aligned, printable
 from gridworld.process.memory_budget import limited
 from gridworld.restore.saved_run import SavedRun, choose_policy
 from gridworld.run.summary import MOST_NAMED, circles_text
-from gridworld.world.exact.evaluation import Evaluator, Score
+from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.mdp import FloatArray
 from gridworld.world.metrics import METRICS, optimal_score
 

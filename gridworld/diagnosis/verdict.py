@@ -25,7 +25,7 @@ from gridworld.diagnosis.finding import Finding
 from gridworld.errors import InputError
 from gridworld.process.console.command_line import command
 from gridworld.restore.saved_run import SavedRun
-from gridworld.world.exact.evaluation import score_of_optimum
+from gridworld.world.evaluation import score_of_optimum
 from gridworld.world.mdp import IntArray, Mdp
 
 _MOST_CHANGES = 3

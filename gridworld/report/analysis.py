@@ -17,7 +17,7 @@ from gridworld.report.evidence import ONLINE, SAMPLED_RETURN, Evidence, reported
 from gridworld.report.grouping import Group, Study
 from gridworld.report.statistics import Interval, Share
 from gridworld.run.reader import read_run, stored_world
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray
 
 GRID_POINTS = 101  # from step 0 to the end of the task's longest run

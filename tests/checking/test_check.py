@@ -21,8 +21,8 @@ from gridworld.checking.probes import PROBES
 from gridworld.checking.settings import arguments, settings, subject
 from gridworld.checking.training import Trained, train
 from gridworld.errors import InputError
-from gridworld.world.exact.markov_chain import one_hot_policy
-from gridworld.world.exact.solver import solved
+from gridworld.world.chain import one_hot_policy
+from gridworld.world.solver import solved
 
 PLANT_ALL = os.environ.get("GRIDWORLD_BUGS") == "all"
 FEW = [

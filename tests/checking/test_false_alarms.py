@@ -20,8 +20,8 @@ from gridworld.checking import probes as expect
 from gridworld.checking.probes import PROBES, Probe
 from gridworld.checking.settings import settings, subject
 from gridworld.checking.training import Trained, train
-from gridworld.world.exact.markov_chain import Chain
-from gridworld.world.exact.solver import backup, solved
+from gridworld.world.chain import Chain
+from gridworld.world.solver import backup, solved
 
 TRIALS = int(os.environ.get("GRIDWORLD_TRIALS", "0"))
 CLASSES = (

@@ -29,10 +29,10 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError, in_short
-from gridworld.world.exact.solver import backup, swept_values
 from gridworld.world.mdp import Mdp, checked_reward, frozen
 from gridworld.world.outcomes import thresholds_of
-from gridworld.world.sources.pure_functions import SO_UNKNOWN, asked, remembered, same
+from gridworld.world.snapshots import SO_UNKNOWN, asked, remembered, same
+from gridworld.world.solver import backup, swept_values
 
 NEUTRAL, LIMIT, MEMORY = "neutral", "time limit", "memory"
 _STEPS, _MOST_STEPS = 2000, 40_000  # of the copy beside the tables, in episodes
