@@ -30,7 +30,7 @@ from gridworld.run.folder import claimed
 from gridworld.run.reader import check_free, is_started
 from gridworld.training.setup import without_pictures
 from gridworld.training.train import train as train_in
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 
 Curve = dict[str, NDArray[Any]]
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from gridworld.checking import worlds
 from gridworld.checking.worlds import BONUS
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import Chain
-from gridworld.world.exact.solver import backup, solved
+from gridworld.world.chain import Chain
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import BoolArray, FloatArray, Mdp
+from gridworld.world.solver import backup, solved
 
 if TYPE_CHECKING:
     from gridworld.checking.training import Trained

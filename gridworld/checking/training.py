@@ -24,7 +24,7 @@ from gridworld.config.agents import AgentConfig
 from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
-from gridworld.world.exact.markov_chain import one_hot_policy
+from gridworld.world.chain import one_hot_policy
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 
 _LAST = 0.6  # of training; what it does after that is its behaviour

@@ -14,7 +14,7 @@ from gridworld.process.console import aligned, printable, program, telling_if_sl
 from gridworld.process.memory_budget import limited
 from gridworld.restore.saved_run import SavedRun, choose_policy
 from gridworld.run.summary import MOST_NAMED, circles_text
-from gridworld.world.exact.evaluation import Evaluator, Score
+from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.mdp import FloatArray
 from gridworld.world.metrics import METRICS, optimal_score
 

@@ -23,7 +23,7 @@ from gridworld.storage.safe_read import check_no_link
 from gridworld.visualization import files
 from gridworld.visualization.episode import film
 from gridworld.visualization.picture import drawer
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 
 MAPS = {picture.name: picture.drawer for picture in PICTURES if picture.is_map}
 

@@ -8,7 +8,7 @@ a sum over states of the discounted visits under π times what its action there 
 With γ = 1 a policy that never ends has no such sum. The walk then stops where it cannot end any more, and
 such a state costs its visits times V* - V_π, all that is lost from there on.
 
-As `world.exact.evaluation` has it, value and regret are without a step limit. What an episode of training
+As `world.evaluation` has it, value and regret are without a step limit. What an episode of training
 loses by being cut off is therefore no part of the split.
 
 Reference: S. Kakade and J. Langford, Approximately optimal approximate reinforcement learning, ICML 2002.
@@ -32,10 +32,10 @@ from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.report.evidence import read_columns
 from gridworld.restore.saved_run import SavedRun, read_visits
-from gridworld.world.exact.evaluation import Evaluator, Score
-from gridworld.world.exact.markov_chain import Chain, discounted_visits, stopping_states
-from gridworld.world.exact.solver import Solution, backup, pick, solved
+from gridworld.world.chain import Chain, discounted_visits, stopping_states
+from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.mdp import BoolArray, FloatArray
+from gridworld.world.solver import Solution, backup, pick, solved
 
 
 @dataclass(frozen=True, eq=False)

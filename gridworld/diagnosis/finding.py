@@ -11,10 +11,10 @@ import numpy as np
 
 from gridworld.config.agents import LINEAR
 from gridworld.diagnosis.evidence import Evidence
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import Chain, discounted_visits, stopping_states
-from gridworld.world.exact.solver import backup
+from gridworld.world.chain import Chain, discounted_visits, stopping_states
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import BoolArray, FloatArray, Mdp
+from gridworld.world.solver import backup
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,7 +31,7 @@ from gridworld.visualization.canvas import Canvas, shown
 from gridworld.visualization.paths import directions, draw_paths, greedy_paths
 from gridworld.visualization.sheet import INK, ORANGES, PAPER, UNREACHABLE, Swatch, is_dark, linear, short
 from gridworld.visualization.state_table import Numbers, StateTable, table_states
-from gridworld.world.exact.evaluation import score_of_optimum
+from gridworld.world.evaluation import score_of_optimum
 from gridworld.world.mdp import IntArray, Mdp
 
 _MOST_CHANGES = 3

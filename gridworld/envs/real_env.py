@@ -14,7 +14,7 @@ from PIL import Image
 from gridworld.envs.rendering import Frame, import_pygame
 from gridworld.errors import InputError, in_short
 from gridworld.world.mdp import Mdp
-from gridworld.world.sources.making import make_env
+from gridworld.world.sources.gymnasium_table import make_env
 
 _MOST_PIXELS = 512 * 512
 _OFF_SCREEN = {"SDL_VIDEODRIVER": "dummy", "SDL_AUDIODRIVER": "dummy"}

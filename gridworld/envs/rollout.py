@@ -9,8 +9,8 @@ import numpy as np
 from gridworld.envs.intervals import Estimate, estimate_mean, estimate_share
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.storage.serialization import independent_generator
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import check_policy
+from gridworld.world.chain import check_policy
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 
 

@@ -31,7 +31,7 @@ from gridworld.report.grouping import Group, Study, arrange
 from gridworld.report.statistics import Interval, Share
 from gridworld.report.tuning_study import TuningStudy, find_tunings
 from gridworld.run.reader import read_run, stored_world
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray
 
 GRID_POINTS = 101  # from step 0 to the end of the task's longest run

@@ -28,7 +28,7 @@ from gridworld.process.user_input import DAMAGED
 from gridworld.run.folder import shown
 from gridworld.run.reader import RunReader, open_run, stored_world
 from gridworld.training.setup import make_context
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import GridMdp
 from gridworld.world.layout import CLASSIC, load
 from gridworld.world.mdp import FloatArray, Mdp

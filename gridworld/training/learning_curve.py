@@ -25,7 +25,7 @@ from gridworld.process.together import clock
 from gridworld.storage.append_log import AppendLog
 from gridworld.storage.csv_text import csv_text
 from gridworld.storage.serialization import State
-from gridworld.world.exact.evaluation import Evaluator, Score
+from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.metrics import METRICS, TRAINING_METRICS, Metric, numbers, optimal_score
 
 if TYPE_CHECKING:

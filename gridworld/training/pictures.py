@@ -26,7 +26,7 @@ from gridworld.visualization.animation import Animation
 from gridworld.visualization.files import encode_gif, save
 from gridworld.visualization.picture import Draw, drawer
 from gridworld.visualization.policy_history import PolicyHistory
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 
 _GROUP = "pictures"  # of TensorBoard's tags: behind the learning curve
 

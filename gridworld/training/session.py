@@ -45,7 +45,7 @@ from gridworld.training.learning_curve import (
 from gridworld.training.pictures import Pictures
 from gridworld.training.tensorboard import EventWriter, as_markdown, hparams
 from gridworld.training.together import Training
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import EXACT
 from gridworld.world.metrics import numbers, optimal_numbers
 

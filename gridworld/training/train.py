@@ -29,7 +29,7 @@ from gridworld.training.session import Session
 from gridworld.training.setup import check_settings, make_context, notes
 from gridworld.training.tensorboard import EventWriter
 from gridworld.training.together import Training, run_alone
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 
 OnBuilt = Callable[[Agent], None]

@@ -22,7 +22,7 @@ from gridworld.config.train import TrainConfig
 from gridworld.envs.rendering import Frame
 from gridworld.errors import InputError
 from gridworld.visualization.animation import Animation
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 
 if TYPE_CHECKING:
     from gridworld.visualization.policy_history import PolicyHistory

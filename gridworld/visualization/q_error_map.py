@@ -18,8 +18,8 @@ from gridworld.visualization.paths import moving_actions
 from gridworld.visualization.picture import IMAGES_TAB, Draw, Subject, agents_gamma, visits_of
 from gridworld.visualization.sheet import ORANGES, linear, short
 from gridworld.visualization.state_table import Numbers, draw_table, table_states
-from gridworld.world.exact.solver import Solution, solved
 from gridworld.world.mdp import FloatArray, Mdp
+from gridworld.world.solver import Solution, solved
 
 TENSORBOARD_SIDE: int | None = IMAGES_TAB
 

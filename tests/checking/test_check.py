@@ -19,9 +19,9 @@ from gridworld.checking.probes import PROBES
 from gridworld.checking.training import Trained, arguments, settings, subject, train
 from gridworld.commands import check as command
 from gridworld.errors import InputError
-from gridworld.world.exact.markov_chain import one_hot_policy
-from gridworld.world.exact.solver import solved
+from gridworld.world.chain import one_hot_policy
 from gridworld.world.mdp import Mdp
+from gridworld.world.solver import solved
 
 PLANT_ALL = os.environ.get("GRIDWORLD_BUGS") == "all"
 FEW = [

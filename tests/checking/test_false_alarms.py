@@ -19,7 +19,7 @@ import pytest
 from gridworld.checking import probes as expect
 from gridworld.checking.probes import PROBES, Probe
 from gridworld.checking.training import Trained, settings, subject, train
-from gridworld.world.exact.solver import solved
+from gridworld.world.solver import solved
 
 TRIALS = int(os.environ.get("GRIDWORLD_TRIALS", "0"))
 CLASSES = (

@@ -20,7 +20,7 @@ from gridworld.agents.sb3.settings.schemas import SB3ClassConfig
 from gridworld.diagnosis.causes import PHRASES
 from gridworld.diagnosis.causes.implementation import of_library
 from gridworld.diagnosis.verdict import Diagnosis
-from gridworld.world.exact.solver import solved
+from gridworld.world.solver import solved
 
 ALL = os.environ.get("GRIDWORLD_SABOTAGES") == "all"
 _MAP, _SEED = MADE_ON[0]

@@ -21,7 +21,7 @@ from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.job_table import FAILED, JobRow, JobTable
 from gridworld.sweep.plan import Job
 from gridworld.tune.study_folder import SEARCH_JSON
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 
 _COLUMNS = ("value", "regret", "certified", "goal_probability", "trap_probability", "timeout_probability")
 _COLUMNS += ("return", "length")

@@ -50,7 +50,7 @@ from gridworld.report.statistics import Interval
 from gridworld.report.tuning_study import find_tunings
 from gridworld.report.writer import BANDS, MARKERS
 from gridworld.storage.safe_read import sealed
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 
 FORMATS = ("png", "pdf", "svg")  # more words of `--formats`
 NO_CACHE = {"MPLCONFIGDIR": "/proc/nowhere"}  # what matplotlib has to say of that is not for the user

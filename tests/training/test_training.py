@@ -22,8 +22,8 @@ from gridworld.storage.safe_read import sealed
 from gridworld.training.learning_curve import LearningCurve
 from gridworld.training.together import run_together
 from gridworld.training.train import training
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import one_hot_policy
+from gridworld.world.chain import one_hot_policy
+from gridworld.world.evaluation import Evaluator
 
 FILES = {
     *("manifest.json", "curve.csv", "model.zip", "summary.json", "visits.npy"),

@@ -19,10 +19,10 @@ from gridworld.visualization.policy_map import DISAGREES, UNKNOWN, draw_policy_m
 from gridworld.visualization.q_error_map import draw_error_map, value_error
 from gridworld.visualization.sheet import BLUES, ORANGES, VIRIDIS, Scale, counting, linear, short
 from gridworld.visualization.visit_map import draw_visit_map
-from gridworld.world.exact.solver import value_iteration
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
 from gridworld.world.mdp import Mdp
+from gridworld.world.solver import value_iteration
 
 CLASSIC = compile_mdp(load("classic"))
 WORLDS = ["classic", "four_rooms", "maze", "cliff", "cliff_walking", "aima_4x3"]

@@ -7,7 +7,7 @@ import numpy as np
 from gridworld.config.agents import LINEAR
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.finding import Finding, best_of_what_was_tried, longer
-from gridworld.world.exact.markov_chain import Chain
+from gridworld.world.chain import Chain
 from gridworld.world.mdp import BoolArray
 
 _FEWEST = 3  # tries of an action where they are used once; one that is kept may do

@@ -36,9 +36,9 @@ from gridworld.process.console import ProgressLine, printable, telling_if_slow
 from gridworld.process.memory_budget import check_memory
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import MOST_ACTIONS, MOST_STATES, Outcomes, mdp_from_outcomes
-from gridworld.world.sources.making import make_env
-from gridworld.world.sources.snapshots import Snapshots, key_of, random_states
-from gridworld.world.sources.wrappers import refuse_transformed
+from gridworld.world.snapshots import Snapshots, key_of, random_states
+from gridworld.world.sources.gymnasium_table import make_env
+from gridworld.world.wrappers import refuse_transformed
 
 _BEYOND = 1_000  # states further than a step limit that are found too, so that a small world is whole
 _DEEPEST = 10_000  # steps from the start
