@@ -118,7 +118,7 @@ def test_the_line_before_training() -> None:
         "recipe cliff_dqn: 80,000 steps; tuned=none keeps the agent's own settings"
     ]
     assert lines(configure("agent=dqn", "env.slip=0.1")) == [
-        "classic is stochastic: preset=stochastic, 9,600,000 steps; "
+        "classic is stochastic: preset=stochastic, 12,800,000 steps; "
         "preset=none keeps the agent's own settings"
     ]
     [line] = lines(configure("agent=ppo_sb3_defaults", "env.num_rows=4"))
