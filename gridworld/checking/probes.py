@@ -4,25 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from gridworld.agents import PolicySnapshot
 from gridworld.checking import worlds
 from gridworld.checking.worlds import BONUS
 from gridworld.world.chain import Chain
 from gridworld.world.evaluation import Evaluator
-from gridworld.world.mdp import BoolArray, FloatArray, Mdp
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 from gridworld.world.solver import backup, solved
-
-if TYPE_CHECKING:
-    from gridworld.checking.training import Trained
 
 TOLERANCE = 0.1  # of a value, relative to the largest number in the world
 LEAST_BEST = 0.99  # share of late steps with a best action
 PROBABILITY = 0.06  # tolerance of an action's
 _VISITED = 0.05  # share of steps; an actor-critic knows the values of the states that it is in
 _LIMIT = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """An implementation after training."""
+
+    mdp: Mdp
+    gamma: float
+    first: PolicySnapshot  # what it had before training
+    last: PolicySnapshot  # what it has learnt
+    greedy: FloatArray  # (S, A), its own deterministic policy
+    visits: IntArray  # (S, A), its actions in training
+    late: IntArray  # (S, A), those in the last two fifths of it
+    frozen: list[str]  # the names of the parameters that training left as they were
 
 
 class UnmetError(Exception):

@@ -17,15 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import Agent, PolicySnapshot, TrainingContext, family
+from gridworld.agents import Agent, TrainingContext, family
 from gridworld.agents.sb3.settings.schemas import SB3ClassConfig, SB3Config
-from gridworld.checking.probes import Probe
+from gridworld.checking.probes import Probe, Trained
 from gridworld.config.agents import AgentConfig
 from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
 from gridworld.world.chain import one_hot_policy
-from gridworld.world.mdp import FloatArray, IntArray, Mdp
+from gridworld.world.mdp import Mdp
 
 _LAST = 0.6  # of training; what it does after that is its behaviour
 _OURS = {"gamma": "each probe has its own", "seed": "see --seed", "device": "it is cpu"}
@@ -149,20 +149,6 @@ def arguments(words: Sequence[str]) -> dict[str, Any]:
         except (ValueError, SyntaxError):
             found[name] = value
     return found
-
-
-@dataclass(frozen=True, eq=False)
-class Trained:
-    """An implementation after training."""
-
-    mdp: Mdp
-    gamma: float
-    first: PolicySnapshot  # what it had before training
-    last: PolicySnapshot  # what it has learnt
-    greedy: FloatArray  # (S, A), its own deterministic policy
-    visits: IntArray  # (S, A), its actions in training
-    late: IntArray  # (S, A), those in the last two fifths of it
-    frozen: list[str]  # the names of the parameters that training left as they were
 
 
 def build(config: AgentConfig, mdp: Mdp, num_envs: int, seed: int) -> tuple[Agent, TrainingContext]:

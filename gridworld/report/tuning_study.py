@@ -8,16 +8,13 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gridworld.errors import InputError
 from gridworld.process.console import plain
 from gridworld.process.memory_budget import check_memory
 from gridworld.storage.csv_text import csv_rows
 from gridworld.storage.safe_read import LARGEST_CSV, as_table, read_bytes, read_sealed, sha256
-
-if TYPE_CHECKING:
-    from gridworld.report.tables import Cell
 
 STUDY_JSON, TRIALS_CSV = "study.json", "trials.csv"
 TRIALS_SUM = "trials_sha256"  # in the former, of the latter
@@ -50,7 +47,7 @@ class TuningStudy:
     began_from: Mapping[str, Any]  # the same keys before; empty where that was outside the space
     space: Mapping[str, Mapping[str, Any]]
     importances: Mapping[str, float]
-    finalists: Sequence[Sequence[Cell]]  # trial, score, certified; the winner first
+    finalists: Sequence[Sequence[str | float]]  # trial, score, certified; the winner first
     trials: Sequence[TrialRow]
 
     @property

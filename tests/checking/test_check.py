@@ -15,8 +15,8 @@ import gridworld
 from gridworld.agents import PolicySnapshot
 from gridworld.checking import probes as expect
 from gridworld.checking import run, worlds
-from gridworld.checking.probes import PROBES
-from gridworld.checking.training import Trained, arguments, settings, subject, train
+from gridworld.checking.probes import PROBES, Trained
+from gridworld.checking.training import arguments, settings, subject, train
 from gridworld.commands import check as command
 from gridworld.errors import InputError
 from gridworld.world.chain import one_hot_policy

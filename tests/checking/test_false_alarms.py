@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from gridworld.checking import probes as expect
-from gridworld.checking.probes import PROBES, Probe
-from gridworld.checking.training import Trained, settings, subject, train
+from gridworld.checking.probes import PROBES, Probe, Trained
+from gridworld.checking.training import settings, subject, train
 from gridworld.world.solver import solved
 
 TRIALS = int(os.environ.get("GRIDWORLD_TRIALS", "0"))
