@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from types import MappingProxyType
 
+LARGEST = 32  # runs of a population unless more are asked for; larger ones train no faster
+
 
 class Clock:
     """Counts the seconds that were spent on one run, with `shared`, its share of those spent on all."""

@@ -22,6 +22,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
+from gridworld.bounds import LARGEST_INTEGER
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import check_memory
 
@@ -112,7 +113,7 @@ def _number(text: str) -> float:
 
 def _whole(text: str) -> int:
     number = int(text)
-    if abs(number) >= 2**63:
+    if abs(number) >= LARGEST_INTEGER:
         raise ValueError(f"{text[:20]}... is too large a number")
     return number
 

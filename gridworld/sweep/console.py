@@ -24,7 +24,13 @@ from gridworld.run.reader import read_run
 from gridworld.run.summary import Summary
 from gridworld.sweep.job_table import DONE, FAILED, INTERRUPTED, JOBS_CSV, PENDING, RUNNING, STATUSES, JobRow
 
+_HEADINGS = ("agent", "task", "settings", "certified", "steps to certificate, median")
+_OF_SETTINGS = ON_RESULT - {Effect.SEED, Effect.LABELS, Effect.MACHINE}
+_MOST_NAMED = 3  # jobs
+_LONGEST = 60  # characters of settings
 _MOST_LISTED = 50  # of a kind, on the terminal; jobs.csv has them all
+
+Settings = tuple[tuple[str, str], ...]  # dotted names, values as text
 
 
 def counts_text(rows: Iterable[JobRow]) -> str:
@@ -107,14 +113,6 @@ def shell_path(folder: Path) -> str:
     path = folder.absolute()
     here = Path.cwd()
     return printable(shlex.quote(str(path.relative_to(here) if path.is_relative_to(here) else path)))
-
-
-_HEADINGS = ("agent", "task", "settings", "certified", "steps to certificate, median")
-_OF_SETTINGS = ON_RESULT - {Effect.SEED, Effect.LABELS, Effect.MACHINE}
-_MOST_NAMED = 3  # jobs
-_LONGEST = 60  # characters of settings
-
-Settings = tuple[tuple[str, str], ...]  # dotted names, values as text
 
 
 def results_lines(folder: Path, rows: Sequence[JobRow]) -> list[str]:

@@ -20,7 +20,7 @@ from hydra.core.utils import JobReturn, JobStatus, configure_log
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from gridworld.agents import family
-from gridworld.config.train import TrainConfig
+from gridworld.config.train import AUTO, TrainConfig
 from gridworld.errors import FolderLostError, InputError, MachineError, reason
 from gridworld.process.console import called_from
 from gridworld.process.memory_budget import collect_less_often
@@ -36,6 +36,7 @@ from gridworld.sweep.job_table import one_line, run_status
 from gridworld.training.together import Training, run_together
 from gridworld.training.train import training
 
+_Dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 _UNFINISHED = ("running", "interrupted")  # statuses of runs that were stopped from outside
 
 
@@ -92,9 +93,6 @@ def mark_failed(folder: Path, why: str, trace: str = "") -> None:
         write_text(folder / ERROR_FILE, f"{why}\n{trace}")
 
 
-_Dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-
-
 @dataclass(frozen=True)
 class SweepJob:
     """A job as its process needs it."""
@@ -122,7 +120,7 @@ class Worker:
         os.environ.update(self.master.hydra.job.env_set)
         configure_log(self.master.hydra.job_logging, self.master.hydra.verbose)
         config = jobs[0].config  # all have one device
-        asked = self.master.hydra.sweeper.population != "auto" and len(jobs) > 1
+        asked = self.master.hydra.sweeper.population != AUTO and len(jobs) > 1
         depend = asked and not family(config.agent).on_processor(config.device)
         with mixing({job.folder.name: job.hash for job in jobs} if depend else {}):
             results = run_together([partial(self._run, job) for job in jobs])

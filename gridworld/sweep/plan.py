@@ -27,15 +27,20 @@ from omegaconf import DictConfig
 from gridworld.config.composition.presets import with_preset
 from gridworld.config.plain_settings import foreign, has_own_code
 from gridworld.config.sweep import SweepConfig
-from gridworld.config.train import TrainConfig
+from gridworld.config.train import AUTO, TrainConfig
 from gridworld.config.worlds import EnvConfig
 from gridworld.errors import InputError
 from gridworld.process.processes import file_limit, free_memory, worker_count
+from gridworld.process.together import LARGEST
 from gridworld.run.provenance import settings_hash
 from gridworld.training.setup import check_settings, notes
 from gridworld.world.mdp import Mdp
 
-LARGEST = 32  # runs of a population unless more are asked for; larger ones train no faster
+RUNS_FILES = 5  # that a run has open: its lock, its curve, its events, its log
+_SHARE_OF_MEMORY = 4  # a population takes a fourth of what is free, shared by the workers
+_RUNS_BYTES = 16 * 2**20  # of a run beside its agent, with its pictures
+_OTHER_FILES = 64  # of the process
+_FEWEST = 4  # runs of a population for which another core is taken
 _LONGEST_NAME = 100  # characters of a job's folder
 _MOST_VALUES = 1_000_000  # of one key
 _HASH_SHOWN = 6  # characters of the hash in a name that needs it
@@ -234,14 +239,6 @@ def _slug(override: str) -> str:
     if "/" in value:
         value = PurePath(value.strip("'\"")).stem
     return re.sub(r"[^A-Za-z0-9_.=+-]+", "-", key + equals + value).strip("-.+~")
-
-
-AUTO = "auto"
-RUNS_FILES = 5  # that a run has open: its lock, its curve, its events, its log
-_SHARE_OF_MEMORY = 4  # a population takes a fourth of what is free, shared by the workers
-_RUNS_BYTES = 16 * 2**20  # of a run beside its agent, with its pictures
-_OTHER_FILES = 64  # of the process
-_FEWEST = 4  # runs of a population for which another core is taken
 
 
 def populations(

@@ -29,6 +29,7 @@ from omegaconf import OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.agents import Learning, family
+from gridworld.bounds import LARGEST_INTEGER
 from gridworld.config.composition.compose import to_config
 from gridworld.config.train import TrainConfig
 from gridworld.envs.observations import make_observation
@@ -40,7 +41,6 @@ from gridworld.tune.workers import Ask
 from gridworld.world.evaluation import Evaluator
 
 SEEDS, ERROR, WORKER, DRAW = "seeds", "error", "worker", "draw"  # attributes of a trial in the study
-_MOST_STEPS = 2**63
 
 Values = Mapping[str, Any]  # {"agent.learning_rate": 0.01, ...}
 
@@ -64,7 +64,7 @@ def read_score(content: Any) -> SeedScore:
     """A seed's score from the study's storage. Raises `ValueError` or `TypeError` for anything else."""
     found = SeedScore(**content)
     since = found.certified_since
-    if type(found.regret) is not float or not (since is None or 0 <= int(since) < _MOST_STEPS):
+    if type(found.regret) is not float or not (since is None or 0 <= int(since) < LARGEST_INTEGER):
         raise ValueError(f"{str(content)[:80]} is not the score of a seed")
     return found
 

@@ -17,13 +17,13 @@ from multiprocessing.context import SpawnProcess
 from typing import Any, TypeVar
 
 from gridworld.process.signals import blocking, signal_name
+from gridworld.process.together import LARGEST
 
 Ask = Callable[[Any], Any]  # by which a task sends a message to the command, and gets the answer
 Task = Callable[[Ask], Any]  # pickled, as is what it returns
 
 T = TypeVar("T")
 
-_LARGEST = 32  # runs that train together; more train no faster
 _POLL_SECONDS = 0.1
 _STOP_WITHIN = 3.0  # seconds
 _MOST_KILLED = 4  # workers in one task: what kills them may be the task
@@ -63,7 +63,7 @@ class Workers:
 
     def shares(self, runs: Sequence[T], can_join: bool) -> Iterator[Sequence[T]]:
         """Divide runs into tasks: of runs that train together as many to each worker, of others one each."""
-        size = max(1, min(_LARGEST, math.ceil(len(runs) / self.count))) if can_join else 1
+        size = max(1, min(LARGEST, math.ceil(len(runs) / self.count))) if can_join else 1
         return (runs[start : start + size] for start in range(0, len(runs), size))
 
     def run(

@@ -17,6 +17,7 @@ import yaml
 from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import OmegaConf
 
+from gridworld.bounds import LARGEST_INTEGER
 from gridworld.config.agents import MISSING
 from gridworld.config.composition.conf_folder import is_override
 from gridworld.config.composition.words import as_whole
@@ -32,7 +33,6 @@ IN_A_STUDY = ("experiment", "winner.yaml")
 CHOSEN = ("agent", "env", "observation", "preset", "tuned")
 _LARGEST = 2**16  # bytes
 _DEEPEST = 20  # levels
-_LARGEST_WHOLE = 2**63
 _CHOICE = re.compile(r"\w[\w.-]*(/\w[\w.-]*)*")  # no way out of the folder of choices
 _WORD = re.compile(
     r"(?:(~)|(\+{0,2}))(\w+(?:\.\w+)*)(?(1)(?:=.*)?|=(.*))", re.ASCII | re.DOTALL
@@ -199,7 +199,7 @@ def literal(value: Any, where: str) -> str:
         return value if bare else str(QuotedString(value, Quote.single).with_quotes())
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
-    if isinstance(value, int) and abs(value) >= _LARGEST_WHOLE:
+    if isinstance(value, int) and abs(value) >= LARGEST_INTEGER:
         raise InputError(f"{where}: is too large a number")
     if not isinstance(value, int | float):
         raise InputError(f"{where}: must be plain values, has a {type(value).__name__}")
