@@ -10,7 +10,6 @@ from gridworld.config.fields import bounds
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
 
-_MOST_TRIALS = 1_000_000
 _MOST_RUNS = 10_000  # of one kind: seeds, finalists
 _MOST_LOOKS = 100_000  # at a seed's training
 
@@ -31,7 +30,7 @@ class DimensionConfig:
 class TuneConfig:
     """How `scripts/tune.py` searches; `tune` on the command line."""
 
-    trials: int = field(default=100, metadata=bounds(1, _MOST_TRIALS))  # the search ends after so many
+    trials: int = field(default=100, metadata=bounds(1))  # the search ends after so many
     seeds: int = field(default=3, metadata=bounds(1, _MOST_RUNS))  # a trial's: seed, seed + 1, ...
     # trials that go on to more seeds, beside what the search began from
     finalists: int = field(default=5, metadata=bounds(1, _MOST_RUNS))
