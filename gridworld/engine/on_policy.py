@@ -33,8 +33,7 @@ import torch
 
 from gridworld.engine.environments import Rollout
 from gridworld.engine.networks import Array
-from gridworld.engine.population import FEW_STATES, Population
-from gridworld.engine.run import Run
+from gridworld.engine.population import FEW_STATES, Population, Run
 from gridworld.storage.serialization import State
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 

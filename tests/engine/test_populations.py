@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gridworld.agents import Learning, family, learn_together
-from gridworld.agents.sb3.settings.engine import ACTIVATIONS
+from gridworld.agents.sb3.agent import ACTIVATIONS
 from gridworld.engine import population
 from gridworld.envs.observations import make_observation
 from gridworld.training.setup import check_settings, make_context
