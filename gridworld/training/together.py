@@ -22,8 +22,8 @@ Training = Generator[Learning, None, T]
 
 def run_alone(training: Training[T]) -> T:
     """Run a training; returns what it returns, and raises what it raises."""
-    learning = next(training)
     try:
+        learning = next(training)
         try:
             learning.agent.learn(
                 learning.total_timesteps, learning.on_step, learning.on_safe_point, learning.state

@@ -10,7 +10,7 @@ Every wrapper is looked at, and recognised by whose `step` and `reset` it runs:
     memory       shows more than the state's number; the task is the same, but a policy behind it has no table
 
 Anything else is refused. The three methods must be functions of their argument alone: they are asked on a
-copy, see `pure_functions` in `snapshots`, and the copy is stepped beside the tables.
+copy (`snapshots.asked`), and the copy is stepped beside the tables.
 """
 
 from __future__ import annotations
