@@ -57,6 +57,10 @@ class OnPolicy(Population):
             self._outputs = logits, values[..., 0]
         return self._outputs
 
+    def column(self, name: str) -> FloatArray:
+        """(P, 1, 1), of `settings`."""
+        return np.array(self.settings(name)).reshape(-1, 1, 1)
+
     def log_policy(self) -> tuple[Array, Array]:
         """log π (P, S, A) and values (P, S) of all states."""
         logits, values = self.outputs

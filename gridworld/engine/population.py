@@ -227,10 +227,6 @@ class Population:
         """The share of a run's training that is done."""
         return self.num_timesteps / run.total_timesteps
 
-    def column(self, name: str) -> FloatArray:
-        """(P, 1, 1), of `settings`."""
-        return np.array(self.settings(name)).reshape(-1, 1, 1)
-
     def learn(self, total_timesteps: int) -> None:
         """Train until all runs have ended, or have made so many environment steps."""
         population: Population | None = self.safe_point()
