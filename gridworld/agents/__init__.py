@@ -124,24 +124,22 @@ def learn_together(learnings: Sequence[Learning]) -> list[BaseException | None]:
     Returns:
         What each ended with; None where it came to its end.
     """
-    found: dict[int, BaseException | None] = {}
+    errors: list[BaseException | None] = [None] * len(learnings)
     classes: dict[type, list[int]] = {}
-    for place, learning in enumerate(learnings):
-        if hasattr(learning.agent, "learn_together"):
-            classes.setdefault(type(learning.agent), []).append(place)
+    for place, each in enumerate(learnings):
+        if hasattr(each.agent, "learn_together"):
+            classes.setdefault(type(each.agent), []).append(place)
             continue
         try:
-            learning.agent.learn(
-                learning.total_timesteps, learning.on_step, learning.on_safe_point, learning.state
-            )
-            found[place] = None
+            each.agent.learn(each.total_timesteps, each.on_step, each.on_safe_point, each.state)
         except BaseException as error:
-            found[place] = error
+            errors[place] = error
     for places in classes.values():
         first: Any = learnings[places[0]].agent
-        errors = first.learn_together([learnings[place] for place in places])
-        found |= dict(zip(places, errors, strict=True))
-    return [found[place] for place in range(len(learnings))]
+        ends = first.learn_together([learnings[place] for place in places])
+        for place, end in zip(places, ends, strict=True):
+            errors[place] = end
+    return errors
 
 
 class Family(Protocol):

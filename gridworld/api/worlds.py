@@ -71,9 +71,9 @@ def evaluate(
     task = task_of(place, max_episode_steps)
     mdp, limit = task.mdp, task.max_episode_steps
     if is_model:
-        from gridworld.agents.sb3.exact_eval import tables_of  # here, since it imports torch
+        from gridworld.agents.sb3.exact_eval import ForeignPolicy  # here, since it imports torch
 
-        tables = tables_of(model_or_table, task)
+        tables = ForeignPolicy(model_or_table, task).tables()
         if tables.sampled is None and not deterministic:
             raise InputError(
                 f"{type(model_or_table).__name__}: has its own predict(), so the distribution that it "

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, TrainingContext, family
-from gridworld.agents.sb3.settings.schemas import SB3ClassConfig, SB3Config
+from gridworld.agents.sb3.settings import SB3ClassConfig, SB3Config
 from gridworld.checking.probes import Probe, Trained
 from gridworld.config.agents import AgentConfig
 from gridworld.envs.observations import make_observation
@@ -67,7 +67,7 @@ def settings(config: AgentConfig, probe: Probe, given: Mapping[str, Any]) -> tup
     """
     algorithm: Any = None
     if isinstance(config, SB3ClassConfig):
-        from gridworld.agents.sb3.settings.constructor_arguments import algorithm_class  # imports torch
+        from gridworld.agents.sb3.factory import algorithm_class  # imports torch
 
         algorithm = algorithm_class("check", config.algorithm)
         known = _arguments_of(algorithm)

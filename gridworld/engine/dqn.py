@@ -20,9 +20,8 @@ from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from gridworld.engine.environments import Step
 from gridworld.engine.networks import Array, Networks
-from gridworld.engine.population import FEW_STATES, Population, make_networks
+from gridworld.engine.population import FEW_STATES, Population, Run, make_networks
 from gridworld.engine.replay import CountedReplay, Replay, Transitions, UniformReplay
-from gridworld.engine.run import Run
 from gridworld.storage.serialization import State
 from gridworld.world.mdp import FloatArray, IntArray
 

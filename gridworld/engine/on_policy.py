@@ -33,8 +33,7 @@ import torch
 
 from gridworld.engine.environments import Rollout
 from gridworld.engine.networks import Array
-from gridworld.engine.population import FEW_STATES, Population
-from gridworld.engine.run import Run
+from gridworld.engine.population import FEW_STATES, Population, Run
 from gridworld.storage.serialization import State
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
@@ -57,6 +56,10 @@ class OnPolicy(Population):
             logits, values = self.networks.run()
             self._outputs = logits, values[..., 0]
         return self._outputs
+
+    def column(self, name: str) -> FloatArray:
+        """(P, 1, 1), of `settings`."""
+        return np.array(self.settings(name)).reshape(-1, 1, 1)
 
     def log_policy(self) -> tuple[Array, Array]:
         """log π (P, S, A) and values (P, S) of all states."""

@@ -17,7 +17,7 @@ from gridworld.engine.on_policy import (
     losses_of,
     slopes_of,
 )
-from gridworld.engine.run import Run
+from gridworld.engine.population import Run
 from gridworld.storage.serialization import State
 from gridworld.world.mdp import BoolArray, IntArray
 

@@ -31,8 +31,7 @@ from torch import Tensor, nn
 from gridworld.engine.networks import Array, Networks, aligned
 from gridworld.engine.on_policy import OnPolicy, Sums, log_softmax
 from gridworld.engine.optimizer import Optimizer
-from gridworld.engine.population import make_networks
-from gridworld.engine.run import Run
+from gridworld.engine.population import Run, make_networks
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 _OF_VALUES = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")  # parameters of these alone

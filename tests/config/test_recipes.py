@@ -14,7 +14,7 @@ from helpers.support import CONF, NO_FILES, configure, script, train_in
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from gridworld.agents import family
-from gridworld.agents.sb3.settings.constructor_arguments import algorithm_and_arguments
+from gridworld.agents.sb3.factory import algorithm_and_arguments
 from gridworld.commands.manual import manual
 from gridworld.config.composition.words import pairs
 from gridworld.config.train import check

@@ -16,7 +16,7 @@ from helpers.sabotage import CATALOGUE, HELD_OUT, MADE_ON, SOUND, Sabotage, rand
 
 import gridworld
 from gridworld.agents.sb3.oracle_fit import one_state_fit
-from gridworld.agents.sb3.settings.schemas import SB3ClassConfig
+from gridworld.agents.sb3.settings import SB3ClassConfig
 from gridworld.diagnosis.causes import PHRASES
 from gridworld.diagnosis.causes.implementation import of_library
 from gridworld.diagnosis.verdict import Diagnosis

@@ -14,7 +14,7 @@ from gridworld.agents.sb3.agent import extractors_kind
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.engine import a2c, dqn, on_policy, population
-from gridworld.engine.run import Run
+from gridworld.engine.population import Run
 from gridworld.engine.sb3_format import algorithm_of, make_run, put_weights
 from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv

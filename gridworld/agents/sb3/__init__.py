@@ -8,8 +8,7 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING
 
-from gridworld.agents.sb3.settings.schemas import SCHEMAS, SB3Config
-from gridworld.agents.sb3.settings.validation import check
+from gridworld.agents.sb3.settings import SCHEMAS, SB3Config, check
 from gridworld.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,7 +31,7 @@ def schemas() -> dict[str, type[AgentConfig]]:
 def import_for(config: AgentConfig) -> None:
     """See `gridworld.agents.Family.import_for`. Nothing is computed, which would keep torch from forking."""
     from gridworld.agents.sb3 import agent  # noqa: F401
-    from gridworld.agents.sb3.settings.constructor_arguments import algorithm_and_arguments
+    from gridworld.agents.sb3.factory import algorithm_and_arguments
 
     assert isinstance(config, SB3Config)
     with contextlib.suppress(InputError):
@@ -51,11 +50,10 @@ def on_processor(device: str) -> bool:
 
 def build(config: AgentConfig, context: TrainingContext) -> Agent:
     """See `gridworld.agents.Family.build`."""
-    from gridworld.agents.sb3.agent import EngineAgent, SB3Agent
-    from gridworld.agents.sb3.settings.engine import learns_in_engine
+    from gridworld.agents.sb3.agent import build
 
     assert isinstance(config, SB3Config)
-    return EngineAgent(config, context) if learns_in_engine(config, context) else SB3Agent(config, context)
+    return build(config, context)
 
 
 def weights(path: Path, most: int) -> dict[str, NDArray[Any]]:

@@ -6,30 +6,43 @@ import io
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from torch import nn
 
 from gridworld.agents import Learning, PolicySnapshot, TrainingContext, WriteScalars
-from gridworld.agents.sb3.callbacks import RunCallback, check_finite, diverged, falling_settings
-from gridworld.agents.sb3.factory import UnfitError, cannot_update, make_callbacks, make_model
+from gridworld.agents.sb3.callbacks import RunCallback, check_finite, class_without_state, diverged
+from gridworld.agents.sb3.factory import (
+    Arguments,
+    UnfitError,
+    algorithm_and_arguments,
+    make_callbacks,
+    make_model,
+    unfit,
+)
 from gridworld.agents.sb3.features import FIXED, LEARNED
 from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters, reason
 from gridworld.agents.sb3.policy_outputs import explored, read_table, why_no_table
-from gridworld.agents.sb3.settings.schemas import SB3Config, counts_transitions, reward_scale
-from gridworld.agents.sb3.state import class_without_state
+from gridworld.agents.sb3.replay_counts import ReplayCounts
+from gridworld.agents.sb3.settings import SB3ClassConfig, SB3Config
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.bounds import Bounds
-from gridworld.engine.population import train
-from gridworld.engine.sb3_format import Kind, algorithm_of, make_run, model_file, put_weights
+from gridworld.engine.networks import Kind
+from gridworld.engine.optimizer import ELEMENTWISE
+from gridworld.engine.population import Population, train
+from gridworld.engine.sb3_format import algorithm_of, make_run, model_file, put_weights
 from gridworld.errors import InputError
+from gridworld.process.console import tell
 from gridworld.storage.serialization import State, StateError
 from gridworld.world.chain import one_hot_policy
 from gridworld.world.mdp import FloatArray
@@ -39,12 +52,80 @@ from gridworld.world.mdp import FloatArray
 _BYTES_A_BYTE = 16
 _SPARE_BYTES = 64 * 2**20
 _FIRST_YEAR = 1980  # of the zip format
+# Of torch.nn, what maps every number by itself, in training as in evaluation, and never draws at random.
+ACTIVATIONS = (
+    *(nn.CELU, nn.ELU, nn.GELU, nn.Hardshrink, nn.Hardsigmoid, nn.Hardswish, nn.Hardtanh, nn.Identity),
+    *(nn.LeakyReLU, nn.LogSigmoid, nn.Mish, nn.PReLU, nn.ReLU, nn.ReLU6, nn.SELU, nn.SiLU, nn.Sigmoid),
+    *(nn.Softplus, nn.Softshrink, nn.Softsign, nn.Tanh, nn.Tanhshrink),
+)
+# Of a policy's classes: those that are known to fit, and why another one need not.
+_CLASSES: tuple[tuple[str, tuple[type, ...], str], ...] = (
+    ("activation_fn", ACTIVATIONS, "is not known to give the same for the same number always"),
+    ("features_extractor_class", (*FIXED, *LEARNED), "may keep more than a function of the state"),
+    ("optimizer_class", ELEMENTWISE, "may look at more than a weight at a time"),
+)
+
+
+def build(config: SB3Config, context: TrainingContext) -> SB3Agent:
+    """Build an agent that learns in the engine, if that gives what SB3's own loop would, else in that one.
+
+    A line says why not where the engine is asked for.
+    """
+    algorithm, arguments = algorithm_and_arguments(config, context.features)
+    ours = algorithm_of(algorithm) if config.engine == "tabulated" else None
+    if ours is not None:
+        reason = why_not_in_engine(config, algorithm, arguments)
+        if context.callbacks:
+            reason = "callbacks read and change what only SB3's own loop has"
+        if reason is None:
+            return EngineAgent(config, context, algorithm, arguments, ours)
+        if not context.only_asked:
+            tell(f"engine: stock, since {reason}")
+    agent = SB3Agent(config, context, algorithm, arguments, not context.only_asked)
+    agent.check_table()
+    return agent
+
+
+def why_not_in_engine(
+    config: SB3Config, algorithm: type[BaseAlgorithm], arguments: Mapping[str, Any]
+) -> str | None:
+    """Why these settings need SB3's own loop, or None where the engine gives the same.
+
+    It does where the network's outputs at a state follow from the parameters and that state alone: whatever
+    the mode, the other states of the batch and the passes before. That is known of the classes listed alone.
+    """
+    where = "agent.arguments" if isinstance(config, SB3ClassConfig) else "agent"
+    classes = arguments.get("policy_kwargs", {})
+    if arguments["policy"] not in (algorithm.policy_aliases[name] for name in ("MlpPolicy", "CnnPolicy")):
+        return f"agent.policy={config.policy} may compute more than a function of the state"
+    for name, known, why in _CLASSES:
+        if name in classes and classes[name] not in known:
+            own = config.policy_kwargs_given.get(name)
+            chosen = f"{where}.policy_kwargs.{name}={own}"
+            return f"{chosen if own else f'observation.features={classes[name].__name__}'} {why}"
+    counts = arguments.get("replay_buffer_class") is ReplayCounts and issubclass(algorithm, DQN)
+    for name in ("replay_buffer", "rollout_buffer"):
+        is_known = arguments.get(f"{name}_class") is None or (counts and name == "replay_buffer")
+        if not is_known or arguments.get(f"{name}_kwargs"):
+            return f"{where}.{name}_class is not the plain {name.replace('_', ' ')}"
+    if arguments.get("optimize_memory_usage"):
+        return f"{where}.optimize_memory_usage changes what the replay buffer samples"
+    if issubclass(algorithm, OffPolicyAlgorithm) and arguments.get("n_steps", 1) > 1:
+        return f"{where}.n_steps above 1 needs SB3's n-step replay buffer"
+    return None
 
 
 class SB3Agent:
     """One SB3 model, which learns in SB3's own loop."""
 
-    def __init__(self, config: SB3Config, context: TrainingContext, with_buffers: bool = True) -> None:
+    def __init__(
+        self,
+        config: SB3Config,
+        context: TrainingContext,
+        algorithm: type[BaseAlgorithm],
+        arguments: Arguments,
+        with_buffers: bool,
+    ) -> None:
         if (today := time.localtime()).tm_year < _FIRST_YEAR:
             raise InputError(
                 f"the clock says {time.strftime('%Y-%m-%d', today)}, and SB3's model.zip can have no date "
@@ -55,23 +136,24 @@ class SB3Agent:
         self.observation = context.observation
         self._envs = context.envs
         self._loaded = False
-        self._model = make_model(config, context, with_buffers and not context.only_asked)
-        if with_buffers:
-            self._check_table()
+        self._model = make_model(config, context, algorithm, arguments, with_buffers)
         self._callbacks = make_callbacks(context.callbacks)
         writers = [] if context.write_scalars is None else [_ScalarsOnly(context.write_scalars)]
         self._model.set_logger(Logger(folder=None, output_formats=list(writers)))
 
-    def _check_table(self) -> None:
+    def check_table(self) -> None:
         """Check that the policy can be asked, and answers the same in the same state always."""
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # which come again while it learns
-                reason = why_no_table(self._model.policy, self.observation)
+                why = why_no_table(self._model.policy, self.observation)
         except Exception as error:  # the class may be anybody's
-            raise cannot_update(self.config, error) from error
-        if reason is not None:
-            raise UnfitError(self.config, reason)
+            raise self._cannot_update(error) from error
+        if why is not None:
+            raise UnfitError(self.config, why)
+
+    def _cannot_update(self, error: Exception) -> UnfitError:
+        return unfit(self.config, "cannot make its first update", error)
 
     @property
     def model(self) -> BaseAlgorithm:
@@ -86,7 +168,7 @@ class SB3Agent:
         state: State | None = None,
     ) -> None:
         """See `gridworld.agents.Agent.learn`."""
-        interval, falling = self.config.log_interval, falling_settings(self.config)
+        interval, falling = self.config.log_interval, self.config.falling()
         self._callback = RunCallback(on_step, on_safe_point, state, interval, self._callbacks, falling)
         try:
             self._model.learn(total_timesteps, callback=self._callback, log_interval=interval)
@@ -101,7 +183,7 @@ class SB3Agent:
             library = type(self._model).__module__.partition(".")[0]
             is_known = library in ("stable_baselines3", "sb3_contrib")  # a custom class may have a bug
             if is_update and is_known and not self._model._n_updates:
-                raise cannot_update(self.config, error) from error
+                raise self._cannot_update(error) from error
             raise
 
     def class_without_state(self) -> str | None:
@@ -122,18 +204,15 @@ class SB3Agent:
         if probabilities is not None:
             return PolicySnapshot(np.argmax(probabilities, axis=1), probabilities, values)
         assert q is not None
-        if (scale := reward_scale(self.config)) != 1:
+        if (scale := self.config.reward_factor) != 1:
             values, q = values / scale, q / scale
         greedy = np.argmax(q, axis=1)
-        sampled = explored(one_hot_policy(greedy, q.shape[1]), self._exploration_rate())
-        return PolicySnapshot(greedy, sampled, values, q)
-
-    def _exploration_rate(self) -> float:
-        """That of DQN; SB3 acts at random until learning starts, while its own attribute still says 0."""
+        # SB3 acts at random until learning starts, while its own attribute still says 0.
         warmup = getattr(self._model, "learning_starts", 0)
+        epsilon = float(getattr(self._model, "exploration_rate", 0.0))
         if not self._loaded and self._model.num_timesteps < max(warmup, 1):
-            return 1.0
-        return float(getattr(self._model, "exploration_rate", 0.0))
+            epsilon = 1.0
+        return PolicySnapshot(greedy, explored(one_hot_policy(greedy, q.shape[1]), epsilon), values, q)
 
     def model_file(self) -> bytes:
         """See `gridworld.agents.Agent.model_file`."""
@@ -144,7 +223,7 @@ class SB3Agent:
     def load(self, path: Path) -> None:
         """See `gridworld.agents.Agent.load`: nothing in the file is unpickled as SB3 would, or run."""
         own = self._model.get_parameters()
-        modules = [name for name in own if isinstance(recursive_getattr(self._model, name), torch.nn.Module)]
+        modules = [name for name in own if isinstance(recursive_getattr(self._model, name), nn.Module)]
         expected = flat({name: own[name] for name in modules})
         most = _SPARE_BYTES + _BYTES_A_BYTE * sum(weights.nbytes for weights in expected.values())
         try:
@@ -167,22 +246,27 @@ class SB3Agent:
 class EngineAgent(SB3Agent):
     """One SB3 model, which learns in the engine."""
 
-    def __init__(self, config: SB3Config, context: TrainingContext) -> None:
-        super().__init__(config, context, with_buffers=False)
-        algorithm = algorithm_of(type(self._model))
-        assert algorithm is not None
-        self._algorithm, self._is_only_asked = algorithm, context.only_asked
+    def __init__(
+        self,
+        config: SB3Config,
+        context: TrainingContext,
+        algorithm: type[BaseAlgorithm],
+        arguments: Arguments,
+        ours: type[Population],
+    ) -> None:
+        super().__init__(config, context, algorithm, arguments, with_buffers=False)
+        self._algorithm, self._is_only_asked = ours, context.only_asked
         self.run = make_run(
             self._model,
             context.observation,
             context.envs,
             context.seed,
             extractors_kind(self._model),
-            reward_scale(config),
-            falling_settings(config, all_of_them=True),
+            config.reward_factor,
+            config.falling(),
             config.log_interval,
         )
-        self.run.counts_transitions = counts_transitions(vars(config) | vars(config).get("arguments", {}))
+        self.run.counts_transitions = config.counts_transitions
         self._algorithm([self.run], [None])
 
     @property
@@ -192,7 +276,7 @@ class EngineAgent(SB3Agent):
             put_weights(self.run)
             return self._model
         file = io.BytesIO(self.model_file())
-        envs = GridWorldVecEnv(self._envs, self.observation, reward_scale(self.config))
+        envs = GridWorldVecEnv(self._envs, self.observation, self.config.reward_factor)
         return type(self._model).load(file, env=envs, device=self._model.device)
 
     def learn(
@@ -216,8 +300,11 @@ class EngineAgent(SB3Agent):
         train([agent.run for agent in agents], [learning.state for learning in learnings])
         for agent in agents:
             if agent.run.failed_update is not None and not agent.run.model._n_updates:
-                agent.run.error = cannot_update(agent.config, agent.run.failed_update)
+                agent.run.error = agent._cannot_update(agent.run.failed_update)
         return [agent.run.error for agent in agents]
+
+    def class_without_state(self) -> None:
+        """See `gridworld.agents.Agent.class_without_state`: the engine takes known classes alone."""
 
     def get_state(self) -> State:
         """See `gridworld.agents.Agent.get_state`."""
@@ -238,7 +325,7 @@ class EngineAgent(SB3Agent):
 
 
 def extractors_kind(model: Any) -> Kind:
-    """Of a model's features extractors, see `engine.sb3_format.Inputs`."""
+    """Of a model's features extractors, see `engine.networks.Inputs`."""
     kinds = {type(each) for each in model.policy.modules() if isinstance(each, BaseFeaturesExtractor)}
     if kinds == {FlattenExtractor}:
         return "flat"
@@ -256,13 +343,10 @@ class _ScalarsOnly(KVWriter):
     def write(
         self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
     ) -> None:
-        numbers = {
-            key: value for key, value in key_values.items() if isinstance(value, int | float | np.number)
-        }
         wanted = {
             key: float(value)
-            for key, value in numbers.items()
-            if "tensorboard" not in (key_excluded[key] or ())
+            for key, value in key_values.items()
+            if isinstance(value, int | float | np.number) and "tensorboard" not in (key_excluded[key] or ())
         }
         self._write_scalars(wanted, step)
 

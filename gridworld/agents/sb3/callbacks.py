@@ -1,38 +1,69 @@
-"""What calls the hooks of a run while SB3's own `learn` is at work, and settings that fall over training.
+"""SB3's own loop: the hooks of a run, settings that fall over training, and the state between two rollouts.
 
 SB3 calls `on_step` before it has stored the transition. A rollout's start is where nothing is half done: the
 transitions are stored, the update is made. What was saved is put back when training starts, after SB3 has
 reset everything that it resets then.
+
+The state is exact for the classes of Stable-Baselines3 and sb3-contrib: all that they change while they learn
+is listed here. What a custom class keeps, only that class can know: it defines
+
+    get_state(): a dict of numbers, strings, None, arrays, and of dicts and lists of these
+    set_state(state): mirrors it
+
+For an algorithm, that is in addition to what its base class keeps, for a layer to its parameters; a replay
+buffer or callback says everything. With a custom class that does not define them a run has no checkpoints.
 """
 
 from __future__ import annotations
 
-import contextlib
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import torch
+from stable_baselines3.common import callbacks as sb3_callbacks
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import FloatSchedule
+from torch import Tensor
 
 from gridworld.agents.sb3.factory import first_line
-from gridworld.agents.sb3.settings.schemas import SB3Config
-from gridworld.agents.sb3.settings.validation import FALLING, SCHEDULES
-from gridworld.agents.sb3.state import get_state, set_state
-from gridworld.config.agents import Decay, falls, parse_schedule
+from gridworld.agents.sb3.settings import SCHEDULES
+from gridworld.config.agents import Decay
 from gridworld.errors import InputError
 from gridworld.process.console import tell
-from gridworld.storage.serialization import State, fitting
+from gridworld.storage.serialization import (
+    State,
+    StateError,
+    fill,
+    fitting,
+    generator_state,
+    global_state,
+    set_generator_state,
+    set_global_state,
+)
+
+_LIBRARIES = ("stable_baselines3", "sb3_contrib", "torch", "gridworld")
+_NUMBERS = (
+    *("num_timesteps", "_n_updates", "_episode_num", "_n_calls"),
+    *("exploration_rate", "_current_progress_remaining"),
+)
+_OF_CALLBACKS: dict[type[BaseCallback], tuple[str, ...]] = {  # SB3's own, and what these count
+    sb3_callbacks.CallbackList: (),
+    sb3_callbacks.CheckpointCallback: (),
+    sb3_callbacks.EveryNTimesteps: ("last_time_trigger",),
+    sb3_callbacks.StopTrainingOnMaxEpisodes: ("n_episodes", "_total_max_episodes"),
+}
 
 
 class RunCallback(BaseCallback):
     """Calls `on_step` after every step and `on_safe_point` at rollouts' starts, as `Agent.learn` has them.
 
-    Settings that are `falling` are set before `others` are called, the user's callbacks.
+    Settings that are `falling` without a schedule of SB3's are set before the user's callbacks are called.
     """
 
     def __init__(
@@ -47,15 +78,26 @@ class RunCallback(BaseCallback):
         super().__init__()
         self._hook, self._on_safe_point, self._state = on_step, on_safe_point, state
         self._log_interval, self._others = log_interval, others
-        self._schedules = [FallingSetting(name, each.initial, each.power) for name, each in falling.items()]
+        self._schedules = [
+            FallingSetting(name, decay.initial, decay.power)
+            for name, decay in falling.items()
+            if not (name in SCHEDULES and decay.power == 1)
+        ]
         self._continues = True
 
     def _init_callback(self) -> None:
         for schedule in self._schedules:
             schedule.init_callback(self.model)
+        self._begin("init_callback", self.model)
+
+    def _begin(self, name: str, *arguments: Any) -> None:
         for index, other in enumerate(self._others):
-            with _beginning(index, other):
-                other.init_callback(self.model)
+            try:
+                getattr(other, name)(*arguments)
+            except InputError:
+                raise
+            except Exception as error:  # the class may be anybody's
+                raise InputError(f"{_name(index, other)} cannot begin: {first_line(error)}") from error
 
     def _on_step(self) -> bool:
         self._continues = self._hook(self.num_timesteps) > 0
@@ -71,9 +113,7 @@ class RunCallback(BaseCallback):
             other.update_locals(locals_)
 
     def _on_training_start(self) -> None:
-        for index, other in enumerate(self._others):
-            with _beginning(index, other):
-                other.on_training_start(self.locals, self.globals)
+        self._begin("on_training_start", self.locals, self.globals)
         if self._state is not None:
             state, self._state = self._state, None
             with fitting():
@@ -151,30 +191,12 @@ class FallingSetting(BaseCallback):
         model.logger.record(f"train/{self._name}", value)
 
 
-def falling_settings(config: SB3Config, all_of_them: bool = False) -> dict[str, Decay]:
-    """An agent's settings that fall over training, or only those for which SB3 has no schedule."""
-    given = vars(config) | vars(config).get("arguments", {})
-    found = {name: parse_schedule(name, given[name]) for name in FALLING if falls(given.get(name))}
-    return {
-        name: decay
-        for name, decay in found.items()
-        if all_of_them or not (name in SCHEDULES and decay.power == 1)
-    }
-
-
 def _name(index: int, other: BaseCallback) -> str:
-    kind = type(other)
-    return f"callbacks[{index}]: {kind.__module__}.{kind.__qualname__}"
+    return f"callbacks[{index}]: {_path(other)}"
 
 
-@contextlib.contextmanager
-def _beginning(index: int, other: BaseCallback) -> Iterator[None]:
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as error:  # the class may be anybody's
-        raise InputError(f"{_name(index, other)} cannot begin: {first_line(error)}") from error
+def _path(thing: object) -> str:
+    return f"{type(thing).__module__}.{type(thing).__qualname__}"
 
 
 def check_finite(model: BaseAlgorithm) -> None:
@@ -194,3 +216,162 @@ def diverged(model: BaseAlgorithm, what: str) -> InputError:
         f"training diverged at update {model._n_updates:,}, after {model.num_timesteps:,} steps: {what}; "
         "try a smaller learning rate"
     )
+
+
+@runtime_checkable
+class HasState(Protocol):
+    """A custom class that says what it keeps."""
+
+    def get_state(self) -> State:
+        """All that it keeps."""
+
+    def set_state(self, state: State) -> None:
+        """Mirrors `get_state`."""
+
+
+def class_without_state(model: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> str | None:
+    """The path of a class of which nobody knows what it keeps; None: all are known."""
+    for each in (*_custom_parts(model), *_flat(callbacks)):
+        if type(each) not in _OF_CALLBACKS and not isinstance(each, HasState):
+            return _path(each)
+    return None
+
+
+def _custom_parts(model: Any) -> list[Any]:
+    """The model and those of its parts whose classes come from no library."""
+    buffers = [getattr(model, f"{kind}_buffer", None) for kind in ("replay", "rollout")]
+    parts = [model, *model.policy.modules(), model.policy.optimizer, *buffers]
+    libraries = (*_LIBRARIES, "builtins")  # None is no part
+    return [part for part in parts if type(part).__module__.partition(".")[0] not in libraries]
+
+
+def _flat(callbacks: Sequence[BaseCallback]) -> Iterator[BaseCallback]:
+    """Callbacks, and those that they hold."""
+    for callback in callbacks:
+        yield callback
+        held = [*getattr(callback, "callbacks", ()), getattr(callback, "callback", None)]
+        yield from _flat([each for each in held if isinstance(each, BaseCallback)])
+
+
+def get_state(model: Any, callbacks: Sequence[BaseCallback]) -> State:
+    """The state of a model that waits between a rollout and the next, and of its callbacks."""
+    logger, buffer = model.logger, getattr(model, "replay_buffer", None)
+    return {
+        **{name: getattr(model, name) for name in _NUMBERS if hasattr(model, name)},
+        "parameters": _plain(model.get_parameters()),
+        "replay": None if buffer is None else _replay_state(buffer),
+        "environments": model.env.envs.get_state(),
+        "last_episode_starts": model._last_episode_starts,
+        "recent_episodes": [[each["r"], each["l"]] for each in model.ep_info_buffer],
+        "logged": [
+            [name, float(value), logger.name_to_count[name], "tensorboard" in (excluded or ())]
+            for name, value in logger.name_to_value.items()
+            for excluded in [logger.name_to_excluded[name]]
+        ],
+        "seconds": (time.time_ns() - model.start_time) / 1e9,
+        "global_generators": global_state(),
+        "torch_generators": _torch_state(),
+        "action_generator": generator_state(model.action_space.np_random),
+        "custom_parts": [part.get_state() for part in _custom_parts(model)],
+        "callbacks": [_callback_state(each) for each in _flat(callbacks)],
+    }
+
+
+def set_state(model: Any, callbacks: Sequence[BaseCallback], state: State) -> None:
+    """Mirrors `get_state`, where SB3's `learn` has begun and made no step; generators come last."""
+    for name in _NUMBERS:
+        if hasattr(model, name):
+            setattr(model, name, type(getattr(model, name))(state[name]))
+    expected, parameters = _plain(model.get_parameters()), _tensors(state["parameters"])
+    if parameters.keys() != expected.keys():
+        raise StateError(f"the model's parameters must be {', '.join(expected)}")
+    for name, found in parameters.items():
+        if "param_groups" in found:  # of an optimiser: its numbers of each weight, which are counted
+            found["state"] = {int(number): values for number, values in found["state"].items()}
+            continue
+        for key, array in expected[name].items():
+            fill(array, state["parameters"][name].get(key), f"{name}.{key}")
+    model.set_parameters(parameters, exact_match=True, device=model.device)
+    if getattr(model, "replay_buffer", None) is not None:
+        _set_replay_state(model.replay_buffer, state["replay"])
+    model.env.envs.set_state(state["environments"])
+    model._last_obs = model.env.observation.rows(model.env.states)
+    if model._last_episode_starts is not None:
+        fill(model._last_episode_starts, state["last_episode_starts"], "last_episode_starts")
+    model.ep_info_buffer.clear()
+    model.ep_info_buffer.extend({"r": each, "l": size, "t": 0.0} for each, size in state["recent_episodes"])
+    for name, value, count, is_excluded in state["logged"]:
+        model.logger.record(name, float(value), exclude="tensorboard" if is_excluded else None)
+        model.logger.name_to_count[name] = int(count)
+    model.start_time = time.time_ns() - int(state["seconds"] * 1e9)
+    for part, own in zip(_custom_parts(model), state["custom_parts"], strict=True):
+        part.set_state(own)
+    for callback, own in zip(_flat(callbacks), state["callbacks"], strict=True):
+        _set_callback_state(callback, own)
+    set_generator_state(model.action_space.np_random, state["action_generator"])
+    set_global_state(state["global_generators"])
+    torch.set_rng_state(torch.from_numpy(state["torch_generators"]["cpu"]))
+    if "cuda" in state["torch_generators"]:
+        torch.cuda.set_rng_state_all([torch.from_numpy(each) for each in state["torch_generators"]["cuda"]])
+
+
+def _torch_state() -> State:
+    state: State = {"cpu": torch.get_rng_state().numpy().copy()}
+    if torch.cuda.is_available() and torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
+        state["cuda"] = [device.cpu().numpy().copy() for device in torch.cuda.get_rng_state_all()]
+    return state
+
+
+def _replay_state(buffer: Any) -> State:
+    if isinstance(buffer, HasState):
+        return buffer.get_state()
+    return {**_rows(buffer), "pos": int(buffer.pos), "full": bool(buffer.full)}
+
+
+def _set_replay_state(buffer: Any, state: State) -> None:
+    if isinstance(buffer, HasState):
+        buffer.set_state(state)
+        return
+    if not 0 <= state["pos"] < buffer.buffer_size:
+        raise StateError(f"the replay's pos must be from 0 to {buffer.buffer_size - 1}")
+    buffer.pos, buffer.full = int(state["pos"]), bool(state["full"])
+    for name, rows in _rows(buffer).items():
+        fill(rows, state[name], f"the replay's {name}")
+
+
+def _rows(buffer: Any) -> dict[str, Any]:
+    """Views of a replay buffer's arrays, of the steps that it holds."""
+    count = buffer.buffer_size if buffer.full else buffer.pos
+    arrays = {name: each for name, each in vars(buffer).items() if isinstance(each, np.ndarray)}
+    return {name: each[:count] for name, each in arrays.items() if len(each) == buffer.buffer_size}
+
+
+def _callback_state(callback: BaseCallback) -> State:
+    counted = {name: getattr(callback, name) for name in _OF_CALLBACKS.get(type(callback), ())}
+    own = callback.get_state() if isinstance(callback, HasState) else None
+    return {"n_calls": callback.n_calls, "num_timesteps": callback.num_timesteps, **counted, "own": own}
+
+
+def _set_callback_state(callback: BaseCallback, state: State) -> None:
+    for name in ("n_calls", "num_timesteps", *_OF_CALLBACKS.get(type(callback), ())):
+        setattr(callback, name, int(state[name]))
+    if isinstance(callback, HasState):
+        callback.set_state(state["own"])
+
+
+def _plain(node: Any) -> Any:
+    """Tensors as arrays, keys as text."""
+    if isinstance(node, dict):
+        return {str(key): _plain(value) for key, value in node.items()}
+    if isinstance(node, list | tuple):
+        return [_plain(value) for value in node]
+    return node.detach().cpu().numpy().copy() if isinstance(node, Tensor) else node
+
+
+def _tensors(node: Any) -> Any:
+    """Mirrors `_plain`, but for the keys."""
+    if isinstance(node, dict):
+        return {key: _tensors(value) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_tensors(value) for value in node]
+    return torch.from_numpy(node.copy()) if isinstance(node, np.ndarray) else node

@@ -32,7 +32,7 @@ from gridworld.world.metrics import numbers
 from gridworld.world.snapshots import random_states, same
 from gridworld.world.wrappers import is_discrete
 
-_LIBRARIES = ("stable_baselines3.", "sb3_contrib.", "gridworld.")
+_LIBRARIES = ("stable_baselines3.", "sb3_contrib.", "gridworld.", "torch.")
 _ONE_BY_ONE = 512  # states in which `predict` is asked alone, too
 _OFTEN = 100  # times, where `predict` is a custom one
 _PREDICTS = ("predict", "_predict")  # what decides an action, of a model or a policy
@@ -71,7 +71,7 @@ class ForeignPolicy:
         predicts = (model.predict, policy.predict)
         takes_masks = any("action_masks" in inspect.signature(each).parameters for each in predicts)
         self._masks = task.masks() if takes_masks else None
-        self._is_known = self._is_of_a_library()  # so that its network says how it explores
+        self._is_known = _is_of_a_library(model, policy)  # so that its network says how it explores
         self._check_is_a_table(self._observation())
 
     def tables(self) -> Tables:
@@ -121,9 +121,8 @@ class ForeignPolicy:
                 "the model: what it was shown in training is not known, so it cannot be scored on an "
                 f"environment that shows something else; give one that shows the same ({error})"
             ) from None
-        is_ours = shown is not None and shown.kind in KINDS
         alike = shown is not None and shown.space == guess.space and same(shown.table(), guess.table())
-        if not is_ours and not alike:
+        if not alike and (shown is None or shown.kind not in KINDS):
             raise InputError(
                 f"the model was shown observations of its own in training, and {guess.kind} of this world "
                 "only has the same space; give an environment with the wrappers that it was trained on"
@@ -132,11 +131,9 @@ class ForeignPolicy:
 
     def _predicted(self, observation: ObservationTable) -> IntArray:
         """(S,), the actions that `predict` takes, asked in batches."""
-        parts = [
-            self._predict(observation, np.arange(start, min(start + CHUNK, observation.num_states)))
-            for start in range(0, observation.num_states, CHUNK)
-        ]
-        return np.concatenate(parts)
+        states = np.arange(observation.num_states)
+        starts = range(0, len(states), CHUNK)
+        return np.concatenate([self._predict(observation, states[at : at + CHUNK]) for at in starts])
 
     def _predict(self, observation: ObservationTable, states: IntArray) -> IntArray:
         """(n,), the actions of some states; `states` is one number to ask as for a single environment."""
@@ -177,19 +174,16 @@ class ForeignPolicy:
         if reason is not None:
             raise InputError(f"the model {reason}")
 
-    def _is_of_a_library(self) -> bool:
-        """Whether no custom layer or `predict` decides on an action."""
-        modules = [type(each).__module__ for each in self._policy.modules()]
-        for thing in (self._model, self._policy):
-            found = {name: getattr(type(thing), name, None) for name in _PREDICTS}
-            modules += [method.__module__ for method in found.values() if method is not None]
-            modules += ["custom" for name in _PREDICTS if name in vars(thing)]
-        return all(module.startswith((*_LIBRARIES, "torch.")) for module in modules)
 
-
-def tables_of(model: Any, task: Task) -> Tables:
-    """Read a model's policies once; see `ForeignPolicy`."""
-    return ForeignPolicy(model, task).tables()
+def _is_of_a_library(model: Any, policy: BasePolicy) -> bool:
+    """Whether no custom layer or `predict` decides on an action."""
+    modules = [type(each).__module__ for each in policy.modules()]
+    for thing in (model, policy):
+        for name in _PREDICTS:
+            method = getattr(type(thing), name, None)
+            modules += [] if method is None else [method.__module__]
+            modules += ["custom"] if name in vars(thing) else []
+    return all(module.startswith(_LIBRARIES) for module in modules)
 
 
 def _is_transposed(shown: Any, wanted: Any) -> bool:

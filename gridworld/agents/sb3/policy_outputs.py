@@ -29,12 +29,7 @@ class Reading(NamedTuple):
     q: Tensor | None  # (n, A), of a value-based agent
 
 
-class Outputs(NamedTuple):
-    """A `Reading` of all S states, as float64."""
-
-    values: FloatArray  # (S,)
-    probabilities: FloatArray | None  # (S, A)
-    q: FloatArray | None  # (S, A)
+Tables = tuple[FloatArray, FloatArray | None, FloatArray | None]  # a `Reading` of all S states, float64
 
 
 def why_unreadable(policy: BasePolicy) -> str | None:
@@ -88,7 +83,7 @@ def read(policy: BasePolicy, observations: Any, masks: BoolArray | None = None) 
     return Reading(torch.max(q, dim=1).values, None, q)
 
 
-def read_table(policy: BasePolicy, observation: ObservationTable, masks: BoolArray | None = None) -> Outputs:
+def read_table(policy: BasePolicy, observation: ObservationTable, masks: BoolArray | None = None) -> Tables:
     """Ask a policy about all states, in batches and without gradients; `masks`: allowed actions (S, A)."""
     parts = []
     with torch.no_grad():
@@ -101,7 +96,7 @@ def read_table(policy: BasePolicy, observation: ObservationTable, masks: BoolArr
         for of_all in zip(*parts, strict=True)
     )
     assert values is not None
-    return Outputs(values, probabilities, q)
+    return values, probabilities, q
 
 
 def explored(greedy: FloatArray, epsilon: float) -> FloatArray:

@@ -151,16 +151,11 @@ def make_vec_env(
         >>> from stable_baselines3 import PPO
         >>> model = PPO("MlpPolicy", make_vec_env("four_rooms", n_envs=8, slip=0.1))
     """
-    known = [
-        name
-        for name in inspect.signature(GridWorldVectorEnv.__init__).parameters
-        if name not in _NOT_OF_THE_WORLD
-    ]
-    for name in world:
+    names = inspect.signature(GridWorldVectorEnv.__init__).parameters
+    known = [name for name in names if name not in _NOT_OF_THE_WORLD]
+    for name, value in world.items():
         if name not in known:
-            raise InputError(
-                f"{name}={world[name]!r}: is no argument of a world; there are {', '.join(known)}"
-            )
+            raise InputError(f"{name}={value!r}: is no argument of a world; there are {', '.join(known)}")
     envs = GridWorldVectorEnv(n_envs, layout=layout, autoreset_mode=AutoresetMode.SAME_STEP, **world)
     batch = GridWorldVecEnv(envs, make_observation(envs.mdp, observation, cell_size))
     batch.seed(seed)

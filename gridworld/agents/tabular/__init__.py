@@ -8,7 +8,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gridworld.agents.tabular.settings import TabularConfig
 from gridworld.errors import InputError
 
 if TYPE_CHECKING:
@@ -29,7 +28,6 @@ def schemas() -> dict[str, type[AgentConfig]]:
 def check(config: TrainConfig) -> None:
     """See `gridworld.agents.Family.check`."""
     agent = config.agent
-    assert isinstance(agent, TabularConfig)
     if config.observation.kind != "none":
         raise InputError(
             f"observation={config.observation.kind}: agent={agent.name} keeps a table over the states "

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gridworld.agents import PolicySnapshot, TrainingContext
-from gridworld.agents.tabular.settings import TabularConfig
 from gridworld.agents.tabular.td_control import (
+    TabularConfig,
     TabularControl,
     TabularControlConfig,
     epsilon_greedy,

@@ -23,10 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot, TrainingContext
-from gridworld.agents.tabular.settings import TabularConfig
 from gridworld.bounds import Bounds
-from gridworld.config.agents import MOST_KEPT, Schedule, parse_schedule
-from gridworld.config.fields import Effect, affects, bounds, rate
+from gridworld.config.agents import MOST_KEPT, AgentConfig, Schedule, parse_schedule
+from gridworld.config.fields import Effect, Word, affects, bounds, rate
 from gridworld.errors import InputError
 from gridworld.process.user_input import npz_arrays, npz_bytes
 from gridworld.storage.safe_read import read_bytes
@@ -45,6 +44,14 @@ if TYPE_CHECKING:
 
 _BELOW_ONE = 1 - 2**-53  # replaces a step of 1, after which nothing of the past is left
 _SPARE_BYTES = 2**20  # of a model file, for the frames around its arrays
+
+
+@dataclass
+class TabularConfig(AgentConfig):
+    """An agent that keeps a table over the states."""
+
+    family: Word = "tabular"
+    gamma: float = field(default=0.99, metadata=bounds(0, 1))  # the discount it learns with
 
 
 @dataclass

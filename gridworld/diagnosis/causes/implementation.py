@@ -11,7 +11,7 @@ import time
 from dataclasses import replace
 
 from gridworld.agents import family
-from gridworld.agents.sb3.settings.schemas import SB3ClassConfig
+from gridworld.agents.sb3.settings import SB3ClassConfig
 from gridworld.config.agents import AgentConfig
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.finding import Finding
@@ -50,7 +50,7 @@ def of_library(config: AgentConfig) -> SB3ClassConfig | None:
     """
     if not isinstance(config, SB3ClassConfig):
         return None
-    from gridworld.agents.sb3.settings.constructor_arguments import algorithm_class  # imports torch
+    from gridworld.agents.sb3.factory import algorithm_class  # imports torch
 
     kinds = algorithm_class("agent.algorithm", config.algorithm).__mro__
     first = next((kind for kind in kinds if kind.__module__.split(".")[0] in _LIBRARIES), None)

@@ -11,6 +11,7 @@ from helpers.own_class import OWN_CLASS, any_class
 from helpers.support import NO_FILES, SHORT, configure, script
 
 from gridworld.errors import InputError
+from gridworld.restore.saved_run import SavedRun
 from gridworld.training.train import train
 
 OWN_YAML = """# @package _global_
@@ -80,7 +81,7 @@ def test_what_cannot_work_is_refused_before_anything_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_ones_own_class_in_ones_own_yaml(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ones_own_class_in_ones_own_yaml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "my_agents.py").write_text(OWN_CLASS)
     (tmp_path / "my_conf" / "agent").mkdir(parents=True)
     (tmp_path / "my_conf" / "agent" / "mine.yaml").write_text(OWN_YAML)
@@ -91,13 +92,10 @@ def test_ones_own_class_in_ones_own_yaml(tmp_path: Path, capsys: pytest.CaptureF
     settings = json.loads((tmp_path / "out" / "manifest.json").read_text())["config"]["agent"]
     assert settings["arguments"] == {"caution": 0.9, "gamma": 0.9}
 
-    refused = script("evaluate.py", "out", cwd=tmp_path, PYTHONPATH=str(tmp_path))
-    assert refused.returncode == 2
-    assert "algorithm=my_agents.Mine is from none of" in refused.stderr
-    assert "add --trust" in refused.stderr
-    trusted = script("evaluate.py", "out", "--trust", cwd=tmp_path, PYTHONPATH=str(tmp_path))
-    assert trusted.returncode == 0, trusted.stderr
-    assert "greedy policy of out on classic" in trusted.stdout
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(InputError, match=r"algorithm=my_agents\.Mine is from none of"):
+        SavedRun(tmp_path / "out").snapshot()
+    assert SavedRun(tmp_path / "out", trust=True).snapshot().greedy.shape == (30,)
 
 
 def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

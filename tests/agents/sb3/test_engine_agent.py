@@ -15,9 +15,8 @@ from stable_baselines3 import A2C, DQN, PPO
 
 from gridworld.agents import Agent, TrainingContext, family
 from gridworld.agents.sb3 import check
-from gridworld.agents.sb3.agent import EngineAgent, SB3Agent
+from gridworld.agents.sb3.agent import ACTIVATIONS, EngineAgent, SB3Agent
 from gridworld.agents.sb3.factory import UnfitError
-from gridworld.agents.sb3.settings.engine import ACTIVATIONS
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.training.setup import make_context

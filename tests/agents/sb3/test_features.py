@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from helpers.support import train_in
+from helpers.support import NO_FILES, SHORT, train_in
 from stable_baselines3 import DQN, PPO
 from torch import Tensor
 
@@ -107,12 +107,9 @@ def test_learned_features_have_one_length_and_follow_from_distinct_squares() -> 
     assert all(weight.grad is not None and weight.grad.any() for weight in network.parameters())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("agent", "seed"), [("dqn", 0), ("dqn", 1), ("ppo", 0), ("ppo", 1)])
-def test_it_learns_from_pixels(agent: str, seed: int, tmp_path: Path) -> None:
-    quiet = [f"recording.{name}=false" for name in ("frames", "gif", "learning", "policy_map", "q_error")]
-    summary = train_in(tmp_path, f"agent={agent}", "observation=image", f"seed={seed}", *quiet)
-    assert summary["certified"]
+@pytest.mark.parametrize("agent", ["dqn", "ppo"])
+def test_it_learns_from_pixels(agent: str, tmp_path: Path) -> None:
+    assert train_in(tmp_path, f"agent={agent}", "observation=image", *NO_FILES)["certified"]
 
 
 @pytest.mark.parametrize(
@@ -138,9 +135,7 @@ def test_what_they_cannot_take(kind: Any, arguments: list[Any], words: str) -> N
 
 @pytest.mark.parametrize("agent", [DQN, PPO])
 def test_a_runs_model_loads_in_plain_sb3(agent: Any, tmp_path: Path) -> None:
-    words = (f"agent={agent.__name__.lower()}", "n_envs=8", "total_timesteps=2048", "observation=coordinates")
-    words += ("agent.n_steps=32", "agent.batch_size=256") if agent is PPO else ()
-    words += tuple(f"recording.{name}=false" for name in ("gif", "frames", "learning"))
+    words = (*SHORT[agent.__name__.lower()], "n_envs=8", "observation=coordinates", *NO_FILES)
     summary = train_in(tmp_path, *words)
     model = agent.load(tmp_path / "model.zip", device="cpu")
     assert any(isinstance(each, FourierFeatures) for each in model.policy.modules())

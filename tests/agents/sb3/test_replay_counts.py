@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium import spaces
-from helpers.support import SHORT, train_in
+from helpers.support import NO_FILES, SHORT, train_in
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import DQN
@@ -166,11 +166,7 @@ def test_a_world_with_chances_is_certified_with_it(tmp_path: Path) -> None:
     """The shipped settings, and fewer steps."""
     world = ["env.num_rows=4", "env.num_cols=4", "env.slip=0.1", "env.step_reward=-0.1"]
     less = ["n_envs=1024", "total_timesteps=300000", "agent.target_update_interval=4096"]
-    quiet = [
-        "evaluation.every=100000",
-        *(f"recording.{name}=false" for name in ("frames", "gif", "learning")),
-    ]
-    assert train_in(tmp_path, "agent=dqn", *world, *less, *quiet)["certified"]
+    assert train_in(tmp_path, "agent=dqn", *world, *less, "evaluation.every=100000", *NO_FILES)["certified"]
 
 
 def test_it_is_sb3s_to_use_with_other_algorithms_too(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers.support import ROOT, SHORT, train_in
 
-from gridworld import GridWorldEnv, GridWorldVectorEnv, InputError
+from gridworld import GridWorldVectorEnv, InputError
 from gridworld.agents import Agent, TrainingContext
 from gridworld.agents.tabular import build
 from gridworld.agents.tabular.algorithms import (
@@ -20,8 +20,8 @@ from gridworld.agents.tabular.algorithms import (
     SarsaConfig,
     ValueIterationConfig,
 )
-from gridworld.agents.tabular.settings import TabularConfig
 from gridworld.agents.tabular.td_control import (
+    TabularConfig,
     TabularControl,
     TabularControlConfig,
     draw_actions,
@@ -48,18 +48,14 @@ def trained(config: TabularControlConfig, steps: int, context: TrainingContext) 
 
 
 class Textbook:
-    """Sutton & Barto's boxes of sections 6.4 to 6.6, on one environment, with a dictionary and loops."""
+    """Sutton & Barto's boxes of sections 6.4 to 6.6 in loops; targets are of the table before a batch."""
 
-    def __init__(self, config: TabularControlConfig, steps: int, seed: int, cut: int, **world: Any) -> None:
-        self.config, self.steps, self.cut = config, steps, cut
-        self.env = GridWorldEnv(**world)
+    def __init__(self, config: TabularControlConfig, steps: int, seed: int, count: int, **world: Any) -> None:
+        self.config, self.steps, self.count = config, steps, count
+        self.envs = GridWorldVectorEnv(count, autoreset_mode="SameStep", **world)
         self.random = np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
-        self.q: dict[tuple[int, int], float] = {}
-        self.visits: dict[tuple[int, int], int] = {}
-        for state in range(self.env.num_rows * self.env.num_cols):
-            for action in range(4):
-                self.q[state, action] = config.initial_value
-                self.visits[state, action] = 0
+        self.q = np.full((self.envs.mdp.num_states, 4), float(config.initial_value))
+        self.visits = np.zeros(self.q.shape, dtype=int)
         self.truncations = self.terminations = 0
         self.learn(seed)
 
@@ -68,7 +64,7 @@ class Textbook:
         progress = min(done / self.steps / config.exploration_fraction, 1.0)
         start, end = config.exploration_initial_eps, config.exploration_final_eps
         epsilon = start + (end - start) * progress
-        values = [self.q[state, action] for action in range(4)]
+        values = self.q[state].tolist()
         ties = values.count(max(values))
         return [epsilon / 4 + ((1 - epsilon) / ties if value == max(values) else 0.0) for value in values]
 
@@ -80,74 +76,74 @@ class Textbook:
                 return action
         return 3
 
-    def step_size(self, pair: tuple[int, int], done: int) -> float:
+    def step_size(self, visit: int, done: int) -> float:
         rate = self.config.learning_rate
         if isinstance(rate, str):
             form, number = rate.split("_")
             rate = float(number) * (1 - done / self.steps) ** {"lin": 1, "sqrt": 0.5, "quad": 2}[form]
-        self.visits[pair] += 1
-        visits = np.array([self.visits[pair]], dtype=np.float64)  # numbers alone have another power function
+        visits = np.array([visit], dtype=np.float64)  # numbers alone have another power function
         return rate * float((visits**-self.config.learning_rate_power)[0])
 
     def learn(self, seed: int) -> None:
-        state, _ = self.env.reset(seed=seed)
-        action, length = self.choose(state, 0), 0
-        for done in range(self.steps):
-            following, reward, terminated, _, _ = self.env.step(action)
-            length += 1
-            truncated = length == self.cut and not terminated
-            ahead = self.choose(following, done + 1) if self.config.algorithm == "sarsa" else 0
-            target = reward
-            if not terminated:
-                target = reward + self.config.gamma * self.value(following, ahead, done + 1)
-            pair = state, action
-            self.q[pair] += self.step_size(pair, done) * (target - self.q[pair])
-            state = following
-            if over := terminated or truncated:
-                state, _ = self.env.reset()
-                length = 0
-            self.terminations += terminated
-            self.truncations += truncated
-            goes_on = self.config.algorithm == "sarsa" and not over
-            action = ahead if goes_on else self.choose(state, done + 1)
+        is_sarsa, gamma = self.config.algorithm == "sarsa", self.config.gamma
+        states, _ = self.envs.reset(seed=seed)
+        actions = [self.choose(state, 0) for state in states]
+        for done in range(0, self.steps, self.count):
+            after = done + self.count
+            following, rewards, terminated, truncated, infos = self.envs.step(np.array(actions))
+            over = infos.get("_final_obs", np.zeros(self.count, dtype=bool))
+            reached = [infos["final_obs"][env] if over[env] else following[env] for env in range(self.count)]
+            ahead = [self.choose(state, after) if is_sarsa else 0 for state in reached]
+            targets = [
+                reward + (0.0 if is_end else gamma * self.value(state, action, after))
+                for state, action, reward, is_end in zip(reached, ahead, rewards, terminated, strict=True)
+            ]
+            for state, action, target in zip(states, actions, targets, strict=True):
+                self.visits[state, action] += 1
+                size = self.step_size(self.visits[state, action], done)
+                self.q[state, action] += size * (target - self.q[state, action])
+            self.terminations += int(terminated.sum())
+            self.truncations += int((truncated & ~terminated).sum())
+            states = following
+            actions = [
+                action if is_sarsa and not is_over else self.choose(state, after)
+                for state, action, is_over in zip(states, ahead, over, strict=True)
+            ]
 
     def value(self, state: int, ahead: int, done: int) -> float:
-        values = [self.q[state, action] for action in range(4)]
         if self.config.algorithm == "q_learning":
-            return max(values)
+            return float(max(self.q[state]))
         if self.config.algorithm == "sarsa":
-            return self.q[state, ahead]
-        total = 0.0
-        for probability, value in zip(self.policy(state, done), values, strict=True):
-            total += probability * value
-        return total
+            return float(self.q[state, ahead])
+        return sum(
+            chance * value for chance, value in zip(self.policy(state, done), self.q[state], strict=True)
+        )
 
 
 @pytest.mark.parametrize("schema", CONTROL)
 @pytest.mark.parametrize(
-    "settings",
+    ("count", "settings"),
     [
-        {"learning_rate": 0.5, "exploration_initial_eps": 0.1, "exploration_final_eps": 0.1},
-        {"learning_rate": "lin_0.8", "initial_value": 1.0, "exploration_fraction": 0.5},
-        {"learning_rate": "sqrt_0.8", "exploration_fraction": 0.5},
-        {"learning_rate": 1.0, "learning_rate_power": 0.6, "gamma": 0.9},
+        (1, {"learning_rate": 0.5, "exploration_initial_eps": 0.1, "exploration_final_eps": 0.1}),
+        (1, {"learning_rate": "lin_0.8", "initial_value": 1.0, "exploration_fraction": 0.5}),
+        (1, {"learning_rate": "sqrt_0.8", "exploration_fraction": 0.5}),
+        (1, {"learning_rate": 1.0, "learning_rate_power": 0.6, "gamma": 0.9}),
+        (8, {"learning_rate": 0.3, "learning_rate_power": 0.2, "exploration_initial_eps": 0.4}),
     ],
-    ids=["constant", "linear", "root", "power"],
+    ids=["constant", "linear", "root", "power", "batch"],
 )
-def test_one_environment_is_the_textbook(
-    schema: type[TabularControlConfig], settings: dict[str, Any]
+def test_it_learns_as_the_textbook(
+    schema: type[TabularControlConfig], count: int, settings: dict[str, Any]
 ) -> None:
-    config, steps, world = schema(**settings), 3000, {"layout": "frozen_lake_4x4", "slip": 0.3}
-    agent = trained(config, steps, seat_of(seed=7, max_episode_steps=15, **world))
-    book = Textbook(config, steps, seed=7, cut=15, **world)
+    config, steps = schema(**settings), 1600
+    world = {"layout": "frozen_lake_4x4", "slip": 0.3, "max_episode_steps": 15}
+    agent = trained(config, steps, seat_of(count, seed=7, **world))
+    book = Textbook(config, steps, 7, count, **world)
     assert min(book.truncations, book.terminations) > 20
-    terminal = set(book.env.terminal_states)
-    for (state, action), value in book.q.items():
-        if state in terminal:
-            assert agent.q[state, action] == 0
-        else:
-            assert agent.q[state, action] == pytest.approx(value, rel=1e-9, abs=1e-12)
-            assert agent.visits[state, action] == book.visits[state, action]
+    terminal = book.envs.mdp.terminal
+    assert not agent.q[terminal].any()
+    np.testing.assert_allclose(agent.q[~terminal], book.q[~terminal], rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(agent.visits[~terminal], book.visits[~terminal])
 
 
 @pytest.mark.parametrize("power", [0.0, 0.6, 1.0])
@@ -166,52 +162,6 @@ def test_a_batch_counts_as_its_transitions_in_sequence(rate: float, power: float
     assert loss == pytest.approx(np.mean(np.square(errors)))
     np.testing.assert_allclose(q, expected, rtol=0, atol=1e-12)
     assert visits.tolist() == counted
-
-
-@pytest.mark.parametrize("schema", CONTROL)
-def test_a_batch_learns_from_every_environment(schema: type[TabularControlConfig]) -> None:
-    """Against a loop over environments, in which SARSA's next action is the one that is really taken."""
-    config = schema(learning_rate=0.3, learning_rate_power=0.2, exploration_initial_eps=0.4)
-    steps, count = 320, 8
-    world = {"slip": 0.2, "max_episode_steps": 7}
-    agent = trained(config, steps, seat_of(count, seed=3, **world))
-
-    envs = GridWorldVectorEnv(count, autoreset_mode="SameStep", **world)
-    random = np.random.default_rng(np.random.SeedSequence(3).spawn(1)[0])
-    q, visits = np.zeros((30, 4)), np.zeros((30, 4), dtype=int)
-    states, _ = envs.reset(seed=3)
-    actions = draw_actions(q, 0.4, states, random.random(count))
-    for done in range(0, steps, count):
-        following, rewards, terminated, _, infos = envs.step(actions)
-        reached = following.copy()
-        if infos:
-            reached[infos["_final_obs"]] = infos["final_obs"][infos["_final_obs"]]
-        epsilon = 0.4 + (0.05 - 0.4) * (done + count) / steps
-        before = q.copy()
-        next_actions = np.zeros(count, dtype=int)
-        if config.algorithm == "sarsa":
-            next_actions = draw_actions(before, epsilon, reached, random.random(count))
-        for env in range(count):
-            row = before[reached[env]]
-            ahead = {
-                "q_learning": row.max(),
-                "sarsa": row[next_actions[env]],
-                "expected_sarsa": float(epsilon_greedy(row, epsilon) @ row),
-            }[config.algorithm]
-            pair = states[env], actions[env]
-            visits[pair] += 1
-            target = rewards[env] + 0.99 * (0.0 if terminated[env] else ahead)
-            q[pair] += 0.3 * visits[pair] ** -0.2 * (target - q[pair])
-        if config.algorithm != "sarsa":
-            actions = draw_actions(q, epsilon, following, random.random(count))
-        else:
-            actions = next_actions
-            if over := infos.get("_final_obs", np.zeros(count, dtype=bool)).nonzero()[0].tolist():
-                actions[over] = draw_actions(q, epsilon, following[over], random.random(len(over)))
-        states = following
-    assert visits.sum() == steps
-    np.testing.assert_array_equal(agent.visits, visits)
-    np.testing.assert_allclose(agent.q, q, rtol=0, atol=1e-12)
 
 
 def test_epsilon_is_spread_over_all_actions_and_the_rest_over_the_best() -> None:
@@ -356,20 +306,18 @@ def test_a_model_file_that_does_not_fit_is_refused(name: str, array: Any, words:
         agent.load(path)
 
 
-@pytest.mark.parametrize("agent", ["q_learning", "sarsa", "expected_sarsa", "value_iteration"])
-def test_a_whole_run_never_imports_torch(agent: str, tmp_path: Path) -> None:
+def test_whole_runs_never_import_torch(tmp_path: Path) -> None:
+    script, others = str(ROOT / "scripts" / "train.py"), ("q_learning", "expected_sarsa", "value_iteration")
     code = (
-        "import runpy, sys; sys.argv = ['train.py', *sys.argv[1:]];"
-        f"runpy.run_path({str(ROOT / 'scripts' / 'train.py')!r}, run_name='__main__');"
-        "assert 'tensorboard' in sys.modules;"
+        f"import runpy, sys; sys.argv = ['train.py', *{[*SHORT['sarsa'], 'hydra.run.dir=run']}]\n"
+        f"runpy.run_path({script!r}, run_name='__main__')\n"
+        "import gridworld\n"
+        f"for words in {[SHORT[agent] for agent in others]}: gridworld.train(*words)\n"
+        "assert 'tensorboard' in sys.modules\n"
         "assert not {'torch', 'stable_baselines3'} & set(sys.modules)"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, *SHORT[agent], "hydra.run.dir=run"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=60,
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60
     )
     assert done.returncode == 0, done.stderr
     assert list((tmp_path / "run").glob("events.out.tfevents*"))
