@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from gridworld.diagnosis.verdict import Diagnosis
-from gridworld.envs.board import board_of
-from gridworld.envs.rendering import AGENT, Frame
-from gridworld.visualization.canvas import Canvas, shown
-from gridworld.visualization.paths import directions, draw_paths, greedy_paths
-from gridworld.visualization.sheet import INK, ORANGES, PAPER, UNREACHABLE, Swatch, is_dark, linear, short
-from gridworld.visualization.state_table import Numbers, StateTable, table_states
+from gridworld.envs.rendering import AGENT, INK, Frame, board_of
+from gridworld.visualization.canvas import Canvas, directions, greedy_paths
+from gridworld.visualization.sheet import ORANGES, PAPER, UNREACHABLE, Swatch, is_dark, linear, short
+from gridworld.visualization.state_table import StateTable, table_states
 from gridworld.world.mdp import FloatArray
 
 
@@ -25,15 +23,15 @@ def draw_diagnosis(found: Diagnosis, cell_size: int | None = None) -> Frame:
     if not board_of(mdp).panels:
         return _as_table(found, cost, caption)
     canvas = Canvas(mdp, cell_size)
-    scale = linear(ORANGES, cost[shown(mdp)], low=0.0)
+    scale = linear(ORANGES, cost[canvas.board.floor], low=0.0)
     colours = scale.colours(cost)
     colours[cost == 0] = PAPER
     canvas.paint(colours[:, None])
     canvas.draw_world()
     ways = directions(mdp)[np.arange(mdp.num_states), found.greedy].tolist()
     paths = greedy_paths(mdp, found.greedy)
-    draw_paths(canvas, paths, ways, 0.4)
-    costly = np.flatnonzero((cost > 0) & shown(mdp)).tolist()
+    canvas.draw_paths(paths, ways, 0.4)
+    costly = np.flatnonzero((cost > 0) & canvas.board.floor).tolist()
     texts = {state: short(float(cost[state]), scale.high) for state in costly}
     size = canvas.number_size(0.8, texts.values())
     dark = is_dark(colours)
@@ -54,7 +52,7 @@ def _as_table(found: Diagnosis, cost: FloatArray, caption: str) -> Frame:
     )
     table = StateTable(found.mdp, states, ["regret"])
     scale = linear(ORANGES, cost[states], low=0.0)
-    table.paint(Numbers("regret", np.where(cost > 0, cost, np.nan)[:, None], scale))
+    table.paint(np.where(cost > 0, cost, np.nan)[:, None], scale)
     table.caption(caption)
     table.legend(scale, "regret 0", short(scale.high))
     return table.frame()
