@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from gridworld.envs.observations import VectorOneHotObservation as VectorOneHotObservation
     from gridworld.envs.vector_env import GridWorldVectorEnv as GridWorldVectorEnv
     from gridworld.errors import InputError as InputError
-    from gridworld.world.exact.evaluation import Evaluator as Evaluator
-    from gridworld.world.exact.evaluation import Score as Score
+    from gridworld.world.evaluation import Evaluator as Evaluator
+    from gridworld.world.evaluation import Score as Score
     from gridworld.world.grid import compile_mdp as compile_mdp
     from gridworld.world.layout import Layout as Layout
     from gridworld.world.layout import load as load
@@ -60,7 +60,7 @@ _NAMES = {  # the public names of each module
     ),
     "envs.vector_env": "GridWorldVectorEnv",
     "errors": "InputError",
-    "world.exact.evaluation": "Evaluator Score",
+    "world.evaluation": "Evaluator Score",
     "world.grid": "compile_mdp",
     "world.layout": "Layout load shipped_layouts",
     "world.mdp": "Mdp",

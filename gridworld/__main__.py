@@ -1,6 +1,6 @@
 """The console command `gridworld`, also `python -m gridworld`; see `gridworld.commands.console`."""
 
-from gridworld.process.early_signals import listen
+from gridworld.process.signals import listen
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ from gridworld.errors import InputError
 
 STEP_LIMIT = 100  # steps of an episode, where neither the world nor a setting says another
 MOST_STEPS = 100_000  # of an episode; an evaluation goes through all of them
+LARGEST_INTEGER = 2**63  # beyond, neither arrays nor the files of a run have them
 NEAREST_GAMMA = 1 - 1e-11  # to 1, but for 1 itself
 
 
@@ -27,6 +28,8 @@ class Bounds:
         is_large_enough = number == 0 or abs(number) >= self.least
         if not (is_high_enough and is_large_enough and number <= self.high and abs(number) < math.inf):
             raise InputError(f"{key}={number if written is None else written}: must be {self}")
+        if isinstance(number, int) and abs(number) >= LARGEST_INTEGER:
+            raise InputError(f"{key}={number}: must be smaller than 2**63")
 
     def __str__(self) -> str:
         low = f"above {self.low}" if self.above else f"at least {self.low}"

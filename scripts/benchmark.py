@@ -1,6 +1,6 @@
 """Measure this project beside its peers: `python scripts/benchmark.py`; see `--help`."""
 
-from gridworld.process.early_signals import listen
+from gridworld.process.signals import listen
 
 if __name__ == "__main__":
     listen()  # before what takes time to import

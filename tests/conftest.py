@@ -16,7 +16,7 @@ from helpers import huge_pages
 from helpers.composing import compose_quickly
 from hypothesis import settings
 
-from gridworld.process.console import progress
+from gridworld.process import console
 from gridworld.process.memory_budget import collect_less_often
 
 # The package and the tests are compiled once, not in every process.
@@ -26,7 +26,7 @@ sys.dont_write_bytecode = False
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a background job
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-progress._SECONDS_BETWEEN_LINES = 600.0  # no line says that something takes long, as on a busy machine it may
+console._SECONDS_BETWEEN_LINES = 600.0  # no line says that something takes long, as on a busy machine it may
 settings.register_profile("gridworld", derandomize=True, deadline=None, database=None, max_examples=30)
 settings.load_profile("gridworld")
 
@@ -42,7 +42,7 @@ def _environment() -> Iterator[None]:
 
 # One after the other: clusters, browsers and kills at random moments, which want a machine for themselves.
 IN_TURN = (
-    *("sweep/test_sweep_cluster.py", "sweep/test_sweep_kills.py", "sweep/test_population_kills.py"),
+    *("sweep/test_sweep_cluster.py", "sweep/test_sweep_kills.py"),
     *("training/test_tensorboard.py", "report/test_report_page.py"),
 )
 # What takes more than five seconds of a processor, the longest first.

@@ -101,7 +101,7 @@ def _certified(agent: str, seeds: range) -> Callable[[], float]:
         from gridworld.envs.observations import make_observation
         from gridworld.training.learning_curve import LearningCurve
         from gridworld.training.setup import make_context
-        from gridworld.world.exact.evaluation import Evaluator
+        from gridworld.world.evaluation import Evaluator
 
         seconds = []
         for seed in seeds:

@@ -21,9 +21,9 @@ import numpy as np
 
 import gridworld
 from gridworld.errors import InputError
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import one_hot_policy
-from gridworld.world.exact.solver import value_iteration
+from gridworld.world.chain import one_hot_policy
+from gridworld.world.evaluation import Evaluator
+from gridworld.world.solver import value_iteration
 
 PICTURES = ("policy_map", "q_error", "visits", "learning", "frames", "gif")
 QUIET = [f"recording.{each}=false" for each in PICTURES]

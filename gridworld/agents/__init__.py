@@ -42,7 +42,7 @@ class PolicySnapshot:
     def greedy_policy(self) -> FloatArray:
         """The greedy policy's action probabilities, (S, A)."""
         # here, since settings are read without numpy
-        from gridworld.world.exact.markov_chain import one_hot_policy
+        from gridworld.world.chain import one_hot_policy
 
         return one_hot_policy(self.greedy, self.sampled.shape[1])
 

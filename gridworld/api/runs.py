@@ -26,11 +26,11 @@ from gridworld.process.signals import Interrupted
 from gridworld.report.evidence import read_columns
 from gridworld.restore.resume import unfinished_of
 from gridworld.restore.saved_run import SavedRun, read_visits
-from gridworld.run.claim import check_free, claimed
-from gridworld.run.reader import is_started
+from gridworld.run.folder import claimed
+from gridworld.run.reader import check_free, is_started
 from gridworld.training.setup import without_pictures
 from gridworld.training.train import train as train_in
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 
 Curve = dict[str, NDArray[Any]]
 

@@ -12,8 +12,8 @@ from gridworld.bounds import discount
 from gridworld.envs.inspection import Task, task_of, world_of
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.errors import InputError
-from gridworld.world.exact.evaluation import Evaluator, Score
-from gridworld.world.exact.markov_chain import one_hot_policy
+from gridworld.world.chain import one_hot_policy
+from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.grid import GridMdp
 from gridworld.world.mdp import FloatArray, Mdp
 
@@ -37,7 +37,7 @@ def evaluate(
         env: an environment or a batch of Gymnasium or SB3: a GridWorld, or one with a transition table; a
             compiled world (`compile_mdp`, `compile_env`); or the name of a map. The task is that of the
             environment with its wrappers, which must be neutral or functions; see
-            `gridworld.world.sources.wrappers`. A model sees states as this environment shows them; where that
+            `gridworld.world.wrappers`. A model sees states as this environment shows them; where that
             is the world's own observation of another kind, by the kind that has the model's observation
             space. None: the environment that the model was trained on.
         gamma: discount of value and regret.

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gridworld.checking import worlds
-from gridworld.checking.training import Trained
 from gridworld.checking.worlds import BONUS
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import Chain
-from gridworld.world.exact.solver import backup, solved
+from gridworld.world.chain import Chain
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import BoolArray, FloatArray, Mdp
+from gridworld.world.solver import backup, solved
+
+if TYPE_CHECKING:
+    from gridworld.checking.training import Trained
 
 TOLERANCE = 0.1  # of a value, relative to the largest number in the world
 LEAST_BEST = 0.99  # share of late steps with a best action
@@ -29,9 +31,9 @@ class UnmetError(Exception):
 
 def values(trained: Trained) -> str:
     """Its values are the exact ones: Q* of a learner of Q, of an actor-critic V of its own policy."""
-    mdp, found, last = trained.mdp, trained.last.q, trained.last
-    if found is not None:
-        return _near(mdp, found, solved(mdp, trained.gamma).q)
+    mdp, last = trained.mdp, trained.last
+    if last.q is not None:
+        return _near(mdp, last.q, solved(mdp, trained.gamma).q)
     often = trained.late.sum(axis=1) >= _VISITED * trained.late.sum()
     return _near(mdp, last.values, Chain(mdp, last.sampled).value(trained.gamma), often)
 
@@ -41,7 +43,7 @@ def optimal(trained: Trained) -> str:
     mdp = trained.mdp
     score = Evaluator(mdp, trained.gamma, mdp.max_episode_steps or _LIMIT).score(trained.greedy)
     if not score.certified:
-        actions = trained.greedy.argmax(axis=1)[_live(mdp)].tolist()
+        actions = trained.greedy.argmax(axis=1)[mdp.reachable & ~mdp.terminal].tolist()
         raise UnmetError(f"its best actions are {actions}, with regret {score.regret:.3g}")
     return "optimal"
 
@@ -93,10 +95,6 @@ def first_backup(trained: Trained) -> str:
     return _near(mdp, trained.last.q, exact)
 
 
-def _live(mdp: Mdp) -> BoolArray:
-    return np.asarray(mdp.reachable & ~mdp.terminal)
-
-
 def _near(
     mdp: Mdp,
     found: FloatArray,
@@ -105,11 +103,10 @@ def _near(
     probability: bool = False,
 ) -> str:
     """Compare numbers of live states, or of these (S,) of them; says which is farthest from the exact one."""
-    where = _live(mdp) if states is None else _live(mdp) & states
+    where = mdp.reachable & ~mdp.terminal & (True if states is None else states)
     where = np.broadcast_to(where.reshape(-1, *[1] * (exact.ndim - 1)), exact.shape)
-    tolerance = PROBABILITY
-    if not probability:
-        tolerance = TOLERANCE * max(np.abs(exact[where]).max(), np.abs(mdp.reward).max())
+    largest = max(np.abs(exact[where]).max(), np.abs(mdp.reward).max())
+    tolerance = PROBABILITY if probability else TOLERANCE * largest
     error = np.where(where, np.abs(found - exact), -1.0)
     worst = tuple(int(each) for each in np.unravel_index(np.argmax(error), error.shape))
     name = "P" if probability else "Q" if len(worst) == 2 else "V"
@@ -139,116 +136,51 @@ class Probe:
 
 _NO_EXPLORATION_LEFT = {"exploration_final_eps": 0.0}
 
+# fmt: off
 PROBES = (
-    Probe(
-        "constant",
-        worlds.constant,
-        values,
-        "the value is not learnt at all: its loss, its optimiser or the reward that reaches it",
-    ),
-    Probe(
-        "discount",
-        worlds.corridor,
-        values,
-        "gamma is ignored or applied at the wrong step, or a reward belongs to another step",
-        gamma=0.5,
-    ),
-    Probe(
-        "choice",
-        worlds.bandit,
-        optimal,
-        "worse actions are preferred: the sign of the advantage, or rewards beside the wrong actions",
-    ),
-    Probe(
-        "context",
-        worlds.two_contexts,
-        optimal,
-        "the policy does not depend on the state: observations are lost, mixed up or of another step",
-        arguments=_NO_EXPLORATION_LEFT,
-    ),
-    Probe(
-        "behaviour",
-        worlds.two_contexts,
-        acts_as_learnt,
-        "it acts otherwise than it has learnt: exploration does not end, or ends late, or it sees another "
-        "observation when it acts than when it learns",
-        arguments=_NO_EXPLORATION_LEFT,
-    ),
-    Probe(
-        "layers",
-        worlds.two_contexts,
-        all_layers_learn,
-        "a layer never changes: it is not in the optimiser, cut off from the gradient or never copied",
-        arguments=_NO_EXPLORATION_LEFT,
-    ),
-    Probe(
-        "exploration",
-        worlds.two_contexts,
-        acts_at_random,
-        "it explores less than its epsilon says: that is ignored, scaled or starts elsewhere",
-        arguments={"exploration_initial_eps": 1.0, "exploration_final_eps": 1.0},
-        needs="exploration_final_eps",
-    ),
-    Probe(
-        "entropy",
-        worlds.dear_contexts,
-        soft_optimal,
-        "the entropy bonus is not what its coefficient says: its sign or scale is wrong, it is missing, or "
-        "it is not that of each state's policy",
-        arguments={"ent_coef": worlds.BONUS},
-        needs="ent_coef",
-    ),
-    Probe(
-        "delay",
-        worlds.delay,
-        optimal_with_values,
-        "credit does not reach earlier steps: returns, traces or next observations are of the wrong step",
-    ),
-    Probe(
-        "termination",
-        worlds.end_like_the_start,
-        values,
-        "values are taken from beyond the end of an episode: the terminal flag is ignored",
-    ),
-    Probe(
-        "truncation",
-        worlds.endless,
-        values,
-        "a step limit is treated as an end: the value of the state where it was cut is missing",
-        gamma=0.8,
-    ),
-    Probe(
-        "stochastic",
-        worlds.gamble,
-        optimal_with_values,
-        "it does not learn the mean of a random reward, but its extreme, its median or its last draw",
-    ),
-    Probe(
-        "alternation",
-        worlds.alternation,
-        optimal_with_values,
-        "the value of the next state is wrong: another state's, or not that of its best action",
-        gamma=0.8,
-    ),
-    Probe(
-        "trap",
-        worlds.trap,
-        optimal_with_values,
-        "the next reward counts for more than the return: what follows is not added, or costs are lost",
-    ),
-    Probe(
-        "slip",
-        worlds.slippery,
-        optimal_with_values,
-        "uncertain moves are not averaged over, or next states are not where the world went",
-    ),
-    Probe(
-        "target",
-        worlds.endless,
-        first_backup,
-        "targets are not computed with the target network: it never had an update, the values moved on",
-        gamma=0.8,
-        arguments={"target_update_interval": 10_000_000},
-        needs="target_update_interval",
-    ),
+    Probe("constant", worlds.constant, values,
+          "the value is not learnt at all: its loss, its optimiser or the reward that reaches it"),
+    Probe("discount", worlds.corridor, values,
+          "gamma is ignored or applied at the wrong step, or a reward belongs to another step",
+          gamma=0.5),
+    Probe("choice", worlds.bandit, optimal,
+          "worse actions are preferred: the sign of the advantage, or rewards beside the wrong actions"),
+    Probe("context", worlds.two_contexts, optimal,
+          "the policy does not depend on the state: observations are lost, mixed up or of another step",
+          arguments=_NO_EXPLORATION_LEFT),
+    Probe("behaviour", worlds.two_contexts, acts_as_learnt,
+          "it acts otherwise than it has learnt: exploration does not end, or ends late, or it sees another "
+          "observation when it acts than when it learns",
+          arguments=_NO_EXPLORATION_LEFT),
+    Probe("layers", worlds.two_contexts, all_layers_learn,
+          "a layer never changes: it is not in the optimiser, cut off from the gradient or never copied",
+          arguments=_NO_EXPLORATION_LEFT),
+    Probe("exploration", worlds.two_contexts, acts_at_random,
+          "it explores less than its epsilon says: that is ignored, scaled or starts elsewhere",
+          arguments={"exploration_initial_eps": 1.0, "exploration_final_eps": 1.0},
+          needs="exploration_final_eps"),
+    Probe("entropy", worlds.dear_contexts, soft_optimal,
+          "the entropy bonus is not what its coefficient says: its sign or scale is wrong, it is missing, or "
+          "it is not that of each state's policy",
+          arguments={"ent_coef": BONUS}, needs="ent_coef"),
+    Probe("delay", worlds.delay, optimal_with_values,
+          "credit does not reach earlier steps: returns, traces or next observations are of the wrong step"),
+    Probe("termination", worlds.end_like_the_start, values,
+          "values are taken from beyond the end of an episode: the terminal flag is ignored"),
+    Probe("truncation", worlds.endless, values,
+          "a step limit is treated as an end: the value of the state where it was cut is missing",
+          gamma=0.8),
+    Probe("stochastic", worlds.gamble, optimal_with_values,
+          "it does not learn the mean of a random reward, but its extreme, its median or its last draw"),
+    Probe("alternation", worlds.alternation, optimal_with_values,
+          "the value of the next state is wrong: another state's, or not that of its best action",
+          gamma=0.8),
+    Probe("trap", worlds.trap, optimal_with_values,
+          "the next reward counts for more than the return: what follows is not added, or costs are lost"),
+    Probe("slip", worlds.slippery, optimal_with_values,
+          "uncertain moves are not averaged over, or next states are not where the world went"),
+    Probe("target", worlds.endless, first_backup,
+          "targets are not computed with the target network: it never had an update, the values moved on",
+          gamma=0.8, arguments={"target_update_interval": 10_000_000}, needs="target_update_interval"),
 )
+# fmt: on

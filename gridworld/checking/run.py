@@ -13,11 +13,10 @@ from multiprocessing import get_context
 from typing import Any
 
 from gridworld.checking.probes import PROBES, Probe, UnmetError
-from gridworld.checking.settings import settings, subject
-from gridworld.checking.training import build, train
+from gridworld.checking.training import build, settings, subject, train
 from gridworld.config.agents import AgentConfig
 from gridworld.errors import InputError, in_short
-from gridworld.process.console.terminal import aligned
+from gridworld.process.console import aligned
 
 Outcomes = list[tuple[bool | None, str]]  # of one probe on each seed: see `Finding`
 SEEDS = 3  # of a probe that fails at first: it has failed if it fails on most of them
@@ -61,14 +60,14 @@ class CheckResult:
     seconds: float
 
     @property
-    def passed(self) -> bool:
-        """Whether no probe failed."""
-        return not self.failed
-
-    @property
     def failed(self) -> list[str]:
         """The names of the probes that failed."""
         return [each.name for each in self.findings if each.passed is False]
+
+    @property
+    def passed(self) -> bool:
+        """Whether no probe failed."""
+        return not self.failed
 
     def verdict(self) -> str:
         """The last line of the table."""
@@ -120,7 +119,11 @@ def check(
             raise InputError(f"--probe {name}: there is no such probe; there are {', '.join(known)}")
     chosen = [probe for probe in PROBES if not probes or probe.name in probes]
     groups = [list(group) for _, group in itertools.groupby(chosen, lambda probe: probe.training)]
-    _try_out(config, given, groups[0][0], seed)
+    if (first := settings(config, chosen[0], given)) is not None:
+        try:  # what it refuses is the user's mistake, not a finding
+            build(first[0], chosen[0].world(), first[1].num_envs, seed)
+        except InputError as error:
+            raise InputError(str(error).replace("agent.arguments.", "--set ")) from None
     findings: list[Finding] = []
     check_group = partial(_check_group, config, given, seed)
     with ProcessPoolExecutor(max(1, min(processes, len(groups))), get_context("spawn")) as pool:
@@ -131,15 +134,6 @@ def check(
     return CheckResult(config.name, tuple(findings), time.monotonic() - started)
 
 
-def _try_out(config: AgentConfig, given: Mapping[str, Any], probe: Probe, seed: int) -> None:
-    """Build it once: what it refuses is the user's mistake, not a finding."""
-    if (found := settings(config, probe, given)) is not None:
-        try:
-            build(found[0], probe.world(), found[1].num_envs, seed)
-        except InputError as error:
-            raise InputError(str(error).replace("agent.arguments.", "--set ")) from None
-
-
 def _check_group(
     config: AgentConfig, given: Mapping[str, Any], seed: int, group: list[Probe]
 ) -> list[Finding]:
@@ -147,8 +141,7 @@ def _check_group(
     started = time.monotonic()
     outcomes: dict[str, Outcomes] = {probe.name: [] for probe in group}
     for number in range(SEEDS):
-        unsettled = [probe for probe in group if not _is_settled(outcomes[probe.name])]
-        if unsettled:
+        if unsettled := [probe for probe in group if not _is_settled(outcomes[probe.name])]:
             for probe, outcome in zip(unsettled, _once(config, given, seed + number, unsettled), strict=True):
                 outcomes[probe.name].append(outcome)
     seconds = (time.monotonic() - started) / len(group)
@@ -165,9 +158,9 @@ def _is_settled(outcomes: Outcomes) -> bool:
 
 
 def _once(config: AgentConfig, given: Mapping[str, Any], seed: int, probes: list[Probe]) -> Outcomes:
+    """Train on one seed, and ask all probes of the group."""
     first = probes[0]
-    found = settings(config, first, given)
-    if found is None:
+    if (found := settings(config, first, given)) is None:
         return [(None, f"takes no {first.needs}")] * len(probes)
     settled, kind = found
     try:

@@ -1,7 +1,16 @@
-"""One training run on a probe's world, and what is seen of it."""
+"""Training an implementation on a probe's world: with which settings, how long, and what is seen of it.
+
+They are chosen so that what fails is a bug: training goes on longer than SB3's own classes need, and the
+learning rate falls to 0, so that values come to rest well within the tolerance. The kind of an algorithm
+shows in the names of its arguments. It gets those of the kind's that it takes, and keeps its other defaults.
+"""
 
 from __future__ import annotations
 
+import ast
+import dataclasses
+import inspect
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,13 +18,137 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot, TrainingContext, family
+from gridworld.agents.sb3.settings.schemas import SB3ClassConfig, SB3Config
+from gridworld.checking.probes import Probe
 from gridworld.config.agents import AgentConfig
 from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
-from gridworld.world.exact.markov_chain import one_hot_policy
+from gridworld.errors import InputError
+from gridworld.world.chain import one_hot_policy
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 
 _LAST = 0.6  # of training; what it does after that is its behaviour
+_OURS = {"gamma": "each probe has its own", "seed": "see --seed", "device": "it is cpu"}
+_FEW_QUANTILES = {"n_quantiles": 25}  # of a policy that has them; 200 take ten times as long
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Algorithms that are trained alike."""
+
+    sign: str  # an argument by which the kind is known
+    steps: int  # environment steps of a training run
+    num_envs: int  # that step together
+    arguments: Mapping[str, Any]  # of the algorithm, by SB3's names
+
+
+_EXPLORING = {"exploration_fraction": 0.5, "exploration_initial_eps": 1.0, "exploration_final_eps": 0.05}
+_REPLAY = {"buffer_size": 10_000, "learning_starts": 400, "batch_size": 128, "train_freq": 1}
+# fmt: off
+KINDS = (  # the first that fits: DQN and QR-DQN, TRPO, PPO, A2C, tables, others
+    Kind("buffer_size", 6400, 8, {**_EXPLORING, **_REPLAY, "learning_rate": "lin_0.003", "gradient_steps": 1,
+                                  "target_update_interval": 80}),
+    Kind("cg_max_steps", 20_480, 8, {"learning_rate": "lin_0.003", "n_steps": 64, "batch_size": 128,
+                                     "target_kl": 0.05}),
+    Kind("n_epochs", 20_480, 32, {"learning_rate": "lin_0.006", "n_steps": 32, "batch_size": 512,
+                                  "n_epochs": 5, "ent_coef": 0.0}),
+    Kind("n_steps", 25_600, 32, {"learning_rate": "lin_0.006", "n_steps": 4, "ent_coef": 0.0}),
+    Kind("learning_rate_power", 16_000, 8, {**_EXPLORING, "learning_rate": 0.05, "learning_rate_power": 0.0,
+                                            "initial_value": 0.0}),
+    Kind("", 20_000, 8, {"learning_rate": 1e-3}),
+)
+# fmt: on
+
+
+def settings(config: AgentConfig, probe: Probe, given: Mapping[str, Any]) -> tuple[AgentConfig, Kind] | None:
+    """The settings of an algorithm on a probe, whose own arguments go before the user's, and its kind.
+
+    None where it does not take what the probe needs.
+    """
+    algorithm: Any = None
+    if isinstance(config, SB3ClassConfig):
+        from gridworld.agents.sb3.settings.constructor_arguments import algorithm_class  # imports torch
+
+        algorithm = algorithm_class("check", config.algorithm)
+        known = _arguments_of(algorithm)
+    else:
+        general = {field.name for field in dataclasses.fields(SB3Config)}
+        known = sorted({field.name for field in dataclasses.fields(config)} - general)
+    for name in given:
+        if name in _OURS:
+            raise InputError(f"--set {name}: {_OURS[name]}; leave it out")
+        if name not in known:
+            raise InputError(f"--set {name}: {config.name} has no such argument; it has {', '.join(known)}")
+    if probe.needs and probe.needs not in known:
+        return None
+    kind = next(each for each in KINDS if each.sign in known or not each.sign)
+    wanted = {**kind.arguments, "gamma": probe.gamma, **given, **probe.arguments}
+    if isinstance(config, SB3ClassConfig):
+        policies = algorithm.policy_aliases
+        if "n_quantiles" in _arguments_of(policies.get(config.policy, object)):
+            wanted = {"policy_kwargs": _FEW_QUANTILES, **wanted}
+        chosen = {**config.arguments, **{name: wanted[name] for name in wanted if name in known}}
+        # A class may have a name of its own for the policy.
+        policy = next((name for name in policies if name.startswith("Mlp")), config.policy)
+        return dataclasses.replace(config, policy=policy, arguments=chosen), kind
+    chosen = {name: wanted[name] for name in wanted if name in known}
+    for name, value in chosen.items():
+        own = getattr(config, name)
+        if isinstance(own, int) and type(value) is not type(own):
+            raise InputError(f"--set {name}={value}: must be {type(own).__name__}")
+    return dataclasses.replace(config, **chosen), kind
+
+
+def _arguments_of(kind: type) -> list[str]:
+    """Names of its constructor's arguments; one with **kwargs takes those of its base class."""
+    names: set[str] = set()
+    for each in kind.__mro__:
+        if "__init__" not in vars(each):
+            continue
+        parameters = inspect.signature(each).parameters.values()
+        kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+        names |= {parameter.name for parameter in parameters if parameter.kind in kinds}
+        if all(parameter.kind is not parameter.VAR_KEYWORD for parameter in parameters):
+            break
+    return sorted(name for name in names - {"policy", "env"} if not name.startswith("_"))
+
+
+def subject(algorithm: Any) -> AgentConfig:
+    """Name an implementation by its settings.
+
+    It is a class with SB3's interface or its import path, which trains in its own loop, or the name of a
+    shipped agent.
+    """
+    if inspect.isclass(algorithm):
+        algorithm = f"{algorithm.__module__}.{algorithm.__qualname__}"
+    name = str(algorithm)
+    if "." in name:
+        return SB3ClassConfig(name=name, algorithm=name, engine="stock")
+    from gridworld.config.composition.compose import compose
+    from gridworld.config.composition.conf_folder import conf_folder
+
+    known = sorted(file.stem for file in (conf_folder() / "agent").glob("*.yaml"))
+    if name not in known:
+        raise InputError(
+            f"check {name}: must be the import path of a class, e.g. my_package.MyPPO, or a shipped agent, "
+            f"which are {', '.join(known)}"
+        )
+    return compose(conf_folder(), [f"agent={name}"]).agent
+
+
+def arguments(words: Sequence[str]) -> dict[str, Any]:
+    """The arguments of `--set NAME=VALUE`; values are Python's, or text."""
+    found: dict[str, Any] = {}
+    plain = {"true": True, "false": False, "null": None}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not (name.isidentifier() and equals and value):
+            raise InputError(f"--set {word}: must be NAME=VALUE, e.g. learning_rate=0.001")
+        try:
+            found[name] = plain[value] if value in plain else ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            found[name] = value
+    return found
 
 
 @dataclass(frozen=True, eq=False)

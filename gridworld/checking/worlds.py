@@ -108,20 +108,21 @@ def _world(
     limit: int = _LIMIT,
 ) -> Mdp:
     """Compile the rows; a number without a row is an end."""
-    size = 1 + max(len(rows) - 1, *(each[1] for row in rows for outcomes in row for each in outcomes))
-    shape = (size, len(rows[0]), max(len(outcomes) for row in rows for outcomes in row))
+    entries = [
+        ((state, action, index), outcome)
+        for state, row in enumerate(rows)
+        for action, outcomes in enumerate(row)
+        for index, outcome in enumerate(outcomes)
+    ]
+    size = 1 + max(len(rows) - 1, *(leads_to for _, (_, leads_to, _, _) in entries))
+    shape = size, len(rows[0]), 1 + max(index for (_, _, index), _ in entries)
+    probability, reward, ends = np.zeros(shape), np.zeros(shape), np.ones(shape, dtype=np.bool_)
+    next_state = np.broadcast_to(np.arange(size)[:, None, None], shape).copy()
+    probability[:, :, 0] = 1.0
+    for place, outcome in entries:
+        probability[place], next_state[place], reward[place], ends[place] = outcome
+    begins = np.pad(np.asarray(start), (0, size - len(start)))
     tables = Outcomes(
-        next_state=np.broadcast_to(np.arange(size)[:, None, None], shape).copy(),
-        probability=np.zeros(shape),
-        reward=np.zeros(shape),
-        terminated=np.ones(shape, dtype=np.bool_),
-        start=np.pad(np.asarray(start), (0, size - len(start))),
+        next_state=next_state, probability=probability, reward=reward, terminated=ends, start=begins
     )
-    tables.probability[:, :, 0] = 1.0
-    columns = tables.probability, tables.next_state, tables.reward, tables.terminated
-    for state, row in enumerate(rows):
-        for action, outcomes in enumerate(row):
-            for index, outcome in enumerate(outcomes):
-                for column, number in zip(columns, outcome, strict=True):
-                    column[state, action, index] = number
     return mdp_from_outcomes(name, tables, max_episode_steps=limit)

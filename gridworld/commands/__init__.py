@@ -16,10 +16,9 @@ from typing import Any
 from gridworld.bounds import Bounds
 from gridworld.config.composition.words import digits
 from gridworld.errors import EXIT_CODE, InputError, failure
-from gridworld.process.console.command_line import program
-from gridworld.process.console.terminal import prepare, printing, tell_error
-from gridworld.process.early_signals import AtWork
+from gridworld.process.console import prepare, printing, program, tell_error
 from gridworld.process.memory_budget import collect_less_often
+from gridworld.process.signals import at_work
 
 Main = Callable[[Sequence[str]], None]
 
@@ -73,7 +72,7 @@ def run(main: Main) -> None:
     collect_less_often()
     prepare()
     try:
-        with AtWork(), printing():
+        with at_work(), printing():
             main(sys.argv[1:])
     except InputError as error:
         tell_error(str(error))

@@ -13,8 +13,8 @@ from typing import Any
 
 from gridworld.commands import parser_of
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import program
-from gridworld.run.claim import check_inside, check_writable
+from gridworld.process.console import program
+from gridworld.run.folder import check_inside, check_writable
 from gridworld.storage.atomic_write import write_json
 
 _DOCS = Path(__file__).resolve().parents[2] / "docs"  # where the measurements are, in the source

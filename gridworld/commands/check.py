@@ -14,9 +14,9 @@ from collections.abc import Sequence
 
 from gridworld.checking.probes import PROBES
 from gridworld.checking.run import check
-from gridworld.checking.settings import arguments
+from gridworld.checking.training import arguments
 from gridworld.commands import parser_of, whole
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import printable
 
 _PROCESSES = 2
 _FAILED = 1  # the exit code

@@ -9,7 +9,7 @@ from importlib import import_module
 
 from gridworld.commands import run
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import CONSOLE
+from gridworld.process.console import CONSOLE
 
 # By name, in the order of the manual: what it does.
 COMMANDS = {

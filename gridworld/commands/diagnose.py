@@ -8,11 +8,16 @@ from collections.abc import Sequence
 
 from gridworld.commands import parser_of
 from gridworld.diagnosis.evidence import Evidence
-from gridworld.diagnosis.picture import draw_diagnosis
-from gridworld.diagnosis.verdict import Diagnosis, check_trusted, diagnose, trials_folder, try_offers
+from gridworld.diagnosis.verdict import (
+    Diagnosis,
+    check_trusted,
+    diagnose,
+    draw_diagnosis,
+    trials_folder,
+    try_offers,
+)
 from gridworld.errors import InputError
-from gridworld.process.console.progress import telling_if_slow
-from gridworld.process.console.terminal import aligned, printable, tell
+from gridworld.process.console import aligned, printable, tell, telling_if_slow
 from gridworld.process.memory_budget import limited
 from gridworld.process.signals import Interrupted
 from gridworld.restore.saved_run import SavedRun

@@ -10,13 +10,11 @@ from gridworld.envs.env import GridWorldEnv
 from gridworld.envs.rendering import has_display
 from gridworld.envs.rollout import SampledScores, play, sample_episodes
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import program
-from gridworld.process.console.progress import telling_if_slow
-from gridworld.process.console.terminal import aligned, printable
+from gridworld.process.console import aligned, printable, program, telling_if_slow
 from gridworld.process.memory_budget import limited
 from gridworld.restore.saved_run import SavedRun, choose_policy
 from gridworld.run.summary import MOST_NAMED, circles_text
-from gridworld.world.exact.evaluation import Evaluator, Score
+from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.mdp import FloatArray
 from gridworld.world.metrics import METRICS, optimal_score
 

@@ -18,11 +18,10 @@ from gridworld.commands import parser_of
 from gridworld.errors import InputError, reason
 from gridworld.export.exported_run import read
 from gridworld.export.targets import TARGETS, check_installed
-from gridworld.process.console.progress import telling_if_slow
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import printable, telling_if_slow
 from gridworld.process.memory_budget import limited
 from gridworld.report.evidence import find_runs
-from gridworld.run.claim import check_inside, check_writable
+from gridworld.run.folder import check_inside, check_writable
 from gridworld.storage.safe_read import check_no_link
 
 

@@ -15,7 +15,7 @@ from gridworld.envs.env import GridWorldEnv
 from gridworld.envs.rendering import Frame
 from gridworld.storage.serialization import independent_generator
 from gridworld.visualization.canvas import Canvas
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray
 
 _SAME = 1e-9  # returns that differ by rounding alone

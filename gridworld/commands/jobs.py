@@ -7,9 +7,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from gridworld.process.console.command_line import program
-from gridworld.process.console.progress import telling_if_slow
-from gridworld.process.console.terminal import aligned, printable
+from gridworld.process.console import aligned, printable, program, telling_if_slow
 from gridworld.process.memory_budget import limited
 from gridworld.sweep.console import counts_text
 from gridworld.sweep.folder import open_sweep

@@ -8,7 +8,7 @@ from __future__ import annotations
 import textwrap
 from pathlib import Path
 
-from gridworld.process.console.command_line import as_called
+from gridworld.process.console import as_called
 
 FAILS = "known_failure:"  # a setting of recipes that do not solve their task
 RECIPES = "tuned"  # the group of recipes

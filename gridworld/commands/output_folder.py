@@ -13,8 +13,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.config.composition.compose import without_hydra
 from gridworld.errors import InputError
-from gridworld.run.claim import check_free, check_inside, claimed
-from gridworld.run.folder import MANIFEST
+from gridworld.run.folder import MANIFEST, check_inside, claimed
+from gridworld.run.reader import check_free
 from gridworld.storage.atomic_write import check_no_links
 
 

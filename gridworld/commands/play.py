@@ -14,12 +14,10 @@ from gridworld.config.train import EvaluationConfig
 from gridworld.config.worlds import MapConfig
 from gridworld.envs import rendering as drawing
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import program
-from gridworld.process.console.progress import telling_if_slow
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import printable, program, telling_if_slow
 from gridworld.process.memory_budget import limited
 from gridworld.restore.saved_run import SavedRun
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import GridMdp
 
 _WIDEST_BOARD = 800  # pixels; two boards share twice 640

@@ -14,17 +14,16 @@ from gridworld.commands import parser_of, whole
 from gridworld.config.pictures import PICTURES
 from gridworld.envs.rendering import frame_size
 from gridworld.envs.rollout import play
-from gridworld.process.console.progress import telling_if_slow
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import printable, telling_if_slow
 from gridworld.process.memory_budget import limited
 from gridworld.restore.saved_run import SavedRun, choose_policy, read_visits
-from gridworld.run.claim import check_inside, check_writable
+from gridworld.run.folder import check_inside, check_writable
 from gridworld.storage.atomic_write import make_inside
 from gridworld.storage.safe_read import check_no_link
 from gridworld.visualization import files
 from gridworld.visualization.episode import film
 from gridworld.visualization.picture import drawer
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 
 MAPS = {picture.name: picture.drawer for picture in PICTURES if picture.is_map}
 

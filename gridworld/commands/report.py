@@ -15,13 +15,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from gridworld.commands import parser_of, whole
-from gridworld.process.console.progress import telling_if_slow
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import printable, telling_if_slow
 from gridworld.process.memory_budget import limited
-from gridworld.report.build import MOST_SHOWN, Reason, gather, reasons
+from gridworld.report.analysis import MOST_SHOWN, Reason, gather, reasons
 from gridworld.report.writer import FORMATS, MARKERS, check_markers, check_out, write_readme, write_report
 from gridworld.restore.saved_run import SavedRun
-from gridworld.run.claim import check_inside
+from gridworld.run.folder import check_inside
 
 _MOST_DIAGNOSED = 10
 

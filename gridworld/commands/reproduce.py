@@ -18,16 +18,14 @@ from pathlib import Path
 
 from gridworld.commands import parser_of
 from gridworld.errors import InputError
-from gridworld.process.console.progress import telling_if_slow
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import printable, telling_if_slow
 from gridworld.process.memory_budget import limited
 from gridworld.process.signals import Interrupted
 from gridworld.restore.reproduce import check_whole, compare, lengths, population, repeat
 from gridworld.restore.saved_run import settings_of
-from gridworld.run.claim import check_free, check_inside
-from gridworld.run.folder import MANIFEST
+from gridworld.run.folder import MANIFEST, check_inside
 from gridworld.run.provenance import describe, differences, source_differences
-from gridworld.run.reader import RunReader, open_run, read_run, stored_world
+from gridworld.run.reader import RunReader, check_free, open_run, read_run, stored_world
 from gridworld.training.setup import without_pictures
 
 DIFFERENT = 1  # exit code

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from gridworld.config.composition.words import digits
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import result_is_in_files
+from gridworld.process.console import result_is_in_files
 from gridworld.process.memory_budget import limited
-from gridworld.run.claim import alone_in, check_inside
+from gridworld.run.folder import alone_in, check_inside
 from gridworld.run.reader import check_is_run
 
 KEY, STEPS = "resume", "total_timesteps"

@@ -28,12 +28,17 @@ from gridworld.config.composition.hydra_errors import sentence, unreadable_file
 from gridworld.config.composition.words import refuse_dashes
 from gridworld.config.train import TrainConfig
 from gridworld.errors import EXIT_CODE, InputError
-from gridworld.process.console.command_line import called_from
-from gridworld.process.console.terminal import prepare, printable, printing, result_is_in_files, tell_error
-from gridworld.process.early_signals import AtWork
+from gridworld.process.console import (
+    called_from,
+    prepare,
+    printable,
+    printing,
+    result_is_in_files,
+    tell_error,
+)
 from gridworld.process.memory_budget import collect_less_often
-from gridworld.run.claim import claimed
-from gridworld.run.folder import SWEEP_JSON, shown
+from gridworld.process.signals import at_work
+from gridworld.run.folder import SWEEP_JSON, claimed, shown
 from gridworld.storage.safe_read import check_yaml
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -94,7 +99,7 @@ def main() -> None:
     asked_for_traceback = FULL_ERROR in os.environ
     os.environ[FULL_ERROR] = "1"  # so that Hydra raises its errors instead of printing them
     try:
-        with AtWork(), printing(), _at_end:
+        with at_work(), printing(), _at_end:
             _prepare_command_line(conf)
             hydra.main(version_base=VERSION_BASE, config_path=str(conf), config_name="train")(run_job)()
     except Exception as error:

@@ -23,8 +23,14 @@ from gridworld.commands.manual import choices
 from gridworld.config.composition.conf_folder import conf_folder
 from gridworld.config.composition.words import refuse_dashes
 from gridworld.errors import InputError, install_command
-from gridworld.process.console.command_line import as_called, command_line, program
-from gridworld.process.console.terminal import printable, result_is_in_files, tell_error
+from gridworld.process.console import (
+    as_called,
+    command_line,
+    printable,
+    program,
+    result_is_in_files,
+    tell_error,
+)
 from gridworld.storage.safe_read import check_yaml
 
 if TYPE_CHECKING:

@@ -21,8 +21,7 @@ from gridworld.config.settings import NEWER, effect_of
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, schema_of
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import users_folder
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import printable, users_folder
 
 _LARGEST_KWARG = 1000  # of an environment: sizes, and what it pays
 

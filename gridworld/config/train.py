@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, is_dataclass
 from typing import Any, Optional, Union
 
-from gridworld.bounds import discount
+from gridworld.bounds import LARGEST_INTEGER, discount
 from gridworld.config.agents import AgentConfig, parse_schedule
 from gridworld.config.fields import (
     BOUNDS,
@@ -126,13 +126,10 @@ def check(config: TrainConfig) -> None:
     if source is not None and SOURCES.get(source) is not type(config.env):
         raise InputError(f"env.source={source}: is no setting of its own; choose a source by env=...")
     every = config.checkpoint.every
-    if not (every is None or every == AUTO or (type(every) is int and 1 <= every < _INTEGERS)):
+    if not (every is None or every == AUTO or (type(every) is int and 1 <= every < LARGEST_INTEGER)):
         raise InputError(
             f"checkpoint.every={every}: must be a number of steps, {AUTO}, or null for no checkpoints"
         )
-
-
-_INTEGERS = 2**63  # beyond, neither arrays nor the files of a run have them
 
 
 def check_bounds(section: Any, prefix: str = "") -> None:
@@ -146,5 +143,3 @@ def check_bounds(section: Any, prefix: str = "") -> None:
             is_rate = RATE in metadata
             number = parse_schedule(key, value, metadata[RATE]).initial if is_rate else value
             metadata[BOUNDS].check(key, number, value)
-            if isinstance(value, int) and abs(value) >= _INTEGERS:
-                raise InputError(f"{key}={value}: must be smaller than 2**63")

@@ -10,6 +10,9 @@ from gridworld.config.fields import bounds
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
 
+MOST_SEEDS = 10_000
+MOST_TRIALS = 1_000_000
+
 
 @dataclass
 class DimensionConfig:
@@ -27,13 +30,13 @@ class DimensionConfig:
 class TuneConfig:
     """How `scripts/tune.py` searches; `tune` on the command line."""
 
-    trials: int = field(default=100, metadata=bounds(1))  # the search ends after so many
-    seeds: int = field(default=3, metadata=bounds(1))  # a trial's: seed, seed + 1, ...
+    trials: int = field(default=100, metadata=bounds(1, MOST_TRIALS))  # the search ends after so many
+    seeds: int = field(default=3, metadata=bounds(1, MOST_SEEDS))  # a trial's: seed, seed + 1, ...
     # trials that go on to more seeds, beside what the search began from
-    finalists: int = field(default=5, metadata=bounds(1))
-    final_seeds: int = field(default=10, metadata=bounds(0))  # the next ones, for the finalists
+    finalists: int = field(default=5, metadata=bounds(1, MOST_SEEDS))
+    final_seeds: int = field(default=10, metadata=bounds(0, MOST_SEEDS))  # the next ones, for the finalists
     # the next ones, for the winner and for what the search began from
-    confirm_seeds: int = field(default=20, metadata=bounds(2))
+    confirm_seeds: int = field(default=20, metadata=bounds(2, MOST_SEEDS))
     study: Optional[str] = None  # noqa: UP045  # its name; null: of agent and world
     folder: Optional[str] = None  # noqa: UP045  # null: runs/STUDY
     storage: Optional[str] = None  # noqa: UP045  # any URL that Optuna takes; null: study.db in the folder
@@ -46,8 +49,8 @@ class TuneConfig:
     sampler_seed: int = field(default=0, metadata=bounds(0))  # of the search itself
     pruner: str = "median"  # or hyperband, none
     # of a seed, at least, so that who is certified sooner shows
-    evaluations: int = field(default=50, metadata=bounds(1))
-    reports: int = field(default=10, metadata=bounds(1))  # looks of the pruner at a seed's curve
+    evaluations: int = field(default=50, metadata=bounds(1, 100_000))
+    reports: int = field(default=10, metadata=bounds(1, 100_000))  # looks of the pruner at a seed's curve
     # a trial's seed ends at this many certificates in a row
     stop_after: Optional[int] = field(default=3, metadata=bounds(1))  # noqa: UP045
     space: dict[str, DimensionConfig] = field(default_factory=dict)  # conf/tune/*.yaml

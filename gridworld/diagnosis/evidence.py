@@ -8,7 +8,7 @@ a sum over states of the discounted visits under π times what its action there 
 With γ = 1 a policy that never ends has no such sum. The walk then stops where it cannot end any more, and
 such a state costs its visits times V* - V_π, all that is lost from there on.
 
-As `world.exact.evaluation` has it, value and regret are without a step limit. What an episode of training
+As `world.evaluation` has it, value and regret are without a step limit. What an episode of training
 loses by being cut off is therefore no part of the split.
 
 Reference: S. Kakade and J. Langford, Approximately optimal approximate reinforcement learning, ICML 2002.
@@ -32,10 +32,10 @@ from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.report.evidence import read_columns
 from gridworld.restore.saved_run import SavedRun, read_visits
-from gridworld.world.exact.evaluation import Evaluator, Score
-from gridworld.world.exact.markov_chain import Chain, discounted_visits, stopping_states
-from gridworld.world.exact.solver import Solution, backup, pick, solved
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+from gridworld.world.chain import Chain, discounted_visits, stopping_states
+from gridworld.world.evaluation import Evaluator, Score
+from gridworld.world.mdp import BoolArray, FloatArray
+from gridworld.world.solver import Solution, backup, pick, solved
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +65,9 @@ def split_regret(evaluator: Evaluator, policy: FloatArray) -> RegretSplit:
     return RegretSplit(evaluator.score(policy), visits, lost, cost, (visits > 0) & errs)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Evidence:
-    """A run, as its files and its agent have it; what follows from these is computed when it is asked for."""
+    """A run, as its files and its agent have it; what takes time to compute is computed when asked for."""
 
     config: TrainConfig
     overrides: Sequence[str]  # the words of its command line
@@ -84,33 +84,22 @@ class Evidence:
         curve, evaluator = read_columns(saved.run), saved.evaluator()
         return cls(saved.config, saved.overrides, curve, visits, evaluator, agent, agent.snapshot())
 
-    @property
-    def mdp(self) -> Mdp:
-        return self.evaluator.mdp
-
-    @property
-    def greedy(self) -> IntArray:
-        """(S,), the greedy actions."""
-        return self.snapshot.greedy
-
-    @property
-    def is_tabular(self) -> bool:
-        return self.config.agent.family == "tabular"
-
-    @property
-    def is_actor_critic(self) -> bool:
-        """Whether it has a policy of its own and no Q."""
-        return self.snapshot.q is None
+    def __post_init__(self) -> None:
+        self.mdp, snapshot = self.evaluator.mdp, self.snapshot
+        self.greedy = snapshot.greedy  # (S,)
+        self.values = np.where(self.mdp.terminal, 0.0, snapshot.values)  # (S,)
+        self.spread = entropy(snapshot.sampled)  # (S,)
+        self.gamma = float(getattr(self.config.agent, "gamma", self.evaluator.solution.gamma))  # the agent's
+        self.largest_reward = float(np.abs(self.mdp.reward).max())  # of a step
+        self.is_tabular = self.config.agent.family == "tabular"
+        self.is_actor_critic = snapshot.q is None  # it has a policy of its own and no Q
+        # At which small networks learn with Adam, or the table of a deterministic world.
+        self.usual_rate = 0.5 if self.is_tabular else 0.005 if self.is_actor_critic else 0.001
 
     @cached_property
     def split(self) -> RegretSplit:
         """The regret of the greedy policy."""
         return split_regret(self.evaluator, self.snapshot.greedy_policy())
-
-    @cached_property
-    def gamma(self) -> float:
-        """The discount that the agent learns with."""
-        return float(getattr(self.config.agent, "gamma", self.evaluator.solution.gamma))
 
     @cached_property
     def own(self) -> Solution:
@@ -119,11 +108,6 @@ class Evidence:
             return solved(self.mdp, self.gamma)
         except InputError:
             return self.evaluator.solution
-
-    @cached_property
-    def values(self) -> FloatArray:
-        """(S,), the agent's values; 0 where it is over."""
-        return np.where(self.mdp.terminal, 0.0, self.snapshot.values)
 
     @cached_property
     def q(self) -> FloatArray:
@@ -136,16 +120,6 @@ class Evidence:
         return np.asarray(self.own.v - pick(self.own.q, self.greedy))
 
     @cached_property
-    def largest_reward(self) -> float:
-        """The largest |reward| of a step."""
-        return float(np.abs(self.mdp.reward).max())
-
-    @cached_property
-    def spread(self) -> FloatArray:
-        """(S,), the entropy of the sampled policy, 1 where it is uniform."""
-        return entropy(self.snapshot.sampled)
-
-    @cached_property
     def steps_to_goal(self) -> float:
         """The exact expected number of steps until a random walk first meets a goal.
 
@@ -154,11 +128,6 @@ class Evidence:
         uniform = np.full_like(self.snapshot.sampled, 1 / self.mdp.num_actions)
         walk = Chain(self.mdp, uniform).outcome(self.evaluator.max_episode_steps)
         return walk.expected_length / walk.goal if walk.goal > 0 else np.inf
-
-    @property
-    def usual_rate(self) -> float:
-        """A learning rate at which small networks learn with Adam; or a deterministic world's table."""
-        return 0.5 if self.is_tabular else 0.005 if self.is_actor_critic else 0.001
 
     def setting(self, name: str, default: float = 0.0) -> float:
         """A number among the agent's settings: as configured, or as its model has it by default.

@@ -11,10 +11,10 @@ import numpy as np
 
 from gridworld.config.agents import LINEAR
 from gridworld.diagnosis.evidence import Evidence
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import Chain, discounted_visits, stopping_states
-from gridworld.world.exact.solver import backup
+from gridworld.world.chain import Chain, discounted_visits, stopping_states
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import BoolArray, FloatArray, Mdp
+from gridworld.world.solver import backup
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,6 @@ class Finding:
     changes: tuple[str, ...]  # words for a command line, the best first
 
 
-ADAM = "torch.optim.Adam"
 _ENOUGH = {False: 3000, True: 500}  # updates, by whether it is an actor-critic
 _MEETINGS = 10  # of a random walk with the goal
 _FAR = 10  # times the learning rate
@@ -59,8 +58,8 @@ def falling(run: Evidence) -> tuple[str, ...]:
 def faster(run: Evidence) -> tuple[str, ...]:
     """Words for a network that learns too slowly: what scales its steps, the usual rate, and a longer run."""
     optimizer = getattr(getattr(run.agent.model, "policy", None), "optimizer", None)
-    takes_gradients_as_they_are = "SGD" in type(optimizer).__name__
-    adam = (run.change("policy_kwargs.optimizer_class", ADAM),) if takes_gradients_as_they_are else ()
+    is_plain = "SGD" in type(optimizer).__name__
+    adam = (run.change("policy_kwargs.optimizer_class", "torch.optim.Adam"),) if is_plain else ()
     by = run.usual_rate / max(run.setting("learning_rate"), 1e-300)
     return *adam, *((run.multiplied("learning_rate", by),) if by > 2 else ()), longer(run, 4)
 
@@ -151,13 +150,13 @@ def on_the_way(run: Evidence) -> BoolArray:
     return (discounted_visits(chain, gamma, stopping_states(chain, gamma)) > 0) & run.mdp.acting
 
 
-def sweeps_missing(run: Evidence) -> int:
-    """How many sweeps of value iteration from its own values make its errors right; 0: it cannot be told."""
+def behind(run: Evidence) -> str:
+    """How many sweeps of value iteration from its own values make its errors right, where that is known."""
     v = run.q.max(axis=1) * ~run.mdp.terminal
     states = np.flatnonzero(run.split.wrong)
     for sweep in range(1, _SWEEPS):
         q = backup(run.mdp, v, run.gamma)
         if run.own.optimal[states, q[states].argmax(axis=1)].all():
-            return sweep
+            return f"; {sweep} sweeps of its own values are missing" if sweep > 1 else ""
         v = q.max(axis=1) * ~run.mdp.terminal
-    return 0
+    return ""

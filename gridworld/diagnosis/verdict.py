@@ -1,4 +1,4 @@
-"""A diagnosis: the causes of a run's regret, the largest first, and what to change.
+"""A diagnosis: the causes of a run's regret, the largest first, what to change, and its picture.
 
 What it offers can be put to the test: each offer trains as an ordinary run, until one is certified. The
 settings are composed from the offer's words; the world is the one that the run's folder holds.
@@ -10,7 +10,7 @@ import dataclasses
 import math
 import re
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,10 +22,14 @@ from gridworld.diagnosis.causes import CAUSES, PHRASES
 from gridworld.diagnosis.causes.objective import recommended_gamma
 from gridworld.diagnosis.evidence import Evidence, RegretSplit
 from gridworld.diagnosis.finding import Finding
+from gridworld.envs.rendering import AGENT, INK, Frame, board_of
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import command
+from gridworld.process.console import command
 from gridworld.restore.saved_run import SavedRun
-from gridworld.world.exact.evaluation import score_of_optimum
+from gridworld.visualization.canvas import Canvas, directions, greedy_paths
+from gridworld.visualization.sheet import ORANGES, PAPER, UNREACHABLE, Swatch, is_dark, linear, short
+from gridworld.visualization.state_table import StateTable, table_states
+from gridworld.world.evaluation import score_of_optimum
 from gridworld.world.mdp import IntArray, Mdp
 
 _MOST_CHANGES = 3
@@ -134,15 +138,12 @@ def _offers(run: Evidence, findings: tuple[Finding, ...]) -> tuple[tuple[str, ..
     changes = list(dict.fromkeys((*first, *others)))[:_MOST_CHANGES]
     key, fits = run.config.agent.key("gamma"), score_of_optimum(run.evaluator, run.own.gamma).certified
     gamma = "" if fits else run.change("gamma", recommended_gamma(run, run.split.wrong))
-    return tuple(
-        _with(run.overrides, (each if fits or key in each else f"{each} {gamma}").split(" "))
-        for each in changes
-    )
-
-
-def _with(overrides: Sequence[str], changes: Sequence[str]) -> tuple[str, ...]:
-    keys = set(map(_key, changes))
-    return (*(word for word in overrides if _key(word) not in keys), *changes)
+    offers = []
+    for each in changes:
+        words = (each if fits or key in each else f"{each} {gamma}").split(" ")
+        changed = set(map(_key, words))
+        offers.append((*(word for word in run.overrides if _key(word) not in changed), *words))
+    return tuple(offers)
 
 
 def _key(word: str) -> str:
@@ -152,15 +153,8 @@ def _key(word: str) -> str:
 def try_offers(saved: SavedRun, found: Diagnosis, folder: Path, trust: bool = False) -> Iterator[Trial]:
     """Train the offers of a diagnosis in turn, until one is certified; yields each trial as it ends.
 
-    Args:
-        saved: the run.
-        found: its diagnosis.
-        folder: the runs are in it, each in a new one.
-        trust: whether settings may name classes and callbacks from anywhere, and interpolations.
-
-    Raises:
-        InputError: the run's settings are not trusted, or the folder cannot be written.
-        Interrupted: training was asked to stop.
+    Each run is in a new folder in `folder`. `trust` is whether settings may name classes and callbacks from
+    anywhere. Raises `InputError` where they are not trusted, `Interrupted` where training was asked to stop.
     """
     # here, since it takes a second
     from hydra.errors import HydraException
@@ -169,7 +163,7 @@ def try_offers(saved: SavedRun, found: Diagnosis, folder: Path, trust: bool = Fa
     from gridworld.config.composition.compose import compose
     from gridworld.config.composition.conf_folder import conf_folder
     from gridworld.config.composition.hydra_errors import sentence
-    from gridworld.run.claim import claimed
+    from gridworld.run.folder import claimed
     from gridworld.training.train import train
 
     for words, line in zip(found.offers, found.commands, strict=True):
@@ -179,8 +173,7 @@ def try_offers(saved: SavedRun, found: Diagnosis, folder: Path, trust: bool = Fa
         except (HydraException, OmegaConfBaseException) as error:
             raise InputError(sentence(error)) from None
         config = dataclasses.replace(composed, env=saved.config.env)
-        if not trust:
-            _check_harmless(config, saved)
+        check_trusted(saved, found, trust, config)
         try:
             with claimed(place):
                 summary = train(config, place, list(words), lambda env: saved.mdp)
@@ -197,12 +190,48 @@ def trials_folder(folder: Path) -> Path:
     return folder.resolve().parent / f"{folder.resolve().name}-tried"
 
 
-def check_trusted(saved: SavedRun, found: Diagnosis, trust: bool) -> None:
-    """Check that to compose and train the offers runs no code of a stranger's choice."""
+def check_trusted(saved: SavedRun, found: Diagnosis, trust: bool, offer: TrainConfig | None = None) -> None:
+    """Check that to compose and train the offers, or this one, runs no code of a stranger's choice."""
     if found.offers and not trust:
-        _check_harmless(saved.config, saved)
+        config = saved.config if offer is None else offer
+        built = {"agent": dataclasses.asdict(config.agent), "callbacks": config.callbacks}
+        check_foreign(built, str(saved.run.manifest_file), "--trust")
 
 
-def _check_harmless(config: TrainConfig, saved: SavedRun) -> None:
-    built = {"agent": dataclasses.asdict(config.agent), "callbacks": config.callbacks}
-    check_foreign(built, str(saved.run.manifest_file), "--trust")
+def draw_diagnosis(found: Diagnosis, cell_size: int | None = None) -> Frame:
+    """Draw the split of a run's regret; `cell_size` in pixels, None: 80, less on large maps."""
+    mdp, cost = found.mdp, np.maximum(found.split.cost, 0.0)
+    cost = np.where(np.isfinite(cost) & (found.cause_of >= 0), cost, 0.0)
+    causes = ", ".join(
+        f"{each.cause} {share:.0%}" for each, share in zip(found.findings, found.shares, strict=True)
+    )
+    caption = f"regret {found.split.score.regret:.3g}: {causes}"
+    if not board_of(mdp).panels:  # a world without places: its states in a column, by what they cost
+        places = np.round(cost[:, None] * 1e12 / max(cost.max(), 1e-300)).astype(np.int64)
+        states = table_states(mdp, places)
+        table, scale = StateTable(mdp, states, ["regret"]), linear(ORANGES, cost[states], low=0.0)
+        table.paint(np.where(cost > 0, cost, np.nan)[:, None], scale)
+        table.caption(caption)
+        table.legend(scale, "regret 0", short(scale.high))
+        return table.frame()
+    canvas = Canvas(mdp, cell_size)
+    scale = linear(ORANGES, cost[canvas.board.floor], low=0.0)
+    colours = scale.colours(cost)
+    colours[cost == 0] = PAPER
+    canvas.paint(colours[:, None])
+    canvas.draw_world()
+    ways = directions(mdp)[np.arange(mdp.num_states), found.greedy].tolist()
+    paths = greedy_paths(mdp, found.greedy)
+    canvas.draw_paths(paths, ways, 0.4)
+    costly = np.flatnonzero((cost > 0) & canvas.board.floor).tolist()
+    texts = {state: short(float(cost[state]), scale.high) for state in costly}
+    size = canvas.number_size(0.8, texts.values())
+    dark = is_dark(colours)
+    for state, text in texts.items() if size is not None else ():
+        ink = PAPER if dark[state] else INK
+        canvas.number(text, canvas.point(state, 0.5, 0.83), size or 0, ink, colours[state])
+    canvas.caption(caption)
+    path = Swatch("greedy path from the start" if canvas.cell >= 24 else "greedy path", AGENT, PAPER)
+    swatches = [*([path] if paths else []), *([UNREACHABLE] if canvas.hidden else [])]
+    canvas.legend(scale, "regret 0", short(scale.high), swatches)
+    return canvas.frame()

@@ -14,8 +14,8 @@ from gridworld.engine.environments import Environments
 from gridworld.engine.networks import DenseNetworks, ModuleNetworks, Networks
 from gridworld.engine.optimizer import Optimizer
 from gridworld.engine.run import Run
-from gridworld.process.console.terminal import tell
-from gridworld.process.parallel.together import mixed
+from gridworld.process.console import tell
+from gridworld.process.together import mixed
 from gridworld.storage.serialization import State, StateError, fill, fitting
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 

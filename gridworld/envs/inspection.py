@@ -1,7 +1,7 @@
 """The one door to a certificate: which task an environment or a batch is, and what an agent sees in it.
 
 What is scored has to be what was given: wrappers included, in every copy of a batch. What is not known
-exactly is refused. `gridworld.world.sources.wrappers` says what the wrappers of an environment do; here are
+exactly is refused. `gridworld.world.wrappers` says what the wrappers of an environment do; here are
 the environments below them and the batches above them, known by the names of their classes.
 """
 
@@ -26,9 +26,9 @@ from gridworld.world.grid import GridMdp, compile_mdp
 from gridworld.world.layout import Layout, load, positive_int
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import verified
+from gridworld.world.snapshots import alike, same
 from gridworld.world.sources.gymnasium_table import compile_table, has_table
-from gridworld.world.sources.pure_functions import alike, same
-from gridworld.world.sources.wrappers import NEUTRAL, Wrapped, known_class, step_limit, wrappers_of
+from gridworld.world.wrappers import NEUTRAL, Wrapped, known_class, step_limit, wrappers_of
 
 # What a batch is, by the class whose methods it runs.
 _GYMNASIUM, _SB3 = "gymnasium.wrappers.vector", "stable_baselines3.common.vec_env"

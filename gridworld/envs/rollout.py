@@ -9,8 +9,8 @@ import numpy as np
 
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.storage.serialization import independent_generator
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import check_policy
+from gridworld.world.chain import check_policy
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 _Z = 1.959963984540054  # standard deviations of the normal distribution on either side of 95 % of it

@@ -21,7 +21,7 @@ from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import MapConfig
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import plain, printable, tell
+from gridworld.process.console import plain, printable, tell
 from gridworld.report.evidence import ONLINE, Evidence, Unusable, read_columns
 from gridworld.report.evidence import read as read_evidence
 from gridworld.run.folder import WORLD

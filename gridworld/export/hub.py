@@ -19,7 +19,7 @@ from gridworld.config.worlds import EnvConfig, MapConfig
 from gridworld.envs.registration import ENV_ID
 from gridworld.errors import InputError
 from gridworld.export.exported_run import ExportedRun
-from gridworld.report.table import Table, to_markdown
+from gridworld.report.tables import Table, to_markdown
 from gridworld.run.folder import WORLD
 from gridworld.storage.atomic_write import replacing_folder, write_json, write_text
 from gridworld.storage.safe_read import read_object

@@ -1,9 +1,8 @@
 """One memory budget for whatever reads a folder that somebody else may have written.
 
-What opens a run is `limited`, and so is a command that reads sweeps or studies while it is at work. Whoever
-then allocates by a number that was read calls `check_memory` first. The variable `GRIDWORLD_BUDGET` raises
-the budget, e.g. to 8GB. Time has no limit: `progress.telling_if_slow` says what takes long. The user's own
-training, by train.py or tune.py, has neither budget nor such lines.
+What opens a run is `limited`, and so is a command that reads sweeps or studies. Whoever then allocates by a
+number that was read calls `check_memory` first. The variable `GRIDWORLD_BUDGET` raises the budget, e.g. to
+8GB. Time has no limit: `console.telling_if_slow` says what takes long. Training has neither.
 """
 
 from __future__ import annotations
@@ -31,20 +30,22 @@ class BudgetError(InputError):
 
 @contextmanager
 def limited(most: float | None = None) -> Iterator[None]:
-    """Apply a budget, by default the user's, to the block, or to the function that this decorates."""
-    text = os.environ.get(VARIABLE) or "1GB"
-    found = re.fullmatch(r"([1-9]\d{0,5})(MB|GB)", text.strip().upper(), re.ASCII)
+    """Apply a budget in bytes, by default the user's, to the block or the function that this decorates."""
     if _memory.get() == math.inf:
         most = math.inf
-    elif most is None and found is None:
-        raise InputError(f"{VARIABLE}={text[:80]}: must be an amount of memory, e.g. 500MB or 8GB")
-    elif most is None and found is not None:
-        most = int(found[1]) * _MEGABYTES[found[2]] * 1e6
-    token = _memory.set(most)
+    token = _memory.set(_users_budget() if most is None else most)
     try:
         yield
     finally:
         _memory.reset(token)
+
+
+def _users_budget() -> float:
+    text = os.environ.get(VARIABLE) or "1GB"
+    found = re.fullmatch(r"([1-9]\d{0,5})(MB|GB)", text.strip().upper(), re.ASCII)
+    if found is None:
+        raise InputError(f"{VARIABLE}={text[:80]}: must be an amount of memory, e.g. 500MB or 8GB")
+    return int(found[1]) * _MEGABYTES[found[2]] * 1e6
 
 
 def unlimited() -> AbstractContextManager[None]:
@@ -58,14 +59,10 @@ def is_limited() -> bool:
 
 
 def check_memory(what: object, size: float) -> None:
-    """Refuse what would take more memory than the budget. Call it before allocating.
-
-    Args:
-        what: a file or a part of a run, for the message.
-        size: bytes.
+    """Refuse what would take more bytes than the budget, if there is one; `what` is for the message.
 
     Raises:
-        BudgetError: there is a budget, and `size` is above it.
+        BudgetError: `size` is above the budget.
     """
     most = _memory.get()
     if most is not None and size > most:

@@ -1,13 +1,15 @@
-"""Signal handling while a command is at work. Every handler is installed by a function of this module.
+"""Signal handling: SIGINT is Ctrl-C, and SIGTERM is how a scheduler says that a machine is wanted back.
 
-SIGINT is Ctrl-C; SIGTERM is how a scheduler says that a machine is wanted back. `early_signals` handles both
-until training, a search or a sweep has begun, and imports less than this module does.
+While the package is imported, either ends the process at once (`listen`). In a command, either raises an
+exception, so that the command cleans up (`at_work`). In training, either asks for a checkpoint first
+(`StopRequest`).
 """
 
 from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -15,7 +17,7 @@ from contextvars import ContextVar
 from types import FrameType
 from typing import Any, ClassVar
 
-Handler = Callable[[int, FrameType | None], None]
+Handler = Callable[[int, FrameType | None], Any]
 
 _SECONDS_TO_SAFE_POINT = 1.0  # training may continue for so long to come to where it can be saved
 
@@ -35,6 +37,31 @@ class Interrupted(BaseException):
 def signal_name(number: int) -> str:
     """The name of a signal, e.g. "SIGTERM"."""
     return signal.Signals(number).name
+
+
+def listen() -> None:
+    """Let Ctrl-C end the process at once and without a traceback, as SIGTERM does."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a shell's background job ignores it
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+@contextmanager
+def at_work() -> Iterator[None]:
+    """Let SIGINT raise `KeyboardInterrupt` and SIGTERM `SystemExit`; flush the output at the block's end."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        os.write(2, b"stopped by SIGTERM\n")
+        raise SystemExit(128 + number)
+
+    handlers: dict[signal.Signals, Handler] = {signal.SIGTERM: stop}
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        handlers[signal.SIGINT] = signal.default_int_handler
+    with handling(handlers):
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from gridworld.errors import InputError, install_command
-from gridworld.process.console.command_line import users_folder
+from gridworld.process.console import users_folder
 from gridworld.process.memory_budget import check_memory
 
 if TYPE_CHECKING:

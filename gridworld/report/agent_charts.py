@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from gridworld.report import chart
 from gridworld.report.analysis import BY_KEY, METRICS, Band, Comparison, Overall, Result, TaskAnalysis
-from gridworld.report.chart import INK, LINE, MUTED, PAPER, Chart, Styles, house_style
+from gridworld.report.chart import INK, MUTED, PAPER, Chart, Styles, house_style
 from gridworld.report.setting_charts import sweep_charts, sweeps
 from gridworld.report.statistics import INFINITE, Interval
 from gridworld.world.mdp import FloatArray
@@ -57,17 +56,21 @@ def _curves(analysis: TaskAnalysis, styles: Styles, more: str) -> Iterator[Chart
     bands = {result.group.agent: result.regret for result in results}
     if any(band.point.any() for band in bands.values()):
         highest = [band.point if np.isnan(band.high).any() else band.high for band in bands.values()]
-        top = max((float(high) for high in np.concatenate(highest) if high < INFINITE), default=0.0)
         yield draw(
             f"{task} regret",
             f"Regret on {task}",
             describe("regret of the greedy policy, exact", _BOOTSTRAP) + "; 0 is optimal",
             bands,
             label="regret",
-            bounds=(0.0, 1.06 * top or 1.0),
+            bounds=_bounds(np.concatenate(highest), from_zero=True),
             references={"optimum": 0.0, "uniformly random": world.optimal_value - world.random_value},
         )
-    if any(result.certificates.point.any() for result in results):
+    bands = {result.group.agent: result.certificates for result in results}
+    if any(band.point.any() for band in bands.values()):
+        for result in results:
+            if len(result.group.runs) == 1:  # Wilson's interval for one seed would cover nearly everything
+                band, unknown = result.certificates, np.full(len(result.certificates.steps), math.nan)
+                bands[result.group.agent] = replace(band, low=unknown, high=unknown)
         yield draw(
             f"{task} certified",
             f"Seeds certified optimal on {task}",
@@ -75,29 +78,24 @@ def _curves(analysis: TaskAnalysis, styles: Styles, more: str) -> Iterator[Chart
                 "share of seeds whose greedy policy is optimal from the start",
                 "bands are Wilson's 95 % intervals",
             ),
-            {result.group.agent: _certificates(result) for result in results},
+            bands,
             label="seeds certified",
             bounds=(0.0, 1.0),
             form=chart.percent,
         )
     bands = {result.group.agent: result.online for result in results if result.online is not None}
     if any(band.point.any() for band in bands.values()):
+        # The first tenth, where most is learnt, would flatten all the rest.
+        late = np.concatenate([band.point[len(band.point) // 10 :] for band in bands.values()])
         yield draw(
             f"{task} on-line return",
             f"On-line return on {task}",
             describe("mean return of the training episodes, exploration included", _BOOTSTRAP),
             bands,
             label="return",
-            bounds=_online_bounds(list(bands.values())),
+            bounds=_bounds(late),
             references={"optimum": world.optimal_return},
         )
-
-
-def _certificates(result: Result) -> Band:
-    """The share certified; without Wilson's interval for one seed, which would cover nearly everything."""
-    band = result.certificates
-    unknown = np.full(len(band.steps), math.nan)
-    return band if len(result.group.runs) > 1 else replace(band, low=unknown, high=unknown)
 
 
 def _description(what: str, statistic: str, results: Sequence[Result], more: str) -> str:
@@ -108,15 +106,14 @@ def _description(what: str, statistic: str, results: Sequence[Result], more: str
     return f"{what}: {statistic}, {chart.seed_counts(counts)}{more}"
 
 
-def _online_bounds(bands: Sequence[Band]) -> Bounds:
-    """From the worst after the first tenth: what is learnt at the very start would flatten all the rest."""
-    late = np.concatenate([band.point[len(band.point) // 10 :] for band in bands])
-    late = late[np.abs(late) < INFINITE]
-    if not len(late):
+def _bounds(numbers: FloatArray, from_zero: bool = False) -> Bounds:
+    """Of an axis that has room for all finite numbers."""
+    numbers = numbers[np.abs(numbers) < INFINITE]
+    if not len(numbers):
         return 0.0, 1.0
-    low, high = float(late.min()), float(late.max())
-    margin = 0.1 * (high - low) or 0.1 * abs(high) or 1.0
-    return low - margin, high + margin
+    low, high = 0.0 if from_zero else float(numbers.min()), float(numbers.max())
+    margin = 0.06 * (high - low) or 0.1 * abs(high) or 0.1
+    return (low if from_zero else low - margin), high + margin
 
 
 @house_style()
@@ -131,18 +128,17 @@ def _draw_curves(
     form: Callable[..., str] = chart.compact,
     log_steps: bool = False,
     levels: Bounds | None = None,
-    references: Mapping[str, float] = MappingProxyType({}),
+    references: Mapping[str, float] | None = None,
 ) -> Chart:
     """Each agent's curve with its band against environment steps, or `levels` of optimality.
 
     References are lines across. Curves are bold as far as all runs go, and dotted from where the first ended.
     """
-    seen = {mark: level for mark, level in references.items() if bounds[0] <= level <= bounds[1]}
+    seen = {mark: at for mark, at in (references or {}).items() if bounds[0] <= at <= bounds[1]}
     looks = [styles[agent] for agent in bands]
     looks += [{"color": INK, "linestyle": _REFERENCES[mark]} for mark in seen]
-    names = [chart.wrapped(agent, 56) for agent in chart.without_shared(list(bands))]
     handles = [Line2D([], [], linewidth=2.2, **look) for look in looks]
-    legend = list(zip(handles, [*names, *seen], strict=True))
+    legend = list(zip(handles, [*chart.short_names(list(bands), 56), *seen], strict=True))
     figure, axes = chart.new_figure(title, _HEIGHT, "y", legend)
     axes.set(ylim=bounds, ylabel=label)
     axes.yaxis.set_major_formatter(form)
@@ -191,13 +187,10 @@ def _strip(analysis: TaskAnalysis, key: str, styles: Styles, more: str) -> Chart
     metric = BY_KEY[key]
     results = [result for result in analysis.results if len(result.samples[key])]
     samples = np.concatenate([result.samples[key] for result in results])
-    agents = [result.group.agent for result in results]
-    names = [chart.wrapped(agent, _NAME) for agent in chart.without_shared(agents)]
+    names = chart.short_names([result.group.agent for result in results], _NAME)
     title = f"{metric.title} on {analysis.task}"
-    each = max(34.0, 12 + LINE * max(map(chart.line_count, names)))  # points, of a row
-    figure, axes = chart.new_figure(title[0].upper() + title[1:], each * len(results), "x")
-    chart.rows_on(axes, names)
-    low, high = end = _strip_bounds(samples[np.abs(samples) < INFINITE], key)
+    figure, axes, each = chart.figure_of_rows(title[0].upper() + title[1:], names, 34.0)
+    low, high = end = _bounds(samples, key in ("regret", "steps"))
     far = high + 0.1 * (high - low)
     if not np.isfinite(samples).all():  # it has a place of its own at the end
         end = low, far
@@ -228,16 +221,6 @@ def _strip(analysis: TaskAnalysis, key: str, styles: Styles, more: str) -> Chart
     return Chart(f"{analysis.task} {metric.title}", title, description, figure)
 
 
-def _strip_bounds(numbers: FloatArray, key: str) -> Bounds:
-    if not len(numbers):
-        return 0.0, 1.0
-    low, high = float(numbers.min()), float(numbers.max())
-    if key in ("regret", "steps"):
-        low = 0.0
-    margin = 0.04 * (high - low) or 0.05 * abs(high) or 0.1
-    return (low if low == 0 else low - margin), high + margin
-
-
 def _draw_interval(
     axes: Axes,
     row: float,
@@ -254,10 +237,7 @@ def _draw_interval(
 
 
 def overall_charts(overall: Overall, styles: Styles) -> Iterator[Chart]:
-    """A profile for each agent, and for each metric the pairs of agents, unless all of them are even.
-
-    They are as rliable has them.
-    """
+    """As rliable has them: a profile for each agent, and for each metric the pairs, unless all are even."""
     ranked = sorted(overall.profiles, key=lambda agent: -overall.optimality[agent][1].point)
     shown = ranked[:_MOST_DRAWN]
     most = f"; the {len(shown)} best of {len(ranked)}" if len(ranked) > len(shown) else ""
@@ -286,14 +266,11 @@ def overall_charts(overall: Overall, styles: Styles) -> Iterator[Chart]:
 @house_style()
 def _improvements(metric: str, pairs: Sequence[Comparison], styles: Styles) -> Chart:
     agents = sorted({agent for each in pairs for agent in (each.agent, each.other)})
-    names = [chart.wrapped(agent, _NAME) for agent in chart.without_shared(agents)]
-    short = dict(zip(agents, names, strict=True))
-    between = " >\n" if 2 * max(map(len, names)) + 3 > _NAME else " > "
+    short = dict(zip(agents, chart.short_names(agents, _NAME), strict=True))
+    between = " >\n" if 2 * max(map(len, short.values())) + 3 > _NAME else " > "
     rows = [f"{short[each.agent]}{between}{short[each.other]}" for each in pairs]
     title = f"Improvement in {metric}"
-    height = max(26.0, 8 + LINE * max(map(chart.line_count, rows))) * len(pairs)
-    figure, axes = chart.new_figure(title, height, "x")
-    chart.rows_on(axes, rows)
+    figure, axes, _ = chart.figure_of_rows(title, rows, 26.0)
     axes.set(xlim=(0.0, 1.0), xlabel="probability that the first is better")
     axes.axvline(0.5, color=MUTED, linewidth=1, linestyle=(0, (3, 3)), clip_on=False)
     for row, pair in enumerate(pairs):

@@ -1,26 +1,41 @@
-"""Metrics, curves and comparisons of every agent on every task."""
+"""Metrics, curves and comparisons of every agent on every task: all that a report shows of its runs."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import combinations
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
+import gridworld
 from gridworld.config.train import check_bounds
 from gridworld.config.worlds import schema_of
+from gridworld.errors import InputError
 from gridworld.report import statistics
-from gridworld.report.evidence import ONLINE, SAMPLED_RETURN, Evidence, reported
-from gridworld.report.grouping import Group, Study
+from gridworld.report.evidence import (
+    DAMAGED,
+    ONLINE,
+    SAMPLED_RETURN,
+    Evidence,
+    Unusable,
+    find_runs,
+    read,
+    reported,
+)
+from gridworld.report.grouping import Group, Study, arrange
 from gridworld.report.statistics import Interval, Share
+from gridworld.report.tuning_study import TuningStudy, find_tunings
 from gridworld.run.reader import read_run, stored_world
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray
 
 GRID_POINTS = 101  # from step 0 to the end of the task's longest run
+MOST_SHOWN = 20  # sentences on standard error; the page has them all
 _MOST_CELLS = 100_000  # beyond, solving the world again would take longer than the report
 _TOLERANCE = 1e-6  # relative
 _SLOWER = 10  # times, from which on the steps of a task's agents need a logarithmic axis
@@ -43,7 +58,7 @@ def reference(run: Evidence) -> Reference:
     """Solve the run's world again, from its manifest. Nothing is raised: `problem` says what is wrong."""
     try:
         schema = schema_of(run.world)
-        known = {field.name for field in dataclasses.fields(schema)}
+        known = {each.name for each in dataclasses.fields(schema)}
         if unknown := sorted(run.world.keys() - known):
             raise ValueError(f"env.{unknown[0]} is not known to this version")
         lines = run.layout.split("\n")
@@ -104,17 +119,25 @@ def _last(column: str) -> Callable[[Evidence, Reference], float]:
     return lambda run, _: float(run.curve[column][-1]) if column in run.curve else math.nan
 
 
-_CERTIFICATE = "steps to the first certificate"
-_ONLINE = "on-line return"
 METRICS = (
     RunMetric("regret", "final regret", lambda run, _: run.regret, ("iqm", "median", "mean"), -1, True),
-    RunMetric("steps", _CERTIFICATE, lambda run, _: run.first_certified_step, ("iqm", "median"), -1, True),
+    RunMetric(
+        "steps",
+        "steps to the first certificate",
+        lambda run, _: run.first_certified_step,
+        ("iqm", "median"),
+        better=-1,
+        compared=True,
+    ),
     RunMetric("optimality", "optimality", _optimality, ("iqm", "mean")),
     *(RunMetric(metric.name, metric.label, _last(metric.name)) for metric in reported()),
     RunMetric("sampled_return", "sampled policy's return", _last(SAMPLED_RETURN)),
-    RunMetric("online_return", f"{_ONLINE}, all of training", lambda run, _: online_return(run)),
+    RunMetric("online_return", "on-line return, all of training", lambda run, _: online_return(run)),
     RunMetric(
-        "online_return_end", f"{_ONLINE}, last tenth", lambda run, _: online_return(run, 0.1), compared=True
+        "online_return_end",
+        "on-line return, last tenth",
+        lambda run, _: online_return(run, 0.1),
+        compared=True,
     ),
 )
 BY_KEY = {metric.key: metric for metric in METRICS}
@@ -132,11 +155,8 @@ class Band:
     whole_until: int  # environment steps that all runs reach; later, ended runs keep their last value
 
 
-def grid_for(runs: Sequence[Evidence], logarithmic: bool = False) -> FloatArray:
-    """The steps (points,) of all of a task's curves, from 0 to the end of the longest run, evenly spread.
-
-    Where asked for, they are spread on a logarithmic axis too.
-    """
+def grid_for(runs: Sequence[Evidence], logarithmic: bool) -> FloatArray:
+    """The steps (points,) of all of a task's curves, spread evenly, and on a logarithmic axis where asked."""
     end = max(run.steps for run in runs)
     points = np.linspace(0, end, GRID_POINTS)
     first = min((run.curve["step"][1] for run in runs if run.steps > 0), default=0.0)
@@ -158,26 +178,19 @@ def band(runs: Sequence[Evidence], column: str, grid: FloatArray, seed: int) -> 
 
     It goes from the first step at which every run has a value to the end of the last run.
     """
-    grid, whole_until = _until_the_end(runs, grid)
     values = np.stack([on_grid(run, column, grid) for run in runs], axis=-1)
     is_whole = ~np.isnan(values).any(axis=-1)
     grid, values = grid[is_whole], values[is_whole]
     point, low, high = statistics.bands(statistics.iqm, [values], seed)
-    return Band(grid, point, values.mean(axis=-1), low, high, whole_until)
+    return Band(grid, point, values.mean(axis=-1), low, high, min(run.steps for run in runs))
 
 
 def certificates(runs: Sequence[Evidence], grid: FloatArray) -> Band:
     """The share of runs that are certified at each step of the grid, with Wilson's 95 % interval."""
-    grid, whole_until = _until_the_end(runs, grid)
     counts = np.sum([on_grid(run, "certified", grid) for run in runs], axis=0)
     shares = [statistics.share(int(count), len(runs)) for count in counts]
     low, high = np.array([s.low for s in shares]), np.array([s.high for s in shares])
-    return Band(grid, counts / len(runs), counts / len(runs), low, high, whole_until)
-
-
-def _until_the_end(runs: Sequence[Evidence], grid: FloatArray) -> tuple[FloatArray, int]:
-    ends = [run.steps for run in runs]
-    return np.union1d(grid[grid <= max(ends)], [float(max(ends))]), min(ends)
+    return Band(grid, counts / len(runs), counts / len(runs), low, high, min(run.steps for run in runs))
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,16 +256,80 @@ class Overall:
     profiles: Mapping[str, tuple[FloatArray, ...]]  # by agent: share of runs above each level, low and high
 
 
-def analyse(
-    study: Study, seed: int = 0, log_steps: bool = False
-) -> tuple[tuple[TaskAnalysis, ...], Overall | None]:
-    """Compute all that the report shows: of each task, and over tasks where an agent was run on two.
+class NothingFinishedError(InputError):
+    """No run can be used, and none is damaged: they are not finished."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why one run is not certified, in about four words, and the word for the command line to try, if any."""
+
+    cause: str
+    change: str = ""
+
+
+Reasons = Mapping[Path, Reason]  # by the run's folder
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """Runs, their analysis, and what should be looked into."""
+
+    study: Study
+    tasks: tuple[TaskAnalysis, ...]
+    overall: Overall | None
+    unusable: tuple[Unusable, ...]
+    problems: tuple[str, ...]  # with the paths that were given
+    notes: tuple[str, ...]
+    seed: int  # of the bootstrap
+    tunings: tuple[TuningStudy, ...] = ()
+    reasons: Reasons = field(default_factory=dict)  # of runs that are not certified
+
+    @property
+    def damage(self) -> list[str]:
+        """A sentence for each damaged file of the runs."""
+        counted = [sentence for group in self.study.groups for run in group.runs for sentence in run.damage]
+        return [*counted, *(each for run in self.unusable if run.state == DAMAGED for each in run.reasons)]
+
+    def sentences(self) -> list[str]:
+        """What somebody should look into."""
+        unfinished = [each for run in self.unusable if run.state != DAMAGED for each in run.reasons]
+        return [*self.problems, *self.damage, *unfinished, *self.study.warnings]
+
+
+def gather(paths: Sequence[Path], seed: int = 0, log_steps: bool = False) -> Report:
+    """Read and analyse all runs and tuning studies below the paths.
 
     `seed` is of the bootstrap. With `log_steps`, all curves are against the logarithm of the steps; those
     of a task on which one agent is ten times slower than another always are.
+    Raises `InputError` where no run can be used.
     """
+    folders, problems = find_runs(paths)
+    outcomes = [read(folder) for folder in folders]
+    runs = [outcome for outcome in outcomes if isinstance(outcome, Evidence)]
+    unusable = tuple(outcome for outcome in outcomes if isinstance(outcome, Unusable))
+    if not runs:
+        sentences = [*problems, *(reason for run in unusable for reason in run.reasons)]
+        more = f"; and {len(sentences) - MOST_SHOWN} more" if len(sentences) > MOST_SHOWN else ""
+        is_damage = any(run.state == DAMAGED for run in unusable)
+        kind = NothingFinishedError if unusable and not is_damage else InputError
+        raise kind(f"nothing to report: {'; '.join(sentences[:MOST_SHOWN])}{more}")
+    study = arrange(runs)
     tasks = tuple(_task(task, study.on(task), seed, log_steps) for task in study.tasks)
-    return tasks, _overall(tasks, seed)
+    problems += [f"{task.task}: {task.world.problem}" for task in tasks if task.world.problem]
+    tunings, unread = find_tunings(paths)
+    problems += unread
+    versions: dict[str, list[Path]] = defaultdict(list)
+    for run in runs:
+        versions[run.version].append(run.folder)
+    notes = [
+        f"{len(found)} {'runs were' if len(found) > 1 else 'run was'} written by gridworld {version}, "
+        f"this is {gridworld.__version__}: {found[0]}{' and others' if len(found) > 1 else ''}."
+        for version, found in sorted(versions.items())
+        if version != gridworld.__version__
+    ]
+    overall = _overall(tasks, seed)
+    return Report(study, tasks, overall, unusable, tuple(problems), tuple(notes), seed, tuple(tunings))
 
 
 def _task(task: str, groups: list[Group], seed: int, log_steps: bool) -> TaskAnalysis:
@@ -271,6 +348,8 @@ def _task(task: str, groups: list[Group], seed: int, log_steps: bool) -> TaskAna
 
 def _result(group: Group, world: Reference, grid: FloatArray, seed: int) -> Result:
     runs, samples, estimates = group.runs, {}, {}
+    end = float(max(run.steps for run in runs))
+    grid = np.union1d(grid[grid <= end], [end])
     for metric in METRICS:
         values = np.array([metric.of(run, world) for run in runs])
         samples[metric.key] = values = values[~np.isnan(values)]
@@ -294,13 +373,12 @@ def compare(
 ) -> tuple[Comparison, ...]:
     """Compare every agent with every other on the tasks that both were run on, `least` or more.
 
-    `tasks` has samples (runs,) by agent and metric for each task. Each pair is there twice, seen from either
-    side, for each metric that is compared.
+    `tasks` has samples (runs,) by agent and metric for each task. Each pair is there from either side.
     """
     agents = sorted({agent for task in tasks for agent in task})
     out = []
     for metric in METRICS:
-        for one, other in combinations(agents, 2) if metric.compared else ():
+        for one, other in itertools.combinations(agents, 2) if metric.compared else ():
             pairs = [
                 (metric.better * task[one][metric.key], metric.better * task[other][metric.key])
                 for task in tasks
@@ -333,3 +411,23 @@ def _overall(tasks: Sequence[TaskAnalysis], seed: int) -> Overall | None:
     levels = np.linspace(min(0.0, max(-1.0, lowest)), 1.0, _LEVELS)
     profiles = {agent: statistics.profile(each, levels, seed) for agent, each in strata.items()}
     return Overall(len(tasks), optimality, compare(samples, seed, least=2), levels, profiles)
+
+
+def reasons(
+    groups: Iterable[Group], ask: Callable[[Path], Reason | None], most: int
+) -> tuple[Reasons, list[str]]:
+    """Ask why runs are not certified, the first seed of each group before the second of any.
+
+    `ask` gives the reason of the run in a folder, None where it does not know; `most` is how many runs to ask
+    about. Returns the reasons, and a sentence for each run of which a file is damaged.
+    """
+    found, problems = {}, []
+    columns = ([run for run in group.runs if not run.certified] for group in groups)
+    in_turn = (run for row in itertools.zip_longest(*columns) for run in row if run is not None)
+    for run in itertools.islice(in_turn, most):
+        try:
+            if (reason := ask(run.folder)) is not None:
+                found[run.folder] = reason
+        except InputError as error:
+            problems.append(f"{run.folder}: is not diagnosed; {error}")
+    return found, problems

@@ -7,6 +7,7 @@ of colour vision can distinguish; from the eighth agent on, lines are dashed.
 from __future__ import annotations
 
 import io
+import itertools
 import textwrap
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from cycler import cycler
 from matplotlib import style
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -23,11 +25,11 @@ from matplotlib.patheffects import Normal
 from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
 
-from gridworld.process.console.terminal import plain
+from gridworld.process.console import plain
 
 INK, MUTED, GRID, PAPER = "#1c2430", "#5d6878", "#e3e7ed", "#ffffff"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#b8578f", "#c98500", "#3a9bd9", "#4a4f57")  # of agents
-_DASHES = ((), (6.0, 3.0), (2.0, 2.5))
+_DASHES = ("solid", (0, (6.0, 3.0)), (0, (2.0, 2.5)))
 
 WIDTH = 440.0  # points, of a figure; pixels in the page
 WIDE = 960.0
@@ -45,10 +47,11 @@ _RC = {
     "text.parse_math": False,  # names may be anybody's: no formulas
     "text.color": INK,
     **{f"axes.spines.{side}": False for side in ("left", "right", "top", "bottom")},
-    **{f"{axis}tick.color": MUTED for axis in "xy"},
-    **{f"{axis}tick.major.size": 0.0 for axis in "xy"},
-    **{f"{axis}tick.major.pad": 6.0 for axis in "xy"},
-    **{f"{axis}tick.labelsize": SMALL for axis in "xy"},
+    **{
+        f"{axis}tick.{name}": value
+        for name, value in {"color": MUTED, "major.size": 0.0, "major.pad": 6.0, "labelsize": SMALL}.items()
+        for axis in "xy"
+    },
     "axes.axisbelow": True,
     "axes.labelcolor": MUTED,
     "axes.labelsize": SMALL,
@@ -73,10 +76,7 @@ _CHANGING = {"svg": "Date", "pdf": "CreationDate", "png": "Software"}  # entries
 
 @contextmanager
 def house_style(salt: str = "") -> Iterator[None]:
-    """Draw and save in the report's style, whatever the user's matplotlib is set to.
-
-    `salt` makes the ids in a figure's SVG reproducible.
-    """
+    """The report's style, whatever the user's matplotlib is set to; `salt` makes ids in SVG reproducible."""
     with warnings.catch_warnings(), style.context(["default", _RC | {"svg.hashsalt": salt}]):
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
         warnings.filterwarnings("ignore", "constrained_layout not applied", UserWarning)
@@ -88,12 +88,7 @@ Styles = Mapping[str, dict[str, Any]]  # by agent: arguments of matplotlib's lin
 
 def styles(agents: Sequence[str]) -> Styles:
     """How each agent is drawn in all figures."""
-    count = len(COLOURS)
-    dashes = [_DASHES[index // count % len(_DASHES)] for index in range(len(agents))]
-    return {
-        agent: {"color": COLOURS[index % count], "linestyle": (0, dash) if dash else "solid"}
-        for index, (agent, dash) in enumerate(zip(agents, dashes, strict=True))
-    }
+    return dict(zip(agents, itertools.cycle(cycler(linestyle=_DASHES) * cycler(color=COLOURS)), strict=False))
 
 
 @dataclass(frozen=True)
@@ -147,7 +142,7 @@ def new_figure(
     `grid` is the axis with lines across at its numbers, `legend` has handles with names of a line or more.
     """
     names = [name for _, name in legend]
-    columns, lines = 1, sum(map(line_count, names))
+    columns, lines = 1, sum(name.count("\n") + 1 for name in names)
     if names and lines == len(names):
         fits = sum(len(name) + _HANDLE for name in names) <= _LEGEND
         columns = len(names) if fits else max(1, _LEGEND // (max(map(len, names)) + _HANDLE))
@@ -173,11 +168,16 @@ def new_figure(
     return figure, axes
 
 
-def rows_on(axes: Axes, names: Sequence[str]) -> None:
-    """Give the vertical axis a row for each name, from the top."""
+def figure_of_rows(
+    heading: str, names: Sequence[str], least: float, grid: Literal["x", None] = "x"
+) -> tuple[Figure, Axes, float]:
+    """A figure with a row for each name, from the top; also returns how high one is, in points."""
+    each = least + LINE * max(name.count("\n") for name in names)
+    figure, axes = new_figure(heading, each * len(names), grid)
     axes.set(ylim=(len(names) - 0.5, -0.5), yticks=range(len(names)))
     axes.set_yticklabels(names, size=LABEL, color=INK)
     axes.tick_params(axis="y", pad=10)
+    return figure, axes, each
 
 
 def compact(number: float, _position: float = 0) -> str:
@@ -208,16 +208,12 @@ def wrapped(text: str, most: int) -> str:
     return "\n".join(lines)
 
 
-def line_count(text: str) -> int:
-    """How many lines a text has."""
-    return text.count("\n") + 1
-
-
-def without_shared(names: Sequence[str]) -> list[str]:
-    """The labels of one agent's configurations without its name: "ppo (n_steps=8)" as n_steps=8."""
+def short_names(names: Sequence[str], most: int) -> list[str]:
+    """Labels in lines of `most` characters; of one agent's configurations without its name."""
     parts = [name.removesuffix(")").partition(" (") for name in names]
     is_one_agent = len(names) > 1 and len({head for head, _, _ in parts}) == 1
-    return [tail for _, _, tail in parts] if is_one_agent and all(map(all, parts)) else list(names)
+    shown = [tail for _, _, tail in parts] if is_one_agent and all(map(all, parts)) else names
+    return [wrapped(name, most) for name in shown]
 
 
 def seed_counts(counts: Sequence[int]) -> str:

@@ -21,7 +21,7 @@ import numpy as np
 
 from gridworld.config.settings import NEWER, flat, privileges
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import printable
 from gridworld.run.folder import CURVE, MANIFEST, SUMMARY, VISITS
 from gridworld.run.reader import RunReader, read_run
 from gridworld.storage.safe_read import LARGEST_CSV, as_table
@@ -144,19 +144,19 @@ def read(folder: Path) -> Evidence | Unusable:
         run = read_run(folder)
     except InputError as error:
         return Unusable(folder, (str(error),))
-    config = run.manifest["config"]
-    world = next(filter(None, (_name_in(config.get("env"), key) for key in ("layout", "id", "source"))), None)
-    unusable = Unusable(folder, (), agent=_name_in(config.get("agent"), "name"), env=world)
+    sections = (run.manifest["config"].get(key) for key in ("agent", "env"))
+    agent, env = (section if isinstance(section, dict) else {} for section in sections)
+    names = (agent.get("name"), env.get("layout") or env.get("id") or env.get("source"))
+    named = (_printable(name) if isinstance(name, str) else None for name in names)
+    unusable = Unusable(folder, (), DAMAGED, *named)
     if not run.is_finished:
         status, cause = run.manifest["status"][:_LONGEST_NAME], run.manifest.get("error")
         why = f": {' '.join(cause.split())[:300]}" if cause else ""
         why = ": it is still running, or was killed" if status == "running" else why
         told = f"{folder}: this run is {status!r}, not finished{why}"
         with contextlib.suppress(InputError):
-            steps = int(_read_curve(run)["step"][-1])
-            told += (
-                f" (last evaluated after {steps:,} steps, says {CURVE}, which is not verified before the end)"
-            )
+            steps = f"{_read_curve(run)['step'][-1]:,.0f} steps"
+            told += f" (last evaluated after {steps}, says {CURVE}, which is not verified before the end)"
         return dataclasses.replace(unusable, reasons=(told,), state=_printable(status))
     damaged = run.damage()
     try:
@@ -178,7 +178,12 @@ def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
         agent=_entry(config.get("agent"), "name", str, f"{where}.agent"),
         env=_entry(summary, "env", str, of_summary),
         seed=_entry(config, "seed", int, where),
-        settings=dict(_settings(config)),
+        # Dotted names, and values as JSON.
+        settings={
+            printable(key): printable(value if isinstance(value, str) else json.dumps(value, sort_keys=True))
+            for key, value in flat(config)
+            if value or key not in NEWER
+        },
         world=config["env"],
         layout="\n".join(manifest["layout"]),
         gamma=_entry(config.get("evaluation"), "gamma", float, f"{where}.evaluation"),
@@ -194,14 +199,6 @@ def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
     )
 
 
-def _settings(config: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Dotted names, and values as JSON."""
-    for key, value in flat(config):
-        if value or key not in NEWER:
-            text = value if isinstance(value, str) else json.dumps(value, sort_keys=True)
-            yield printable(key), printable(text)
-
-
 def _entry(content: Any, key: str, kind: type, where: str) -> Any:
     """A checked entry of a file; a name is made printable."""
     value: Any = content.get(key) if isinstance(content, dict) else None
@@ -213,11 +210,6 @@ def _entry(content: Any, key: str, kind: type, where: str) -> Any:
 
 def _printable(text: str) -> str:
     return "".join(sign if sign.isprintable() else "?" for sign in text)[:_LONGEST_NAME]
-
-
-def _name_in(content: Any, key: str) -> str | None:
-    value = content.get(key) if isinstance(content, dict) else None
-    return _printable(value) if isinstance(value, str) else None
 
 
 def reported() -> list[Metric]:
@@ -237,12 +229,8 @@ def _read_curve(run: RunReader) -> dict[str, FloatArray]:
 def read_columns(run: RunReader, wanted: Sequence[str] | None = None) -> dict[str, FloatArray]:
     """Read columns (evaluations,) of the learning curve as the run wrote them, NaN where a field is empty.
 
-    Args:
-        run: the run.
-        wanted: names of columns, which the file need not have; None: all that it has.
-
-    Raises:
-        InputError: the file is missing, too large, cut off, or holds what no run writes.
+    `wanted` are names of columns, which the file need not have; None: all that it has. Raises `InputError`
+    where the file is missing, too large, cut off, or holds what no run writes.
     """
     path = run.curve_file
     lines = as_table(run.read(path, LARGEST_CSV), path).splitlines()

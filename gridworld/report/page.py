@@ -16,11 +16,10 @@ from markupsafe import Markup, escape
 from PIL import Image
 
 from gridworld.config.pictures import PICTURES
-from gridworld.process.console.terminal import plain
-from gridworld.report import table, tables
+from gridworld.process.console import plain
+from gridworld.report import tables
 from gridworld.report.agent_charts import overall_charts, task_charts
-from gridworld.report.analysis import Result, TaskAnalysis
-from gridworld.report.build import Report
+from gridworld.report.analysis import Report, Result, TaskAnalysis
 from gridworld.report.chart import COLOURS, Chart, Styles, styles
 from gridworld.report.setting_charts import tuning_charts
 from gridworld.report.statistics import RESAMPLES, Share
@@ -99,20 +98,15 @@ def render(report: Report, drawn: dict[str, list[Chart]]) -> str:
         most_named=_MOST_NAMED,
         colours={agent: look["color"] for agent, look in _look(report).items()},
         tables=tables,
-        cells=table,
         is_finite=math.isfinite,
         is_share=lambda cell: isinstance(cell, Share),
         world=_world,
         galleries=lambda task: list(filter(None, map(_gallery, task.ranked))),
         plain=plain,
         svg=lambda chart: f"data:image/svg+xml;base64,{base64.b64encode(chart.saved_as('svg')).decode()}",
-        breakable=_breakable,
+        # A column's heading may break after "_" and "=", as labels are long.
+        breakable=lambda heading: Markup(re.sub(r"(?<=[_=])", "<wbr>", str(escape(heading)))),
     )
-
-
-def _breakable(heading: str) -> Markup:
-    """A column's heading with line breaks allowed after "_" and "=", as labels are long."""
-    return Markup(re.sub(r"(?<=[_=])", "<wbr>", str(escape(heading))))
 
 
 def _world(task: TaskAnalysis) -> str:
@@ -141,7 +135,7 @@ def _gallery(result: Result) -> list[_Picture]:
     """The pictures of the run with the median regret that are there, unchanged and not too large."""
     ranked = sorted(result.group.runs, key=lambda run: (run.regret, run.seed))
     run = ranked[(len(ranked) - 1) // 2]
-    verdict = "certified optimal" if run.certified else f"regret {table.number(run.regret)}"
+    verdict = "certified optimal" if run.certified else f"regret {tables.number(run.regret)}"
     pictures = []
     for picture in PICTURES:
         if picture.caption is not None and picture.file in run.pictures:

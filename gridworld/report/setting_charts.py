@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ from gridworld.report.analysis import Result
 from gridworld.report.chart import COLOURS, INK, MUTED, PAPER, SMALL, WIDE, Chart, clipped, house_style
 from gridworld.report.grouping import differing, learning_key
 from gridworld.report.statistics import Interval
-from gridworld.report.table import number, steps_up_to
+from gridworld.report.tables import number, steps_up_to
 from gridworld.report.tuning_study import TrialRow, TuningStudy
 from gridworld.world.mdp import FloatArray
 
@@ -32,8 +32,7 @@ _LINE = 64  # characters of tick labels next to each other
 _NEVER = "#c6c6c6"  # of cells without a finite value: no colour of the ramp
 _RAMP = LinearSegmentedColormap.from_list("share", ["#eaf2f8", "#7fb8dc", "#0a5a8c"])
 _HIGHEST = 1e200  # score that is drawn as it is; its inverse is the lowest
-_BEST = 0.1  # of the trials stand out in parallel coordinates
-_DONE, _PRUNED, _WINNER = COLOURS[0], MUTED, COLOURS[1]
+_DONE, _WINNER = COLOURS[0], COLOURS[1]
 
 _Marks = list[tuple[str, float]]  # texts at an axis, and where, from 0 to 1
 
@@ -75,51 +74,26 @@ def _order(value: str) -> tuple[bool, float, str]:
         return True, 0.0, value
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """What a figure of a sweep shows of a result."""
-
-    name: str
-    title: str
-    statistic: str
-    of: Callable[[Result], Interval]
-    text: Callable[[Result], str]  # in a heatmap's cell
-    better: int  # 1 where more is better
-    form: Callable[..., str] = chart.compact
-
-
-def _share(result: Result) -> Interval:
-    share = result.certified
-    return Interval(share.count / share.total, share.low, share.high)
-
-
-_SHOWN = (
-    _Shown(
-        "certified",
-        "seeds certified",
-        "share of seeds certified at the end",
-        _share,
-        lambda result: f"{result.certified.count}/{result.certified.total}",
-        1,
-        chart.percent,
-    ),
-    _Shown(
-        "steps",
+_SHOWN = {  # title of a metric, and the statistic that the figures of a sweep show
+    "certified": ("seeds certified", "share of seeds certified at the end"),
+    "steps": (
         "steps to certificate",
         "steps to the first certificate, median over seeds; none where half of them have no certificate",
-        lambda result: result.estimates["steps", "median"],
-        lambda result: steps_up_to(result.shortest_uncertified)(result.estimates["steps", "median"].point),
-        -1,
     ),
-    _Shown(
-        "regret",
-        "final regret",
-        "interquartile mean (IQM) over seeds",
-        lambda result: result.estimates["regret", "iqm"],
-        lambda result: number(result.estimates["regret", "iqm"].point),
-        -1,
-    ),
-)
+    "regret": ("final regret", "interquartile mean (IQM) over seeds"),
+}
+
+
+def _of(result: Result, name: str) -> tuple[Interval, str]:
+    """What is shown of a result, and its text in a heatmap's cell."""
+    if name == "certified":
+        share = result.certified
+        return Interval(share.count / share.total, share.low, share.high), f"{share.count}/{share.total}"
+    if name == "steps":
+        steps = result.estimates["steps", "median"]
+        return steps, steps_up_to(result.shortest_uncertified)(steps.point)
+    regret = result.estimates["regret", "iqm"]
+    return regret, number(regret.point)
 
 
 def sweep_charts(sweep: Sweep, task: str) -> Iterator[Chart]:
@@ -129,25 +103,25 @@ def sweep_charts(sweep: Sweep, task: str) -> Iterator[Chart]:
     keys = " and ".join(map(_short, sweep.keys))
     seeds = chart.seed_counts([len(result.group.runs) for result in sweep.results.values()])
     draw = _line if len(sweep.keys) == 1 else _heatmap
-    for shown in _SHOWN:
-        points = np.array([shown.of(result).point for result in sweep.results.values()])
+    for metric, (title, statistic) in _SHOWN.items():
+        points = np.array([_of(result, metric)[0].point for result in sweep.results.values()])
         if np.isfinite(points).any() and points.any():
-            title = f"{shown.title[0].upper()}{shown.title[1:]} by {keys}"
-            description = f"{shown.statistic}; {sweep.agent} on {task}, {seeds} each"
-            yield draw(sweep, shown, f"{task} {sweep.agent} {shown.name} by {keys}", title, description)
+            heading = f"{title[0].upper()}{title[1:]} by {keys}"
+            description = f"{statistic}; {sweep.agent} on {task}, {seeds} each"
+            yield draw(sweep, metric, f"{task} {sweep.agent} {metric} by {keys}", heading, description)
 
 
 @house_style()
-def _line(sweep: Sweep, shown: _Shown, name: str, title: str, description: str) -> Chart:
+def _line(sweep: Sweep, metric: str, name: str, title: str, description: str) -> Chart:
     (values,) = sweep.values
-    found = [shown.of(sweep.results[(value,)]) for value in values]
+    found = [_of(sweep.results[(value,)], metric)[0] for value in values]
     ends = np.array([(each.point, each.low, each.high) for each in found])
-    is_share = shown.form is chart.percent
+    is_share = metric == "certified"
     top = 1.0 if is_share else 1.06 * float(ends[np.isfinite(ends)].max()) or 1.0
     points, low, high = np.where(np.isfinite(ends[:, :1]), np.minimum(ends, top), np.nan).T
     figure, axes = chart.new_figure(title, _HEIGHT, "y")
-    axes.yaxis.set_major_formatter(shown.form)
-    axes.set(ylim=(0.0, top), ylabel=shown.title, xlabel=_short(sweep.keys[0]))
+    axes.yaxis.set_major_formatter(chart.percent if is_share else chart.compact)
+    axes.set(ylim=(0.0, top), ylabel=_SHOWN[metric][0], xlabel=_short(sweep.keys[0]))
     axes.set(xlim=(-0.4, len(values) - 0.6), xticks=range(len(values)))
     axes.set_xticklabels([clipped(value, max(4, _LINE // len(values))) for value in values])
     axes.plot(points, "o-", color=_DONE, linewidth=2.2, markersize=7, clip_on=False)
@@ -159,16 +133,17 @@ def _line(sweep: Sweep, shown: _Shown, name: str, title: str, description: str) 
 
 
 @house_style()
-def _heatmap(sweep: Sweep, shown: _Shown, name: str, title: str, description: str) -> Chart:
+def _heatmap(sweep: Sweep, metric: str, name: str, title: str, description: str) -> Chart:
     rows, columns = sweep.values
+    is_share = metric == "certified"  # of which more is better
     levels = np.full((len(rows), len(columns)), np.nan)
     texts = {}
     for (row, column), result in sweep.results.items():
-        at, point = (rows.index(row), columns.index(column)), shown.of(result).point
-        levels[at] = shown.better * point if math.isfinite(point) else -math.inf
-        texts[at] = shown.text(result)
+        at, (interval, text) = (rows.index(row), columns.index(column)), _of(result, metric)
+        level = interval.point if is_share else -interval.point
+        levels[at], texts[at] = (level if math.isfinite(level) else -math.inf), text
     finite = levels[np.isfinite(levels)]
-    low, high = (0.0, 1.0) if shown.form is chart.percent else (float(finite.min()), float(finite.max()))
+    low, high = (0.0, 1.0) if is_share else (float(finite.min()), float(finite.max()))
     high = high if high > low else low + 1
     figure, axes = chart.new_figure(title, 34 * len(rows))
     colours, levels = _RAMP.with_extremes(bad=(0, 0, 0, 0), under=_NEVER), np.maximum(levels, low - 1)
@@ -217,7 +192,7 @@ def _history(tuning: TuningStudy) -> Chart:
     dots: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 6, "clip_on": False}
     looks = {
         "done": {"color": _DONE, "alpha": 0.75, **dots},
-        "pruned, score at that time": {"color": _PRUNED, "alpha": 0.45, **dots},
+        "pruned, score at that time": {"color": MUTED, "alpha": 0.45, **dots},
     }
     best: dict[str, Any] = {"color": _WINNER, "linewidth": 2.2, "clip_on": False}
     legend = [(Line2D([], [], **look), name) for name, look in looks.items()]
@@ -225,7 +200,7 @@ def _history(tuning: TuningStudy) -> Chart:
     figure, axes = chart.new_figure("Score by trial", _HEIGHT, "y", legend)
     end = max(1.0, numbers.max())
     axes.set(yscale="log", ylim=(low, high), ylabel="score, logarithmic", xlim=(0, end), xlabel="trial")
-    axes.set_yticks(marks, list(map(_power, marks)))
+    axes.set_yticks(marks, [f"{mark:.3g}" for mark in marks])
     axes.yaxis.set_minor_locator(NullLocator())
     for chosen, look in zip((done, ~done), looks.values(), strict=True):
         axes.plot(numbers[chosen], scores[chosen], **look)
@@ -244,8 +219,8 @@ def _history(tuning: TuningStudy) -> Chart:
 def _importances(tuning: TuningStudy) -> Chart:
     ranked = sorted(tuning.importances.items(), key=lambda item: -item[1])
     shares = np.nan_to_num([share for _, share in ranked]).clip(0, 1)
-    figure, axes = chart.new_figure("Importance of each key", 26.0 * len(ranked))
-    chart.rows_on(axes, [clipped(_short(key), 25) for key, _ in ranked])
+    names = [clipped(_short(key), 25) for key, _ in ranked]
+    figure, axes, _ = chart.figure_of_rows("Importance of each key", names, 26.0, None)
     axes.set(xlim=(0, max(0.01, shares.max())), xticks=[], xlabel="share of the score's variance")
     bars = axes.barh(range(len(ranked)), shares, height=0.46, color=_DONE, clip_on=False)
     axes.bar_label(bars, [f"{share:.2f}" for _, share in ranked], padding=6, size=SMALL, color=MUTED)
@@ -260,10 +235,10 @@ def _importances(tuning: TuningStudy) -> Chart:
 @house_style()
 def _parallel(tuning: TuningStudy, done: Sequence[TrialRow]) -> Chart:
     ranked = sorted(done, key=lambda trial: trial.score)
-    bold, keys = max(1, round(_BEST * len(ranked))), list(tuning.space)
+    bold, keys = max(1, round(0.1 * len(ranked))), list(tuning.space)
     scores, low, high, marks = _scale(ranked)
     heights = _on_axis(np.array([*marks, *scores]), low, high, is_log=True)
-    columns = [(heights[len(marks) :], list(zip(map(_power, marks), heights, strict=False)))]
+    columns = [(heights[len(marks) :], list(zip([f"{mark:.3g}" for mark in marks], heights, strict=False)))]
     columns += [_axis(tuning.space[key], [trial.values[key] for trial in ranked]) for key in keys]
     title = "What the best tenth of the finished trials chose, and the winner"
     figure, axes = chart.new_figure(title, 250, width=WIDE)
@@ -306,10 +281,6 @@ def _axis(dimension: Mapping[str, Any], texts: Sequence[str]) -> tuple[FloatArra
     low, high = dimension["low"], dimension["high"]
     numbers = np.array([float(text or low) for text in texts])
     return _on_axis(numbers, low, high, dimension["log"]), [(f"{low:g}", 0.0), (f"{high:g}", 1.0)]
-
-
-def _power(number: float) -> str:
-    return f"{number:.3g}"
 
 
 def _short(key: str) -> str:

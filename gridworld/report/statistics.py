@@ -138,7 +138,7 @@ def interval(statistic: Statistic, samples: Sequence[FloatArray], seed: int) -> 
 def profile(samples: Sequence[FloatArray], levels: FloatArray, seed: int) -> tuple[FloatArray, ...]:
     """A performance profile: the share of runs whose score is above each level, as the mean over tasks.
 
-    `samples` are an agent's scores on each task, (n,). The share has a pointwise 95 % interval, low and high,
+    `samples` are an agent's scores on each task, (n,). Returns the share and its pointwise 95 % interval,
     (points,) each (the score distribution of Agarwal et al. 2021, section 4.3).
     """
 

@@ -1,17 +1,37 @@
-"""The tables of a report."""
+"""The tables of a report, written as Markdown to be read and as CSV to be computed with.
+
+The page writes them as HTML.
+"""
 
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
-from gridworld.report.analysis import BY_KEY, METRICS, Comparison, Overall, Result, TaskAnalysis
-from gridworld.report.build import Reasons, Report
+from gridworld.process.console import plain
+from gridworld.report.analysis import (
+    BY_KEY,
+    METRICS,
+    Comparison,
+    Overall,
+    Reasons,
+    Report,
+    Result,
+    TaskAnalysis,
+)
 from gridworld.report.evidence import Unusable
-from gridworld.report.grouping import Group, Study, differing, learning_key
-from gridworld.report.table import NOTHING, Cell, Estimate, Table, number, steps_up_to
+from gridworld.report.grouping import Study, differing, learning_key
+from gridworld.report.statistics import Interval, Share
 from gridworld.report.tuning_study import TuningStudy
+from gridworld.storage.csv_text import csv_text
+
+NOTHING = "\N{EN DASH}"
+_MINUS = "\N{MINUS SIGN}"
+# Signs with which a name out of a run's folder could be HTML, a link, a row, or the end of a marked place.
+_MARKS = re.compile(r"""[\\|<>&`\[\]*!\n\r]|:(?=//)|(?<=www)\.""")
 
 _SCORES = tuple(metric.key for metric in METRICS if metric.key not in ("regret", "steps"))
 _HEADINGS = {
@@ -20,6 +40,131 @@ _HEADINGS = {
     ("steps", "iqm"): "steps to certificate, IQM",
     ("steps", "median"): "steps to certificate, median",
 }
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An interval with the way its numbers are written."""
+
+    interval: Interval
+    form: Callable[[float], str]
+
+
+Cell = str | float | int | None | Share | Estimate
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table whose texts are plain: control characters in names of strangers' runs are escaped."""
+
+    name: str  # of its files
+    caption: str
+    columns: Sequence[str]  # the headings
+    rows: Sequence[Sequence[Cell]]  # a cell for each column
+
+    def __post_init__(self) -> None:
+        rows = [[plain(cell) if isinstance(cell, str) else cell for cell in row] for row in self.rows]
+        object.__setattr__(self, "caption", plain(self.caption))
+        object.__setattr__(self, "columns", list(map(plain, self.columns)))
+        object.__setattr__(self, "rows", rows)
+
+
+def number(value: float) -> str:
+    """Write a number with four digits, an infinite one as ∞, NaN as a dash."""
+    if math.isnan(value):
+        return NOTHING
+    if math.isinf(value):
+        return "∞" if value > 0 else f"{_MINUS}∞"
+    if value == 0:
+        return "0"
+    text = f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}" if abs(value) >= 1e-4 else f"{value:.1e}"
+    return text.replace("-", _MINUS)
+
+
+def steps_up_to(bound: float) -> Callable[[float], str]:
+    """How to write a number of steps: an infinite one as more than `bound`, the steps that were given."""
+    return lambda value: f"> {bound:,.0f}" if math.isinf(value) else number(round(value))
+
+
+def main_text(cell: Cell) -> str:
+    """The cell without its interval."""
+    match cell:
+        case None:
+            return NOTHING
+        case str():
+            return cell
+        case Share(count, total, _, _):
+            return f"{count} / {total}"
+        case Estimate(interval, form):
+            return form(interval.point)
+        case int():
+            return f"{cell:,}"
+        case float():
+            return number(cell)
+
+
+def interval_text(cell: Cell) -> str:
+    """The interval of a cell, or nothing."""
+    match cell:
+        case Share(_, _, low, high):
+            return f"[{100 * low:.0f} %, {100 * high:.0f} %]"
+        case Estimate(interval, form) if not math.isnan(interval.low):
+            return f"[{form(interval.low)}, {form(interval.high)}]"
+        case _:
+            return ""
+
+
+def is_text(table: Table, column: int) -> bool:
+    """Whether a column holds words, which are aligned to the left; numbers are aligned to the right."""
+    return bool(table.rows) and all(isinstance(row[column], str) for row in table.rows)
+
+
+def to_captioned_markdown(table: Table) -> str:
+    """A Markdown pipe table below its caption."""
+    return f"{_markdown(table.caption)}\n\n{to_markdown(table)}"
+
+
+def to_markdown(table: Table) -> str:
+    """A Markdown pipe table; names in it are shown as they are."""
+    sides = ("---" if is_text(table, column) else "---:" for column in range(len(table.columns)))
+    rows: list[Iterable[str]] = [map(_markdown, table.columns), sides]
+    rows += [map(_markdown, row) for row in table.rows]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def _markdown(cell: Cell) -> str:
+    if isinstance(cell, str):  # it may be anybody's
+        return _MARKS.sub(lambda found: f"&#{ord(found[0])};", cell)
+    return f"{main_text(cell)} {interval_text(cell)}".strip()
+
+
+def to_csv(table: Table) -> str:
+    """A CSV of plain numbers; an interval takes three columns, a share four."""
+    suffixes = []  # of each column's headings
+    for index in range(len(table.columns)):
+        kinds = {type(row[index]) for row in table.rows}
+        parts = (" of", " low", " high") if Share in kinds else (" low", " high") if Estimate in kinds else ()
+        suffixes.append(("", *parts))
+    rows: list[list[object]] = [
+        [head + suffix for head, own in zip(table.columns, suffixes, strict=True) for suffix in own]
+    ]
+    for row in table.rows:
+        rows.append([])
+        for cell, own in zip(row, suffixes, strict=True):
+            match cell:
+                case Estimate(interval, _):
+                    rows[-1] += map(_digits, (interval.point, interval.low, interval.high))
+                case Share(count, total, low, high):
+                    rows[-1] += (count, total, _digits(low), _digits(high))
+                case None:
+                    rows[-1] += [""] * len(own)
+                case _:
+                    rows[-1].append(_digits(cell) if isinstance(cell, float) else cell)
+    return csv_text(rows)
+
+
+def _digits(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.10g}"
 
 
 def all_tables(report: Report) -> Iterator[Table]:
@@ -47,38 +192,29 @@ def all_tables(report: Report) -> Iterator[Table]:
 def results_table(tasks: Sequence[TaskAnalysis], reasons: Reasons) -> Table:
     """The main results on all tasks; also the table for a README. `reasons` are of runs not certified."""
     shown = [("regret", "iqm"), ("steps", "median")]
-    rows: list[list[Cell]] = [
-        [
-            task.task,
-            result.group.agent,
-            result.certified,
-            result.ever,
-            *(estimate(result, *which) for which in shown),
-            *([_most_common(result.group, reasons)] if reasons else []),
-        ]
-        for task in tasks
-        for result in task.results
-    ]
     columns = ["task", "agent", "seeds certified", "ever certified", *(_HEADINGS[which] for which in shown)]
     columns += ["why not"] if reasons else []
+    rows: list[list[Cell]] = []
+    for task, result in [(each, result) for each in tasks for result in each.results]:
+        estimates = [estimate(result, *which) for which in shown]
+        rows.append([task.task, result.group.agent, result.certified, result.ever, *estimates])
+        if reasons:  # the most common cause of those that are not certified
+            runs = result.group.runs
+            causes = Counter(reasons[run.folder].cause for run in runs if run.folder in reasons)
+            most = [f"{cause} ({count} of {causes.total()})" for cause, count in causes.most_common(1)]
+            rows[-1].append("".join(most))
     caption = "Certified seeds, exact regret and steps, with 95 % intervals"
-    results = [result for task in tasks for result in task.results]
-    return _with_privileges(results, Table("results", caption, columns, rows))
+    return _table_of([result for task in tasks for result in task.results], "results", caption, columns, rows)
 
 
-def _most_common(group: Group, reasons: Reasons) -> str:
-    """The most common cause of a group's runs that are not certified, with its count; "" without any."""
-    causes = Counter(reasons[run.folder].cause for run in group.runs if run.folder in reasons)
-    return "".join(f"{cause} ({count} of {causes.total()})" for cause, count in causes.most_common(1))
-
-
-def _with_privileges(results: Iterable[Result], table: Table) -> Table:
-    """The table, with a row for each result, and a column of their privileges where any has some."""
+def _table_of(
+    results: Sequence[Result], name: str, caption: str, columns: list[str], rows: list[list[Cell]]
+) -> Table:
+    """A table with a row for each result, and a column of their privileges where any has some."""
     privileges = [result.group.privileges for result in results]
-    if not any(privileges):
-        return table
-    rows = [[*row, each] for row, each in zip(table.rows, privileges, strict=True)]
-    return Table(table.name, table.caption, [*table.columns, "privileges"], rows)
+    if any(privileges):
+        columns, rows = [*columns, "privileges"], [[*row, privileges[at]] for at, row in enumerate(rows)]
+    return Table(name, caption, columns, rows)
 
 
 def task_table(task: TaskAnalysis) -> Table:
@@ -88,7 +224,7 @@ def task_table(task: TaskAnalysis) -> Table:
         for result in task.results
     ]
     columns = ["agent", "certified at the end", "ever certified", *_HEADINGS.values()]
-    return _with_privileges(task.results, Table(task.task, f"Results on {task.task}", columns, rows))
+    return _table_of(task.results, task.task, f"Results on {task.task}", columns, rows)
 
 
 def scores_table(task: TaskAnalysis) -> Table:
@@ -99,15 +235,14 @@ def scores_table(task: TaskAnalysis) -> Table:
     ]
     caption = f"Means over seeds on {task.task}, of the greedy policy where nothing else is said"
     columns = ["agent", *(BY_KEY[key].title for key in keys)]
-    return _with_privileges(task.results, Table(f"{task.task} scores", caption, columns, rows))
+    return _table_of(task.results, f"{task.task} scores", caption, columns, rows)
 
 
 def estimate(result: Result, key: str, statistic: str) -> Estimate | None:
     """A statistic of a metric as a cell; None where no run has the metric."""
     found = result.estimates.get((key, statistic))
-    if found is None:
-        return None
-    return Estimate(found, steps_up_to(result.shortest_uncertified) if key == "steps" else number)
+    form = steps_up_to(result.shortest_uncertified) if key == "steps" else number
+    return None if found is None else Estimate(found, form)
 
 
 def improvement_tables(comparisons: Sequence[Comparison], name: str) -> list[Table]:
@@ -145,21 +280,12 @@ def answer_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
 
 def runs_table(study: Study) -> Table:
     """A row for each run that is counted."""
-    rows: list[list[Cell]] = [
-        [
-            group.task,
-            group.agent,
-            run.seed,
-            "yes" if run.certified else "no",
-            run.regret,
-            int(run.first_certified_step) if math.isfinite(run.first_certified_step) else None,
-            run.steps,
-            run.seconds,
-            str(run.folder),
-        ]
-        for group in study.groups
-        for run in group.runs
-    ]
+    rows: list[list[Cell]] = []
+    for group, run in [(each, run) for each in study.groups for run in each.runs]:
+        first = int(run.first_certified_step) if math.isfinite(run.first_certified_step) else None
+        certified = "yes" if run.certified else "no"
+        rows.append([group.task, group.agent, run.seed, certified, run.regret, first])
+        rows[-1] += [run.steps, run.seconds, str(run.folder)]
     columns = ["task", "agent", "seed", "certified", "regret", "first certificate", "steps", "seconds"]
     return Table("runs", "Every run that is counted", [*columns, "folder"], rows)
 

@@ -8,15 +8,16 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import plain
+from gridworld.process.console import plain
 from gridworld.process.memory_budget import check_memory
-from gridworld.report.table import Cell
 from gridworld.storage.csv_text import csv_rows
-from gridworld.storage.safe_read import LARGEST_CSV, as_table, read_bytes, sha256
-from gridworld.storage.sealed_json import read_sealed
+from gridworld.storage.safe_read import LARGEST_CSV, as_table, read_bytes, read_sealed, sha256
+
+if TYPE_CHECKING:
+    from gridworld.report.tables import Cell
 
 STUDY_JSON, TRIALS_CSV = "study.json", "trials.csv"
 TRIALS_SUM = "trials_sha256"  # in the former, of the latter

@@ -5,27 +5,33 @@ The event files have the curves over seeds, since TensorBoard cannot average run
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from gridworld.errors import InputError, reason
-from gridworld.process.console.terminal import tell
+from gridworld.process.console import tell
 from gridworld.report import tables
-from gridworld.report.analysis import Band, Result, TaskAnalysis
-from gridworld.report.build import MOST_SHOWN, NothingFinishedError, Report, gather
-from gridworld.report.table import to_captioned_markdown, to_csv, to_markdown
-from gridworld.run.claim import check_writable
+from gridworld.report.analysis import (
+    MOST_SHOWN,
+    Band,
+    NothingFinishedError,
+    Report,
+    Result,
+    TaskAnalysis,
+    gather,
+)
+from gridworld.report.tables import to_captioned_markdown, to_csv, to_markdown
 from gridworld.run.folder import EVENTS as EVENT_FILE
-from gridworld.run.folder import MANIFEST
+from gridworld.run.folder import MANIFEST, check_writable
 from gridworld.storage.atomic_write import replacing_folder, write_text
 from gridworld.training.tensorboard import EventWriter
-from gridworld.world.mdp import FloatArray
 
 PAGE = "report.html"
 FIGURES, TABLES, EVENTS = "figures", "tables", "tensorboard"
@@ -123,31 +129,29 @@ def _write_events(report: Report, folder: Path) -> None:
     for name, (task, result) in zip(names, results, strict=True):
         (folder / name).mkdir(parents=True)
         events = EventWriter(folder / name)
-        curves = dict(_curves(result, task))
+        curves = _curves(result, task)
         events.bands("over seeds, with 95 % intervals", {name: BANDS[name] for name in curves})
-        for of, (steps, parts) in curves.items():
-            for index, step in enumerate(steps.astype(np.int64).tolist()):
+        for of, band in curves.items():
+            parts = {"iqm": band.point, "low": band.low, "high": band.high, "mean": band.mean}
+            for index, step in enumerate(band.steps.astype(np.int64).tolist()):
                 values = {f"{of}/{part}": float(numbers[index]) for part, numbers in parts.items()}
                 events.scalars({tag: value for tag, value in values.items() if math.isfinite(value)}, step)
         events.close()
 
 
-def _curves(
-    result: Result, task: TaskAnalysis
-) -> Iterator[tuple[str, tuple[FloatArray, dict[str, FloatArray]]]]:
-    """Steps and the parts of each curve, by its name."""
-
-    def parts(band: Band) -> dict[str, FloatArray]:
-        return {"iqm": band.point, "low": band.low, "high": band.high, "mean": band.mean}
-
-    regret = parts(result.regret)
-    yield "regret", (result.regret.steps, regret)
+def _curves(result: Result, task: TaskAnalysis) -> dict[str, Band]:
+    """The curves by name."""
+    regret, best = result.regret, task.world.optimal_value
     # The value is the optimum's minus the regret: its upper end belongs to the regret's lower one.
-    value = {part: task.world.optimal_value - numbers for part, numbers in regret.items()}
-    yield "value", (result.regret.steps, value | {"low": value["high"], "high": value["low"]})
-    yield "seeds certified", (result.certificates.steps, parts(result.certificates))
-    if result.online is not None:
-        yield "on-line return", (result.online.steps, parts(result.online))
+    value = dataclasses.replace(
+        regret,
+        point=best - regret.point,
+        mean=best - regret.mean,
+        low=best - regret.high,
+        high=best - regret.low,
+    )
+    curves = {"regret": regret, "value": value, "seeds certified": result.certificates}
+    return curves if result.online is None else curves | {"on-line return": result.online}
 
 
 def check_markers(path: Path) -> None:

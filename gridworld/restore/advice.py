@@ -15,8 +15,7 @@ from gridworld.config.composition.conf_folder import conf_folder, own_conf_folde
 from gridworld.config.composition.presets import fitting_preset, is_world
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import command
-from gridworld.process.console.terminal import aligned
+from gridworld.process.console import aligned, command
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.folder import SWEEP_JSON, RunFolder, shown
 from gridworld.run.reader import LARGEST_RESULT, RunReader

@@ -28,18 +28,17 @@ from gridworld.agents import family
 from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.parallel.together import mixing
+from gridworld.process.together import mixing
 from gridworld.restore.resume import open_unfinished
 from gridworld.restore.saved_run import read_visits, settings_of
 from gridworld.run.folder import BEST_MODEL, EVENTS, MANIFEST, MODEL
-from gridworld.run.manifest import NUMBERS_DEPEND_ON
 from gridworld.run.provenance import settings_hash
-from gridworld.run.reader import LARGEST_RESULT, RunReader, read_run, stored_world
+from gridworld.run.reader import LARGEST_RESULT, NUMBERS_DEPEND_ON, RunReader, read_run, stored_world
 from gridworld.run.summary import Summary
-from gridworld.storage.event_file import read_scalars
 from gridworld.storage.safe_read import LARGEST_CSV, as_table
 from gridworld.training.session import CLOCK
 from gridworld.training.setup import without_pictures
+from gridworld.training.tensorboard import read_scalars
 from gridworld.training.together import Training, run_alone, run_together
 from gridworld.training.train import training
 from gridworld.world.mdp import Mdp
@@ -187,8 +186,9 @@ def check_whole(then: RunReader, config: TrainConfig) -> None:
 
 def compare(then: RunReader, now: RunReader, config: TrainConfig, mdp: Mdp) -> Iterator[Finding]:
     """Compare two finished runs of one configuration in one world, part by part of the result."""
-    rows, difference = _first(_cells(then), _cells(now))
-    yield Finding("learning curve", difference or f"{rows // len(_header(then)):,} rows", not difference)
+    curves = _curve(then), _curve(now)
+    _, difference = _first(_cells(curves[0]), _cells(curves[1]))
+    yield Finding("learning curve", difference or f"{len(curves[0]) - 1:,} rows", not difference)
     yield _weights("final weights", then.folder / MODEL, now.folder / MODEL, config)
     yield _weights("best weights", then.folder / BEST_MODEL, now.folder / BEST_MODEL, config)
     before, after = (read_visits(run, mdp.probability.shape[:2]) for run in (then, now))
@@ -196,7 +196,7 @@ def compare(then: RunReader, now: RunReader, config: TrainConfig, mdp: Mdp) -> I
         yield Finding("visits", f"{before.sum():,} steps")
     else:
         where = f"{mdp.state_name(int(place[0]))}, {mdp.action_names[int(place[1])]}"
-        yield Finding("visits", _told(where, before[place], after[place]), False)
+        yield Finding("visits", _difference(where, before[place], after[place]), False)
     entries = [
         sorted((name, value) for name, value in flat(run.read_summary()) if name not in CLOCK)
         for run in (then, now)
@@ -211,14 +211,13 @@ def compare(then: RunReader, now: RunReader, config: TrainConfig, mdp: Mdp) -> I
         yield Finding("TensorBoard points", difference or f"{count:,} points", not difference)
 
 
-def _header(run: RunReader) -> list[str]:
-    return as_table(run.read(run.curve_file, LARGEST_CSV), run.curve_file).partition("\n")[0].split(",")
+def _curve(run: RunReader) -> list[list[str]]:
+    return [*csv.reader(as_table(run.read(run.curve_file, LARGEST_CSV), run.curve_file).splitlines())]
 
 
-def _cells(run: RunReader) -> Iterator[tuple[str, str]]:
-    """The cells of a run's curve below the header, by step and column."""
-    content = as_table(run.read(run.curve_file, LARGEST_CSV), run.curve_file)
-    header, *rows = csv.reader(content.splitlines())
+def _cells(curve: Sequence[Sequence[str]]) -> Iterator[tuple[str, str]]:
+    """The cells of a curve below the header, by step and column."""
+    header, *rows = curve
     for row in rows:
         for column, text in zip_longest(header, row):
             yield f"step {row[0] if row else ''}, {column}", text
@@ -241,11 +240,11 @@ def _weights(part: str, then: Path, now: Path, config: TrainConfig) -> Finding:
     for name, old in before.items():
         new = after[name]
         if (old.dtype, old.shape) != (new.dtype, new.shape):
-            told = _told(name, f"{old.dtype} {old.shape}", f"{new.dtype} {new.shape}")
-            return Finding(part, told, False)
+            found = _difference(name, f"{old.dtype} {old.shape}", f"{new.dtype} {new.shape}")
+            return Finding(part, found, False)
         if (place := _first_unequal(old, new)) is not None:
             where = f"{name}{list(map(int, place)) if place else ''}"
-            return Finding(part, _told(where, old[place], new[place]), False)
+            return Finding(part, _difference(where, old[place], new[place]), False)
     return Finding(part, f"{len(before):,} tensors and numbers")
 
 
@@ -254,9 +253,9 @@ def _first(then: Entries, now: Entries) -> tuple[int, str]:
     count = 0
     for (where, old), (other, new) in zip_longest(then, now, fillvalue=("", None)):
         if where and other and where != other:
-            return count, _told(where, where, other)
+            return count, _difference(where, where, other)
         if old != new and (old == old or new == new):  # NaN equals NaN
-            return count, _told(where or other, old, new)
+            return count, _difference(where or other, old, new)
         count += 1
     return count, ""
 
@@ -269,6 +268,6 @@ def _first_unequal(old: NDArray[Any], new: NDArray[Any]) -> tuple[Any, ...] | No
     return None if same.all() else tuple(np.argwhere(np.atleast_1d(~same))[0][: old.ndim])
 
 
-def _told(where: str, old: object, new: object) -> str:
+def _difference(where: str, old: object, new: object) -> str:
     then, now = ("nothing" if each is None else str(each)[:80] or "empty" for each in (old, new))
     return f"first at {where[:80]}: {then} then, {now} now"

@@ -20,16 +20,14 @@ from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import BuiltConfig, GymnasiumConfig
 from gridworld.errors import InputError
-from gridworld.process.console.progress import telling_if_slow
-from gridworld.process.console.terminal import printable, tell
+from gridworld.process.console import printable, tell, telling_if_slow
 from gridworld.restore.saved_run import settings_of
 from gridworld.run.checkpoints import MOST_STEPS, Checkpoints, steps_of
 from gridworld.run.folder import CHECKPOINTS, CURVE
 from gridworld.run.provenance import environment, git, identity, settings, source_differences
 from gridworld.run.reader import RunReader, read_run, stored_world
 from gridworld.run.summary import Summary
-from gridworld.run.train_log import TrainLog
-from gridworld.run.writer import RunWriter
+from gridworld.run.writer import RunWriter, TrainLog
 from gridworld.storage.append_log import holds
 from gridworld.storage.safe_read import open_ordinary
 from gridworld.storage.serialization import State, StateError

@@ -22,13 +22,13 @@ from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import MapConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import tell
+from gridworld.process.console import tell
 from gridworld.process.memory_budget import limited
 from gridworld.process.user_input import DAMAGED
 from gridworld.run.folder import shown
 from gridworld.run.reader import RunReader, open_run, stored_world
 from gridworld.training.setup import make_context
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import GridMdp
 from gridworld.world.layout import CLASSIC, load
 from gridworld.world.mdp import FloatArray, Mdp

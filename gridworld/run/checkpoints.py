@@ -2,9 +2,8 @@
 
     checkpoints/000000012032.state    after 12,032 steps; `numpy.load` opens it
 
-The order of writing makes them safe against a power cut: first the files that the checkpoint has marks of
-(`storage.append_log`), then the checkpoint under another name, then its name, then the folder. A checkpoint
-that is damaged, or whose files are, is passed over for the one before.
+A power cut harms none, since the files that a checkpoint has marks of (`storage.append_log`) are written
+first. A checkpoint that is damaged, or whose files are, is passed over for the one before.
 """
 
 from __future__ import annotations
@@ -14,14 +13,13 @@ from pathlib import Path
 
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import BudgetError
-from gridworld.process.parallel.together import clock
+from gridworld.process.together import clock
 from gridworld.run.folder import CHECKPOINTS
-from gridworld.storage.atomic_write import remove_path, sync_folder, write_bytes
-from gridworld.storage.file_lock import check_ours
+from gridworld.storage.atomic_write import check_ours, remove_path, sync_folder, write_bytes
 from gridworld.storage.safe_read import check_no_link, read_bytes
 from gridworld.storage.serialization import State, StateError, decode, encode
 
-_KEPT = 2
+_KEPT = 2  # the newest
 _SUFFIX = ".state"
 _LEAST_SECONDS = 2.0  # between two checkpoints, with "auto"
 _MOST_SHARE = 0.02  # of the time that may go to them, with "auto"
@@ -47,7 +45,7 @@ class Checkpoints:
         self.newest: int | None = None
 
     def save(self, steps: int, state: State, durable: bool = True, small: bool = False) -> None:
-        """Write a checkpoint and remove the oldest.
+        """Write the state after so many environment steps, and remove the oldest checkpoint.
 
         Args:
             steps: environment steps so far.
@@ -56,7 +54,6 @@ class Checkpoints:
             small: compress it, which takes longer.
 
         Raises:
-            FolderLostError: the run's folder is no longer this process's.
             OSError: it could not be written; the ones before are still there.
         """
         check_no_link(self.folder)

@@ -1,4 +1,4 @@
-"""The files of a run: their names and paths.
+"""A run's folder: the names of its files, and having it for this process alone.
 
     manifest.json   what ran, with which versions and settings, from when to when, and how it ended
     source.diff     what was changed in the source tree since its commit, where anything was; and
@@ -25,15 +25,18 @@ the files that hold its result, its world and its pictures. It is sealed. `run.w
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from gridworld.config import pictures
 from gridworld.config.plain_settings import foreign
-from gridworld.process.console.command_line import command, users_folder
-from gridworld.process.console.terminal import printable
+from gridworld.errors import FolderLostError, InputError
+from gridworld.process.console import command, printable, users_folder
+from gridworld.storage.atomic_write import check_ours, locked, make_folder, remove_inside, tidy
 
 MANIFEST = "manifest.json"
 SOURCE_DIFF = "source.diff"
@@ -95,3 +98,60 @@ def shown(folder: Path) -> str:
         return printable(str(folder.relative_to(users_folder())))
     except ValueError:
         return printable(str(folder))
+
+
+def check_inside(path: Path, key: str) -> None:
+    """Refuse a relative path that leads out of the current folder; `key` is the option that has it."""
+    normal = os.path.normpath(path)
+    if os.path.isabs(normal) or normal.split(os.sep)[0] not in (os.curdir, os.pardir):
+        return
+    if normal == os.curdir:
+        raise InputError(f"{key}={path}: is the current folder; name one in it, e.g. runs/mine")
+    raise InputError(
+        f"{key}={path}: leads out of the current folder; if that is meant, say {os.path.abspath(path)}"
+    )
+
+
+def check_writable(folder: Path, key: str) -> None:
+    """Refuse a folder that cannot be made, where there is none, or written to."""
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    if not existing.is_dir():
+        raise InputError(f"{folder}: cannot be made, {existing} is a file; choose another {key}")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise InputError(f"{folder}: cannot be written, {existing} is read-only; choose another {key}")
+
+
+@contextlib.contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Hold a run's folder for this process; an `InputError` if another process holds it."""
+    with locked(folder / LOCK, wait=0) as is_ours:
+        if not is_ours:
+            raise InputError(f"{shown(folder)}: another process is at work in it; wait for it or stop it")
+        yield
+
+
+@contextlib.contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Make a run's folder and hold it for this process; afterwards, undo that where no run was started.
+
+    Raises:
+        InputError: another process holds the folder.
+        OSError: the folder could not be made; or one of the block, which then names the folder.
+    """
+    make_folder(folder.parent)
+    folder.mkdir(exist_ok=True)
+    with alone_in(folder):
+        try:
+            yield
+        except OSError as error:
+            error.filename = error.filename or shown(folder)  # a failed write names no file
+            raise
+        finally:
+            # Remove what Hydra wrote for a run that never started.
+            with contextlib.suppress(FolderLostError, OSError):
+                check_ours(folder / MANIFEST)
+                if not (folder / MANIFEST).exists():
+                    tidy(folder)
+                    remove_inside(folder, HYDRA)
+                    (folder / LOCK).unlink(missing_ok=True)
+                    folder.rmdir()

@@ -41,6 +41,7 @@ _VARIABLES = (
     *("CUDA_VISIBLE_DEVICES", "CUBLAS_WORKSPACE_CONFIG"),
 )
 _GIT_SECONDS = 10
+_PACKAGE = Path(__file__).parents[1]
 _PARTS = ("gridworld", "conf", "scripts", "pyproject.toml")  # of the source tree: what the numbers depend on
 _FIXED = frozenset(Effect) - {Effect.LENGTH, Effect.NOTHING}
 _FOR_ALL_AGENTS = ("python", "gridworld", "gymnasium", "numpy", "scipy")
@@ -53,13 +54,16 @@ def settings(config: TrainConfig) -> dict[str, Any]:
 
 def identity(config: TrainConfig, layout: str) -> str:
     """SHA-256 of a run's fixed settings and of its map's text."""
-    return sha256(json.dumps([settings(config), layout], sort_keys=True, default=str).encode())
+    return _hash(settings(config), layout)
 
 
 def settings_hash(settings: dict[str, Any], layout: str) -> str:
     """A hash of a run's settings and its map's text; the same for settings read from a manifest."""
-    text = json.dumps([with_effects(ON_RESULT, settings), layout], sort_keys=True, default=str)
-    return sha256(text.encode())[:32]
+    return _hash(with_effects(ON_RESULT, settings), layout)[:32]
+
+
+def _hash(settings: dict[str, Any], layout: str) -> str:
+    return sha256(json.dumps([settings, layout], sort_keys=True, default=str).encode())
 
 
 def environment(agent: AgentConfig) -> dict[str, str]:
@@ -74,22 +78,6 @@ def environment(agent: AgentConfig) -> dict[str, str]:
     found["machine"] = processor()["machine"]
     found["processor for numpy"] = " ".join(processor()["numpy"])
     return found
-
-
-@dataclass(frozen=True)
-class Source:
-    """The state of a source tree: its commit, and what was changed since."""
-
-    commit: str
-    diff: bytes  # as git writes it, empty for a clean tree; files that git does not know are in it
-
-    def manifest_entry(self, file: str = SOURCE_DIFF) -> dict[str, Any]:
-        """Its commit, and of the changes their size and checksum, and the name of the file that has them."""
-        about: dict[str, Any] = {"commit": self.commit, "dirty": bool(self.diff)}
-        if self.diff:
-            kept = file if len(self.diff) <= LARGEST_DIFF else None
-            about["diff"] = {"file": kept, "bytes": len(self.diff), "sha256": sha256(self.diff)}
-        return about
 
 
 @functools.cache  # the code that runs is the code that was imported
@@ -108,15 +96,35 @@ def versions() -> dict[str, str | None]:
 
 
 @functools.cache
+def code() -> str:
+    """A hash of the package's source files, SHA-256 as hexadecimal digits."""
+    found = hashlib.sha256()
+    elsewhere = _PACKAGE / "sweep" / "hydra_plugin.py"  # in a wheel; no number depends on it
+    for path in sorted({*_PACKAGE.rglob("*.py")} - {elsewhere}):
+        found.update(f"{path.relative_to(_PACKAGE).as_posix()} {sha256(path.read_bytes())}\n".encode())
+    return found.hexdigest()
+
+
+@dataclass(frozen=True)
+class Source:
+    """The state of a source tree: its commit, and what was changed since."""
+
+    commit: str
+    diff: bytes  # as git writes it, empty for a clean tree; files that git does not know are in it
+
+    def manifest_entry(self, file: str = SOURCE_DIFF) -> dict[str, Any]:
+        """Its commit, and of the changes their size and checksum, and the name of the file that has them."""
+        about: dict[str, Any] = {"commit": self.commit, "dirty": bool(self.diff)}
+        if self.diff:
+            kept = file if len(self.diff) <= LARGEST_DIFF else None
+            about["diff"] = {"file": kept, "bytes": len(self.diff), "sha256": sha256(self.diff)}
+        return about
+
+
+@functools.cache
 def source() -> Source | None:
     """The source tree of this package; None outside a git checkout, or where git fails."""
-    return source_of(Path(__file__).parents[2])
-
-
-def git(file: str = SOURCE_DIFF) -> dict[str, Any] | None:
-    """The manifest's entry for this package's source tree, whose changes go to `file`; None: not known."""
-    tree = source()
-    return None if tree is None else tree.manifest_entry(file)
+    return source_of(_PACKAGE.parent)
 
 
 def source_of(tree: Path) -> Source | None:
@@ -151,14 +159,10 @@ def source_of(tree: Path) -> Source | None:
         return None
 
 
-@functools.cache
-def code() -> str:
-    """A hash of the package's source files, SHA-256 as hexadecimal digits."""
-    package, found = Path(__file__).parents[1], hashlib.sha256()
-    elsewhere = package / "sweep" / "hydra_plugin.py"  # in a wheel; no number depends on it
-    for path in sorted({*package.rglob("*.py")} - {elsewhere}):
-        found.update(f"{path.relative_to(package).as_posix()} {sha256(path.read_bytes())}\n".encode())
-    return found.hexdigest()
+def git(file: str = SOURCE_DIFF) -> dict[str, Any] | None:
+    """The manifest's entry for this package's source tree, whose changes go to `file`; None: not known."""
+    tree = source()
+    return None if tree is None else tree.manifest_entry(file)
 
 
 def processor() -> dict[str, Any]:
@@ -172,16 +176,13 @@ def processor() -> dict[str, Any]:
 def _hardware() -> dict[str, Any]:
     import numpy as np
 
-    try:
-        info = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
-        models = (line.split(":", 1)[1].strip() for line in info if line.startswith("model name"))
-        model = next(models, None)
-    except OSError:  # not Linux
-        model = platform.processor() or None
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text("utf-8", "replace").splitlines() if info.exists() else []
+    models = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     extensions = np.show_config(mode="dicts").get("SIMD Extensions", {})
     return {
         "machine": platform.machine(),
-        "model": model,
+        "model": next(models, platform.processor() or None),
         "cores": os.cpu_count(),
         "numpy": [*extensions.get("baseline", []), *extensions.get("found", [])],
     }
@@ -202,8 +203,7 @@ def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str
     """A line for each difference between a manifest, which need not be valid, and what `describe` returns."""
     yield from source_differences(then.get("git"), now.get("git"))
     for section, name in (("versions", ""), ("processor", "processor "), ("environment", "")):
-        before, after = then.get(section), now[section]
-        before = before if isinstance(before, dict) else {}
+        before, after = _mapping(then.get(section)), now[section]
         for key in sorted(before.keys() | after.keys(), key=str):
             if before.get(key) != after.get(key):
                 yield f"{name}{key}: {_shown(before.get(key))} then, {_shown(after.get(key))} now"
@@ -213,15 +213,19 @@ def differences(then: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str
 
 def source_differences(then: Any, now: Any) -> Iterator[str]:
     """A line for each difference between two results of `git`, of which `then` need not be valid."""
-    before, after = (git if isinstance(git, dict) else {} for git in (then, now))
+    before, after = _mapping(then), _mapping(now)
     if before.get("commit") != after.get("commit"):
         yield f"commit: {_shown(before.get('commit'))} then, {_shown(after.get('commit'))} now"
-    changes = [about.get("diff") or {} for about in (before, after)]
-    sums = [change.get("sha256") if isinstance(change, dict) else None for change in changes]
+    changes = [_mapping(about.get("diff")) for about in (before, after)]
+    sums = [change.get("sha256") for change in changes]
     if sums[0] != sums[1]:
         kept = f" ({SOURCE_DIFF} has them)" if sums[0] and changes[0].get("file") == SOURCE_DIFF else ""
         shown = [f"changes {_shown(digest)[:12]}" if digest else "no changes" for digest in sums]
         yield f"uncommitted source: {shown[0]}{kept} then, {shown[1]} now"
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
 
 
 def _shown(value: Any) -> str:

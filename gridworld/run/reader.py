@@ -1,30 +1,50 @@
 """Reading a run's folder: its manifest, its world, and the files with its result, verified.
 
-`read_run` reads a run whatever its status, `open_run` a finished one, `find_run` one that there may be.
+`read_run` reads a run whatever its status, `open_run` a finished one, `find_run` one that there may be. The
+manifest's seal and the types of its entries are checked.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import os
-from pathlib import Path
+from collections.abc import Callable
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
 from gridworld.config.worlds import EnvConfig, MapConfig
 from gridworld.errors import InputError
 from gridworld.process.user_input import COPIES
-from gridworld.run.folder import CHECKED, MANIFEST, PICTURES, RunFolder
-from gridworld.run.manifest import read_manifest
-from gridworld.storage.safe_read import LARGEST_JSON, as_object, file_sha256, read_bytes, sha256
+from gridworld.run.folder import (
+    CHECKED,
+    CHECKPOINTS,
+    MANIFEST,
+    PICTURES,
+    SWEEP_JSON,
+    RunFolder,
+    check_writable,
+)
+from gridworld.storage.safe_read import (
+    LARGEST_JSON,
+    as_object,
+    check_no_link,
+    file_sha256,
+    read_bytes,
+    read_sealed,
+    sha256,
+)
 
 if TYPE_CHECKING:
     from gridworld.world.mdp import Mdp
 
 LARGEST_RESULT = 2**30  # bytes of a file
+# Runs that were updated at once, this one among them, so that the numbers of each depend on all: a hash of
+# the settings of each (`provenance.settings_hash`) by its folder's name, in their order.
+NUMBERS_DEPEND_ON = "numbers_depend_on"
 
 
 class RunReader(RunFolder):
-    """A run that another process wrote: its folder, and the manifest as `read_manifest` gives it."""
+    """A run that another process wrote: its folder, and the content of its manifest."""
 
     def __init__(self, folder: Path, manifest: dict[str, Any]) -> None:
         super().__init__(folder)
@@ -111,7 +131,7 @@ def open_run(folder: Path) -> RunReader:
 def read_run(folder: Path) -> RunReader:
     """Read a run, finished or not."""
     check_is_run(folder)
-    return RunReader(folder, read_manifest(folder / MANIFEST))
+    return RunReader(folder, _read_manifest(folder / MANIFEST))
 
 
 def find_run(folder: Path) -> RunReader | None:
@@ -141,6 +161,29 @@ def check_is_run(folder: Path) -> None:
         raise InputError(f"{folder}: not a run's folder, it has no {MANIFEST}")
 
 
+def check_free(folder: Path, key: str = "hydra.run.dir") -> None:
+    """Refuse a folder that cannot be written, or holds a finished run, a sweep or other runs.
+
+    An unfinished run in it is accepted here: whether it is the same one is checked with the settings.
+    """
+    try:
+        is_finished = read_run(folder).is_finished
+    except InputError:  # there is none, or its manifest is damaged
+        is_finished = False
+    if is_finished:
+        longer = f", or make that run longer by {RunFolder(folder).resume_command()} total_timesteps=..."
+        can_be_longer = any(folder.glob(f"{CHECKPOINTS}/*"))
+        raise InputError(
+            f"{folder}: holds a run already; choose another folder{longer if can_be_longer else ''}"
+        )
+    if (folder / SWEEP_JSON).exists():
+        raise InputError(f"{folder}: is the folder of a sweep; choose another {key}")
+    if used := next(folder.glob(f"*/{MANIFEST}"), None):
+        raise InputError(f"{folder}: holds other runs, {used.parent} for one; name a new folder in it")
+    check_no_link(folder / CHECKPOINTS)
+    check_writable(folder, key)
+
+
 def stored_world(run: RunReader, env: EnvConfig) -> Mdp:
     """The world that a run keeps, a map in its manifest or tables in its folder, whatever its settings say.
 
@@ -166,3 +209,61 @@ def stored_world(run: RunReader, env: EnvConfig) -> Mdp:
             f"{run.world_file}: is not the world that {MANIFEST} names; it was damaged or changed"
         )
     return mdp
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    content = read_sealed(path)
+    if not content.keys() >= {"status", "config", "layout"}:
+        raise InputError(f"{path}: not the manifest of a run; it lacks status, config or layout")
+    for key, (fits, what) in _KINDS.items():
+        if key in content and not fits(content[key]):
+            raise InputError(f"{path}: {key} must be {what}")
+    return content
+
+
+def _is(*kinds: type) -> Callable[[Any], bool]:
+    return lambda value: type(value) in kinds
+
+
+def _is_list_of(kind: type, fits: Callable[[Any], bool] = lambda each: True) -> Callable[[Any], bool]:
+    return lambda value: (
+        isinstance(value, list) and all(isinstance(each, kind) and fits(each) for each in value)
+    )
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and value >= 0
+
+
+def _are_sums(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(digest, str) for digest in value.values())
+
+
+def _are_runs(value: Any) -> bool:
+    return _are_sums(value) and all(
+        name.isprintable() and PurePath(name).name == name not in ("", "..") for name in value
+    )
+
+
+def _is_resumption(value: dict[str, Any]) -> bool:
+    return "total_timesteps" not in value or _is_count(value.get("step"))
+
+
+_KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "status": (_is(str), "a word"),
+    "config": (_is(dict), "the run's settings; is it of another version?"),
+    "layout": (_is_list_of(str, str.isprintable), "a list of the map's rows; is it of another version?"),
+    "started": (_is(str), "a date"),
+    "ended": (_is(str, type(None)), "a date"),
+    "error": (_is(str), "a sentence"),
+    "overrides": (_is_list_of(str), "a list of what stood on the command line"),
+    "sha256": (_are_sums, "a checksum for each file"),
+    "resumed": (
+        _is_list_of(dict, _is_resumption),
+        "a list of when the run went on, with the step after which it was made longer",
+    ),
+    NUMBERS_DEPEND_ON: (_are_runs, "a hash for each run, by the name of a folder beside this one"),
+    "reached": (lambda value: value is None or _is_count(value), "a number of steps"),
+    "checkpoint": (lambda value: value is None or _is_count(value), "a number of steps"),
+    "versions": (_is(dict), "a version for each package"),
+}

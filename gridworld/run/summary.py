@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gridworld.process.console.terminal import aligned, printable
+from gridworld.process.console import aligned, printable
 from gridworld.process.signals import Interrupted
 from gridworld.run.folder import EVENTS, RunFolder, shown
 from gridworld.run.reader import read_run

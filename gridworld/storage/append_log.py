@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 from gridworld.errors import InputError
-from gridworld.storage.file_lock import check_ours
+from gridworld.storage.atomic_write import check_ours
 from gridworld.storage.safe_read import open_ordinary
 
 _PIECE = 1 << 20  # bytes read at once
@@ -83,19 +83,15 @@ class AppendLog:
 
     def _check_there(self) -> None:
         check_ours(self.path)
-        if not os.path.lexists(self.path) or not os.path.samestat(
-            os.lstat(self.path), os.fstat(self._file.fileno())
-        ):
+        opened = os.fstat(self._file.fileno())
+        if not os.path.lexists(self.path) or not os.path.samestat(os.lstat(self.path), opened):
             raise InputError(f"{self.path}: was deleted or replaced during the run")
 
 
 def holds(folder: Path, mark: Any, pattern: str) -> bool:
-    """Whether the file of a mark, which may come from anybody, is there and unchanged up to the mark.
+    """Whether the file of a mark, which may be anything, is in `folder` and unchanged up to the mark.
 
-    Args:
-        folder: where the file is.
-        mark: of any type.
-        pattern: which names a file may have, as for `fnmatch`.
+    `pattern` says which names the file may have, as for `fnmatch`.
     """
     try:
         path = folder / mark["name"]

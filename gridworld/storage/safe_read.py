@@ -4,6 +4,9 @@ A file is read only if it is a regular file of bounded size: not through a symbo
 any file of the reader's, and not a pipe or a device, which need not end. JSON nests a hundred levels at most,
 and its numbers fit into 64 bits. Nothing is resolved, imported or unpickled. Every function raises
 `InputError`, with a sentence that names the file, and `BudgetError` where it would take too much memory.
+
+JSON may have a seal, which is a checksum over all of its content. A seal finds damage and changes. It finds
+no forgery: whoever writes a file can seal it.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ import json
 import math
 import os
 import stat
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -23,6 +27,7 @@ from gridworld.process.memory_budget import check_memory
 
 LARGEST_JSON = 4 * 2**20  # bytes
 LARGEST_CSV = 64 * 2**20
+FORMAT = 2  # of sealed JSON
 _DEEPEST = 100  # levels of JSON; what reads it further may call itself for each
 # Bytes of memory that a byte of text may come to as Python's objects: short strings in short lists.
 _AS_CSV, AS_JSON = 64, 48
@@ -41,10 +46,11 @@ def open_ordinary(path: Path, mode: str = "rb", most: float = math.inf) -> Binar
         what = "read" if mode == "rb" else "written"
         raise InputError(f"{path}: cannot be {what} ({error.strerror})") from None
     found = os.fstat(descriptor)
-    if not stat.S_ISREG(found.st_mode) or found.st_size > most:
+    is_ordinary = stat.S_ISREG(found.st_mode)
+    if not is_ordinary or found.st_size > most:
         os.close(descriptor)
-        ordinary = stat.S_ISREG(found.st_mode)
-        raise InputError(f"{path}: {f'is larger than {_size(most)}' if ordinary else 'is no ordinary file'}")
+        what = f"is larger than {_size(most)}" if is_ordinary else "is no ordinary file"
+        raise InputError(f"{path}: {what}")
     return cast("BinaryIO", open(descriptor, mode, buffering=-1 if mode == "rb" else 0))
 
 
@@ -114,6 +120,33 @@ def _whole(text: str) -> int:
 def _is_deeper(content: Any, most: int) -> bool:
     inner = content.values() if isinstance(content, dict) else content
     return most == 0 or any(_is_deeper(each, most - 1) for each in inner if isinstance(each, dict | list))
+
+
+def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content with its format and its seal; those that it had are replaced."""
+    whole = {"format": FORMAT} | {key: content[key] for key in content if key not in ("format", "seal")}
+    return whole | {"seal": _seal(json.loads(json.dumps(whole)))}  # as it will be read
+
+
+def read_sealed(path: Path) -> dict[str, Any]:
+    """Read the JSON object in a file and check its seal."""
+    content = read_object(path)
+    found = content.get("format")
+    if type(found) is not int or found != FORMAT:
+        raise InputError(
+            f"{path}: has format {str(found)[:20]}, this version reads {FORMAT}; "
+            "was it made by an older version?"
+        )
+    if content.get("seal") != _seal(content):
+        raise InputError(
+            f"{path}: was changed or damaged, its seal is not that of its content; put back a good copy"
+        )
+    return content
+
+
+def _seal(content: Mapping[str, Any]) -> str:
+    unsealed = {key: value for key, value in content.items() if key != "seal"}
+    return sha256(json.dumps(unsealed, sort_keys=True).encode())
 
 
 def check_yaml(folder: Path) -> None:

@@ -8,7 +8,6 @@ which is needed: most flipped bits in an array would pass for good numbers.
 
 from __future__ import annotations
 
-import functools
 import io
 import json
 import random
@@ -53,9 +52,8 @@ def encode(state: State, compress: bool = False) -> memoryview:
     with zipfile.ZipFile(content, "w") as archive:
         archive.writestr(zipfile.ZipInfo(_TREE), tree)
         for name, array in arrays.items():
-            data = np.ascontiguousarray(array).tobytes()
-            how = zipfile.ZIP_DEFLATED if compress and _gets_smaller(data) else zipfile.ZIP_STORED
-            member = _head(array.dtype.str, array.shape) + data
+            member = _npy(array)
+            how = zipfile.ZIP_DEFLATED if compress and _gets_smaller(member) else zipfile.ZIP_STORED
             archive.writestr(zipfile.ZipInfo(f"{name}.npy"), member, how, compresslevel=1)
     return content.getbuffer()
 
@@ -109,17 +107,15 @@ def fill(target: NDArray[Any], value: Any, where: str) -> None:
     target[...] = value
 
 
-@functools.lru_cache
-def _head(dtype: str, shape: tuple[int, ...]) -> bytes:
-    """What is before an array's bytes in a file of numpy's."""
-    head = io.BytesIO()
-    np.lib.format.write_array_header_1_0(head, {"descr": dtype, "fortran_order": False, "shape": shape})
-    return head.getvalue()
+def _npy(array: NDArray[Any]) -> bytes:
+    content = io.BytesIO()
+    np.lib.format.write_array(content, np.asarray(array, order="C"), allow_pickle=False)
+    return content.getvalue()
 
 
-def _gets_smaller(data: bytes) -> bool:
+def _gets_smaller(member: bytes) -> bool:
     """Whether a sample does: weights do not."""
-    sample = data[len(data) // 2 :][:_SAMPLE]
+    sample = member[len(member) // 2 :][:_SAMPLE]
     return len(zlib.compress(sample, 1)) < _WORTH_IT * len(sample)
 
 

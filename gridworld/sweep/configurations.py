@@ -32,12 +32,7 @@ _SHARED = ("sweep", "sweeper", "launcher", "callbacks", "job.chdir", "job.env_se
 
 
 class Configurations:
-    """Composes jobs; of those that differ only in the seed, the first, for all of them.
-
-    Args:
-        loader: Hydra's.
-        master: the configuration of the sweep itself.
-    """
+    """Composes jobs; of those that differ only in the seed, the first, for all of them."""
 
     def __init__(self, loader: ConfigLoader, master: DictConfig) -> None:
         subdir = _plain(master, "sweep")["subdir"]
@@ -54,12 +49,7 @@ class Configurations:
         self._is_group = functools.cache(self._find_group)
 
     def __call__(self, words: Sequence[str]) -> TrainConfig:
-        """Compose a job's overrides.
-
-        Raises:
-            InputError: a file that only some jobs choose sets what all have in common.
-            HydraException: overrides that do not fit.
-        """
+        """Compose a job's overrides."""
         seeds = [int(found[1]) for word in words if (found := _SEED.fullmatch(word)) is not None]
         others = tuple(word for word in words if _SEED.fullmatch(word) is None)
         if len(seeds) == 1 and others in self._known:

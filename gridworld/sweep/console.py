@@ -1,19 +1,28 @@
-"""Terminal output of a sweep at its start and at its end."""
+"""What a sweep prints: its start, its end, and a table of results.
+
+A row of the table is an agent, a task and settings, over the seeds. Settings are named by the words that
+asked for them, since many others may follow from these.
+"""
 
 from __future__ import annotations
 
+import math
 import shlex
+import statistics
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Container, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from gridworld.errors import reason
-from gridworld.process.console.command_line import command_line
-from gridworld.process.console.progress import duration
-from gridworld.process.console.terminal import printable, tell_error
+from gridworld.config.fields import Effect
+from gridworld.config.settings import ON_RESULT, effect_of, flat, with_effects
+from gridworld.envs.rollout import wilson_interval
+from gridworld.errors import InputError, reason
+from gridworld.process.console import aligned, command_line, duration, printable, tell_error
+from gridworld.run.reader import read_run
+from gridworld.run.summary import Summary
 from gridworld.sweep.job_table import DONE, FAILED, INTERRUPTED, JOBS_CSV, PENDING, RUNNING, STATUSES, JobRow
-from gridworld.sweep.results import results_lines
 
 _MOST_LISTED = 50  # of a kind, on the terminal; jobs.csv has them all
 
@@ -33,15 +42,7 @@ def tell_start(folder: Path, rows: Sequence[JobRow], to_run: int) -> None:
 def tell_end(
     folder: Path, rows: Sequence[JobRow], seconds: float, stopped: str, mistakes: Container[str]
 ) -> None:
-    """Print the results, how the jobs stand, why some did not end well, and how to go on with the rest.
-
-    Args:
-        folder: the sweep's folder.
-        rows: of the jobs that were asked for.
-        seconds: how long it took.
-        stopped: why the sweep was stopped, or "".
-        mistakes: jobs that would fail again, as their settings are wrong.
-    """
+    """Print the results, how the jobs stand, why some did not end well, and how to go on with the rest."""
     print(f"sweep {shell_path(folder)}: {counts_text(rows)}, in {duration(seconds)}")
     results = results_lines(folder, rows)
     for line in ("", *results[: _MOST_LISTED + 1], "") if results else ():
@@ -106,3 +107,104 @@ def shell_path(folder: Path) -> str:
     path = folder.absolute()
     here = Path.cwd()
     return printable(shlex.quote(str(path.relative_to(here) if path.is_relative_to(here) else path)))
+
+
+_HEADINGS = ("agent", "task", "settings", "certified", "steps to certificate, median")
+_OF_SETTINGS = ON_RESULT - {Effect.SEED, Effect.LABELS, Effect.MACHINE}
+_MOST_NAMED = 3  # jobs
+_LONGEST = 60  # characters of settings
+
+Settings = tuple[tuple[str, str], ...]  # dotted names, values as text
+
+
+def results_lines(folder: Path, rows: Sequence[JobRow]) -> list[str]:
+    """The table of the results, a line each with the headings first; empty where no job is done."""
+    groups: dict[tuple[str, str], dict[Settings, list[_Result]]] = defaultdict(lambda: defaultdict(list))
+    lost = []
+    for row in rows:
+        found = _result(folder / row.job) if row.status == DONE else None
+        if found is None:
+            lost.append(row.job)
+        else:
+            groups[found.summary["agent"], found.summary["env"]][found.settings].append(found)
+    cells = []
+    for (agent, task), alike in groups.items():
+        told = _differences([results[0] for results in alike.values()])
+        for results, difference in zip(alike.values(), told, strict=True):
+            summaries = [result.summary for result in results]
+            cells.append([agent, task, difference, _certified(summaries), _steps(summaries)])
+    if not cells:
+        return []
+    keep = [0, 1, *([2] if any(row[2] for row in cells) else []), 3, 4]
+    table = [[row[column] for column in keep] for row in [list(_HEADINGS), *cells]]
+    forms = ["<0" if column < 3 else ">0" for column in keep]
+    lines = aligned([[f"{cell} " for cell in row] for row in table], forms)  # two blanks between columns
+    if lost:
+        named = f"{', '.join(lost[:_MOST_NAMED])}{', ...' if len(lost) > _MOST_NAMED else ''}"
+        lines[0] += f"; {len(lost)} of {len(rows)} jobs are not counted: {named}"
+    return lines
+
+
+@dataclass(frozen=True)
+class _Result:
+    """What a job came to, and by which settings and words."""
+
+    summary: Summary
+    settings: Settings
+    words: tuple[str, ...]  # that chose settings
+
+
+def _result(folder: Path) -> _Result | None:
+    try:
+        run = read_run(folder)
+        chosen = with_effects(_OF_SETTINGS, run.manifest["config"])
+        settings = tuple((name, str(value)) for name, value in flat(chosen))
+        asked = [word for word in run.manifest["overrides"] if _chooses(_key(word))]
+        words = tuple(_resolved(word, dict(settings)) for word in asked)
+        return _Result(run.read_summary(), settings, words)
+    except InputError:  # it was changed since; `report` says in what
+        return None
+
+
+def _chooses(key: str) -> bool:
+    return key == "preset" or effect_of(key) in _OF_SETTINGS
+
+
+def _resolved(word: str, settings: dict[str, str]) -> str:
+    """The word with its value where it names other settings, as `n_envs=${seed}` does."""
+    value = settings.get(_key(word))
+    return f"{_key(word)}={value}" if "${" in word and value is not None else word
+
+
+def _key(word: str) -> str:
+    return word.partition("=")[0].lstrip("+~").partition("@")[0]
+
+
+def _differences(results: Sequence[_Result]) -> list[str]:
+    """The words of each that not all have; where one names no such setting, its value."""
+    shared = set(results[0].words).intersection(*(result.words for result in results))
+    keys = dict.fromkeys(_key(word) for result in results for word in result.words if word not in shared)
+    told = []
+    for result in results:
+        given = {_key(word): word for word in result.words}
+        values = {key: f"{key}={value}" for key, value in result.settings}
+        words = [given.get(key) or values.get(key, "") for key in keys]
+        text = " ".join(word.removeprefix("agent.") for word in words if word)
+        told.append(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…")
+    return told
+
+
+def _certified(found: Sequence[Summary]) -> str:
+    count = sum(bool(summary["certified"]) for summary in found)
+    low, high = wilson_interval(count, len(found))
+    return f"{count} of {len(found)} [{100 * low:.0f} %, {100 * high:.0f} %]"
+
+
+def _steps(found: Sequence[Summary]) -> str:
+    """The median step of the first certificate, or more than what the runs without one were given."""
+    first = [summary["first_certified_step"] for summary in found]
+    median = statistics.median(math.inf if step is None else step for step in first)
+    if math.isfinite(median):
+        return f"{round(median):,}"
+    given = [summary["timesteps"] for summary in found if summary["first_certified_step"] is None]
+    return f"> {min(given):,}"

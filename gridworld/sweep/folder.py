@@ -20,13 +20,11 @@ from pathlib import Path
 from typing import Any
 
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import recorded_command_line
-from gridworld.run.claim import check_writable
-from gridworld.run.folder import HYDRA, LOCK, MANIFEST, SWEEP_JSON
+from gridworld.process.console import recorded_command_line
+from gridworld.run.folder import HYDRA, LOCK, MANIFEST, SWEEP_JSON, check_writable
 from gridworld.run.provenance import versions
-from gridworld.storage.atomic_write import check_no_links, make_folder, tidy, write_json
-from gridworld.storage.file_lock import locked
-from gridworld.storage.sealed_json import read_sealed, sealed
+from gridworld.storage.atomic_write import check_no_links, locked, make_folder, tidy, write_json
+from gridworld.storage.safe_read import read_sealed, sealed
 from gridworld.sweep.plan import Job, folder_name
 
 STOP = ".stop"  # in the sweep's folder: no more jobs begin, wherever they wait
@@ -90,11 +88,7 @@ class SweepFolder:
             yield
 
     def add(self, jobs: Sequence[Job], words: Sequence[str]) -> list[JobEntry]:
-        """Write to sweep.json what is asked for by the overrides `words`.
-
-        Returns:
-            The jobs' entries; a new job has a folder's name of its own.
-        """
+        """Write to sweep.json what is asked for by the overrides `words`."""
         taken = {entry.job.lower() for entry in self.entries.values()}
         # Also the folders of no job.
         taken |= {file.parent.name.lower() for file in self.path.glob(f"*/{MANIFEST}")}

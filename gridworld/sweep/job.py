@@ -1,25 +1,39 @@
-"""One job of a sweep, in the process that it runs in."""
+"""The jobs of a sweep in the process that they run in: one job, and a population of them."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
+import os
+import signal
 import sys
 import traceback
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import yaml
+from hydra.core.utils import JobReturn, JobStatus, configure_log
+from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+
+from gridworld.agents import family
 from gridworld.config.train import TrainConfig
 from gridworld.errors import FolderLostError, InputError, MachineError, reason
-from gridworld.process.signals import Interrupted
+from gridworld.process.console import called_from
+from gridworld.process.memory_budget import collect_less_often
+from gridworld.process.signals import Interrupted, exiting, handling, send_sigterm
+from gridworld.process.together import mixing
 from gridworld.restore.resume import unfinished_of
 from gridworld.run.folder import ERROR_FILE, LOCK, MANIFEST
 from gridworld.run.reader import find_run, is_started
 from gridworld.run.writer import clear, record_failure
-from gridworld.storage.atomic_write import write_text
-from gridworld.storage.file_lock import locked
+from gridworld.storage.atomic_write import locked, write_bytes, write_text
+from gridworld.sweep.folder import STOP
 from gridworld.sweep.job_table import one_line, run_status
-from gridworld.training.together import Training
+from gridworld.training.together import Training, run_together
 from gridworld.training.train import training
 
 _UNFINISHED = ("running", "interrupted")  # statuses of runs that were stopped from outside
@@ -39,21 +53,6 @@ def run_in_sweep(
     """Train in the job's folder, unless that is done or another process does it.
 
     An interrupted run goes on from its checkpoint; a failed one is replaced.
-
-    Args:
-        config: the job's configuration.
-        folder: the job's, in the sweep's folder.
-        overrides: the job's, for its manifest.
-        stop_at_failure: whether a failure is to stop the sweep.
-        replaces: whether a finished run is replaced too.
-
-    Returns:
-        The final policy's regret; NaN where there was nothing to do.
-
-    Raises:
-        JobError: the job failed, or the machine has to be put right first.
-        StopSweep: the job failed, and that is to stop the sweep.
-        SystemExit: the job was interrupted.
     """
     try:
         with locked(folder / LOCK, wait=1) as is_ours:
@@ -91,3 +90,105 @@ def mark_failed(folder: Path, why: str, trace: str = "") -> None:
             record_failure(run, why)
     if trace or run is None:
         write_text(folder / ERROR_FILE, f"{why}\n{trace}")
+
+
+_Dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+
+@dataclass(frozen=True)
+class SweepJob:
+    """A job as its process needs it."""
+
+    folder: Path
+    number: int  # among those of this start of the sweep
+    hash: str
+    config: TrainConfig
+    overrides: tuple[str, ...]
+    replaces: bool  # a finished run in the folder, which is not the job's result
+
+
+@dataclass(frozen=True)
+class Worker:
+    """Runs populations."""
+
+    sweep: Path  # its folder
+    where: str  # the folder that the command was typed in
+    master: DictConfig  # the configuration of the sweep itself
+    callbacks: Any  # Hydra's, if some are the user's
+
+    def __call__(self, jobs: Sequence[SweepJob]) -> list[str]:
+        """Run the jobs of a population; returns the error of each, or ""."""
+        collect_less_often()
+        os.environ.update(self.master.hydra.job.env_set)
+        configure_log(self.master.hydra.job_logging, self.master.hydra.verbose)
+        config = jobs[0].config  # all have one device
+        asked = self.master.hydra.sweeper.population != "auto" and len(jobs) > 1
+        depend = asked and not family(config.agent).on_processor(config.device)
+        with mixing({job.folder.name: job.hash for job in jobs} if depend else {}):
+            results = run_together([partial(self._run, job) for job in jobs])
+        return [one_line(reason(result)) if isinstance(result, Exception) else "" for result in results]
+
+    def on_node(self, groups: Sequence[Sequence[SweepJob]]) -> list[str]:
+        """Run populations one after the other on a node of a cluster."""
+        errors: list[str] = []
+        # SIGUSR2 is Slurm's warning of its time limit. While training is on, it handles SIGTERM itself.
+        warning = {signal.SIGUSR2: send_sigterm}
+        try:
+            with exiting(signal.SIGTERM), handling(warning), contextlib.chdir(self.where):
+                for jobs in groups:
+                    if (self.sweep / STOP).exists():
+                        break
+                    errors += self(jobs)
+        except StopSweep:
+            write_bytes(self.sweep / STOP, b"")  # for those that wait in a queue
+        except (SystemExit, KeyboardInterrupt):
+            pass
+        return errors
+
+    def _run(self, job: SweepJob) -> Training[float]:
+        hydra = self.master.hydra
+        job.folder.mkdir(parents=True, exist_ok=True)
+        if hydra.output_subdir is not None:
+            _save(job, job.folder / hydra.output_subdir)
+        own_folder = contextlib.chdir(job.folder) if hydra.job.chdir else contextlib.nullcontext()
+        with called_from(Path(self.where)), own_folder:
+            run = run_in_sweep(
+                job.config, job.folder, list(job.overrides), hydra.sweeper.stop_at_first_failure, job.replaces
+            )
+            if self.callbacks is None:
+                return (yield from run)
+            return (yield from self._between_callbacks(job, run))
+
+    def _between_callbacks(self, job: SweepJob, run: Training[float]) -> Training[float]:
+        whole = OmegaConf.create(dataclasses.asdict(job.config))
+        with open_dict(whole):
+            whole.hydra = OmegaConf.to_container(self.master.hydra, resolve=False)
+            whole.hydra.runtime.output_dir = str(job.folder)
+            whole.hydra.job.num = job.number
+            whole.hydra.overrides.task = list(job.overrides)
+        self.callbacks.on_job_start(config=whole, task_function=None)
+        done = JobReturn(overrides=list(job.overrides), status=JobStatus.FAILED)
+        try:
+            done.return_value = yield from run
+            done.status = JobStatus.COMPLETED
+            return float(done.return_value)
+        except Exception as error:
+            done.return_value = error
+            raise
+        finally:
+            self.callbacks.on_job_end(config=whole, job_return=done)
+
+
+def _save(job: SweepJob, folder: Path) -> None:
+    """Write the job's settings and overrides, as Hydra does for a single run."""
+    folder.mkdir(exist_ok=True)
+    for name, content in (("config", dataclasses.asdict(job.config)), ("overrides", list(job.overrides))):
+        text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+        (folder / f"{name}.yaml").write_text(text, encoding="utf-8")
+
+
+def shared_part(master: DictConfig, sweep: Path) -> DictConfig:
+    """The configuration of a sweep with its folder as that of all jobs, for `hydra.job_logging`."""
+    with read_write(master.hydra.runtime), open_dict(master.hydra.runtime):
+        master.hydra.runtime.output_dir = str(sweep)
+    return master

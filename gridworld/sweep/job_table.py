@@ -14,9 +14,8 @@ from gridworld.errors import InputError
 from gridworld.run.folder import ERROR_FILE, LOCK
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import RunReader, find_run
-from gridworld.storage.atomic_write import write_text
+from gridworld.storage.atomic_write import is_locked, write_text
 from gridworld.storage.csv_text import csv_rows, csv_text
-from gridworld.storage.file_lock import is_locked
 from gridworld.storage.safe_read import LARGEST_JSON, read_bytes, read_table
 from gridworld.sweep.folder import JobEntry
 
@@ -73,13 +72,7 @@ class JobTable:
         before: Mapping[str, JobRow],
         ended: Mapping[str, JobRow] | None = None,
     ) -> dict[str, JobRow]:
-        """The rows as they should be.
-
-        Args:
-            entries: the jobs.
-            before: rows with reasons that no folder has: of a mistake in the settings, or of a full disk.
-            ended: rows that cannot change any more.
-        """
+        """The rows as they should be; `before` has reasons that no folder has, `ended` what cannot change."""
         known = ended or {}
         return {e.job: known.get(e.job) or self._inspect(e, before.get(e.job)) for e in entries}
 

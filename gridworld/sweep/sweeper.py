@@ -18,21 +18,17 @@ from omegaconf import DictConfig
 from gridworld.config.composition.words import prepared
 from gridworld.config.sweep import SweepConfig
 from gridworld.errors import EXIT_CODE, FolderLostError, InputError
-from gridworld.process.console.progress import ProgressLine, time_left
-from gridworld.process.console.terminal import tell, tell_error
-from gridworld.process.parallel.machine import worker_count
-from gridworld.process.parallel.processes import LostError
+from gridworld.process.console import ProgressLine, tell, tell_error, time_left
+from gridworld.process.processes import LostError, worker_count
 from gridworld.process.signals import exiting, signal_name
 from gridworld.run.folder import MANIFEST
 from gridworld.sweep import console
 from gridworld.sweep.configurations import Configurations
 from gridworld.sweep.folder import STOP, SweepFolder
-from gridworld.sweep.grouping import populations, runs_in_turn
-from gridworld.sweep.job import StopSweep, mark_failed
+from gridworld.sweep.job import StopSweep, SweepJob, Worker, mark_failed, shared_part
 from gridworld.sweep.job_table import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, JobRow, JobTable
 from gridworld.sweep.launchers import Group, Launch, launcher_settings, local
-from gridworld.sweep.plan import Job, expand, plan
-from gridworld.sweep.worker import SweepJob, Worker, shared_part
+from gridworld.sweep.plan import Job, expand, plan, populations, runs_in_turn
 
 _ORPHANS_END_WITHIN = 5.0  # seconds; workers of a sweep that was killed
 _POLL_SECONDS = 0.1
@@ -43,18 +39,7 @@ _SHARE_OF_TIME = 30  # looking after the jobs takes at most one thirtieth of it
 
 
 def run_sweep(words: list[str], context: HydraContext, master: DictConfig, settings: SweepConfig) -> None:
-    """Run the jobs that are asked for and not done yet.
-
-    Args:
-        words: the command line's overrides.
-        context: Hydra's.
-        master: the configuration of the sweep itself.
-        settings: how to run it.
-
-    Raises:
-        InputError: a mistake on the command line; nothing was run or written.
-        SystemExit: not all jobs are done.
-    """
+    """Run the jobs that are asked for and not done yet."""
     folder = SweepFolder(Path(master.hydra.sweep.dir))
     launcher, own = launcher_settings(master)
     divide = partial(populations, settings=settings, launcher=launcher, own=own, hydra=master.hydra)

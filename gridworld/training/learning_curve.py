@@ -21,15 +21,15 @@ from gridworld.agents import Agent, PolicySnapshot
 from gridworld.config.train import TrainConfig
 from gridworld.envs.statistics_env import NO_EPISODES, Returns, StatisticsVectorEnv
 from gridworld.errors import InputError
-from gridworld.process.parallel.together import clock
+from gridworld.process.together import clock
 from gridworld.storage.append_log import AppendLog
 from gridworld.storage.csv_text import csv_text
 from gridworld.storage.serialization import State
-from gridworld.world.exact.evaluation import Evaluator, Score
+from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.metrics import METRICS, TRAINING_METRICS, Metric, numbers, optimal_score
 
 if TYPE_CHECKING:
-    from gridworld.process.console.progress import Progress
+    from gridworld.process.console import Progress
     from gridworld.training.tensorboard import EventWriter
 
 # TensorBoard sorts its groups by name and opens with the first: the greedy policy's learning curve. Behind it
@@ -87,6 +87,19 @@ class BestModel:
         return {"step": self.step, "regret": self.regret, "content": np.frombuffer(self.content, np.uint8)}
 
 
+@dataclass(frozen=True, eq=False)
+class Held:
+    """An evaluation that was due where training may be over, see `LearningCurve.on_step`."""
+
+    step: int
+    snapshot: PolicySnapshot
+    model: bytes  # if it was the best by then, else empty
+
+    def get_state(self) -> State:
+        snapshot, model = vars(self.snapshot).copy(), np.frombuffer(self.model, np.uint8)
+        return {"step": self.step, "snapshot": snapshot, "model": model}
+
+
 class LearningCurve:
     """Evaluates an agent every so many environment steps, and at the end.
 
@@ -98,11 +111,6 @@ class LearningCurve:
         agent: the one that learns.
         config: the run's settings; `evaluation` and `total_timesteps` say when an evaluation is due.
         envs: those that the agent learns in, which count the returns of its episodes.
-
-    Attributes:
-        newest: the newest evaluation.
-        seconds: spent on evaluation.
-        sinks: take every evaluation, one after the other.
     """
 
     def __init__(
@@ -116,47 +124,38 @@ class LearningCurve:
         self.certificate = Certificate()
         self.best = BestModel()
         self.newest: Evaluation | None = None
-        self.seconds = 0.0
-        self.sinks: list[Sink] = []
+        self.seconds = 0.0  # spent on evaluation
+        self.sinks: list[Sink] = []  # take every evaluation, one after the other
         self._agent, self._envs = agent, envs
         self._every, self._stop_after = config.evaluation.every, config.evaluation.stop_after
         self._total = config.total_timesteps
         self._next = self._every
-        # The evaluation that was due where training may be over, see `on_step`: the step, the policy and,
-        # if it was the best by then, the model.
-        self._held: tuple[int, PolicySnapshot, bytes] | None = None
+        self._held: Held | None = None
         self._due = NO_EPISODES  # those of the newest evaluation that was due, held or not
 
     def get_state(self) -> State:
         """The schedule, the certificate, the best model; the newest snapshot, which gives its scores."""
-        newest, held = self.newest, None
-        if self._held is not None:
-            step, snapshot, model = self._held
-            held = {"step": step, "snapshot": vars(snapshot).copy(), "model": np.frombuffer(model, np.uint8)}
+        newest = self.newest
         return {
             "step": -1 if newest is None else newest.step,
             "next": self._next,
             **vars(self.certificate),
             "seconds": self.seconds,
             "snapshot": None if newest is None else vars(newest.snapshot).copy(),
-            "held": held,
+            "held": None if self._held is None else self._held.get_state(),
             "best": self.best.get_state(),
             "due": self._due._asdict(),
         }
 
     def set_state(self, state: State) -> None:
-        """Continue from a state.
-
-        Raises:
-            Exception: of any kind for a state that does not fit; see `storage.serialization.fitting`.
-        """
+        """Continue from a state; inside `storage.serialization.fitting`."""
         self._next = int(state["next"])
         self.certificate = Certificate(
             int(state["streak"]), state["first_certified_step"], state["certified_since_step"]
         )
         self.seconds = float(state["seconds"])
         if (held := state["held"]) is not None:
-            self._held = int(held["step"]), _snapshot(held["snapshot"]), held["model"].tobytes()
+            self._held = Held(int(held["step"]), _snapshot(held["snapshot"]), held["model"].tobytes())
         best = state["best"]
         self.best = BestModel(int(best["step"]), float(best["regret"]), best["content"].tobytes())
         self._due = Returns(int(state["due"]["episodes"]), float(state["due"]["total"]))
@@ -166,7 +165,7 @@ class LearningCurve:
 
     def write_held_of_shorter_run(self) -> None:
         """Write what was held at the end of a shorter run, if that is no longer the end."""
-        if self._held is not None and self._held[0] < self._total:
+        if self._held is not None and self._held.step < self._total:
             self._write_held()
 
     def on_step(self, step: int) -> int:
@@ -188,11 +187,11 @@ class LearningCurve:
             self._next += self._every * ((step - self._next) // self._every + 1)
             self._due = self._take_returns()
             if step < self._total:
-                self._evaluate(step, self._agent.snapshot, self._agent.model_file, self._due)
+                self._evaluate(step, self._due)
             else:
                 snapshot = self._agent.snapshot()
                 is_best = self.best.is_beaten_by(self._greedy_score(snapshot))
-                self._held = step, snapshot, self._agent.model_file() if is_best else b""
+                self._held = Held(step, snapshot, self._agent.model_file() if is_best else b"")
         if self._stop_after is not None and self.certificate.streak >= self._stop_after:
             return 0
         return self._next if self._held is None else step + 1
@@ -202,26 +201,19 @@ class LearningCurve:
         self._held = None  # of this step, as it was before the last update
         if self.newest is not None and step == self.newest.step:
             return self.newest
-        returns = self._due.merged(self._take_returns())
-        return self._evaluate(step, self._agent.snapshot, self._agent.model_file, returns)
+        return self._evaluate(step, self._due.merged(self._take_returns()))
 
     def _write_held(self) -> None:
         if self._held is not None:
-            (step, snapshot, model), self._held = self._held, None
-            self._evaluate(step, lambda: snapshot, lambda: model, self._due)
+            held, self._held = self._held, None
+            self._evaluate(held.step, self._due, held)
 
     def _take_returns(self) -> Returns:
         return NO_EPISODES if self._envs is None else self._envs.take_returns()
 
-    def _evaluate(
-        self,
-        step: int,
-        take_snapshot: Callable[[], PolicySnapshot],
-        model_file: Callable[[], bytes],
-        returns: Returns,
-    ) -> Evaluation:
+    def _evaluate(self, step: int, returns: Returns, held: Held | None = None) -> Evaluation:
         started = clock()
-        snapshot, before = take_snapshot(), self.newest
+        snapshot, before = self._agent.snapshot() if held is None else held.snapshot, self.newest
         if not (np.isfinite(snapshot.values).all() and np.isfinite(snapshot.sampled).all()):
             raise InputError(
                 f"training diverged: the agent's values are no finite numbers after {step} steps; "
@@ -231,7 +223,8 @@ class LearningCurve:
         self.newest = evaluation = Evaluation(step, snapshot, *self._scores(snapshot), returns)
         self.certificate.update(step, evaluation.greedy.certified, is_new)
         if self.best.is_beaten_by(evaluation.greedy):
-            self.best = BestModel(step, evaluation.greedy.shortfall, model_file())
+            content = self._agent.model_file() if held is None else held.model
+            self.best = BestModel(step, evaluation.greedy.shortfall, content)
         self.seconds += clock() - started
         for take in self.sinks:
             take(evaluation)

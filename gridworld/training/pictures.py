@@ -25,7 +25,7 @@ from gridworld.training.tensorboard import EventWriter
 from gridworld.visualization.animation import Animation
 from gridworld.visualization.files import encode_gif, save
 from gridworld.visualization.picture import Draw, PolicyHistory, drawer
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 
 # Pixels that pictures have in TensorBoard. It scales by skipping pixels: thin lines vanish, text frays.
 _IMAGES_TAB, _TIME_SERIES_CARD = 350, 240

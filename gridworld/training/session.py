@@ -22,10 +22,9 @@ from gridworld.agents import Agent, Learning, TrainingContext
 from gridworld.config.settings import privileges
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.console.progress import Progress
-from gridworld.process.console.terminal import tell
-from gridworld.process.parallel.together import clock
+from gridworld.process.console import Progress, tell
 from gridworld.process.signals import StopRequest
+from gridworld.process.together import clock
 from gridworld.run.checkpoints import Checkpoints, Pace
 from gridworld.run.folder import CURVE, EVENTS
 from gridworld.run.provenance import environment, identity
@@ -46,7 +45,7 @@ from gridworld.training.learning_curve import (
 from gridworld.training.pictures import Pictures
 from gridworld.training.tensorboard import EventWriter, as_markdown, hparams
 from gridworld.training.together import Training
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import EXACT
 from gridworld.world.metrics import numbers, optimal_numbers
 
@@ -117,9 +116,6 @@ class Session:
         state: the content of a checkpoint to continue from; None: from the start.
         is_trusted: whether the environment that the settings name may be made.
 
-    Attributes:
-        reached: environment steps.
-
     Raises:
         StateError: for a state that does not fit.
     """
@@ -139,7 +135,7 @@ class Session:
         self._evaluator, self._visits = evaluator, context.envs.visits
         self._is_new = state is None
         self._curve_mark = None if state is None else state["marks"]["curve"]
-        self.reached = 0 if state is None else int(state["steps"])
+        self.reached = 0 if state is None else int(state["steps"])  # environment steps
         self.checkpoints = Checkpoints(folder)
         self.checkpoints.newest = None if state is None else self.reached
         self._origin = {
@@ -159,23 +155,17 @@ class Session:
 
     def _checkpoint_every(self, agent: Agent) -> int | str | None:
         every = self._config.checkpoint.every
-        unknown = None if every is None else agent.class_without_state()
-        if unknown is None:
-            return every
-        tell(f"checkpoints: none, since {unknown} does not define get_state and set_state")
-        return None
+        if every is not None and (unknown := agent.class_without_state()) is not None:
+            tell(f"checkpoints: none, since {unknown} does not define get_state and set_state")
+            return None
+        return every
 
     def progress(self) -> dict[str, int | None]:
         """How many steps were made, and how many of them are saved."""
         return {"reached": self.reached, "checkpoint": self.checkpoints.newest}
 
     def run(self, run: RunWriter) -> Training[Summary]:
-        """Train, evaluate, record; the summary is written, too.
-
-        Raises:
-            InputError: where training diverges, or the folder is taken away.
-            Interrupted: by a signal, after a checkpoint.
-        """
+        """Train, evaluate, record; the summary is written, too."""
         self._open(run)
         succeeded = False
         try:
@@ -264,14 +254,14 @@ class Session:
 
     def _finish(self) -> Summary:
         seconds = clock() - self._started
-        parts = self._parts
+        run, parts = self._run, self._parts
         last = parts.curve.evaluate(self.reached)
-        write_bytes(self._run.model_file, parts.agent.agent.model_file())
-        write_bytes(self._run.best_model_file, parts.curve.best.content)
+        write_bytes(run.model_file, parts.agent.agent.model_file())
+        write_bytes(run.best_model_file, parts.curve.best.content)
         self._write_evaluations()
-        write_array(self._run.visits_file, self._visits)
+        write_array(run.visits_file, self._visits)
         summary = summarise(self._config, parts.curve, last, seconds)
-        write_json(self._run.summary_file, _as_json(summary))
+        write_json(run.summary_file, _as_json(summary))
         if self._events is not None:
             timeless = {key: value for key, value in summary.items() if key not in CLOCK}
             self._events.text("run/summary", as_markdown(timeless), last.step)

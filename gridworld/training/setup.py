@@ -14,7 +14,7 @@ from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
-from gridworld.world.exact.evaluation import Evaluator, fitting_discounts, score_of_optimum
+from gridworld.world.evaluation import Evaluator, fitting_discounts, score_of_optimum
 from gridworld.world.mdp import Mdp
 
 _QUICKLY_SOLVED = 6000  # outcomes of all states and actions

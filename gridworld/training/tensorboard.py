@@ -1,17 +1,25 @@
-"""What TensorBoard shows of a run: scalars, pictures, hyperparameters and the charts' layout.
+"""What TensorBoard shows of a run: its event file, with scalars, pictures, hyperparameters and charts.
 
-Written with TensorBoard's own message types; torch is not needed for it.
+An event file is a sequence of events, each framed by its length (8 bytes, little-endian), the length's
+checksum (4) and its own (4). A checksum is CRC-32C, rotated and shifted by a constant, so that a record
+inside a record is not taken for one. TensorBoard's own writer has a thread and a checksum in pure Python,
+which takes as long for a picture as two evaluations, and it cannot truncate its file when a run is resumed.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import os
+import struct
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
+import google_crc32c
+from google.protobuf.message import DecodeError
+from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.compat.proto.types_pb2 import DT_STRING
 from tensorboard.plugins.custom_scalar import layout_pb2
@@ -22,11 +30,18 @@ from tensorboard.plugins.text import metadata as text_metadata
 from gridworld.config.settings import ON_RESULT, flat, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.envs.rendering import Frame
+from gridworld.errors import InputError
+from gridworld.process.memory_budget import check_memory
 from gridworld.storage.append_log import AppendLog
-from gridworld.storage.event_file import EventFile
+from gridworld.storage.safe_read import open_ordinary
 from gridworld.visualization.files import encode_png
 
 HParamValue = bool | float | str | None
+
+_AS_EVENT = 48  # bytes of memory that a byte of a record may come to, in a list of empty values
+_HEADER, _FOOTER = 12, 4  # bytes before and after an event
+_VERSION = "brain.Event:2"
+_MASK_DELTA = 0xA282EAD8
 
 
 def hparams(config: TrainConfig) -> dict[str, HParamValue]:
@@ -56,13 +71,15 @@ class EventWriter:
         self._folder, self._mark = folder, mark
 
     @functools.cached_property
-    def _file(self) -> EventFile:
-        return EventFile(self._folder, self._mark)
-
-    @property
     def log(self) -> AppendLog:
         """The file as bytes."""
-        return self._file.journal
+        if self._mark is not None:
+            return AppendLog(self._folder / self._mark["name"], self._mark)
+        now = time.time()
+        name = f"events.out.tfevents.{int(now)}.{os.uname().nodename}.{os.getpid()}"
+        log = AppendLog(self._folder / name)
+        log.append(_framed(Event(wall_time=now, file_version=_VERSION)))
+        return log
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
         """Write one event with a value for every tag."""
@@ -116,7 +133,7 @@ class EventWriter:
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        self.log.close()
 
     def _layout(self, title: str, charts: Sequence[dict[str, Any]]) -> None:
         content = layout_pb2.Layout(category=[{"title": title, "chart": charts}]).SerializeToString()
@@ -139,4 +156,45 @@ class EventWriter:
         self._add([{"tag": tag, "metadata": {"plugin_data": plugin}}], 0)
 
     def _add(self, values: Sequence[dict[str, Any]], step: int) -> None:
-        self._file.add(Summary(value=values), step)
+        event = Event(wall_time=time.time(), step=step, summary=Summary(value=values))
+        self.log.append(_framed(event))
+
+
+def _framed(event: Event) -> bytes:
+    content = event.SerializeToString()
+    length = struct.pack("<Q", len(content))
+    return b"".join([length, _checksum(length), content, _checksum(content)])
+
+
+def _checksum(content: bytes) -> bytes:
+    crc = google_crc32c.value(content)
+    rotated = crc >> 15 | crc << 17
+    return struct.pack("<I", rotated + _MASK_DELTA & 0xFFFFFFFF)
+
+
+def read_scalars(path: Path) -> Iterator[tuple[str, int, float]]:
+    """Read (tag, step, value) of an event file's scalars, in the order in which they were written."""
+    with open_ordinary(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        while (start := file.tell()) < size:
+            try:
+                event = Event.FromString(_record(file, size, path))
+            except DecodeError:
+                raise InputError(f"{path}: is damaged or cut off after {start:,} bytes") from None
+            for value in event.summary.value:
+                if value.HasField("simple_value"):
+                    yield value.tag, event.step, value.simple_value
+
+
+def _record(file: BinaryIO, size: int, path: Path) -> bytes:
+    frame = file.read(_HEADER)
+    if len(frame) < _HEADER or _checksum(frame[:8]) != frame[8:]:
+        raise DecodeError
+    length: int = struct.unpack("<Q", frame[:8])[0]
+    if length > size - file.tell():
+        raise DecodeError
+    check_memory(path, _AS_EVENT * length)
+    record = file.read(length)
+    if _checksum(record) != file.read(_FOOTER):
+        raise DecodeError
+    return record

@@ -14,7 +14,7 @@ from collections.abc import Callable, Generator, Sequence
 from typing import Any, Generic, TypeVar
 
 from gridworld.agents import Learning, learn_together
-from gridworld.process.parallel.together import Clock, set_clock
+from gridworld.process.together import Clock, set_clock
 
 T = TypeVar("T")
 Training = Generator[Learning, None, T]
@@ -24,18 +24,18 @@ def run_alone(training: Training[T]) -> T:
     """Run a training; returns what it returns, and raises what it raises."""
     try:
         learning = next(training)
-        while True:
-            error: BaseException | None = None
-            try:
-                learning.agent.learn(
-                    learning.total_timesteps, learning.on_step, learning.on_safe_point, learning.state
-                )
-            except BaseException as failure:
-                error = failure
-            learning = next(training) if error is None else training.throw(error)
+        try:
+            learning.agent.learn(
+                learning.total_timesteps, learning.on_step, learning.on_safe_point, learning.state
+            )
+        except BaseException as error:
+            training.throw(error)
+        else:
+            next(training)
     except StopIteration as end:
         result: T = end.value
         return result
+    raise RuntimeError("a training yields once")
 
 
 def run_together(trainings: Sequence[Callable[[], Training[T]]]) -> list[T | Exception]:
@@ -86,14 +86,13 @@ class _Together:
         try:
             return learn_together([run.learning for run in runs if run.learning is not None])
         finally:
-            self._seconds += time.perf_counter() - self._started
-            self._started = None
+            self._seconds, self._started = self._elapsed() + self._apart, None
 
     def share(self) -> float:
         """A run's share of the seconds in which all learnt."""
         return self._elapsed() / self._runs
 
-    def apart(self, call: Callable[[int], T], steps: int) -> T:
+    def apart(self, call: Callable[[int], Any], steps: int) -> Any:
         """Call something that is one run's alone."""
         before = self._elapsed()
         try:
@@ -130,9 +129,8 @@ class _Run(Generic[T]):
             if self._training is None:
                 self._training = self._call(self._begin)
             assert self._training is not None
-            learning = (
-                self._call(next, self._training) if error is None else self._call(self._training.throw, error)
-            )
+            resume = (next, self._training) if error is None else (self._training.throw, error)
+            learning = self._call(*resume)
         except StopIteration as end:
             self.result = end.value
         except Exception as failure:

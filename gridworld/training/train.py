@@ -17,21 +17,19 @@ from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError, MachineError, reason
-from gridworld.process.console.command_line import recorded_command_line
-from gridworld.process.console.terminal import tell
+from gridworld.process.console import recorded_command_line, tell
 from gridworld.process.signals import Interrupted
 from gridworld.run.folder import MANIFEST, RunFolder, shown
 from gridworld.run.reader import is_started
 from gridworld.run.summary import Summary, interruption_text
-from gridworld.run.train_log import TrainLog
-from gridworld.run.writer import RunWriter
+from gridworld.run.writer import RunWriter, TrainLog
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.serialization import State, StateError
 from gridworld.training.session import Session
 from gridworld.training.setup import check_settings, make_context, notes
 from gridworld.training.tensorboard import EventWriter
 from gridworld.training.together import Training, run_alone
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 
 OnBuilt = Callable[[Agent], None]

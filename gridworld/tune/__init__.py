@@ -3,7 +3,7 @@
 study_spec.py, search_space.py   a command line -> the configuration to begin from, and how to search
 study.py                         a study from its beginning to its verdict
 search.py, objective.py          the study in its database; trials, and what their settings come to
-finalists.py, confirmation.py    the best few on more seeds; the winner on seeds that nothing was chosen by
+confirmation.py                  the best few on more seeds; the winner on seeds that nothing was chosen by
 workers.py                       the processes that train all this
 study_folder.py, recipe.py       trials.csv and study.json, for readers without Optuna; the winner's yaml
 """

@@ -1,14 +1,18 @@
-"""Confirmation of the winner: held-out runs beside those of what the search began from, and a verdict.
+"""Finalists and their confirmation, since the best of many trials on a few seeds is so partly by luck.
 
-The best of many trials on a few seeds is so partly by luck. These seeds are ones that no trial has seen. The
-runs are ordinary ones, with a folder each; what is there already is kept.
+The best few trials run on more seeds, and the winner is chosen among them by all of their seeds. What the
+search began from is always a finalist. Results are attributes of the study, so that machines share them.
+
+The winner is confirmed on seeds that no trial has seen, beside what the search began from. These runs are
+ordinary ones, with a folder each; what is there already is kept.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import partial
@@ -16,20 +20,101 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from optuna import Study
+from optuna.trial import FrozenTrial, TrialState
 
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import tell
+from gridworld.process.console import tell
 from gridworld.report import statistics
-from gridworld.report.table import number, steps_up_to
+from gridworld.report.tables import number, steps_up_to
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import find_run
 from gridworld.storage.atomic_write import check_no_links, make_inside, names_inside, remove_inside
 from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.job_table import FAILED, JobTable
 from gridworld.training.together import Training, run_together
-from gridworld.tune.workers import Ask
+from gridworld.tune.objective import SEEDS, FinalRuns, SeedScore, read_score, score
+from gridworld.tune.study_spec import StudySpec
+from gridworld.tune.workers import Ask, Workers
 from gridworld.world.mdp import FloatArray
+
+FINAL = "final "  # what the names of these attributes begin with
+_FAILED = sys.float_info.max  # the regret of a run that did
+
+
+@dataclass(frozen=True)
+class Finalist:
+    """A trial after its final runs, by its own seeds and the final seeds together."""
+
+    trial: int
+    score: float
+    certified: int
+    seeds: int
+    failed: int  # of these, runs that ended by an error, and count as not certified
+
+
+def choose_finalists(study: Study, spec: StudySpec) -> list[FrozenTrial]:
+    """The best complete trials, no two alike, and the one of the configuration that the search began from.
+
+    Machines that search together may end with a few trials more than were asked for; these do not count.
+    """
+    began_from = spec.space.parameters_of(spec.base)
+    ended = study.get_trials(deepcopy=False)[: spec.settings.trials]
+    complete = [trial for trial in ended if trial.state == TrialState.COMPLETE]
+    found: list[FrozenTrial] = []
+    for trial in sorted(complete, key=lambda trial: (trial.value, trial.number)):
+        is_new = all(trial.params != other.params for other in found)
+        if is_new and (len(found) < spec.settings.finalists or trial.params == began_from):
+            found.append(trial)
+    return found
+
+
+def rank_finalists(
+    spec: StudySpec, study: Study, trials: Sequence[FrozenTrial], workers: Workers
+) -> list[Finalist]:
+    """Run what the finalists lack on the final seeds; returns them, the winner first."""
+    runs = {
+        _name(trial, seed): (spec.space.values(trial.params), seed)
+        for seed in spec.final_seeds
+        for trial in trials
+        if _name(trial, seed) not in study.user_attrs
+    }
+    if runs:
+        print(
+            f"the {len(trials)} finalists on {len(spec.final_seeds)} seeds more: {len(runs)} runs",
+            file=sys.stderr,
+            flush=True,
+        )
+    shares = workers.shares(list(runs), spec.base.agent.shape is not None)
+    tasks = [FinalRuns(spec.objective, {name: runs[name] for name in names}) for names in shares]
+
+    def on_end(task: FinalRuns, results: Mapping[str, SeedScore | str] | None) -> None:
+        for name, (_, seed) in task.runs.items():
+            result = results[name] if results is not None else "the workers that ran it were killed"
+            if isinstance(result, str):
+                tell(f"{name.removeprefix(FINAL)} failed, and counts as not certified: {result}")
+                result = SeedScore(seed, None, _FAILED)
+            study.set_user_attr(name, dataclasses.asdict(result))
+
+    workers.run(lambda: tasks.pop(0) if tasks else None, on_end)
+    return sorted(_ranked(spec, study, trials), key=lambda finalist: (finalist.score, finalist.trial))
+
+
+def _ranked(spec: StudySpec, study: Study, trials: Sequence[FrozenTrial]) -> Iterator[Finalist]:
+    attributes: Mapping[str, Any] = study.user_attrs
+    for trial in trials:
+        results = [read_score(each) for each in trial.user_attrs[SEEDS]]
+        results += [read_score(attributes[_name(trial, seed)]) for seed in spec.final_seeds]
+        certified = sum(result.certified_since is not None for result in results)
+        value = score(results, spec.base.total_timesteps, len(results))
+        failed = sum(result.regret == _FAILED for result in results)
+        yield Finalist(trial.number, value, certified, len(results), failed)
+
+
+def _name(trial: FrozenTrial, seed: int) -> str:
+    return f"{FINAL}trial={trial.number},seed={seed}"
+
 
 CONFIRM = "confirm"  # the runs' folder, in the study's
 _HASH_SHOWN = 8  # characters

@@ -37,7 +37,7 @@ from gridworld.training.learning_curve import LearningCurve
 from gridworld.training.setup import check_settings, make_context
 from gridworld.training.together import Training, run_together
 from gridworld.tune.workers import Ask
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 
 SEEDS, ERROR, WORKER, DRAW = "seeds", "error", "worker", "draw"  # attributes of a trial in the study
 _MOST_STEPS = 2**63

@@ -30,11 +30,10 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import program
-from gridworld.process.console.progress import ProgressLine, time_left
+from gridworld.process.console import ProgressLine, program, time_left
 from gridworld.sweep.console import shell_path
 from gridworld.sweep.job_table import one_line
-from gridworld.tune.finalists import FINAL
+from gridworld.tune.confirmation import FINAL
 from gridworld.tune.objective import (
     DRAW,
     ERROR,

@@ -16,24 +16,25 @@ from gridworld.config.composition.compose import search_path
 from gridworld.config.composition.recipe_file import TRUST, overrides
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import command
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import command, printable
 from gridworld.process.signals import StopRequest
 from gridworld.report.writer import write_over_seeds
 from gridworld.run.folder import LOCK
-from gridworld.storage.file_lock import is_locked
+from gridworld.storage.atomic_write import is_locked
 from gridworld.sweep.console import shell_path
 from gridworld.training.tensorboard import hparams
 from gridworld.tune.confirmation import (
     CONFIRM,
+    Finalist,
     HeldOutRun,
     HeldOutRuns,
+    choose_finalists,
     held_out_runs,
     prepare,
+    rank_finalists,
     read_results,
     verdict_on,
 )
-from gridworld.tune.finalists import Finalist, choose_finalists, rank_finalists
 from gridworld.tune.objective import ERROR, with_values
 from gridworld.tune.recipe import write_recipe
 from gridworld.tune.search import in_reach, open_study, search, study_url
@@ -50,24 +51,20 @@ def tune(spec: StudySpec) -> None:
         StopRequest().listening(),
         Workers(int(spec.settings.workers)) as workers,
     ):
-        url = study_url(spec)
-        study = _begin(spec, url)
+        url, about = study_url(spec), _about(spec)
+        is_begun = is_claimed(spec.folder, spec.name)
+        study = open_study(url, spec.name, about, spec.space, must_exist=is_begun)
+        claim(spec.folder, spec.name, about)
         with in_reach(url):
             search(spec, study, workers)
             trials = choose_finalists(study, spec)
             if not trials:
-                raise SearchError(f"{shell_path(spec.folder)}: no trial came to a score; {_why(study)}")
+                errors = [error for trial in study.trials if (error := trial.user_attrs.get(ERROR))]
+                why = f"all {len(errors)} failed, the first: {errors[0]}" if errors else "there was no time"
+                raise SearchError(f"{shell_path(spec.folder)}: no trial came to a score; {why}")
             ranked = rank_finalists(spec, study, trials, workers)
             best = next(trial for trial in trials if trial.number == ranked[0].trial)
             _conclude(spec, study, best, ranked, workers)
-
-
-def _begin(spec: StudySpec, url: str) -> optuna.Study:
-    """Make the study, or check that the one there is of this search."""
-    about = _about(spec)
-    study = open_study(url, spec.name, about, spec.space, must_exist=is_claimed(spec.folder, spec.name))
-    claim(spec.folder, spec.name, about)
-    return study
 
 
 def _about(spec: StudySpec) -> dict[str, Any]:
@@ -84,12 +81,6 @@ def _about(spec: StudySpec) -> dict[str, Any]:
             "reports": spec.settings.reports,
         },
     }
-
-
-def _why(study: optuna.Study) -> str:
-    """Why no trial has a score."""
-    reasons = [trial.user_attrs[ERROR] for trial in study.trials if trial.user_attrs.get(ERROR)]
-    return f"all {len(reasons)} failed, the first: {reasons[0]}" if reasons else "there was no time"
 
 
 def _conclude(

@@ -26,16 +26,13 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import recorded_command_line
+from gridworld.process.console import recorded_command_line
 from gridworld.report.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
-from gridworld.run.claim import alone_in, check_writable
-from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON
+from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, alone_in, check_writable
 from gridworld.run.provenance import versions
-from gridworld.storage.atomic_write import check_no_links, make_folder, tidy, write_json, write_text
+from gridworld.storage.atomic_write import check_no_links, make_folder, noted, tidy, write_json, write_text
 from gridworld.storage.csv_text import csv_text
-from gridworld.storage.file_lock import noted
-from gridworld.storage.safe_read import LARGEST_CSV, file_sha256
-from gridworld.storage.sealed_json import read_sealed, sealed
+from gridworld.storage.safe_read import LARGEST_CSV, file_sha256, read_sealed, sealed
 from gridworld.tune.confirmation import CONFIRM
 from gridworld.tune.objective import ERROR, SEEDS, WORKER
 from gridworld.tune.recipe import EXPERIMENT

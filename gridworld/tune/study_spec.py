@@ -33,8 +33,8 @@ from gridworld.config.composition.recipe_file import CHOSEN, with_recipe
 from gridworld.config.train import AUTO, TrainConfig, check_bounds
 from gridworld.config.tune import TuneConfig
 from gridworld.errors import InputError
-from gridworld.process.console.command_line import program
-from gridworld.process.parallel.machine import core_count
+from gridworld.process.console import program
+from gridworld.process.processes import core_count
 from gridworld.training.setup import check_settings
 from gridworld.tune.objective import Objective
 from gridworld.tune.search_space import SearchSpace

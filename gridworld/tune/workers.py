@@ -73,17 +73,7 @@ class Workers:
         answer: Callable[[Any], Any] = lambda message: None,
         on_tick: Callable[[], None] = lambda: None,
     ) -> None:
-        """Run tasks until there are none.
-
-        Args:
-            next_task: returns the next task, or None.
-            on_end: takes a task and what it returned; None where it has killed too many workers.
-            answer: answers what a task asks.
-            on_tick: is called ten times a second.
-
-        Raises:
-            SearchError: a worker failed, or too many were killed.
-        """
+        """Run tasks until there are none."""
         again: list[Task] = []
         killed = Counter[int]()
 

@@ -17,7 +17,7 @@ from gridworld.config.worlds import EnvConfig, GymnasiumConfig
 from gridworld.envs.rendering import Frame, board_of, frame_size, import_pygame
 from gridworld.envs.rollout import Episode, play
 from gridworld.errors import InputError, in_short
-from gridworld.process.console.terminal import printable, tell
+from gridworld.process.console import printable, tell
 from gridworld.visualization.animation import (
     Animation,
     animation_of_cards,
@@ -26,7 +26,7 @@ from gridworld.visualization.animation import (
 )
 from gridworld.visualization.picture import Draw, Subject
 from gridworld.world.mdp import Mdp
-from gridworld.world.sources.making import make_env
+from gridworld.world.sources.gymnasium_table import make_env
 
 _MOST_FRAMES = 500  # of an episode that finds no end; by then a greedy one goes round in circles
 _MOST_PIXELS = 512 * 512  # of a frame that another environment renders

@@ -45,8 +45,8 @@ from gridworld.visualization.sheet import (
     short,
 )
 from gridworld.visualization.state_table import StateTable, table_states
-from gridworld.world.exact.solver import Solution, solved
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+from gridworld.world.solver import Solution, solved
 
 _UNKNOWN_DISAGREES: Colour = (226, 178, 174)
 _SMALLEST_ARROW_CELL = 12  # pixels; below it an arrow is a blot

@@ -20,7 +20,7 @@ from gridworld.envs.rendering import Frame
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State
 from gridworld.visualization.animation import Animation
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 
 _MOST = 48  # moments of a history
 _MOST_NUMBERS = 5_000_000  # of all moments together: some 25 MB

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from gridworld.world.exact.evaluation import Evaluator, Score
+from gridworld.world.evaluation import Evaluator, Score
 
 _ROUNDING = 1e-12  # of a regret, which may be below 0 for it
 

@@ -229,7 +229,7 @@ def test_torch_keeps_its_number_of_threads() -> None:
 def test_progress_is_shown_or_not(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gridworld.process.console.progress._SECONDS_BETWEEN_LINES", 0.0)
+    monkeypatch.setattr("gridworld.process.console._SECONDS_BETWEEN_LINES", 0.0)
     gridworld.train(*SHORT["q_learning"], progress=False)
     assert capsys.readouterr().err == ""
     gridworld.train(*SHORT["q_learning"])

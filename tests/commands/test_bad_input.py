@@ -12,7 +12,7 @@ import pytest
 from helpers.support import SHORT, configure, script, train_in
 
 from gridworld.errors import InputError
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 from gridworld.training.train import train
 
 YAMLS: dict[str, bytes] = {
@@ -71,7 +71,7 @@ ABSURD = [
     (f"agent=sarsa agent.stats_window_size={10**30}", "must be from 1 to 1000000000"),
     (f"agent.n_steps={10**30}", "must be from 1 to 100000"),
     (f"agent.train_freq={10**30}", "must be from 1 to 100000"),
-    (f"agent=qrdqn +agent.arguments.train_freq={10**30}", "must be from 1 to 100000"),
+    (f"agent=qrdqn +agent.arguments.train_freq={10**30}", "must be smaller than 2**63"),
     ("agent=qrdqn +agent.arguments.tau=1e307", "agent.arguments.tau=1e+307: must be from 0 to 1"),
     ("agent=ppo agent.clip_range=1e307", "agent.clip_range=1e+307: must be from 0 to 1000000000000000"),
     (

@@ -16,7 +16,7 @@ from gridworld import __version__
 from gridworld.commands.console import COMMANDS
 from gridworld.config.composition.conf_folder import conf_folder
 from gridworld.errors import DISTRIBUTION
-from gridworld.process.console import command_line
+from gridworld.process import console
 from gridworld.run.provenance import code
 
 TEXTS = (".py", ".md", ".yaml", ".toml", ".cff", ".j2")
@@ -81,21 +81,21 @@ def test_help_names_the_command_that_was_called(name: str, tmp_path: Path) -> No
 
 def test_what_is_typed_and_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["gridworld train", "agent=dqn"])
-    assert command_line.command("report") == command_line.program("report") == "gridworld report"
-    assert command_line.as_called("python scripts/tune.py x; as for train.py") == (
+    assert console.command("report") == console.program("report") == "gridworld report"
+    assert console.as_called("python scripts/tune.py x; as for train.py") == (
         "gridworld tune x; as for gridworld train"
     )
-    assert command_line.command_line() == ["gridworld", "train", "agent=dqn"]
-    assert command_line.recorded_command_line() == ["gridworld", "train", "agent=dqn"]
+    assert console.command_line() == ["gridworld", "train", "agent=dqn"]
+    assert console.recorded_command_line() == ["gridworld", "train", "agent=dqn"]
     monkeypatch.setattr(sys, "argv", ["../scripts/train.py", "agent=dqn"])
-    assert command_line.command("report") == "python scripts/report.py"
-    assert command_line.program("report") == "report.py"
-    assert command_line.command_line() == ["python", "../scripts/train.py", "agent=dqn"]
-    assert command_line.recorded_command_line() == ["train.py", "agent=dqn"]
+    assert console.command("report") == "python scripts/report.py"
+    assert console.program("report") == "report.py"
+    assert console.command_line() == ["python", "../scripts/train.py", "agent=dqn"]
+    assert console.recorded_command_line() == ["train.py", "agent=dqn"]
     monkeypatch.setattr(sys, "argv", ["notebook.py"])  # no command: as it is installed
-    assert command_line.command("report") == "python scripts/report.py"
-    monkeypatch.setattr(command_line, "_SCRIPTS", Path("nowhere"))
-    assert command_line.command("report") == "gridworld report"
+    assert console.command("report") == "python scripts/report.py"
+    monkeypatch.setattr(console, "_SCRIPTS", Path("nowhere"))
+    assert console.command("report") == "gridworld report"
 
 
 def test_a_run_is_told_as_it_was_started(tmp_path: Path) -> None:

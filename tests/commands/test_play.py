@@ -14,7 +14,7 @@ from helpers.support import ROOT, SHORT, train_in
 from gridworld.commands import play as command
 from gridworld.commands.game import Game, Key, draw
 from gridworld.envs.rendering import AGENT, draw_frame
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
 

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gridworld.diagnosis.evidence import split_regret
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import one_hot_policy
+from gridworld.world.chain import one_hot_policy
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
 

@@ -20,7 +20,7 @@ from PIL import Image
 from gridworld.commands import export
 from gridworld.errors import InputError
 from gridworld.export.exported_run import read
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 
 NAME = "dqn-classic-seed0"
 

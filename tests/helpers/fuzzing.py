@@ -26,14 +26,13 @@ from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.report.evidence import read
 from gridworld.report.setting_charts import tuning_charts
-from gridworld.report.table import to_captioned_markdown, to_csv
-from gridworld.report.tables import finalists_table, trials_table, winner_table
+from gridworld.report.tables import finalists_table, to_captioned_markdown, to_csv, trials_table, winner_table
 from gridworld.report.tuning_study import TRIALS_SUM, find_tunings
 from gridworld.restore.saved_run import SavedRun
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 from gridworld.training.setup import check_settings, make_context
 from gridworld.tune.study_folder import is_claimed
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load
 

@@ -29,9 +29,9 @@ import torch
 from gridworld.config.plain_settings import read_config
 from gridworld.process.user_input import npz_bytes
 from gridworld.run.provenance import identity
-from gridworld.storage.event_file import _checksum
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 from gridworld.storage.serialization import decode, encode
+from gridworld.training.tensorboard import _checksum
 
 SECRET = "the-secret-7f3a"
 Spoil = Callable[[Path, Path], None]

@@ -16,13 +16,12 @@ from helpers.support import configure
 from gridworld.report import tuning_study as tuning
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import read_run
-from gridworld.storage.safe_read import sha256
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed, sha256
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.job_table import FAILED, JobRow, JobTable
 from gridworld.sweep.plan import Job
 from gridworld.tune.study_folder import SEARCH_JSON
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.world.evaluation import Evaluator
 
 _COLUMNS = ("value", "regret", "certified", "goal_probability", "trap_probability", "timeout_probability")
 _COLUMNS += ("return", "length")

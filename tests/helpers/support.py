@@ -64,7 +64,7 @@ def configure(*overrides: str) -> TrainConfig:
     """The configuration that the command line would give to a run.
 
     Composed as a sweep composes its jobs: the files of each choice are read once. It comes to the same, see
-    tests/sweep/test_configurations.py, in 3 ms instead of 100.
+    tests/sweep/test_sweep_plan.py, in 3 ms instead of 100.
     """
     return copy.deepcopy(_composed(overrides))
 

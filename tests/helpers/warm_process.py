@@ -48,7 +48,7 @@ from omegaconf import OmegaConf
 import gridworld
 from gridworld.config.composition.compose import compose
 from gridworld.envs.rendering import import_pygame
-from gridworld.process.console import progress
+from gridworld.process import console
 from gridworld.process.memory_budget import collect_less_often
 from gridworld.report import page
 from gridworld.tune import search as tune_search
@@ -263,7 +263,7 @@ if __name__ == "__main__":
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     gc.disable()
     _import_everything()
-    progress._SECONDS_BETWEEN_LINES = 600.0
+    console._SECONDS_BETWEEN_LINES = 600.0
     tune_search._SECONDS_BETWEEN_TABLES = 0.3
     _wait_less_for_slurm()
     compose_quickly()

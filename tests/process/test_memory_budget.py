@@ -10,8 +10,8 @@ from helpers.support import SHORT, script, train_in
 
 from gridworld.commands import evaluate
 from gridworld.errors import InputError
-from gridworld.process.console import progress
-from gridworld.process.console.progress import telling_if_slow
+from gridworld.process import console
+from gridworld.process.console import telling_if_slow
 from gridworld.process.memory_budget import (
     VARIABLE,
     BudgetError,
@@ -74,7 +74,7 @@ def test_a_state_is_refused_by_what_its_arrays_say_before_they_are_made() -> Non
 def test_what_takes_long_says_so_until_it_is_done(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(progress, "_SECONDS_BETWEEN_LINES", 0.01)
+    monkeypatch.setattr(console, "_SECONDS_BETWEEN_LINES", 0.01)
     with telling_if_slow("training"):  # of one's own
         time.sleep(0.05)
     with limited(), telling_if_slow("reading\x1b"), telling_if_slow("a part of it"):

@@ -14,10 +14,10 @@ from helpers.support import SHORT, train_in
 
 from gridworld.commands import evaluate, jobs, record, report, reproduce, run
 from gridworld.commands import resume as resume_command
-from gridworld.process.console.terminal import prepare
-from gridworld.report.table import Table, to_captioned_markdown, to_csv, to_markdown
+from gridworld.process.console import prepare
+from gridworld.report.tables import Table, to_captioned_markdown, to_csv, to_markdown
 from gridworld.report.tuning_study import find_tunings
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 from gridworld.sweep import console
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.job_table import FAILED, JobRow, JobTable

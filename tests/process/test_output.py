@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from helpers.support import ROOT, SHORT, script, train_in
 
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 
 NO_UTF8 = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 ASCII = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii"}
@@ -48,10 +48,10 @@ def test_a_run_ends_well_whoever_reads_its_output(line: str, tmp_path: Path) -> 
 
 def test_progress_that_nobody_reads_is_no_reason_to_stop(tmp_path: Path) -> None:
     code = (
-        "import os, sys; from gridworld.process.console import terminal; terminal.prepare();"
-        "from gridworld.process.console import progress; progress._SECONDS_BETWEEN_LINES = 0;"
+        "import os, sys; from gridworld.process import console; console.prepare();"
+        "console._SECONDS_BETWEEN_LINES = 0;"
         "read, write = os.pipe(); os.close(read); os.dup2(write, 2);"
-        "p = progress.Progress(10, 'x'); [p.update(i, 'y') for i in range(10)]; print('done')"
+        "p = console.Progress(10, 'x'); [p.update(i, 'y') for i in range(10)]; print('done')"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, "done\n")

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from gridworld.process.parallel.processes import LostError, run_in_processes
+from gridworld.process.processes import LostError, run_in_processes
 
 
 def run(tasks: Sequence[Callable[[], Any]], count: int = 2, forks: bool = True) -> list[Any]:

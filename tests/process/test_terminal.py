@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gridworld.commands import jobs as jobs_command
-from gridworld.process.console.terminal import aligned, printable
+from gridworld.process.console import aligned, printable
 from gridworld.run.summary import summary_text
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 from gridworld.sweep.job_table import JobRow, JobTable
 
 NUMBERS = st.floats() | st.sampled_from([-0.0001381, 1e-300, -1e-300, -1.234e300, float("-inf"), 0.0])

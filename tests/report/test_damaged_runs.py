@@ -10,13 +10,13 @@ from helpers.support import SHORT, train_in
 
 from gridworld.commands import report as command
 from gridworld.errors import InputError
-from gridworld.report.build import gather
+from gridworld.report.analysis import gather
 from gridworld.report.evidence import Evidence, Unusable, read
 from gridworld.report.writer import write_over_seeds
 from gridworld.run.folder import RESULTS, WORLD
 from gridworld.run.reader import read_run
+from gridworld.sweep.console import results_lines
 from gridworld.sweep.job_table import DONE, JobRow
-from gridworld.sweep.results import results_lines
 
 AGENTS = {"sarsa": SHORT["sarsa"], "dqn": SHORT["dqn"]}
 SEEDS = range(3)

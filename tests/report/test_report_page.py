@@ -10,7 +10,7 @@ from helpers.support import SHORT, train_in
 from PIL import Image
 
 from gridworld.commands import report as command
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 
 SIZES = {"phone": (390, 844), "desktop": (1280, 900)}
 

@@ -28,13 +28,13 @@ from gridworld.commands import record as record_command
 from gridworld.config.pictures import PICTURES
 from gridworld.errors import InputError
 from gridworld.report import tuning_study as tuning
-from gridworld.report.build import gather
+from gridworld.report.analysis import gather
 from gridworld.report.page import charts, render
 from gridworld.restore.reproduce import check_whole
 from gridworld.restore.resume import open_unfinished
 from gridworld.restore.saved_run import SavedRun, read_visits
 from gridworld.run.reader import read_run
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 from gridworld.storage.serialization import decode, encode
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.job_table import JobTable
@@ -56,8 +56,8 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def reported(folder: Path) -> str:
     report = gather([folder / "run"])
-    if not report.complete:
-        raise InputError(report.sentences()[0])
+    if found := report.sentences():
+        raise InputError(found[0])
     return render(report, charts(report))
 
 

@@ -14,14 +14,13 @@ from helpers.hostile import manifest, seal, weights
 from helpers.own_class import OWN_CLASS, any_class
 from helpers.resuming import go_on, stopped_after
 from helpers.support import DEEP, ROOT, SHORT, script, train_in
-from tensorboard.compat.proto.summary_pb2 import Summary
 
 from gridworld.commands import reproduce as command
 from gridworld.commands.reproduce import main
 from gridworld.errors import InputError
 from gridworld.run.folder import SOURCE_DIFF
 from gridworld.run.provenance import describe, differences, source_of
-from gridworld.storage.event_file import EventFile, read_scalars
+from gridworld.training.tensorboard import EventWriter, read_scalars
 
 PARTS = ["learning curve", "final weights", "best weights", "visits", "summary", "TensorBoard points"]
 PLAIN = ["recording.frames=false", "recording.gif=false", "env.slip=0.1", "seed=3"]
@@ -105,8 +104,8 @@ def other_summary(run: Path) -> None:
 
 def other_points(run: Path) -> None:
     (run / "more").mkdir()
-    events = EventFile(run / "more")
-    events.add(Summary(value=[Summary.Value(tag="eval/value", simple_value=0.5)]), 7)
+    events = EventWriter(run / "more")
+    events.scalars({"eval/value": 0.5}, 7)
     events.close()
     next((run / "more").iterdir()).rename(run / "events.out.tfevents.0.first")
 

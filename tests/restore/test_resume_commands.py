@@ -21,9 +21,8 @@ from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.folder import LOCK, RunFolder
 from gridworld.run.provenance import Source
 from gridworld.storage.append_log import AppendLog
-from gridworld.storage.atomic_write import write_json
-from gridworld.storage.file_lock import locked
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.atomic_write import locked, write_json
+from gridworld.storage.safe_read import sealed
 from gridworld.storage.serialization import decode, encode
 from gridworld.sweep.job import run_in_sweep
 from gridworld.training.together import run_alone
@@ -300,12 +299,12 @@ def test_a_signal_saves_and_ends_soon(number: signal.Signals, tmp_path: Path) ->
 STOPPED_EARLY = """
 import os, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job would ignore it
-from gridworld.process.early_signals import AtWork, listen
+from gridworld.process.signals import at_work, listen
 listen()
 if sys.argv[1] == "before":
     os.kill(os.getpid(), int(sys.argv[2]))
 try:
-    with AtWork():
+    with at_work():
         if sys.argv[1] == "at work":
             os.kill(os.getpid(), int(sys.argv[2]))
 except KeyboardInterrupt:
@@ -327,7 +326,7 @@ def test_a_signal_that_comes_early_or_late(when: str, number: signal.Signals) ->
 def test_scripts_listen_before_what_takes_time_to_import() -> None:
     for path in (ROOT / "scripts").glob("*.py"):
         code = [line for line in path.read_text().splitlines()[1:] if line]
-        assert code[0] == "from gridworld.process.early_signals import listen"
+        assert code[0] == "from gridworld.process.signals import listen"
         assert code[2] == "    listen()  # before what takes time to import"
 
 

@@ -16,17 +16,16 @@ from helpers.support import SHORT, configure, script, start
 
 from gridworld.errors import FolderLostError
 from gridworld.run.checkpoints import Checkpoints
-from gridworld.run.claim import alone_in
-from gridworld.run.folder import LOCK
+from gridworld.run.folder import LOCK, alone_in
 from gridworld.run.writer import RunWriter, clear
 from gridworld.storage.append_log import AppendLog
 from gridworld.storage.atomic_write import (
+    locked,
     remove_path,
     write_array,
     write_json,
     write_text,
 )
-from gridworld.storage.file_lock import locked
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.job import run_in_sweep
 from gridworld.sweep.job_table import JobTable

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import gridworld
-from gridworld.process.console.terminal import plain
-from gridworld.report.table import Table, to_csv
+from gridworld.process.console import plain
+from gridworld.report.tables import Table, to_csv
 from gridworld.storage.csv_text import csv_rows, csv_text
 from gridworld.sweep.job_table import JobRow, JobTable
 

@@ -6,8 +6,9 @@ import pytest
 from helpers.support import SHORT, configure, script
 
 from gridworld.errors import InputError
-from gridworld.run.claim import check_free
-from gridworld.storage.atomic_write import check_no_links, make_inside, names_inside, remove_inside
+from gridworld.run.folder import alone_in
+from gridworld.run.reader import check_free
+from gridworld.storage.atomic_write import check_no_links, is_locked, make_inside, names_inside, remove_inside
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.plan import Job
 from gridworld.tune import confirmation as confirm
@@ -128,3 +129,14 @@ def test_a_new_run_is_not_begun_beside_checkpoints_that_lead_elsewhere(tmp_path:
     (tmp_path / "run" / "checkpoints").symlink_to(victim)
     with pytest.raises(InputError, match=f"run/checkpoints: {REFUSED}"):
         check_free(tmp_path / "run")
+
+
+def test_a_lock_that_is_a_link_is_refused(tmp_path: Path, victim: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / ".lock").symlink_to(victim / "trial=1,seed=0" / "model.zip")
+    before = contents(victim)
+    with pytest.raises(InputError, match=rf"run/\.lock: {REFUSED}"), alone_in(tmp_path / "run"):
+        pass
+    with pytest.raises(InputError, match=r"run/\.lock: is a symbolic link"):
+        is_locked(tmp_path / "run" / ".lock")
+    assert contents(victim) == before

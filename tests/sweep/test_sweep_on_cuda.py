@@ -28,11 +28,10 @@ from gridworld.config.sweep import SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
-from gridworld.process.parallel.together import mixing
+from gridworld.process.together import mixing
 from gridworld.restore.reproduce import population
 from gridworld.run.reader import read_run
-from gridworld.sweep.grouping import populations
-from gridworld.sweep.plan import Job
+from gridworld.sweep.plan import Job, populations
 from gridworld.training.setup import check_settings, make_context
 
 SMALL = (

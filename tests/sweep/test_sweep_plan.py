@@ -1,4 +1,4 @@
-"""From a sweep's command line to its jobs: which there are, when two are the same, what they are called."""
+"""From a sweep's command line or yaml to its jobs: which there are, what they are, what they are called."""
 
 import dataclasses
 import re
@@ -6,19 +6,26 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
-from helpers.support import CONF, SHORT, configure
-from hydra import initialize_config_dir
+from helpers.support import CONF, SHORT, configure, script
+from hydra import compose, initialize_config_dir
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.types import RunMode
 from hypothesis import given
 from hypothesis import strategies as st
+from omegaconf import DictConfig
 
-from gridworld.config.composition.compose import register_schemas
+from gridworld.config.composition.compose import register_schemas, to_config
+from gridworld.config.composition.hydra_errors import sentence
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import read_run
 from gridworld.run.writer import RunWriter
+from gridworld.storage.safe_read import read_object
+from gridworld.sweep.configurations import Configurations
 from gridworld.sweep.plan import Job, expand, folder_name, plan
 from gridworld.training.setup import check_settings
 
@@ -28,6 +35,7 @@ def loader() -> Iterator[ConfigLoader]:
     register_schemas()
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         yield GlobalHydra.instance().config_loader()
+    HydraConfig.instance().cfg = None
 
 
 def lines(loader: ConfigLoader, *words: str, most: int = 1000) -> list[str]:
@@ -139,3 +147,158 @@ def test_a_folders_name_is_safe_short_free_and_keeps_the_seed(
         assert re.fullmatch(r"[A-Za-z0-9_.=+,-]{1,100}", name)
         assert name not in (".", "..")
         assert f"seed={seed}" in name
+
+
+def master_of(loader: ConfigLoader, *words: str) -> DictConfig:
+    return loader.load_configuration("train", list(words), RunMode.MULTIRUN)
+
+
+@pytest.mark.parametrize(
+    ("words", "composed"),
+    [
+        ([], 1),
+        (["agent=ppo", "seed=range(3)"], 1),
+        (["agent=ppo,q_learning", "env.slip=0,0.1", "seed=0,1"], 2),
+        (["env=maze", "agent=q_learning", "agent.learning_rate=lin_0.5,0.25", "seed=1,2"], 1),
+        (["agent=a2c", "+agent.arguments.max_grad_norm=0.5", "seed=0,1", "observation=coordinates"], 1),
+        (["agent.gamma=0.1,0.2", "agent.policy_kwargs.net_arch=[8,8]", "agent=dqn", "++n_envs=4"], 2),
+        (["agent.gamma=0.1,0.2", "agent={gamma: 0.5}", "env.layout='my map.txt'"], 2),
+        (["n_envs=${seed}", "seed=1,2,3"], 1),  # it follows from the seed
+        (["seed=${n_envs}", "n_envs=1,2"], 1),
+        (["evaluation.stop_after=null", "device='cpu'", "stratified_draws=true,false"], 1),
+    ],
+)
+def test_each_job_is_what_hydra_composes(
+    loader: ConfigLoader, words: list[str], composed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    by_hydra: list[list[str]] = []
+    load = type(loader).load_sweep_config
+
+    def counted(self: ConfigLoader, master: DictConfig, words: list[str]) -> DictConfig:
+        by_hydra.append(words)
+        return load(self, master, words)
+
+    monkeypatch.setattr(type(loader), "load_sweep_config", counted)
+    configure = Configurations(loader, master_of(loader))
+    jobs = [overrides for overrides, _ in expand(words, loader, 100)]
+    configs = [configure(job) for job in jobs]
+    assert len(by_hydra) == composed
+    assert configs == [to_config(compose("train", job)) for job in jobs]
+
+
+@pytest.mark.parametrize(
+    ("word", "told"),
+    [("agent.gama=0.5", "did you mean gamma"), ("total_timesteps=often", "total_timesteps=often: Value")],
+)
+def test_a_mistake_is_told_as_hydra_tells_it(loader: ConfigLoader, word: str, told: str) -> None:
+    with pytest.raises(HydraException) as mistake:
+        Configurations(loader, master_of(loader))(["agent=dqn", word])
+    assert told in sentence(mistake.value)
+
+
+def test_what_all_jobs_have_in_common_is_not_some_jobs_own(loader: ConfigLoader, tmp_path: Path) -> None:
+    (tmp_path / "experiment").mkdir()
+    text = "# @package _global_\nhydra: {sweep: {dir: mine}}\n"
+    (tmp_path / "experiment" / "dir.yaml").write_text(text)
+    master = master_of(loader, f"hydra.searchpath=[file://{tmp_path}]")
+    with pytest.raises(InputError, match=r"^hydra\.sweep: is set in a file that only some of the jobs"):
+        Configurations(loader, master)(["experiment=dir"])
+    with pytest.raises(InputError, match=r"^hydra\.sweep\.subdir=\$\{seed\}: a sweep names the folders"):
+        Configurations(loader, master_of(loader, "hydra.sweep.subdir=${seed}"))
+
+
+GRID = """\
+# @package _global_
+defaults: [{override /agent: q_learning}]
+total_timesteps: 300
+recording: {frames: false, gif: false, learning: false}
+hydra:
+  mode: MULTIRUN
+  sweeper:
+    params: {seed: range(2), agent.learning_rate: "0.1,0.2", env: "classic,cliff", n_envs: 4}
+    paired: [agent.learning_rate, env]
+"""
+OTHER = "# @package _global_\nhydra: {sweeper: {params: {seed: '0,1'}}}\n"
+NO_TEXT = "# @package _global_\nhydra: {sweeper: {params: {seed: [0, 1]}}}\n"
+
+
+@pytest.fixture(scope="module")
+def conf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("conf")
+    (folder / "experiment").mkdir()
+    for name, text in {"grid": GRID, "other": OTHER, "no_text": NO_TEXT}.items():
+        (folder / "experiment" / f"{name}.yaml").write_text(text)
+    return folder
+
+
+def test_a_yaml_says_what_is_swept_and_that_it_is_a_sweep(conf: Path, tmp_path: Path) -> None:
+    words = ["--config-dir", str(conf), "experiment=grid", "hydra.sweep.dir=sweep", "hydra.job.chdir=true"]
+    done = script("train.py", *words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    names = {path.parent.name for path in tmp_path.glob("sweep/*/summary.json")}
+    pairs = ("agent.learning_rate=0.1,env=classic", "agent.learning_rate=0.2,env=cliff")
+    assert names == {f"seed={seed},{pair}" for seed in (0, 1) for pair in pairs}
+    config = read_object(tmp_path / "sweep" / min(names) / "manifest.json")["config"]
+    assert (config["total_timesteps"], config["n_envs"]) == (300, 4)
+
+    words[2:3] = ["-m", "experiment=grid", "seed=1", "total_timesteps=300"]  # the command line goes before
+    again = script("train.py", *words, cwd=tmp_path)
+    assert "2 jobs: 2 done; 0 to run" in again.stderr + again.stdout, again.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("experiment=grid env=maze", "[agent.learning_rate,env]: env has no list of values; give it one"),
+        ("experiment=other,maze_dqn", "hydra.sweeper: is set in a file that only some of the jobs choose"),
+        ("experiment=no_text", "hydra.sweeper.params.seed: must be text as on the command line, such as 0,1"),
+    ],
+)
+def test_a_yaml_that_cannot_be_swept_is_refused(words: str, told: str, conf: Path, tmp_path: Path) -> None:
+    done = script("train.py", "--config-dir", str(conf), "-m", *words.split(), cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: ")
+    assert told in done.stderr
+    assert list(tmp_path.rglob("*.*")) == []
+
+
+def test_lists_that_vary_together(loader: ConfigLoader) -> None:
+    words = ["agent=dqn,ppo", "device=cpu", "seed=0,1", "+n_envs=2,4", "threads=3,4"]
+
+    def lines(*paired: object) -> list[str]:
+        return [" ".join(job) for job, _ in expand(words, loader, 16, paired)]
+
+    assert lines("agent", "n_envs") == [
+        f"agent={agent} device=cpu seed={seed} +n_envs={n_envs} threads={threads}"
+        for agent, n_envs in (("dqn", 2), ("ppo", 4))
+        for seed in (0, 1)
+        for threads in (3, 4)
+    ]
+    assert lines(["threads", "seed"], ["n_envs", "agent"]) == [
+        f"agent={agent} device=cpu seed={seed} +n_envs={n_envs} threads={threads}"
+        for agent, n_envs in (("dqn", 2), ("ppo", 4))
+        for seed, threads in ((0, 3), (1, 4))
+    ]
+    assert len(lines()) == 16
+    _, swept = expand(words, loader, 4, [["seed", "threads"], ["agent", "n_envs"]])[0]
+    assert swept == ["agent=dqn", "seed=0", "+n_envs=2", "threads=3"]
+
+
+@pytest.mark.parametrize(
+    ("paired", "told"),
+    [
+        (
+            ["agent", "seed"],
+            "[agent,seed]: lists that vary together are equally long; agent has 2, seed has 3",
+        ),
+        (["agent", "n_envs"], "[agent,n_envs]: n_envs has no list of values; give it one, n_envs=A,B"),
+        (["agent", "sed"], "[agent,sed]: sed has no list of values"),
+        (["agent"], "[agent]: names one setting; a pair is of two or more"),
+        (["agent", "agent"], "[agent,agent]: agent is paired already; name it once"),
+        ([["agent", "env"], ["env", "agent"]], "[env,agent]: env is paired already; name it once"),
+        ([1, 2], "[1,2]: 1 has no list of values"),
+    ],
+)
+def test_pairs_that_cannot_be_are_refused(loader: ConfigLoader, paired: list[object], told: str) -> None:
+    with pytest.raises(InputError, match=re.escape(f"hydra.sweeper.paired={told}")):
+        expand(["agent=dqn,ppo", "env=maze,cliff", "n_envs=3", "seed=0,1,2"], loader, 100, paired)

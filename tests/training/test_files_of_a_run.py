@@ -7,7 +7,7 @@ from pathlib import Path
 
 from helpers.support import ROOT
 
-MOST = 93
+MOST = 85
 
 COUNTED = """
 import inspect, runpy, sys, threading

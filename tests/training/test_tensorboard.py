@@ -1,4 +1,4 @@
-"""What a real TensorBoard serves of a run, and what a real browser shows of it."""
+"""What a real TensorBoard serves of a run and of a sweep."""
 
 import json
 import re
@@ -11,22 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.browser import chromium
 from helpers.support import SHORT, script, train_in
 
 from gridworld.training.learning_curve import CHARTS
-
-# Walks through the shadow roots that TensorBoard's components hide behind.
-PAGE_TEXT = """
-const texts = [];
-const walk = node => {
-  if (node.nodeType === Node.TEXT_NODE) texts.push(node.textContent);
-  if (node.shadowRoot) walk(node.shadowRoot);
-  node.childNodes.forEach(walk);
-};
-walk(document.body);
-return texts.join(" ");
-"""
 
 SWEPT = {
     f"agent={agent},agent.learning_rate={rate},seed={seed}"
@@ -147,6 +134,8 @@ def test_the_hparams_table_has_settings_and_metrics(served: str) -> None:
     for group in groups:
         assert group["hparams"]["env.layout"] == "classic"
         assert {value["name"]["tag"] for value in group["metricValues"]} >= set(RESULTS)
+    (category,) = ask(served, "data/plugin/custom_scalars/layout")["category"]
+    assert {chart["title"]: chart["multiline"]["tag"] for chart in category["chart"]} == CHARTS
 
 
 def test_the_hparams_table_opens_with_what_varies_and_the_results(served_sweep: str) -> None:
@@ -171,58 +160,3 @@ def test_a_sweep_has_every_run_by_its_name_with_its_metrics(served_sweep: str) -
         "seeds certified",
     }
     assert {chart["title"]: chart["multiline"]["tag"] for chart in curves["chart"]} == CHARTS
-
-
-def test_custom_scalars_group_the_curves(served: str) -> None:
-    layout = ask(served, "data/plugin/custom_scalars/layout")
-    charts = layout["category"][0]["chart"]
-    assert {chart["title"]: chart["multiline"]["tag"] for chart in charts} == CHARTS
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    with chromium(tmp_path_factory.mktemp("profile")) as started:
-        yield started
-
-
-def test_a_browser_shows_it(served: str, browser: Any, tmp_path: Path) -> None:
-    shows(
-        browser,
-        served,
-        {
-            "timeseries": ["dqn_run", "ppo_run", "/mean_reward", "/regret"],
-            "text": ["run/command", "run/settings", "run/summary", "first_certified_step"],
-            "images": ["dqn_run", "policy", "q_error", "visits", "learning", "episode"],
-            "hparams": ["agent.name", "env.layout", "eval/regret"],
-        },
-        tmp_path,
-    )
-
-
-def test_a_browser_shows_a_sweep(served_sweep: str, browser: Any, tmp_path: Path) -> None:
-    shows(
-        browser,
-        served_sweep,
-        {
-            "timeseries": [*SWEPT, *OVER_SEEDS, "/goal_probability"],
-            "hparams": ["agent.learning_rate", "q_learning", "sarsa", "eval/regret"],
-            "custom_scalars": [*CHARTS, *SWEPT],
-        },
-        tmp_path,
-    )
-
-
-def shows(browser: Any, address: str, pages: dict[str, list[str]], folder: Path) -> None:
-    """Whether it comes to show these words on TensorBoard's pages; leaves a picture where it does not."""
-    from selenium.common.exceptions import TimeoutException
-    from selenium.webdriver.support.ui import WebDriverWait
-
-    for page, expected in pages.items():
-        browser.get(f"{address}#{page}")
-        try:
-            WebDriverWait(browser, 30).until(
-                lambda b, words=expected: all(word in b.execute_script(PAGE_TEXT) for word in words)
-            )
-        except TimeoutException:
-            browser.save_screenshot(str(folder / f"{page}.png"))
-            raise

@@ -13,8 +13,8 @@ import pytest
 
 from gridworld.agents import Learning
 from gridworld.process import signals
-from gridworld.process.parallel.together import clock
 from gridworld.process.signals import Interrupted, StopRequest
+from gridworld.process.together import clock
 from gridworld.training.together import Training, run_alone, run_together
 
 NAME: ContextVar[str] = ContextVar("name", default="outside")
@@ -115,60 +115,35 @@ def test_each_is_what_it_is_alone() -> None:
     assert run_together([]) == []
 
 
-@pytest.mark.parametrize("where", ["before", "learning", "after"])
-def test_one_that_fails_leaves_the_others(where: str) -> None:
-    log: list[str] = []
-    error = ZeroDivisionError("by zero")
-
-    def fails() -> Training[str]:
-        if where == "before":
-            raise error
-        at_step = {2: raises(error)} if where == "learning" else {}
-        return (yield from walk(log, "b", at_step=at_step, then=raises(error) if where == "after" else int))
-
-    found = run_together([partial(walk, log, "a"), fails, partial(walk, log, "c")])
-    assert found == ["A", error, "C"]
-    assert [line for line in log if not line.startswith("b")] == ["a walked [1, 2, 3]", "c walked [1, 2, 3]"]
+def ends_by(error: BaseException, where: str, log: list[str]) -> Training[str]:
+    """A training that raises this before, while or after it learns."""
+    raising = raises(error)
+    if where == "before":
+        raising()
+    at_step = {2: raising} if where == "learning" else {}
+    return (yield from walk(log, "b", at_step=at_step, then=raising if where == "after" else int))
 
 
 @pytest.mark.parametrize("where", ["before", "learning", "after"])
-def test_a_system_exit_lets_the_others_end(where: str) -> None:
-    """Those that had not begun are left for another time."""
-    log: list[str] = []
-
-    def exits() -> Training[str]:
-        if where == "before":
-            sys.exit(3)
-        at_step = {2: partial(sys.exit, 3)} if where == "learning" else {}
-        return (
-            yield from walk(log, "b", at_step=at_step, then=partial(sys.exit, 3) if where == "after" else int)
+def test_one_that_fails_leaves_the_others_and_all_end_where_it_is_no_exception(where: str) -> None:
+    def together(error: BaseException) -> list[Any]:
+        log.clear()
+        return run_together(
+            [partial(walk, log, "a"), partial(ends_by, error, where, log), partial(walk, log, "c")]
         )
 
-    with pytest.raises(SystemExit) as end:
-        run_together([partial(walk, log, "a"), exits, partial(walk, log, "c")])
-    assert end.value.code == 3
-    walked = ["a walked [1, 2, 3]"] + ["c walked [1, 2, 3]"] * (where != "before")
-    assert [line for line in log if not line.startswith("b")] == walked
-
-
-@pytest.mark.parametrize("where", ["before", "learning", "after"])
-def test_what_is_no_exception_ends_all(where: str) -> None:
     log: list[str] = []
-
-    def stops() -> Training[str]:
-        stop = Interrupted(signal.SIGTERM)
-        if where == "before":
-            raise stop
-        at_step = {2: raises(stop)} if where == "learning" else {}
-        return (yield from walk(log, "b", at_step=at_step, then=raises(stop) if where == "after" else int))
-
+    failure = ZeroDivisionError("by zero")
+    assert together(failure) == ["A", failure, "C"]
+    assert [line for line in log if line[0] != "b"] == ["a walked [1, 2, 3]", "c walked [1, 2, 3]"]
+    with pytest.raises(SystemExit, match="3"):  # those that had not begun are left for another time
+        together(SystemExit(3))
+    walked = ["a walked [1, 2, 3]"] + ["c walked [1, 2, 3]"] * (where != "before")
+    assert [line for line in log if line[0] != "b"] == walked
     with pytest.raises(Interrupted):
-        run_together([partial(walk, log, "a"), stops, partial(walk, log, "c")])
-    first = "a walked [1, 2, 3]" if where == "after" else "a ended by Interrupted"
-    assert log[0] == first or where != "after"
-    ended = {line for line in log if "ended" in line}
-    expected = {"before": {"a"}, "learning": {"a", "b", "c"}, "after": {"b", "c"}}[where]
-    assert ended == {f"{name} ended by Interrupted" for name in expected}
+        together(Interrupted(signal.SIGTERM))
+    ended = {"before": "a", "learning": "abc", "after": "bc"}[where]
+    assert {line for line in log if "ended" in line} == {f"{name} ended by Interrupted" for name in ended}
 
 
 def test_the_clock_counts_a_runs_own_time_and_its_share() -> None:

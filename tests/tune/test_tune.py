@@ -20,7 +20,7 @@ from optuna.trial import TrialState, create_trial
 from gridworld.commands import report as report_command
 from gridworld.commands import tune as tune_command
 from gridworld.errors import InputError
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 from gridworld.tune.study_folder import at_work_in
 
 QUICK = (
@@ -198,54 +198,39 @@ FLOAT = "agent.learning_rate: {type: float, low: 1e-3, high: 1e-2}"
 @pytest.mark.parametrize(
     ("yaml", "sentence"),
     [
-        (FLOAT, "Key 'agent.learning_rate' not in 'TuneConfig'"),  # without the line that says where it goes
-        ("# @package tune.space\n", "there is nothing to search"),
-        ("# @package tune.space\nagent.x: {type: float\n b", "bad.yaml: line 3, column 3: cannot be read"),
-        ("# @package tune.space\nagent.gamma: 3", "int is not a subclass of DimensionConfig"),
-        ("# @package tune.space\nagent.gamma: {type: flaot, low: 0, high: 1}", "type=flaot must be"),
         (
-            "# @package tune.space\nagent.gamma: {type: float, lo: 0}",
-            "Key 'lo' not in 'DimensionConfig'",
-        ),
+            f"\n{FLOAT}",
+            "Key 'agent.learning_rate' not in 'TuneConfig'",
+        ),  # without the line that says where it goes
+        ("", "there is nothing to search"),
+        ("agent.x: {type: float\n b", "bad.yaml: line 3, column 3: cannot be read"),
+        ("agent.gamma: 3", "int is not a subclass of DimensionConfig"),
+        ("agent.gamma: {type: flaot, low: 0, high: 1}", "type=flaot must be"),
+        ("agent.gamma: {type: float, lo: 0}", "Key 'lo' not in 'DimensionConfig'"),
+        ("agent.gamma: {type: float, low: 1, high: 0}", "takes two numbers, low=1.0 below high=0.0"),
+        ("agent.gamma: {type: float, low: 0, high: 1, log: true}", "`low > 0` must hold"),
+        ("agent.gamma: {type: float, low: 0, high: 1, step: 0.3}", "is not divisible by `step`"),
+        ("agent.gamma: {type: categorical, choices: [0.9, 0.9]}", "a list of different values"),
+        ("agent.gamma: {type: categorical, low: 1}", "a list of different values"),
+        ("n_envs: {type: int, low: 1.5, high: 3}", "takes whole numbers"),
+        ("n_envs: {type: categorical, choices: [many]}", "n_envs=many"),
+        ("agent.gamma: {type: float, low: 0.5, high: 5}", "agent.gamma=5.0: must be from"),
         (
-            "# @package tune.space\nagent.gamma: {type: float, low: 1, high: 0}",
-            "takes two numbers, low=1.0 below high=0.0",
-        ),
-        (
-            "# @package tune.space\nagent.gamma: {type: float, low: 0, high: 1, log: true}",
-            "`low > 0` must hold",
-        ),
-        (
-            "# @package tune.space\nagent.gamma: {type: float, low: 0, high: 1, step: 0.3}",
-            "is not divisible by `step`",
-        ),
-        (
-            "# @package tune.space\nagent.gamma: {type: categorical, choices: [0.9, 0.9]}",
-            "a list of different values",
-        ),
-        ("# @package tune.space\nagent.gamma: {type: categorical, low: 1}", "a list of different values"),
-        ("# @package tune.space\nn_envs: {type: int, low: 1.5, high: 3}", "takes whole numbers"),
-        ("# @package tune.space\nn_envs: {type: categorical, choices: [many]}", "n_envs=many"),
-        (
-            "# @package tune.space\nagent.gamma: {type: float, low: 0.5, high: 5}",
-            "agent.gamma=5.0: must be from",
-        ),
-        (
-            "# @package tune.space\nagent.learning_rate: {type: float, low: -3, high: -1}",
+            "agent.learning_rate: {type: float, low: -3, high: -1}",
             "tune=bad: agent.learning_rate=-3.0: must be a number of at least 0",
         ),
         (
-            "# @package tune.space\nagent.learning_rate: {type: categorical, choices: [0.1, abc]}",
+            "agent.learning_rate: {type: categorical, choices: [0.1, abc]}",
             "tune=bad: agent.learning_rate=abc",
         ),
         (
-            "# @package tune.space\nobservation.kind: {type: categorical, choices: [one_hot, coordinates]}",
+            "observation.kind: {type: categorical, choices: [one_hot, coordinates]}",
             "tune=bad: observation=one_hot: agent=q_learning keeps a table",
         ),
-        ("# @package tune.space\nagent.gama: {type: float, low: 0, high: 1}", "agent.gama"),
-        ("# @package tune.space\nenv.slip: {type: float, low: 0, high: 1}", "is part of the task"),
+        ("agent.gama: {type: float, low: 0, high: 1}", "agent.gama"),
+        ("env.slip: {type: float, low: 0, high: 1}", "is part of the task"),
         (
-            "# @package tune.space\ncheckpoint.every: {type: int, low: 100, high: 1000}",
+            "checkpoint.every: {type: int, low: 100, high: 1000}",
             "checkpoint.every: changes nothing about what is learnt",
         ),
     ],
@@ -254,7 +239,8 @@ def test_a_search_space_that_makes_no_sense(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, yaml: str, sentence: str
 ) -> None:
     (tmp_path / "tune").mkdir()
-    (tmp_path / "tune" / "bad.yaml").write_text(yaml)
+    head = "" if yaml.startswith("\n") else "# @package tune.space\n"
+    (tmp_path / "tune" / "bad.yaml").write_text(head + yaml)
     monkeypatch.setattr("gridworld.tune.search_space._CORNERS", 5)  # it goes with none of them
     told = refusal(monkeypatch, tmp_path, "agent=q_learning", "tune=bad", "--config-dir", ".")
     assert sentence in told

@@ -28,12 +28,18 @@ from optuna.trial import FrozenTrial, TrialState, create_trial
 from gridworld.config.tune import DimensionConfig
 from gridworld.errors import InputError
 from gridworld.report import statistics
-from gridworld.storage.sealed_json import sealed
+from gridworld.storage.safe_read import sealed
 from gridworld.training.setup import check_settings
 from gridworld.training.together import run_alone
 from gridworld.tune import objective as objective_module
-from gridworld.tune.confirmation import HeldOutResults, held_out_runs, read_results, verdict_on
-from gridworld.tune.finalists import choose_finalists, rank_finalists
+from gridworld.tune.confirmation import (
+    HeldOutResults,
+    choose_finalists,
+    held_out_runs,
+    rank_finalists,
+    read_results,
+    verdict_on,
+)
 from gridworld.tune.objective import (
     FinalRuns,
     Objective,
@@ -288,7 +294,7 @@ def test_a_trial_that_is_worse_than_the_median_is_pruned(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("words", [["tune.sampler=tpe"], ["tune.sampler=random"], ["tune.pruner=hyperband"]])
-@pytest.mark.parametrize("killed", [(0,), (0, 1, 1), (3, 11)])
+@pytest.mark.parametrize("killed", [(0, 1, 1), (3, 11)])
 def test_a_search_of_one_worker_is_the_same_however_it_was_stopped(
     words: list[str], killed: tuple[int, ...], tmp_path: Path
 ) -> None:
@@ -485,19 +491,13 @@ def test_the_verdict_says_which_runs_it_is_without(tmp_path: Path) -> None:
 TRIALS, ATTRIBUTES = "UPDATE trials SET", "UPDATE trial_user_attributes SET value_json ="
 SQL = {
     "a score that is no number": "UPDATE trial_values SET value = NULL",
-    "an infinite score": "UPDATE trial_values SET value = 9e999",
     "a score of a kind that there is not": "UPDATE trial_values SET value_type = 'x'",
     "no score": "DELETE FROM trial_values",
     "a choice that there is not": "UPDATE trial_params SET param_value = 77",
-    "a parameter of another name": "UPDATE trial_params SET param_name = 'agent.' || param_id",
-    "no parameter": "DELETE FROM trial_params",
     "a distribution that is no JSON": "UPDATE trial_params SET distribution_json = '{'",
     "seeds that are no JSON": f"{ATTRIBUTES} '['",
-    "seeds that are no list": f"{ATTRIBUTES} '1'",
     "seeds without a regret": f"{ATTRIBUTES} '[{{\"seed\": 0}}]'",
-    "no seeds": "DELETE FROM trial_user_attributes",
     "a state that there is not": f"{TRIALS} state = 'x'",
-    "a date that is none": f"{TRIALS} datetime_start = 'x'",
     "what it is about, no object": "UPDATE study_user_attributes SET value_json = '[1]'",
     "what it is about, nested as deep as Python goes": "UPDATE study_user_attributes SET value_json = '"
     + 10**5 * "["
@@ -505,7 +505,6 @@ SQL = {
     "final seeds that are none": "INSERT INTO study_user_attributes (study_id, key, value_json) "
     "VALUES (1, 'final trial=0,seed=9', '3')",
     "another direction": "UPDATE study_directions SET direction = 'MAXIMIZE'",
-    "a table less": "DROP TABLE trial_values",
     "a database of nothing": "DROP TABLE studies",
 }
 ABOUT = {"objective": {"seeds": [0, 1]}}

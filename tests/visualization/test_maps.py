@@ -21,10 +21,10 @@ from gridworld.visualization.maps import (
 )
 from gridworld.visualization.picture import PolicyHistory, drawer
 from gridworld.visualization.sheet import BLUES, DISAGREES, ORANGES, VIRIDIS, Scale, counting, linear, short
-from gridworld.world.exact.solver import value_iteration
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
 from gridworld.world.mdp import Mdp
+from gridworld.world.solver import value_iteration
 
 CLASSIC = compile_mdp(load("classic"))
 WORLDS = ["classic", "four_rooms", "maze", "cliff", "cliff_walking", "aima_4x3"]

@@ -38,12 +38,12 @@ from gridworld.visualization.maps import draw_error_map, draw_policy_map, policy
 from gridworld.visualization.picture import PolicyHistory, Subject, drawer
 from gridworld.visualization.sheet import BLUES, DISAGREES, ORANGES, linear
 from gridworld.visualization.state_table import StateTable, table_states
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.solver import value_iteration
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load
 from gridworld.world.mdp import IntArray, Mdp
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
+from gridworld.world.solver import value_iteration
 
 DIRECTIONS = {"up": (-1, 0), "right": (0, 1), "down": (1, 0), "left": (0, -1)}
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from helpers.support import configure
 
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import Chain, one_hot_policy
+from gridworld.world.chain import Chain, one_hot_policy
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import parse
 

@@ -7,7 +7,7 @@ from helpers.support import script
 
 import gridworld
 from gridworld.training.setup import check_settings, objective_note
-from gridworld.world.exact.evaluation import Evaluator, fitting_discounts, score_of_optimum
+from gridworld.world.evaluation import Evaluator, fitting_discounts, score_of_optimum
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
 

@@ -18,8 +18,8 @@ from gridworld.envs.rollout import play, sample_episodes
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.training.setup import make_context
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import Chain, _openblas, one_hot_policy
+from gridworld.world.chain import Chain, _openblas, one_hot_policy
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse, shipped_layouts
 from gridworld.world.mdp import Mdp

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gridworld import InputError
-from gridworld.world.exact.markov_chain import Chain
+from gridworld.world.chain import Chain
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 
 HORIZON = 7

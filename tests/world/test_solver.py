@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gridworld import InputError
-from gridworld.world.exact import markov_chain as chain
-from gridworld.world.exact import solver as solve
-from gridworld.world.exact.markov_chain import Chain, one_hot_policy
+from gridworld.world import chain
+from gridworld.world import solver as solve
+from gridworld.world.chain import Chain, one_hot_policy
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
 
@@ -126,7 +126,7 @@ def test_without_discount_a_chance_of_never_ending_counts():
 def test_where_nothing_can_be_won_there_still_is_a_best_action(text, slip, gamma):
     code = (  # in a process of its own, which can be stopped
         "from gridworld.world.layout import parse; from gridworld.world.grid import compile_mdp;"
-        "from gridworld.world.exact import solver;"
+        "from gridworld.world import solver;"
         f"solution = solver.value_iteration(compile_mdp(parse({text!r}, 'map'), slip={slip}), {gamma});"
         "print(solution.optimal.any(axis=1).all(), *solution.v)"
     )
@@ -160,7 +160,7 @@ def test_a_world_of_200_by_200_cells_fits_into_a_gigabyte():
     code = (
         "from pathlib import Path; from gridworld.world.layout import Layout;"
         "from gridworld.world.grid import compile_mdp;"
-        "from gridworld.world.exact.solver import value_iteration;"
+        "from gridworld.world.solver import value_iteration;"
         "world = compile_mdp(Layout('open', 200, 200, starts=((0, 0),), goals=((199, 199),)));"
         "print(value_iteration(world, 0.99).v[0].item(), value_iteration(world, 0.5).v[0].item(),"
         "Path('/proc/self/status').read_text().split('VmHWM:')[1].split()[0])"

@@ -13,11 +13,11 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from gridworld import InputError
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import Chain, one_hot_policy
-from gridworld.world.exact.solver import value_iteration
+from gridworld.world.chain import Chain, one_hot_policy
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
+from gridworld.world.solver import value_iteration
 
 SLIPS = [Fraction(0), Fraction(1, 10), Fraction(1, 1000), Fraction(1, 10**7), Fraction(1)]
 TINY = Fraction(1, 10**120)  # 1 - γ: a value V differs by V' TINY, an infinite loss is about -1 / TINY
@@ -172,7 +172,7 @@ def test_large_worlds_are_as_exact_as_small_ones_near_one(monkeypatch):
     for gamma in (1 - 1e-7, 1.0):
         dense, optimum = Chain(mdp, policy).value(gamma), value_iteration(mdp, gamma)
         with monkeypatch.context() as patch:
-            patch.setattr("gridworld.world.exact.markov_chain.DENSE_STATES", 0)
+            patch.setattr("gridworld.world.chain.DENSE_STATES", 0)
             assert Chain(mdp, policy).value(gamma) == pytest.approx(dense, rel=1e-9)
             sparse = value_iteration(mdp, gamma)
         assert sparse.v == pytest.approx(optimum.v, rel=1e-11)
@@ -182,7 +182,7 @@ def test_large_worlds_are_as_exact_as_small_ones_near_one(monkeypatch):
 def test_a_large_world_that_rounding_makes_singular_has_its_values(monkeypatch):
     mdp = compile_mdp(parse("S..\n..G", "map"), slip=1e-16)
     policy = one_hot_policy(np.array([0, 2, 2, 1, 0, 1]), 4)  # comes to the goal by three slips
-    monkeypatch.setattr("gridworld.world.exact.markov_chain.DENSE_STATES", 0)
+    monkeypatch.setattr("gridworld.world.chain.DENSE_STATES", 0)
     assert Chain(mdp, policy).value(1.0)[mdp.start_states] == pytest.approx([1.0], rel=1e-12)
 
 

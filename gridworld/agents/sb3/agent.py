@@ -31,7 +31,7 @@ from gridworld.engine.population import train
 from gridworld.engine.sb3_format import Kind, algorithm_of, make_run, model_file, put_weights
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State, StateError
-from gridworld.world.exact.markov_chain import one_hot_policy
+from gridworld.world.chain import one_hot_policy
 from gridworld.world.mdp import FloatArray
 
 # A model file holds the optimiser's numbers beside every weight, and what SB3 pickles: the last

@@ -25,7 +25,7 @@ from gridworld.agents.sb3.settings.validation import FALLING, SCHEDULES
 from gridworld.agents.sb3.state import get_state, set_state
 from gridworld.config.agents import Decay, falls, parse_schedule
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import tell
+from gridworld.process.console import tell
 from gridworld.storage.serialization import State, fitting
 
 

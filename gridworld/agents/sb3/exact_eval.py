@@ -25,13 +25,12 @@ from gridworld.errors import InputError, in_short
 from gridworld.run.folder import BEST_MODEL, EVALUATIONS
 from gridworld.run.writer import write_evaluations
 from gridworld.storage.atomic_write import replacing
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import one_hot_policy
+from gridworld.world.chain import one_hot_policy
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray, IntArray
 from gridworld.world.metrics import numbers
-from gridworld.world.sources.pure_functions import same
-from gridworld.world.sources.snapshots import random_states
-from gridworld.world.sources.wrappers import is_discrete
+from gridworld.world.snapshots import random_states, same
+from gridworld.world.wrappers import is_discrete
 
 _LIBRARIES = ("stable_baselines3.", "sb3_contrib.", "gridworld.")
 _ONE_BY_ONE = 512  # states in which `predict` is asked alone, too

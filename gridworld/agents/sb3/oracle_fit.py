@@ -18,8 +18,8 @@ from torch import Tensor
 from gridworld.agents import Agent
 from gridworld.agents.sb3.agent import SB3Agent
 from gridworld.agents.sb3.policy_outputs import Reading, read
-from gridworld.world.exact.solver import Solution
 from gridworld.world.mdp import IntArray
+from gridworld.world.solver import Solution
 
 _RATE = 3e-3
 _STEPS, _FEWEST = 1500, 500  # of the fit; a network that is too slow for the fewest is not judged

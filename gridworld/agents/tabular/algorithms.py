@@ -26,8 +26,8 @@ from gridworld.agents.tabular.td_control import (
 from gridworld.config.fields import Word, privilege
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State
-from gridworld.world.exact.solver import value_iteration
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
+from gridworld.world.solver import value_iteration
 
 if TYPE_CHECKING:
     from gridworld.envs.vector_env import Ended

@@ -40,8 +40,12 @@ def sentence(error: BaseException) -> str:
         key = missing.group(1)
         key = key if "." in key else getattr(error, "full_key", None) or key
         return f"{key}: has no value; give {key}=..., or have the yaml that is chosen for it do so"
-    if "Config group override must be a string" in message:
+    if "Config group override must be a string" in message or "'int' is not iterable" in message:
         return "a choice is a name, and null is none: write preset=none, tuned=none, or ~experiment"
+    if lacking := re.search(r"Interpolation key '([^']*)' not found", message):
+        return f"{lacking.group(1)}: is missing, and other settings refer to it; give it a value"
+    if "Error resolving interpolation '${env}_${agent}'" in message:
+        return "agent and env: every run needs both; give agent=... and env=..., not ~agent or ~env"
     if "Could not find" in message and "Available options in" in message:
         return _unknown_choice(message)
     if added := re.search(

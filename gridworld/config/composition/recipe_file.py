@@ -67,6 +67,8 @@ def _file(word: str) -> Path:
     if not given:
         raise InputError(f"{word}: must be a recipe's yaml, or the folder of a study")
     path = Path(given)
+    if not path.exists():
+        raise InputError(f"{word}: there is no such file; must be a recipe's yaml, or the folder of a study")
     if not path.is_dir():
         return path
     if (path / IN_A_STUDY[0]).is_symlink():

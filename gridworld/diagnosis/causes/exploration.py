@@ -7,7 +7,7 @@ import numpy as np
 from gridworld.config.agents import LINEAR
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.finding import Finding, best_of_what_was_tried, longer
-from gridworld.world.exact.markov_chain import Chain
+from gridworld.world.chain import Chain
 from gridworld.world.mdp import BoolArray
 
 _FEWEST = 3  # tries of an action where they are used once; one that is kept may do
@@ -48,15 +48,11 @@ def collapsed(run: Evidence) -> Finding | None:
 def ended_early(run: Evidence) -> Finding | None:
     """Its random steps were fewer than a random walk needs to meet the goal twice."""
     optimistic = run.setting("initial_value") >= run.own.v[run.mdp.acting].max()
-    if (
-        run.is_actor_critic
-        or optimistic
-        or _random(run) * run.config.total_timesteps >= 2 * run.steps_to_goal
-    ):
+    explored = _random(run) * run.config.total_timesteps >= 2 * run.steps_to_goal
+    if run.is_actor_critic or optimistic or explored:
         return None
-    return _exploration(
-        run, run.split.wrong, "it stopped trying other actions before their values were known"
-    )
+    why = "it stopped trying other actions before their values were known"
+    return _exploration(run, run.split.wrong, why)
 
 
 def _exploration(run: Evidence, states: BoolArray, why: str) -> Finding:

@@ -8,6 +8,7 @@ from gridworld.config.agents import LINEAR
 from gridworld.diagnosis.evidence import Evidence, entropy
 from gridworld.diagnosis.finding import (
     Finding,
+    behind,
     costliest,
     entropy_optimum,
     falling,
@@ -15,11 +16,10 @@ from gridworld.diagnosis.finding import (
     longer,
     on_the_way,
     slower,
-    sweeps_missing,
     visits_needed,
 )
-from gridworld.world.exact.solver import backup
 from gridworld.world.mdp import BoolArray
+from gridworld.world.solver import backup
 
 _SPREAD = 0.5  # of the entropy of a uniform policy: above, it has hardly made up its mind
 _FORGOTTEN = 0.05  # of a first value
@@ -74,9 +74,10 @@ def hardly_moved(run: Evidence) -> Finding | None:
     """All updates together are too small to have moved a network's weights."""
     rate = run.setting("learning_rate")
     has_own_step = run.setting("cg_max_steps") > 0  # TRPO's, whatever the rate
-    if run.is_tabular or has_own_step or _too_short(run) or run.updates * rate >= _MOVES:
+    moves = run.updates * rate >= _MOVES
+    if run.is_tabular or has_own_step or moves or _too_short(run, run.split.wrong):
         return None
-    why = f"{run.updates:,.0f} updates at a learning rate of {rate:g} cannot move a weight far{_behind(run)}"
+    why = f"{run.updates:,.0f} updates at a learning rate of {rate:g} cannot move a weight far{behind(run)}"
     late = run.setting("learning_starts") > run.config.total_timesteps / 2
     starts = (run.change("learning_starts", 100),) if late else ()
     return Finding("slow", run.split.wrong, why, (*starts, *faster(run)))
@@ -113,8 +114,8 @@ def not_there_yet(run: Evidence) -> Finding | None:
         states = run.split.wrong & ((then < now) | (residual < now / 2))
     if not states.any():
         return None
-    if _too_short(run):
-        return _of_a_short_run(run, states)
+    if short := _too_short(run, states):
+        return short
     if run.is_tabular:
         return _slow_table(run, states)
     interval = run.setting("target_update_interval")
@@ -123,29 +124,21 @@ def not_there_yet(run: Evidence) -> Finding | None:
     if interval and run.updates >= _FEW_UPDATES and refreshed < _REFRESHES * path:
         why = (
             f"its target network was refreshed {refreshed:.0f} times, and a value needs {path:.0f} to come "
-            f"from the goal to the start{_behind(run)}"
+            f"from the goal to the start{behind(run)}"
         )
         often = max(1.0, round(run.config.total_timesteps / (8 * path)))
         return Finding("target", states, why, (run.change("target_update_interval", often), longer(run, 4)))
-    why = f"it was still learning: {run.updates:,.0f} updates were too few{_behind(run)}"
+    why = f"it was still learning: {run.updates:,.0f} updates were too few{behind(run)}"
     return Finding("slow", states, why, faster(run))
 
 
-def _too_short(run: Evidence) -> bool:
-    """Whether a run is too short at any rate: a random walk needs longer to meet the goal."""
-    return run.config.total_timesteps < run.steps_to_goal < np.inf
-
-
-def _of_a_short_run(run: Evidence, states: BoolArray) -> Finding:
-    steps = (
-        f"{run.config.total_timesteps:,} steps; a random walk meets the goal once in {run.steps_to_goal:,.0f}"
-    )
-    return Finding("budget", states, f"it was still learning after {steps}", (longer(run, 10),))
-
-
-def _behind(run: Evidence) -> str:
-    missing = sweeps_missing(run)
-    return f"; {missing} sweeps of its own values are missing" if missing > 1 else ""
+def _too_short(run: Evidence, states: BoolArray) -> Finding | None:
+    """A run that is too short at any rate: a random walk needs longer to meet the goal."""
+    total, needed = run.config.total_timesteps, run.steps_to_goal
+    if not total < needed < np.inf:
+        return None
+    why = f"it was still learning after {total:,} steps; a random walk meets the goal once in {needed:,.0f}"
+    return Finding("budget", states, why, (longer(run, 10),))
 
 
 def _slow_table(run: Evidence, states: BoolArray) -> Finding | None:
@@ -171,13 +164,13 @@ def _slow_table(run: Evidence, states: BoolArray) -> Finding | None:
     if rate < run.usual_rate:  # with as many updates, enough of it
         enough = (1 - _FORGOTTEN ** (1 / max(tried, 1))) / rate
         changes.append(run.multiplied("learning_rate", max(10, enough), most=run.usual_rate))
-    return Finding("slow", states, f"{why}{_behind(run)}", (*changes, longer(run, 4)))
+    return Finding("slow", states, f"{why}{behind(run)}", (*changes, longer(run, 4)))
 
 
 def unsettled(run: Evidence) -> Finding:
     """What remains: its values err by more than what the right action is worth."""
-    if _too_short(run):
-        return _of_a_short_run(run, run.split.wrong)
+    if short := _too_short(run, run.split.wrong):
+        return short
     worst = costliest(run, run.split.wrong)
     error = float(np.abs(run.q - run.own.q)[worst].max())
     why = (

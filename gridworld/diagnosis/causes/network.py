@@ -9,8 +9,8 @@ import numpy as np
 
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.finding import Finding, costliest, slower
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import one_hot_policy
+from gridworld.world.chain import one_hot_policy
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import IntArray
 
 _FEW = 4  # transitions of a state in a replay buffer

@@ -6,9 +6,9 @@ import numpy as np
 
 from gridworld.diagnosis.evidence import Evidence, entropy
 from gridworld.diagnosis.finding import Finding, costliest, entropy_optimum, optimum_of_epsilon
-from gridworld.world.exact.evaluation import fitting_discounts
-from gridworld.world.exact.solver import pick, solved
+from gridworld.world.evaluation import fitting_discounts
 from gridworld.world.mdp import BoolArray, FloatArray
+from gridworld.world.solver import pick, solved
 
 _NOTHING = 1e-9  # of the scale of the values
 _CLEARER = 5  # times the gap

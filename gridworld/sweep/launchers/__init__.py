@@ -13,9 +13,8 @@ from typing import Any, Protocol
 from omegaconf import DictConfig, OmegaConf
 
 from gridworld.errors import InputError, install_command
-from gridworld.process.parallel.processes import LostError, can_fork
-from gridworld.sweep.job import StopSweep
-from gridworld.sweep.worker import SweepJob, Worker
+from gridworld.process.processes import LostError, can_fork
+from gridworld.sweep.job import StopSweep, SweepJob, Worker
 
 # By the launcher: the package that it needs, the extra that installs it, and commands.
 _NEEDS: dict[str, tuple[str, str, tuple[str, ...]]] = {

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
-from gridworld.process.parallel.processes import run_in_processes
+from gridworld.process.processes import run_in_processes
 from gridworld.sweep.launchers import Group, Launch
 from gridworld.training.setup import import_for
 
@@ -19,19 +19,7 @@ _SECONDS_BETWEEN_TICKS = 1.0
 
 
 def run(launch: Launch, count: int, forks: bool, elsewhere: Callable[[Group], bool], least: int) -> None:
-    """Run populations.
-
-    Args:
-        launch: the populations.
-        count: how many processes.
-        forks: whether these are forks.
-        elsewhere: whether a population may run in one of them.
-        least: how many have to run at a time; or else all run in this process.
-
-    Raises:
-        StopSweep: a job failed, and that is to stop the sweep.
-        SystemExit: this process was told to stop.
-    """
+    """Run populations."""
     others = [jobs for jobs in launch.groups if elsewhere(jobs)]
     here: Sequence[Group] = [jobs for jobs in launch.groups if not elsewhere(jobs)]
     if min(count, len(others)) < least:

@@ -12,11 +12,10 @@ import ray
 from ray.exceptions import RayError, TaskCancelledError
 
 from gridworld.errors import InputError
-from gridworld.process.parallel.processes import LostError
+from gridworld.process.processes import LostError
 from gridworld.process.signals import keeping
-from gridworld.sweep.job import StopSweep
+from gridworld.sweep.job import StopSweep, SweepJob, Worker
 from gridworld.sweep.launchers import Group, Launch, Task, collect
-from gridworld.sweep.worker import SweepJob, Worker
 
 _POLL_SECONDS = 1.0
 _ENDED_WITHIN = 1.0  # seconds

@@ -21,8 +21,8 @@ from typing import Any
 import submitit
 
 from gridworld.errors import InputError
-from gridworld.process.console.terminal import printable
-from gridworld.process.parallel.processes import LostError
+from gridworld.process.console import printable
+from gridworld.process.processes import LostError
 from gridworld.storage.atomic_write import make_inside, remove_inside
 from gridworld.sweep.launchers import Group, Launch, Task, collect
 

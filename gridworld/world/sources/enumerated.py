@@ -32,14 +32,13 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order
 
 from gridworld.errors import InputError
-from gridworld.process.console.progress import ProgressLine, telling_if_slow
-from gridworld.process.console.terminal import printable
+from gridworld.process.console import ProgressLine, printable, telling_if_slow
 from gridworld.process.memory_budget import check_memory
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import MOST_ACTIONS, MOST_STATES, Outcomes, mdp_from_outcomes
-from gridworld.world.sources.making import make_env
-from gridworld.world.sources.snapshots import Snapshots, key_of, random_states
-from gridworld.world.sources.wrappers import refuse_transformed
+from gridworld.world.snapshots import Snapshots, key_of, random_states
+from gridworld.world.sources.gymnasium_table import make_env
+from gridworld.world.wrappers import refuse_transformed
 
 _BEYOND = 1_000  # states further than a step limit that are found too, so that a small world is whole
 _DEEPEST = 10_000  # steps from the start

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from scipy.special import gammaln, logsumexp
 
 from gridworld.errors import InputError
-from gridworld.world.exact.solver import backup
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 from gridworld.world.outcomes import Outcomes
-from gridworld.world.sources.snapshots import Snapshots
+from gridworld.world.snapshots import Snapshots
+from gridworld.world.solver import backup
 
 if TYPE_CHECKING:
     import gymnasium as gym

@@ -18,9 +18,8 @@ from gridworld.errors import InputError
 from gridworld.restore.resume import open_unfinished
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.checkpoints import Checkpoints
-from gridworld.run.claim import check_free
-from gridworld.run.reader import read_run
-from gridworld.storage.sealed_json import sealed
+from gridworld.run.reader import check_free, read_run
+from gridworld.storage.safe_read import sealed
 
 MODULE = """
 import gridworld

@@ -29,8 +29,8 @@ from gridworld.agents.tabular.td_control import (
     update,
 )
 from gridworld.envs.observations import make_observation
-from gridworld.world.exact.solver import value_iteration
 from gridworld.world.layout import shipped_layouts
+from gridworld.world.solver import value_iteration
 
 CONTROL = [QLearningConfig, SarsaConfig, ExpectedSarsaConfig]
 

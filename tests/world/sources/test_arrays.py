@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from gridworld import InputError, compile_mdp, load
 from gridworld.process.user_input import npz_bytes
-from gridworld.world.exact.solver import value_iteration
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
+from gridworld.world.solver import value_iteration
 from gridworld.world.sources.arrays import load_world, world_bytes, world_from_bytes
 from gridworld.world.sources.classics import river_swim
 

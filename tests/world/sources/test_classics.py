@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from gridworld import InputError
-from gridworld.world.exact.evaluation import Evaluator
-from gridworld.world.exact.markov_chain import Chain
-from gridworld.world.exact.solver import value_iteration
+from gridworld.world.chain import Chain
+from gridworld.world.evaluation import Evaluator
+from gridworld.world.solver import value_iteration
 from gridworld.world.sources.classics import combination_lock, deep_sea, random_walk, river_swim
 
 

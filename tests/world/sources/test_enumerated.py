@@ -11,8 +11,8 @@ import pytest
 from gymnasium import spaces
 
 from gridworld.errors import InputError
-from gridworld.process.console.progress import ProgressLine
-from gridworld.world.exact.evaluation import Evaluator
+from gridworld.process.console import ProgressLine
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import Mdp
 from gridworld.world.sources import enumerated
 from gridworld.world.sources.enumerated import enumerate_env

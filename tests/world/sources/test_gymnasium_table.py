@@ -8,7 +8,7 @@ import pytest
 from gymnasium import spaces
 
 from gridworld import InputError, compile_env
-from gridworld.world.exact.solver import value_iteration
+from gridworld.world.solver import value_iteration
 from gridworld.world.sources import gymnasium_table, table_walk
 from gridworld.world.sources.gymnasium_table import compile_gymnasium, compile_table
 

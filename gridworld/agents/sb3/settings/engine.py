@@ -17,7 +17,7 @@ from gridworld.agents.sb3.settings.constructor_arguments import algorithm_and_ar
 from gridworld.agents.sb3.settings.schemas import SB3ClassConfig, SB3Config, as_dict
 from gridworld.engine.optimizer import ELEMENTWISE
 from gridworld.engine.sb3_format import algorithm_of
-from gridworld.process.console.terminal import tell
+from gridworld.process.console import tell
 
 # Of torch.nn, what maps every number by itself, in training as in evaluation, and never draws at random.
 ACTIVATIONS = (

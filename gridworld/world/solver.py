@@ -30,7 +30,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from gridworld.errors import InputError
-from gridworld.world.exact.markov_chain import (
+from gridworld.world.chain import (
     DENSE_STATES,
     ORDINARY_GAMMA,
     Chain,

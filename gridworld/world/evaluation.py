@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridworld.process.console.progress import telling_if_slow
-from gridworld.world.exact.markov_chain import Chain, Outcome, one_hot_policy
-from gridworld.world.exact.solver import Solution, solved
+from gridworld.process.console import telling_if_slow
+from gridworld.world.chain import Chain, Outcome, one_hot_policy
 from gridworld.world.mdp import FloatArray, Mdp
+from gridworld.world.solver import Solution, solved
 
 _USUAL_DISCOUNTS = (0.8, 0.9, 0.95, 0.97, 0.99)
 _QUICKLY_SOLVED = 20_000  # outcomes of all states and actions: a few tenths of a second

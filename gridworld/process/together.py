@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import contextvars
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
 from types import MappingProxyType
-
-LARGEST = 32  # runs that train together unless more are asked for; larger populations train no faster
 
 
 class Clock:
-    """Counts the seconds that were spent on one run.
-
-    Args:
-        shared: its share of the seconds that were spent on all runs at once.
-    """
+    """Counts the seconds that were spent on one run, with `shared`, its share of those spent on all."""
 
     def __init__(self, shared: Callable[[], float]) -> None:
         self._shared = shared
@@ -39,21 +33,18 @@ class Clock:
         return self._seconds + own + self._shared()
 
 
-_clock: contextvars.ContextVar[Clock | None] = contextvars.ContextVar("clock", default=None)
-_mixed: contextvars.ContextVar[Mapping[str, str]] = contextvars.ContextVar(
-    "mixed", default=MappingProxyType({})
-)
+_now: ContextVar[Callable[[], float]] = ContextVar("now", default=time.perf_counter)
+_mixed: ContextVar[Mapping[str, str]] = ContextVar("mixed", default=MappingProxyType({}))
 
 
 def clock() -> float:
     """Seconds since some moment; of a run among others, only those that were spent on it."""
-    own = _clock.get()
-    return time.perf_counter() if own is None else own.now()
+    return _now.get()()
 
 
 def set_clock(own: Clock) -> None:
     """Let `clock` be this one in the present context."""
-    _clock.set(own)
+    _now.set(own.now)
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ Every wrapper is looked at, and recognised by whose `step` and `reset` it runs:
     memory       shows more than the state's number; the task is the same, but a policy behind it has no table
 
 Anything else is refused. The three methods must be functions of their argument alone: they are asked on a
-copy, see `pure_functions`, and the copy is stepped beside the tables.
+copy (`snapshots.asked`), and the copy is stepped beside the tables.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError, in_short
-from gridworld.world.exact.solver import backup, swept_values
 from gridworld.world.mdp import Mdp, checked_reward, frozen
 from gridworld.world.outcomes import thresholds_of
-from gridworld.world.sources.pure_functions import SO_UNKNOWN, asked, remembered, same
+from gridworld.world.snapshots import SO_UNKNOWN, asked, remembered, same
+from gridworld.world.solver import backup, swept_values
 
 NEUTRAL, LIMIT, MEMORY = "neutral", "time limit", "memory"
 _STEPS, _MOST_STEPS = 2000, 40_000  # of the copy beside the tables, in episodes
