@@ -72,7 +72,7 @@ def _record(options: argparse.Namespace) -> None:
         frame_size(saved.mdp, options.cell_size)
     formats = list(dict.fromkeys(options.format))
     subject, mdp = _SavedSubject(saved, options.trust), saved.mdp
-    drawn = {kind: drawer(MAPS[kind]).draw(subject)(options.cell_size) for kind in formats if kind in MAPS}
+    drawn = {kind: drawer(MAPS[kind])(subject)(options.cell_size) for kind in formats if kind in MAPS}
     policy, limit = choose_policy(subject.snapshot, options.policy), subject.evaluator.max_episode_steps
     episodes = [play(mdp, policy, limit, options.seed + index) for index in range(options.episodes)]
     animation = film(saved.config.env, mdp, episodes, options.trust)(options.cell_size)

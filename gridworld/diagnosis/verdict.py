@@ -22,15 +22,13 @@ from gridworld.diagnosis.causes import CAUSES, PHRASES
 from gridworld.diagnosis.causes.objective import recommended_gamma
 from gridworld.diagnosis.evidence import Evidence, RegretSplit
 from gridworld.diagnosis.finding import Finding
-from gridworld.envs.board import board_of
-from gridworld.envs.rendering import AGENT, Frame
+from gridworld.envs.rendering import AGENT, INK, Frame, board_of
 from gridworld.errors import InputError
 from gridworld.process.console import command
 from gridworld.restore.saved_run import SavedRun
-from gridworld.visualization.canvas import Canvas, shown
-from gridworld.visualization.paths import directions, draw_paths, greedy_paths
-from gridworld.visualization.sheet import INK, ORANGES, PAPER, UNREACHABLE, Swatch, is_dark, linear, short
-from gridworld.visualization.state_table import Numbers, StateTable, table_states
+from gridworld.visualization.canvas import Canvas, directions, greedy_paths
+from gridworld.visualization.sheet import ORANGES, PAPER, UNREACHABLE, Swatch, is_dark, linear, short
+from gridworld.visualization.state_table import StateTable, table_states
 from gridworld.world.evaluation import score_of_optimum
 from gridworld.world.mdp import IntArray, Mdp
 
@@ -212,20 +210,20 @@ def draw_diagnosis(found: Diagnosis, cell_size: int | None = None) -> Frame:
         places = np.round(cost[:, None] * 1e12 / max(cost.max(), 1e-300)).astype(np.int64)
         states = table_states(mdp, places)
         table, scale = StateTable(mdp, states, ["regret"]), linear(ORANGES, cost[states], low=0.0)
-        table.paint(Numbers("regret", np.where(cost > 0, cost, np.nan)[:, None], scale))
+        table.paint(np.where(cost > 0, cost, np.nan)[:, None], scale)
         table.caption(caption)
         table.legend(scale, "regret 0", short(scale.high))
         return table.frame()
     canvas = Canvas(mdp, cell_size)
-    scale = linear(ORANGES, cost[shown(mdp)], low=0.0)
+    scale = linear(ORANGES, cost[canvas.board.floor], low=0.0)
     colours = scale.colours(cost)
     colours[cost == 0] = PAPER
     canvas.paint(colours[:, None])
     canvas.draw_world()
     ways = directions(mdp)[np.arange(mdp.num_states), found.greedy].tolist()
     paths = greedy_paths(mdp, found.greedy)
-    draw_paths(canvas, paths, ways, 0.4)
-    costly = np.flatnonzero((cost > 0) & shown(mdp)).tolist()
+    canvas.draw_paths(paths, ways, 0.4)
+    costly = np.flatnonzero((cost > 0) & canvas.board.floor).tolist()
     texts = {state: short(float(cost[state]), scale.high) for state in costly}
     size = canvas.number_size(0.8, texts.values())
     dark = is_dark(colours)

@@ -5,8 +5,10 @@ Run as a program (`python -m gridworld.envs.env`) it plays one random episode in
 
 from __future__ import annotations
 
+import logging
 import math
 import operator
+import time
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -24,6 +26,8 @@ from gridworld.errors import InputError
 from gridworld.world.grid import ACTION_NAMES, NUM_ACTIONS, GridMdp, mdp_or_compiled
 from gridworld.world.layout import CLASSIC, NUM_COLS, NUM_ROWS, Cell, Layout, positive_int
 from gridworld.world.mdp import Mdp
+
+_log = logging.getLogger("gridworld")
 
 
 class GridWorldEnv(gym.Env[int, int]):
@@ -100,7 +104,7 @@ class GridWorldEnv(gym.Env[int, int]):
         self.observation_space = spaces.Discrete(self.mdp.num_states)
         self.action_space = spaces.Discrete(NUM_ACTIONS)
 
-        self._window: drawing.Window | None = None
+        self._window: Window | None = None
         self._state: int = int(self.mdp.start_states[0])
 
         # The tutorial's public attributes.
@@ -205,7 +209,7 @@ class GridWorldEnv(gym.Env[int, int]):
 
     def _show(self) -> None:
         if self._window is None:
-            self._window = drawing.Window(drawing.frame_size(self.mdp, self.cell_size), "GridWorld")
+            self._window = Window(drawing.frame_size(self.mdp, self.cell_size), "GridWorld")
         try:
             self._window.show(self.mdp, self._state, self.cell_size, self.metadata["render_fps"], self.delay)
         except SystemExit:
@@ -246,6 +250,46 @@ class GridWorldEnv(gym.Env[int, int]):
             draw.polygon(screen, colour, list(coords_list))
         else:
             raise InputError(f"coords_list: {len(coords_list)} points make no shape; give 1, 3 or more")
+
+
+class Window:
+    """The window of human mode, of a size in pixels. `surface` and `clock` are pygame's."""
+
+    def __init__(self, size: tuple[int, int], title: str) -> None:
+        pygame = drawing.import_pygame()
+        if not drawing.has_display():
+            # A log line and no exception: SDL then draws off screen, where every call still works.
+            _log.warning(
+                "human mode found no display, so its window cannot be seen; "
+                "set DISPLAY, or use render_mode='rgb_array'"
+            )
+        self._size, self._title = size, title
+        self.clock = pygame.time.Clock()
+        self._open()
+
+    def _open(self) -> None:
+        display = drawing.import_pygame().display
+        display.init()  # not pygame.init(), which would look for a sound card too
+        self.surface = display.set_mode(self._size)
+        display.set_caption(self._title)
+
+    def show(self, mdp: Mdp, state: int, cell_size: int, fps: int, delay: float) -> None:
+        """Draw and show one frame; keep `fps`, then wait. SystemExit if the user closed the window."""
+        pygame = drawing.import_pygame()
+        if not pygame.display.get_init():  # pygame has one display a process, and another window closed it
+            self._open()
+        drawing.draw_world(self.surface, mdp, state, cell_size)
+        for event in pygame.event.get():
+            if event.type == pygame.QUIT:
+                self.close()
+                raise SystemExit
+        pygame.display.flip()
+        self.clock.tick(fps)
+        time.sleep(delay)
+
+    def close(self) -> None:
+        """Close the window and shut pygame down."""
+        drawing.import_pygame().quit()
 
 
 def play_random_episode() -> None:

@@ -1,17 +1,70 @@
-"""Playing episodes: estimates of a policy's scores by sampling, and the states of a single episode."""
+"""Playing episodes: a policy's scores estimated by sampling, with 95 % intervals, and a single episode."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from gridworld.envs.intervals import Estimate, estimate_mean, estimate_share
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.storage.serialization import independent_generator
 from gridworld.world.chain import check_policy
 from gridworld.world.evaluation import Evaluator
-from gridworld.world.mdp import FloatArray, IntArray, Mdp
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+
+_Z = 1.959963984540054  # standard deviations of the normal distribution on either side of 95 % of it
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over samples with its 95 % interval."""
+
+    mean: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.mean:.4g} [{self.low:.3g}, {self.high:.3g}]"
+
+
+def wilson_interval(count: int, total: int) -> tuple[float, float]:
+    """Wilson's score interval, from 0 to 1, for the share of `count` hits in `total` samples, one or more.
+
+    It is `scipy.stats.binomtest(count, total).proportion_ci(0.95, method="wilson")`, without the second that
+    `scipy.stats` takes to import. Reference: method 3 of R. G. Newcombe, Statistics in Medicine 17, 1998.
+    """
+    share = count / total
+    scale = 2 * (total + _Z**2)
+    centre = (2 * total * share + _Z**2) / scale
+    half_width = _Z / scale * math.sqrt(4 * total * share * (1 - share) + _Z**2)
+    return (0.0 if count == 0 else centre - half_width), (1.0 if count == total else centre + half_width)
+
+
+def _estimate_share(hits: BoolArray) -> Estimate:
+    """The share of samples (n,) that are hits, with Wilson's interval."""
+    count, total = int(hits.sum()), len(hits)
+    return Estimate(count / total, *wilson_interval(count, total))
+
+
+def _estimate_mean(
+    samples: FloatArray,
+    unseen: float,
+    unseen_if_equal: float,
+    bounds: tuple[float, float] = (-math.inf, math.inf),
+) -> Estimate:
+    """The mean of samples (n,), with a normal interval that is widened by what rare samples may hide.
+
+    The half-width is z²R/2n + z √(s²/n + z²R²/4n²): z²R/n for equal samples, z s/√n for many, widened as
+    Wilson's interval is for a share. R, their range, is at least `unseen`, or `unseen_if_equal` where all are
+    equal. No sample is outside of `bounds`, and so is no end of the interval.
+    """
+    count, mean, seen = len(samples), float(samples.mean()), float(np.ptp(samples))
+    spread = max(unseen, seen) if seen else unseen_if_equal
+    variance = float(samples.var(ddof=1)) / count if count > 1 else math.inf
+    hidden = _Z**2 * spread / (2 * count)
+    half_width = hidden + math.hypot(_Z * variance**0.5, hidden)
+    return Estimate(mean, max(bounds[0], mean - half_width), min(bounds[1], mean + half_width))
 
 
 @dataclass(frozen=True)
@@ -56,12 +109,12 @@ def sample_episodes(evaluator: Evaluator, policy: FloatArray, episodes: int, see
     at_most = max(paid, np.abs(rewards).min() * limit)  # ... and going on to the limit, or not
     return SampledScores(
         episodes=episodes,
-        discounted_return=estimate_mean(discounted, paid, at_most),
-        goal=estimate_share(evaluator.mdp.goal[states]),
-        trap=estimate_share(evaluator.mdp.trap[states]),
-        timeout=estimate_share(running),
-        episode_return=estimate_mean(total, paid, at_most),
-        length=estimate_mean(length, 0.0, limit, (0.0, limit)),
+        discounted_return=_estimate_mean(discounted, paid, at_most),
+        goal=_estimate_share(evaluator.mdp.goal[states]),
+        trap=_estimate_share(evaluator.mdp.trap[states]),
+        timeout=_estimate_share(running),
+        episode_return=_estimate_mean(total, paid, at_most),
+        length=_estimate_mean(length, 0.0, limit, (0.0, limit)),
     )
 
 

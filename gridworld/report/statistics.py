@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gridworld.envs.intervals import wilson_interval
+from gridworld.envs.rollout import wilson_interval
 from gridworld.world.mdp import FloatArray
 
 RESAMPLES = 2000

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from gridworld.config.fields import Effect
 from gridworld.config.settings import ON_RESULT, effect_of, flat, with_effects
-from gridworld.envs.intervals import wilson_interval
+from gridworld.envs.rollout import wilson_interval
 from gridworld.errors import InputError, reason
 from gridworld.process.console import aligned, command_line, duration, printable, tell_error
 from gridworld.run.reader import read_run

@@ -24,10 +24,11 @@ from gridworld.training.learning_curve import Evaluation
 from gridworld.training.tensorboard import EventWriter
 from gridworld.visualization.animation import Animation
 from gridworld.visualization.files import encode_gif, save
-from gridworld.visualization.picture import Draw, drawer
-from gridworld.visualization.policy_history import PolicyHistory
+from gridworld.visualization.picture import Draw, PolicyHistory, drawer
 from gridworld.world.evaluation import Evaluator
 
+# Pixels that pictures have in TensorBoard. It scales by skipping pixels: thin lines vanish, text frays.
+_IMAGES_TAB, _TIME_SERIES_CARD = 350, 240
 _GROUP = "pictures"  # of TensorBoard's tags: behind the learning curve
 
 _log = logging.getLogger("gridworld")
@@ -134,13 +135,13 @@ class Pictures:
                 _log.warning("%s: %s is left out, %s", self._folder, label, error)
 
     def _draw_and_show(self, picture: Picture, subject: _Subject) -> None:
-        draw = drawer(picture.drawer).draw(subject)
+        draw = drawer(picture.drawer)(subject)
         self._show(picture, self._for_tensorboard(picture, draw), subject.steps)
 
     def _keep(self, picture: Picture, subject: _Subject, prepared: dict[str, Draw]) -> None:
         """Write the file, and show it in TensorBoard where it has not been shown while training."""
         if picture.drawer not in prepared:
-            prepared[picture.drawer] = drawer(picture.drawer).draw(subject)
+            prepared[picture.drawer] = drawer(picture.drawer)(subject)
         draw = prepared[picture.drawer]
         drawn = draw(None)
         content = save(drawn, self._folder / picture.file, self._config.recording.fps)
@@ -150,8 +151,8 @@ class Pictures:
         self._show(picture, shown, subject.steps, content if shown is drawn else None)
 
     def _for_tensorboard(self, picture: Picture, draw: Draw) -> Frame | Animation:
-        side = drawer(picture.drawer).TENSORBOARD_SIDE
-        return draw(None if side is None else fitting_cell_size(self._evaluator.mdp, side))
+        side = _IMAGES_TAB if picture.is_map else _TIME_SERIES_CARD
+        return draw(fitting_cell_size(self._evaluator.mdp, side))
 
     def _show(self, picture: Picture, drawn: Frame | Animation, steps: int, gif: bytes | None = None) -> None:
         assert self._events is not None

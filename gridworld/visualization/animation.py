@@ -49,14 +49,16 @@ class Animation:
         return self.draw(self.keys[0]).size
 
 
-def automatic_cell_size(mdp: Mdp) -> int:
-    """The cell size in pixels of an episode's pictures: 100, less where the frame would be far above 1000."""
-    return drawing.fitting_cell_size(mdp, _LONGEST_SIDE)
+def automatic_cell_size(mdp: Mdp, cell_size: int | None = None) -> int:
+    """The cell size in pixels: as given, or 100, less where the frame would be far above 1000."""
+    if cell_size is None:
+        return drawing.fitting_cell_size(mdp, _LONGEST_SIDE)
+    return positive_int("cell_size", cell_size)
 
 
 def animation_of_states(mdp: Mdp, states: IntArray, cell_size: int | None = None) -> Animation:
-    """Show the agent in one state (pictures,) after the other; `cell_size` None: `automatic_cell_size`."""
-    size = automatic_cell_size(mdp) if cell_size is None else positive_int("cell_size", cell_size)
+    """Show the agent in one state (pictures,) after the other."""
+    size = automatic_cell_size(mdp, cell_size)
     empty, palette, encoded = _empty_board(mdp, size)
     if sum(map(len, encoded.values())) > _MOST_ENCODED:
         encoded.clear()
@@ -80,8 +82,7 @@ def _empty_board(mdp: Mdp, size: int) -> tuple[Picture, Palette, Encoded]:
 
 def animation_of_cards(mdp: Mdp, episodes: Sequence[Episode], cell_size: int | None = None) -> Animation:
     """Show episodes in text: each picture has a state, the action taken there, and the reward so far."""
-    size = automatic_cell_size(mdp) if cell_size is None else positive_int("cell_size", cell_size)
-    frame_size = drawing.frame_size(mdp, size)
+    frame_size = drawing.frame_size(mdp, automatic_cell_size(mdp, cell_size))
     cards = [lines for episode in episodes for lines in _cards(mdp, episode)]
     greys = np.repeat(np.arange(_MOST_COLOURS, dtype=np.uint8)[:, None], 3, axis=1)
 
@@ -117,11 +118,7 @@ def animation_of_frames(frames: Iterable[Frame | Packed], likely: Iterable[Seque
 def animation_of_rendered(
     frames: Sequence[Frame], keys: Sequence[int], longest_side: int | None = None
 ) -> Animation:
-    """Show the frame with the number of each key, scaled down to `longest_side` pixels where it is larger.
-
-    The frames (height, width, 3), RGB, are of one size. They are quantised where they have more colours than
-    a palette.
-    """
+    """Show the frame of each key, scaled down to `longest_side` pixels, and quantised, where necessary."""
     pictures = [_scaled_down(frame, longest_side) for frame in frames]
     if (numbered := _number(pictures)) is not None:
         numbers, palette = numbered

@@ -1,4 +1,4 @@
-"""The board as a canvas: cells in colours, numbers in them, a caption above, a legend below.
+"""The board as a canvas: cells in colours, numbers in them, a caption above, a legend below, and paths.
 
 It looks as the environment's own frame does: the same grid, walls, cliffs, traps and goals, and a border of
 at least a cell all round, which holds the words. Cells are painted by one look-up for the whole picture, so
@@ -8,15 +8,14 @@ at least a cell all round, which holds the words. Cells are painted by one look-
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.envs import rendering as drawing
-from gridworld.envs.board import Kind, board_of
-from gridworld.envs.rendering import UNKNOWN, Colour, Frame, Point
+from gridworld.envs.rendering import AGENT, INK, UNKNOWN, Colour, Frame, Kind, Point, board_of
 from gridworld.visualization.sheet import (
-    INK,
     PAPER,
     UNREACHABLE,
     ColourArray,
@@ -26,8 +25,9 @@ from gridworld.visualization.sheet import (
     is_dark,
     short,
 )
+from gridworld.world.grid import GridMdp
 from gridworld.world.layout import MOVES
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+from gridworld.world.mdp import FloatArray, IntArray, Mdp
 
 _LONGEST_SIDE = 640  # pixels, of the grid with its border
 _LONGEST_MOSAIC = 1000  # pixels, of several panels
@@ -35,7 +35,9 @@ _LARGEST_CELL = 80  # pixels
 _NO_GRID = 8  # pixels; on smaller cells grid lines would hide the colours
 _SMALLEST_SEPARATED_CELL = 24  # pixels
 _SEPARATOR: Colour = (205, 205, 205)
-_FLOOR = int(Kind.FLOOR)
+_SAME_WAY = 0.9  # of the moves' lengths that add up in one direction: the exceptions are borders and falls
+_MOSTLY = 0.5  # the same, where chance diverts moves
+_MOST_STARTS = 4  # of a distribution; paths from more would cover the map
 _COLOURS = {  # of the cells that have no numbers
     Kind.BLANK: PAPER,
     Kind.UNREACHABLE: UNKNOWN,
@@ -82,7 +84,7 @@ class Canvas(Sheet):
         `parts` (cell, cell) says which part each pixel of a cell belongs to; None: all to the first.
         """
         board, cell = self.board, self.cell
-        cells, is_fixed = colours[board.state], board.kind != _FLOOR
+        cells, is_fixed = colours[board.state], board.kind != Kind.FLOOR
         fixed = _WITH_GRID if self.has_grid else _WITHOUT_GRID
         cells[is_fixed] = fixed[board.kind[is_fixed]][:, None]
         packed = np.full((*cells.shape[:3], 4), 255, dtype=np.uint8)
@@ -114,7 +116,7 @@ class Canvas(Sheet):
 
         NaN is left white, which the legend calls `missing`; `low` and `high` name the scale's ends.
         """
-        playable, known, by_move = shown(self.mdp), np.isfinite(numbers), numbers.shape[1] > 1
+        playable, known, by_move = self.board.floor, np.isfinite(numbers), numbers.shape[1] > 1
         colours = scale.colours(np.where(known, numbers, scale.low))
         colours[~known] = PAPER
         if by_move:
@@ -160,11 +162,30 @@ class Canvas(Sheet):
                 rect(self.world, PAPER, (left + 1 + thick, top + 1 + thick, inner, inner), 1)
             rect(self.world, colour, (left + 1, top + 1, cell - 1, cell - 1), thick)
 
-    def line(self, segments: Sequence[tuple[Point, Point]], colour: Colour) -> None:
-        """Draw lines between points of `world`, edged in white; thin on small cells."""
+    def draw_paths(self, paths: list[list[int]], ways: list[list[int]], middle: float) -> None:
+        """A ring around each start, and lines through the states where one is next to the last.
+
+        `ways` are each state's arrow, down and right; lines are `middle` of a cell below its upper edge.
+        """
+        place = self.board.place
+        for path in paths:
+            placed, lines = [state for state in path if place[state][0] >= 0], []
+            for state, following in pairwise(placed):
+                down, right = place[following][0] - place[state][0], place[following][1] - place[state][1]
+                if abs(down) + abs(right) <= 1 or [down, right] == ways[state]:  # along a diagonal, perhaps
+                    (x, y), (to_x, to_y) = self.point(state, 0.5, middle), self.point(following, 0.5, middle)
+                    if self.mdp.terminal[following] and self.has_grid:  # what is drawn there stays whole
+                        to_x, to_y = (x + to_x) / 2, (y + to_y) / 2
+                    lines.append(((x, y), (to_x, to_y)))
+            self._draw_lines(lines)
+            if placed:
+                self._draw_ring(self.point(placed[0], 0.5, middle))
+
+    def _draw_lines(self, segments: Sequence[tuple[Point, Point]]) -> None:
+        """Lines edged in white; thin on small cells."""
         thick = max(1, self.cell // 10)
         edge = 2 if self.cell >= 5 * _NO_GRID else 1 if self.cell >= 2 * _NO_GRID else 0
-        for half, ink in ((thick / 2 + edge, PAPER), (thick / 2, colour)) if edge else ((0.5, colour),):
+        for half, ink in ((thick / 2 + edge, PAPER), (thick / 2, AGENT)) if edge else ((0.5, AGENT),):
             for (x, y), (to_x, to_y) in segments:
                 if x != to_x and y != to_y:
                     draw = drawing.import_pygame().draw
@@ -174,15 +195,69 @@ class Canvas(Sheet):
                 size = round(abs(x - to_x) + 2 * half), round(abs(y - to_y) + 2 * half)
                 self.world.fill(ink, (left, top, *size))
 
-    def ring(self, middle: Point, colour: Colour) -> None:
-        """Draw a ring around a point of `world`, edged in white; a dot on small cells."""
+    def _draw_ring(self, middle: Point) -> None:
+        """A ring edged in white; a dot on small cells."""
         circle = drawing.import_pygame().draw.circle
         radius, thick = max(2, round(0.36 * self.cell)), max(1, self.cell // 14)
         if self.cell >= 2 * _NO_GRID:
             circle(self.world, PAPER, middle, radius + 1, thick + 3)
-        circle(self.world, colour, middle, radius, thick if self.has_grid else 0)
+        circle(self.world, AGENT, middle, radius, thick if self.has_grid else 0)
 
 
-def shown(mdp: Mdp) -> BoolArray:
-    """Which states' cells an agent can act in, (S,)."""
-    return board_of(mdp).floor
+def directions(mdp: Mdp) -> IntArray:
+    """How far down and right each action's arrow points, (S, A, 2): -1, 0 or 1; 0, 0 for no arrow.
+
+    An action that moves the same way nearly everywhere points that way everywhere, also where a border stops
+    it or chance diverts it. Another one, such as "forward" of an agent that turns, points where it leads.
+    """
+    if isinstance(mdp, GridMdp):
+        return np.broadcast_to(np.array(MOVES), (mdp.num_states, mdp.num_actions, 2))
+    cell = board_of(mdp).cell
+    can_act = (cell >= 0).all(axis=1) & (mdp.reachable & ~mdp.terminal)
+    move = cell[mdp.next_state] - cell[:, None, None]
+    # Moves to a cell that is not next to the first, as a fall back to the start, count as none.
+    is_near = (np.abs(move).max(axis=-1) == 1) & can_act[:, None, None]
+    chance = mdp.probability * is_near * (cell[mdp.next_state] >= 0).all(axis=-1)
+    moves, certain = (chance[..., None] * move).sum(axis=2), chance.max(axis=2) == 1
+    total, length = moves.sum(axis=0), np.hypot(*np.moveaxis(moves, -1, 0)).sum(axis=0)
+    agreement = np.hypot(*total.T) / np.maximum(length, 1e-9)
+    usual = np.where((agreement >= _MOSTLY)[:, None], _signs(total), 0)
+    by_state = (agreement < _SAME_WAY)[:, None] & certain[..., None]
+    return np.where(by_state, _signs(moves), usual)
+
+
+def _signs(moves: FloatArray) -> IntArray:
+    """(..., 2): the nearest of the eight directions."""
+    longest = np.abs(moves).max(axis=-1, keepdims=True)
+    signs: IntArray = np.rint(moves / np.maximum(longest, 1e-9)).astype(np.intp)
+    return signs
+
+
+def moving_actions(mdp: Mdp) -> tuple[int, ...] | None:
+    """The actions that move up, right, down and left; None where these are not all that there are."""
+    arrows = directions(mdp)
+    if mdp.num_actions != len(MOVES) or (arrows != arrows[:1]).any():
+        return None
+    ways = [tuple(way) for way in arrows[0].tolist()]
+    return tuple(ways.index(move) for move in MOVES) if set(ways) == set(MOVES) else None
+
+
+def greedy_paths(mdp: Mdp, greedy: IntArray) -> list[list[int]]:
+    """Follow the greedy policy (S,) from each start, each time to the most probable next state.
+
+    A path ends with the episode, or with the first state that comes twice. There are none from more than four
+    start states.
+    """
+    starts = mdp.start_states.tolist()
+    likely = mdp.probability[np.arange(mdp.num_states), greedy].argmax(axis=1)
+    following = mdp.next_state[np.arange(mdp.num_states), greedy, likely].tolist()
+    paths = []
+    for start in starts if len(starts) <= _MOST_STARTS else []:
+        path, met = [start], {start}
+        while not mdp.terminal[path[-1]]:
+            path.append(following[path[-1]])
+            if path[-1] in met:
+                break
+            met.add(path[-1])
+        paths.append(path)
+    return paths

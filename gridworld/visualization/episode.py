@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
+from PIL import Image
 
 from gridworld.config.worlds import EnvConfig, GymnasiumConfig
-from gridworld.envs.board import board_of
-from gridworld.envs.real_env import RealEnvFrames
-from gridworld.envs.rendering import Frame, frame_size
+from gridworld.envs.rendering import Frame, board_of, frame_size, import_pygame
 from gridworld.envs.rollout import Episode, play
-from gridworld.errors import InputError
+from gridworld.errors import InputError, in_short
 from gridworld.process.console import printable, tell
 from gridworld.visualization.animation import (
     Animation,
@@ -21,22 +24,23 @@ from gridworld.visualization.animation import (
     animation_of_rendered,
     animation_of_states,
 )
-from gridworld.visualization.picture import TIME_SERIES_CARD, Draw, Subject
+from gridworld.visualization.picture import Draw, Subject
 from gridworld.world.mdp import Mdp
-
-TENSORBOARD_SIDE: int | None = TIME_SERIES_CARD
+from gridworld.world.sources.gymnasium_table import make_env
 
 _MOST_FRAMES = 500  # of an episode that finds no end; by then a greedy one goes round in circles
+_MOST_PIXELS = 512 * 512  # of a frame that another environment renders
+_OFF_SCREEN = {"SDL_VIDEODRIVER": "dummy", "SDL_AUDIODRIVER": "dummy"}
 
 _log = logging.getLogger("gridworld")
 
 
-def draw(subject: Subject) -> Draw:
+def episode(subject: Subject) -> Draw:
     """Play one greedy episode on the run's seed; its own cell size is `recording.cell_size`."""
     config, mdp = subject.config, subject.evaluator.mdp
     policy, limit = subject.snapshot.greedy_policy(), subject.evaluator.max_episode_steps
-    episode = play(mdp, policy, limit, config.seed).beginning(_MOST_FRAMES)
-    drawn = film(config.env, mdp, [episode], subject.is_trusted)
+    played = play(mdp, policy, limit, config.seed).beginning(_MOST_FRAMES)
+    drawn = film(config.env, mdp, [played], subject.is_trusted)
     return functools.cache(  # several files show the same
         lambda cell_size: drawn(cell_size or config.recording.cell_size)
     )
@@ -50,34 +54,88 @@ def film(
     The frames are those of the environment that `env` names, where `is_trusted` allows to make it; they are
     scaled down where they are larger than the board would be with cells of that size.
     """
-    frames = _by_the_environment(env, mdp, episodes, is_trusted)
-    if frames is not None:
-
-        def rendered(cell_size: int | None) -> Animation:
-            longest = None if cell_size is None else max(frame_size(mdp, cell_size))
-            return animation_of_rendered(frames, range(len(frames)), longest)
-
-        return rendered
+    if isinstance(env, GymnasiumConfig) and not is_trusted:
+        tell(
+            printable(f"the episode is drawn from the run's tables; {env.id} itself is made with trust only")
+        )
+    elif isinstance(env, GymnasiumConfig):
+        try:
+            frames = rendered_frames(env, mdp, [each.states.tolist() for each in episodes])
+        except InputError as error:
+            _log.warning("the episode is drawn without its environment: %s", error)
+        else:
+            return lambda cell_size: animation_of_rendered(
+                frames, range(len(frames)), None if cell_size is None else max(frame_size(mdp, cell_size))
+            )
     if board_of(mdp).panels:
         states = np.concatenate([each.states for each in episodes])
         return lambda cell_size: animation_of_states(mdp, states, cell_size)
     return lambda cell_size: animation_of_cards(mdp, episodes, cell_size)
 
 
-def _by_the_environment(
-    env: EnvConfig, mdp: Mdp, episodes: Sequence[Episode], is_trusted: bool
-) -> list[Frame] | None:
-    """The frames of the world's own environment; None where it has none, or cannot be asked here."""
-    if not isinstance(env, GymnasiumConfig):
-        return None
-    if not is_trusted:
-        tell(
-            printable(f"the episode is drawn from the run's tables; {env.id} itself is made with trust only")
-        )
-        return None
+def rendered_frames(
+    env: GymnasiumConfig, mdp: Mdp, walks: Sequence[Sequence[int]], most_pixels: int = _MOST_PIXELS
+) -> list[Frame]:
+    """The environment's own frames (height, width, 3), RGB, of walks: the states of episodes from a start on.
+
+    An environment with a transition table is put into each state. Others are enumerated: from a reset on, the
+    actions that lead through the states are taken.
+    """
+    with _off_screen():
+        real = make_env(env.id, dict(env.kwargs), render_mode="rgb_array")
+        try:
+            frames = []
+            for states in walks:
+                real.reset(seed=0)
+                frames += [_frame(real, most_pixels) for _ in _walk(real, mdp, states)]
+            return frames
+        except InputError:
+            raise
+        except Exception as error:  # whatever it raises
+            raise InputError(f"env.id={env.id}: cannot be rendered: {in_short(error)}") from error
+        finally:
+            real.close()
+
+
+def _frame(env: gym.Env[Any, Any], most_pixels: int) -> Frame:
+    frame = np.asarray(env.render(), dtype=np.uint8)
+    height, width = frame.shape[:2]
+    if height * width <= most_pixels:
+        return frame.copy()
+    scale = (most_pixels / (height * width)) ** 0.5
+    size = max(1, int(width * scale)), max(1, int(height * scale))
+    return np.asarray(Image.fromarray(frame).resize(size, Image.Resampling.BOX))
+
+
+def _walk(env: gym.Env[Any, Any], mdp: Mdp, states: Sequence[int]) -> Iterator[None]:
+    """Put the environment into one state after the other."""
+    real: Any = env.unwrapped
+    for before, state in zip([None, *states], states, strict=False):
+        if hasattr(real, "P"):
+            real.s, real.lastaction = int(mdp.number[state]), None
+        elif before is not None:
+            leading = np.flatnonzero(mdp.next_state[before, :, 0] == state)
+            if not leading.size:
+                raise InputError(
+                    f"{mdp.name}: no action leads from {mdp.state_name(before)} to {mdp.state_name(state)}"
+                )
+            env.step(int(leading[0]))
+        yield
+
+
+@contextmanager
+def _off_screen() -> Iterator[None]:
+    """Without a display and a sound card, which environments look for, unless pygame has a display."""
+    pygame = import_pygame()
+    if pygame.display.get_init():
+        yield
+        return
+    before = {name: os.environ.get(name) for name in _OFF_SCREEN}
+    os.environ.update(_OFF_SCREEN)
     try:
-        real = RealEnvFrames(env.id, env.kwargs)
-        return [frame for each in episodes for frame in real.episode(mdp, each.states.tolist())]
-    except InputError as error:
-        _log.warning("the episode is drawn without its environment: %s", error)
-        return None
+        yield
+    finally:
+        pygame.quit()
+        for name, value in before.items():
+            os.environ.pop(name)
+            os.environ.update({} if value is None else {name: value})

@@ -97,11 +97,10 @@ def _encoded(film: Animation, encode: Callable[..., bytes], *keys: int | None) -
 
 
 def encode_gif(film: Animation, fps: int) -> bytes:
-    """Encode an endless GIF; `fps` is rounded to hundredths of a second.
+    """Encode an endless GIF, of each picture the box that changed; `fps` is rounded to 1/100 s.
 
-    After the first picture it has only the box of each in which something changed. Pillow encodes each
-    picture; its `save_all` would hold all of them in memory, write the palette again with each, and fail
-    where a picture is shown for longer than GIF can say.
+    Pillow's `save_all` would hold all pictures in memory, write the palette again with each, and fail where
+    one is shown for longer than GIF can say.
     """
 
     def encode_part(before: int | None, key: int, duration: int) -> bytes:

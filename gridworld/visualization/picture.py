@@ -1,18 +1,15 @@
-"""What a picture of a run is drawn from, and how its drawer is found.
+"""What the pictures of a run are drawn from, and how the function that draws one is found.
 
-A drawer is a module of this package with
-
-    draw(subject) -> Draw                a function of a cell size
-    TENSORBOARD_SIDE: int | None         pixels of its longest side in TensorBoard; None: as in its file
-
-Which pictures there are, and which module draws each, is declared in `gridworld.config.pictures`.
+Which pictures there are is declared in `gridworld.config.pictures`. Each names a function of this package
+that takes a `Subject` and returns a `Draw`.
 """
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol, cast
+from dataclasses import dataclass
+from typing import Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,18 +18,72 @@ from gridworld.agents import PolicySnapshot
 from gridworld.config.train import TrainConfig
 from gridworld.envs.rendering import Frame
 from gridworld.errors import InputError
+from gridworld.storage.serialization import State
 from gridworld.visualization.animation import Animation
 from gridworld.world.evaluation import Evaluator
 
-if TYPE_CHECKING:
-    from gridworld.visualization.policy_history import PolicyHistory
-
-# Pixels that pictures have in TensorBoard. It scales by skipping pixels: thin lines vanish, text frays.
-IMAGES_TAB = 350
-TIME_SERIES_CARD = 240
+_MOST = 48  # moments of a history
+_MOST_NUMBERS = 5_000_000  # of all moments together: some 25 MB
 
 # A picture for a cell size in pixels; None: the picture's own.
 Draw = Callable[[int | None], Frame | Animation]
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """What is kept of an evaluation."""
+
+    step: int
+    values: NDArray[np.float32]  # (S,)
+    greedy: NDArray[np.uint8]  # (S,)
+
+
+class PolicyHistory:
+    """Every evaluation of a short training, every second, fourth, ... of a long one, and always the last."""
+
+    def __init__(self, num_states: int) -> None:
+        self._most = max(4, min(_MOST, _MOST_NUMBERS // num_states))
+        self._every = 1
+        self._seen = 0
+        self._kept: list[Moment] = []
+        self._last: Moment | None = None
+
+    def add(self, step: int, snapshot: PolicySnapshot) -> None:
+        """Take in one more evaluation, after `step` environment steps."""
+        self._last = Moment(step, snapshot.values.astype(np.float32), snapshot.greedy.astype(np.uint8))
+        if self._seen % self._every == 0:
+            if len(self._kept) == self._most:
+                del self._kept[1::2]
+                self._every *= 2
+            if self._seen % self._every == 0:
+                self._kept.append(self._last)
+        self._seen += 1
+
+    def moments(self) -> list[Moment]:
+        """The kept evaluations from the first to the last, at most 49."""
+        if self._last is None or (self._kept and self._kept[-1] is self._last):
+            return list(self._kept)
+        return [*self._kept, self._last]
+
+    def get_state(self) -> State:
+        """The kept evaluations, and how many were seen."""
+        moments = self.moments()
+        return {
+            "every": self._every,
+            "seen": self._seen,
+            "kept": len(self._kept),
+            "steps": [moment.step for moment in moments],
+            "values": [moment.values for moment in moments],
+            "greedy": [moment.greedy for moment in moments],
+        }
+
+    def set_state(self, state: State) -> None:
+        """Continue from a state."""
+        columns = state["steps"], state["values"], state["greedy"]
+        moments = [Moment(*moment) for moment in zip(*columns, strict=True)]
+        self._every, self._seen = int(state["every"]), int(state["seen"])
+        self._kept = moments[: state["kept"]]
+        self._last = moments[-1] if moments else None
 
 
 class Subject(Protocol):
@@ -57,7 +108,7 @@ class Subject(Protocol):
 
     @property
     def visits(self) -> NDArray[np.int64]:
-        """(S, A), how often training took each action in each state."""
+        """(S, A), how often training took each action in each state; InputError where a run has none."""
 
     @property
     def history(self) -> PolicyHistory | None:
@@ -77,15 +128,9 @@ def visits_of(subject: Subject) -> NDArray[np.int64] | None:
         return None
 
 
-class Drawer(Protocol):
-    """The two names of a drawer's module."""
-
-    TENSORBOARD_SIDE: int | None
-
-    def draw(self, subject: Subject) -> Draw:
-        """Prepare the picture: what does not depend on its size is computed here, once."""
-
-
-def drawer(name: str) -> Drawer:
-    """The module of that name in this package."""
-    return cast("Drawer", importlib.import_module(f"{__package__}.{name}"))
+def drawer(name: str) -> Callable[[Subject], Draw]:
+    """The function `module.function` of this package. It computes once what does not depend on the size."""
+    module, _, function = name.partition(".")
+    return cast(
+        "Callable[[Subject], Draw]", getattr(importlib.import_module(f"{__package__}.{module}"), function)
+    )

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from gridworld.envs.rendering import (
     BACKGROUND,
+    INK,
     SMALLEST_TEXT,
     UNKNOWN,
     Colour,
@@ -29,7 +30,6 @@ from gridworld.envs.rendering import (
     text_width,
     write,
 )
-from gridworld.envs.rendering import INK as INK
 from gridworld.world.mdp import BoolArray, FloatArray
 
 ColourArray = NDArray[np.uint8]  # (..., 3), RGB
@@ -113,17 +113,10 @@ UNREACHABLE = Swatch("cannot be reached", UNKNOWN, UNKNOWN_INK)
 
 
 class Sheet:
-    """A picture under construction.
+    """A picture under construction; `world` is the surface of its middle, `width` x `height` pixels.
 
-    Args:
-        width: of the middle, in pixels, its border included.
-        height: of the middle.
-        cell: the width of its border in pixels, and the unit of what is drawn in it.
-        legend_rows: 1 or 2.
-        names: the height of what is written into the upper border itself, in pixels.
-
-    Attributes:
-        world: the surface of the middle and its border.
+    The middle has a border of `cell` pixels, which is the unit of what is drawn in it; `names` is the height
+    of what is written into the upper border itself. The legend has 1 or 2 rows.
     """
 
     def __init__(self, width: int, height: int, cell: int, legend_rows: int = 1, names: int = 0) -> None:
@@ -176,10 +169,7 @@ class Sheet:
             write(self._surface, text, left, middle, size)
 
     def legend(self, scale: Scale, low: str, high: str, swatches: Sequence[Swatch] = ()) -> None:
-        """Draw the colour bar below the grid, between the names of its ends, and the swatches.
-
-        The swatches have a row of their own in a sheet with two rows of legend.
-        """
+        """Draw the colour bar between the names of its ends, and the swatches, in the second row if any."""
         total, edge, bottom = (
             self._surface.get_width(),
             self.world.get_offset()[0] + self.cell,
@@ -193,7 +183,11 @@ class Sheet:
         bar = max(3 * size, min(12 * size, total - 2 * gap - beside - ends))
         left, middle = max(4, min(edge, (total - bar - beside - ends) // 2)), middles[0]
         left = write(self._surface, low, left, middle, size) + gap
-        self._draw_bar(scale, (left, middle - size // 2, bar, size))
+        box = (left, middle - size // 2, bar, size)
+        steps = np.linspace(0, len(scale.ramp) - 1, bar).round().astype(np.intp)
+        pixels = np.tile(scale.ramp[steps], (size, 1, 1))
+        self._surface.blit(import_pygame().image.frombuffer(pixels, (bar, size), "RGB"), box)
+        import_pygame().draw.rect(self._surface, INK, box, 1)
         left = write(self._surface, high, left + bar + gap, middle, size) + 2 * gap
         if len(rows) > 1:
             wide = self._swatches_width(swatches, size)
@@ -207,13 +201,6 @@ class Sheet:
 
     def _swatches_width(self, swatches: Sequence[Swatch], size: int) -> int:
         return sum(size + 3 * (size // 2) + text_width(swatch.label, size) for swatch in swatches)
-
-    def _draw_bar(self, scale: Scale, box: tuple[int, int, int, int]) -> None:
-        left, top, width, height = box
-        steps = np.linspace(0, len(scale.ramp) - 1, width).round().astype(np.intp)
-        bar = np.tile(scale.ramp[steps], (height, 1, 1))
-        self._surface.blit(import_pygame().image.frombuffer(bar, (width, height), "RGB"), (left, top))
-        import_pygame().draw.rect(self._surface, INK, box, 1)
 
     def frame(self) -> Frame:
         """The picture's pixels."""

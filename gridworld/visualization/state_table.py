@@ -7,22 +7,13 @@ are too many states, those remain that training visited most.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.envs.rendering import (
-    SMALLEST_TEXT,
-    UNKNOWN,
-    Colour,
-    Frame,
-    import_pygame,
-    text_size,
-    text_width,
-    write,
-)
-from gridworld.visualization.sheet import INK, PAPER, Scale, Sheet, Swatch, is_dark, short
+from gridworld.envs import rendering as drawing
+from gridworld.envs.rendering import INK, SMALLEST_TEXT, UNKNOWN, Colour, Frame, text_size, text_width, write
+from gridworld.visualization.sheet import PAPER, Scale, Sheet, Swatch, is_dark, short
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 _MOST_ROWS = 24
@@ -44,16 +35,6 @@ def table_states(mdp: Mdp, visits: NDArray[np.int64] | None = None) -> IntArray:
     return states[np.sort(most_visited)]
 
 
-@dataclass(frozen=True, eq=False)
-class Numbers:
-    """What a table shows."""
-
-    name: str
-    table: FloatArray  # (S, columns); NaN is left white
-    scale: Scale
-    written: bool = True  # whether they are written into their cells too
-
-
 class StateTable(Sheet):
     """A table under construction; `states` (rows,) are those of `table_states`, `columns` are names."""
 
@@ -70,64 +51,57 @@ class StateTable(Sheet):
         sizes = [text_size(name, _TEXT, self._column - 4) for name in columns]
         for column, (name, size) in enumerate(zip(columns, sizes, strict=True)):
             if size is not None and None not in sizes:
-                left = self._left(column) + (self._column - text_width(name, size)) // 2
+                left = self.box(0, column)[0] + (self._column - text_width(name, size)) // 2
                 write(self.world, name, left, self._middle(-1), size)
         if hidden:
             line = f"and {hidden:,} more states, visited less or further from the start"
             size = text_size(line, _TEXT, width) or SMALLEST_TEXT
             write(self.world, line, _ROW, self._middle(len(states)) + 3, size)
 
-    def _left(self, column: int) -> int:
-        return _ROW + self._label + column * self._column
-
     def _middle(self, row: int) -> int:
         return (2 + row) * _ROW + _ROW // 2
 
     def box(self, row: int, column: int) -> tuple[int, int, int, int]:
         """Left, top, width and height of a cell, in pixels of `world`."""
-        return self._left(column), (2 + row) * _ROW, self._column + 1, _ROW + 1
+        left = _ROW + self._label + column * self._column
+        return left, (2 + row) * _ROW, self._column + 1, _ROW + 1
 
-    def paint(self, numbers: Numbers, known: BoolArray | None = None) -> None:
-        """Fill the cells; the rows of states that are not `known` (S,) are grey. None: all are."""
-        values = numbers.table[self._states]
+    def paint(
+        self, table: FloatArray, scale: Scale, known: BoolArray | None = None, written: bool = True
+    ) -> None:
+        """Fill the cells with numbers (S, columns) as colours, and as text if `written`.
+
+        NaN is left white; the rows of states that are not `known` (S,) are grey. None: all are.
+        """
+        values = table[self._states]
         rows = np.ones(len(values), dtype=np.bool_) if known is None else known[self._states]
         there = np.isfinite(values) & rows[:, None]
-        colours = numbers.scale.colours(np.where(there, values, numbers.scale.low))
+        colours = scale.colours(np.where(there, values, scale.low))
         colours[~there] = PAPER
         colours[~rows] = UNKNOWN
         for row, column in np.ndindex(*values.shape):
             self.world.fill(colours[row, column].tolist(), self.box(row, column))
-            import_pygame().draw.rect(self.world, INK, self.box(row, column), 1)
-        texts = {value: short(value, numbers.scale.high) for value in set(values[there].tolist())}
+            drawing.import_pygame().draw.rect(self.world, INK, self.box(row, column), 1)
+        texts = {value: short(value, scale.high) for value in set(values[there].tolist())}
         size = min((text_size(text, _TEXT, 0.8 * self._column) or 0 for text in texts.values()), default=0)
         dark = is_dark(colours)
-        for row, column in np.argwhere(there).tolist() if numbers.written and size else []:
-            middle = self._left(column) + self._column / 2, self._middle(row)
+        for row, column in np.argwhere(there).tolist() if written and size else []:
+            middle = self.box(row, column)[0] + self._column / 2, self._middle(row)
             ink = PAPER if dark[row, column] else INK
             self.number(texts[float(values[row, column])], middle, size, ink)
 
     def mark(self, row: int, column: int, colour: Colour) -> None:
         """A frame inside a cell, edged in white."""
         left, top, width, height = self.box(row, column)
-        rect = import_pygame().draw.rect
+        rect = drawing.import_pygame().draw.rect
         rect(self.world, PAPER, (left + 1, top + 1, width - 2, height - 2), 3)
         rect(self.world, colour, (left + 1, top + 1, width - 2, height - 2), 2)
 
-
-def draw_table(
-    mdp: Mdp,
-    states: IntArray,
-    columns: Sequence[str],
-    numbers: Numbers,
-    low: str,
-    high: str,
-    missing: str,
-    caption: str,
-) -> Frame:
-    """The finished picture of numbers; see `Canvas.draw_numbers`."""
-    table = StateTable(mdp, states, columns)
-    table.paint(numbers)
-    table.caption(caption)
-    swatches = [] if np.isfinite(numbers.table[states]).all() else [Swatch(missing)]
-    table.legend(numbers.scale, low, high, swatches)
-    return table.frame()
+    def draw_numbers(
+        self, table: FloatArray, scale: Scale, low: str, high: str, missing: str, caption: str
+    ) -> Frame:
+        """The finished picture of numbers (S, columns); see `Canvas.draw_numbers`."""
+        self.paint(table, scale)
+        self.caption(caption)
+        self.legend(scale, low, high, [] if np.isfinite(table[self._states]).all() else [Swatch(missing)])
+        return self.frame()

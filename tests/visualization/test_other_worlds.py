@@ -15,28 +15,27 @@ from gridworld.agents import PolicySnapshot
 from gridworld.config.pictures import PICTURES
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, GymnasiumConfig
-from gridworld.envs.board import Kind, Panel, board_of
-from gridworld.envs.real_env import RealEnvFrames
 from gridworld.envs.rendering import (
     AGENT,
     GOAL,
     TRAP,
     UNKNOWN,
     Frame,
+    Kind,
+    Panel,
     ansi,
+    board_of,
     draw_frame,
     fitting_cell_size,
 )
 from gridworld.envs.rollout import Episode, play
+from gridworld.visualization import episode
 from gridworld.visualization.animation import Animation, animation_of_rendered
-from gridworld.visualization.canvas import Canvas, shown
+from gridworld.visualization.canvas import Canvas, directions, moving_actions
 from gridworld.visualization.episode import film
 from gridworld.visualization.files import save
-from gridworld.visualization.paths import directions, moving_actions
-from gridworld.visualization.picture import Subject, drawer
-from gridworld.visualization.policy_history import PolicyHistory
-from gridworld.visualization.policy_map import action_numbers, draw_policy_map, draw_policy_table
-from gridworld.visualization.q_error_map import draw_error_map
+from gridworld.visualization.maps import draw_error_map, draw_policy_map, policy, visits
+from gridworld.visualization.picture import PolicyHistory, Subject, drawer
 from gridworld.visualization.sheet import BLUES, DISAGREES, ORANGES, linear
 from gridworld.visualization.state_table import StateTable, table_states
 from gridworld.world.evaluation import Evaluator
@@ -152,7 +151,7 @@ def test_panels_stand_in_a_mosaic_near_to_square_with_a_blank_line_between_two()
     assert (board.kind[:, 5] == Kind.BLANK).all()
     assert (board.kind == Kind.GOAL).sum() == 4
     assert (board.kind == Kind.UNREACHABLE).sum() == 4 * 24  # brought there without having been fetched
-    assert shown(TAXI).sum() == 400
+    assert board_of(TAXI).floor.sum() == 400
     assert len(board_of(CLIFF_WALKING).panels) == 1
 
 
@@ -211,7 +210,7 @@ def test_with_other_actions_a_cell_has_the_largest_error_and_what_cannot_be_reac
 def test_the_policy_of_a_mosaic_has_dots_where_no_action_moves_and_diagonal_paths() -> None:
     best = value_iteration(TAXI, 0.95)
     frame = draw_policy_map(TAXI, best.v, best.optimal.argmax(axis=1), best.optimal).frame()
-    cells = [cell_of(TAXI, frame, state, 2) for state in np.flatnonzero(shown(TAXI))]
+    cells = [cell_of(TAXI, frame, state, 2) for state in np.flatnonzero(board_of(TAXI).floor)]
     assert not any(has(cell, DISAGREES) for cell in cells)
     sea = deep_sea(5, mirrored=False)
     frame = draw_policy_map(sea, np.zeros(26), np.ones(26, dtype=int), np.ones((26, 2), dtype=bool)).frame()
@@ -234,29 +233,28 @@ def table_cell(table: StateTable, frame: Frame, row: int, column: int) -> Frame:
     return frame[y + top : y + top + height, x + left : x + left + width]
 
 
-def test_a_policy_table_frames_the_greedy_action() -> None:
+@pytest.mark.parametrize("has_q", [True, False])
+def test_a_policy_table_frames_the_greedy_action(has_q: bool) -> None:
     world = chain(5)
-    best = value_iteration(world, 0.9)
-    q = best.q.copy()
+    q = value_iteration(world, 0.95).q.copy()
     q[2] = q[2, ::-1]
-    snapshot = PolicySnapshot(q.argmax(axis=1), np.full(q.shape, 0.5), q.max(axis=1), q)
-    states, known = table_states(world), np.arange(6) < 4
-    for each in (snapshot, dataclasses.replace(snapshot, q=None)):
-        frame = draw_policy_table(
-            world, states, action_numbers(each, states), each.greedy, best.optimal, known
-        ).frame()
-        table = StateTable(world, states, world.action_names, legend_rows=2)
-        for row in range(5):
-            cells = [table_cell(table, frame, row, column) for column in range(2)]
-            assert [has(cell, AGENT) for cell in cells] == [False, row != 2]
-            assert [has(cell, DISAGREES) for cell in cells] == [row == 2, False]
-            assert has(cells[0], UNKNOWN) == (row == 4)
+    visited = np.repeat(np.arange(6) < 4, 2).reshape(6, 2)
+    of_it: Any = subject(world, q, visited.astype(np.int64))
+    if not has_q:
+        of_it.snapshot = dataclasses.replace(of_it.snapshot, q=None)
+    frame = policy(of_it)(None)
+    table = StateTable(world, table_states(world), world.action_names, legend_rows=2)
+    for row in range(5):
+        cells = [table_cell(table, frame, row, column) for column in range(2)]
+        assert [has(cell, AGENT) for cell in cells] == [False, row != 2]
+        assert [has(cell, DISAGREES) for cell in cells] == [row == 2, False]
+        assert has(cells[0], UNKNOWN) == (row == 4)
 
 
 def test_a_visit_table_leaves_actions_never_taken_white() -> None:
     world = chain(3)
-    visits = np.array([[1, 50], [0, 25], [0, 0], [0, 0]])
-    frame = drawer("visit_map").draw(subject(world, np.zeros((4, 2)), visits))(None)
+    counts = np.array([[1, 50], [0, 25], [0, 0], [0, 0]])
+    frame = visits(subject(world, np.zeros((4, 2)), counts))(None)
     table = StateTable(world, table_states(world), world.action_names)
     corners = [[tuple(table_cell(table, frame, row, col)[3, 3]) for col in range(2)] for row in range(3)]
     white = (255, 255, 255)
@@ -276,7 +274,7 @@ def test_every_picture_can_be_drawn_of_any_world(world: Mdp, tmp_path: Path) -> 
     of_it = subject(world, rng.normal(size=shape), rng.integers(0, 9, shape))
     for picture in PICTURES:
         if picture.file.endswith((".png", ".gif")):
-            prepared = drawer(picture.drawer).draw(of_it)
+            prepared = drawer(picture.drawer)(of_it)
             drawn = prepared(None)
             if picture.is_map:
                 save(drawn, tmp_path / picture.file, 4)
@@ -287,12 +285,12 @@ def test_every_picture_can_be_drawn_of_any_world(world: Mdp, tmp_path: Path) -> 
 
 def test_an_episode_in_text_tells_state_action_and_reward() -> None:
     world = chain(3)
-    episode = play(world, np.eye(2)[[1, 1, 1, 1]], 10, seed=0)
-    assert episode.states.tolist() == [0, 1, 2, 3]
-    assert episode.actions.tolist() == [1, 1, 1]
-    assert episode.rewards.tolist() == [-0.5, -0.5, 1.0]
-    assert episode.beginning(2).actions.tolist() == [1]
-    told = film(EnvConfig(), world, [episode, episode], True)(None)
+    played = play(world, np.eye(2)[[1, 1, 1, 1]], 10, seed=0)
+    assert played.states.tolist() == [0, 1, 2, 3]
+    assert played.actions.tolist() == [1, 1, 1]
+    assert played.rewards.tolist() == [-0.5, -0.5, 1.0]
+    assert played.beginning(2).actions.tolist() == [1]
+    told = film(EnvConfig(), world, [played, played], True)(None)
     assert len(told) == 8
     pictures = [np.asarray(told.draw(key).convert("RGB")) for key in told.keys]
     assert np.array_equal(pictures[0], pictures[4])
@@ -301,23 +299,23 @@ def test_an_episode_in_text_tells_state_action_and_reward() -> None:
     assert (draw_frame(world, 2) < 128).any()
 
 
-def _noisy(env: RealEnvFrames, mdp: Mdp, states: Sequence[int]) -> list[NDArray[np.uint8]]:
+def _noisy(env: GymnasiumConfig, mdp: Mdp, walks: Sequence[Sequence[int]]) -> list[NDArray[np.uint8]]:
     """Frames of more colours than a palette has."""
-    ramp = np.indices((40, 80)).transpose(1, 2, 0)
-    blue = np.zeros((40, 80, 1), dtype=int)
+    ramp, blue = np.indices((40, 80)).transpose(1, 2, 0), np.zeros((40, 80, 1), dtype=int)
+    states = [state for walk in walks for state in walk]
     return [np.concatenate([3 * ramp, blue + 100 * state], axis=2).astype(np.uint8) for state in states]
 
 
 def test_an_episode_shows_the_frames_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(RealEnvFrames, "episode", _noisy)
+    monkeypatch.setattr(episode, "rendered_frames", _noisy)
     env = GymnasiumConfig(id="FrozenLake-v1")
     walk = Episode(np.array([2, 0, 2, 1]), np.zeros(3, dtype=int), np.zeros(3))
     prepared = film(env, FROZEN_LAKE, [walk], True)
     shown = prepared(None)
     assert shown.size == (80, 40)
     pictures = [np.asarray(shown.draw(key).convert("RGB")).astype(int) for key in shown.keys]
-    for picture, state in zip(pictures, walk.states, strict=True):
-        assert np.abs(picture - _noisy(RealEnvFrames(env.id), FROZEN_LAKE, [state])[0]).mean() < 12
+    for picture, frame in zip(pictures, _noisy(env, FROZEN_LAKE, [walk.states.tolist()]), strict=True):
+        assert np.abs(picture - frame).mean() < 12
     assert np.array_equal(pictures[0], pictures[2])
     assert prepared(5).size == (30, 15)  # a board with such cells has six of them on a side
     assert prepared(100).size == (80, 40)

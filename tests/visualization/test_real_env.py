@@ -7,10 +7,16 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from gridworld.envs.real_env import RealEnvFrames
+from gridworld.config.worlds import GymnasiumConfig
 from gridworld.errors import InputError
+from gridworld.visualization.episode import rendered_frames
+from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 from gridworld.world.sources.enumerated import enumerate_env
+
+
+def frames_of(env_id: str, mdp: Mdp, states: list[int], **options: int):
+    return rendered_frames(GymnasiumConfig(id=env_id), mdp, [states], **options)
 
 
 def tables(env_id: str):
@@ -40,7 +46,7 @@ def tables(env_id: str):
 )
 def test_an_environment_with_a_table_is_put_into_each_state(env_id, states, size):
     before = dict(os.environ)
-    frames = RealEnvFrames(env_id).episode(tables(env_id), states)
+    frames = frames_of(env_id, tables(env_id), states)
     assert [frame.shape for frame in frames] == [(*size, 3)] * 4
     assert frames[0].dtype == np.uint8
     assert np.array_equal(frames[1], frames[3])
@@ -61,25 +67,25 @@ def test_an_enumerated_environment_takes_the_same_walk():
         states.append(int(mdp.next_state[states[-1], action, 0]))
         expected.append(env.render())
     env.close()
-    frames = RealEnvFrames("MiniGrid-Empty-5x5-v0").episode(mdp, states)
+    frames = frames_of("MiniGrid-Empty-5x5-v0", mdp, states)
     assert np.array_equal(frames, expected)
     with pytest.raises(
         InputError, match="no action leads from row 2, column 2, facing right, step 0 to row 2, column 2"
     ):
-        RealEnvFrames("MiniGrid-Empty-5x5-v0").episode(mdp, [0, 0])
+        frames_of("MiniGrid-Empty-5x5-v0", mdp, [0, 0])
 
 
 def test_large_frames_are_made_smaller():
-    frame, *_ = RealEnvFrames("CliffWalking-v1", max_pixels=30_000).episode(tables("CliffWalking-v1"), [36])
+    frame, *_ = frames_of("CliffWalking-v1", tables("CliffWalking-v1"), [36], most_pixels=30_000)
     assert frame.shape == (100, 300, 3)
 
 
 def test_what_cannot_be_rendered_is_one_sentence():
     with pytest.raises(InputError, match=r"^env.id=NoSuchWorld-v0: is no environment .*doesn't exist"):
-        RealEnvFrames("NoSuchWorld-v0").episode(tables("FrozenLake-v1"), [0])
+        frames_of("NoSuchWorld-v0", tables("FrozenLake-v1"), [0])
 
 
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", "CartPole-v1", "Blackjack-v1"])
 def test_an_environment_of_another_kind_is_one_sentence(env_id):
     with pytest.raises(InputError, match=rf"^env.id={env_id}: cannot be rendered: [^\n]*$"):
-        RealEnvFrames(env_id).episode(tables("FrozenLake-v1"), [0, 4, 8])
+        frames_of(env_id, tables("FrozenLake-v1"), [0, 4, 8])

@@ -1,0 +1,274 @@
+"""The maps of a run: its policy, at the end and over training, the error of its values, and its visits.
+
+Each is a function of the subject, and a table where the world has no places. What training never acted in is
+grey in pictures of the policy: its values are guesses, and no part of the scale.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gridworld.agents import PolicySnapshot
+from gridworld.envs import rendering as drawing
+from gridworld.envs.rendering import (
+    AGENT,
+    INK,
+    SMALLEST_TEXT,
+    UNKNOWN,
+    Colour,
+    Frame,
+    Point,
+    board_of,
+    fitting_cell_size,
+)
+from gridworld.visualization.animation import animation_of_frames
+from gridworld.visualization.canvas import Canvas, directions, greedy_paths, moving_actions
+from gridworld.visualization.picture import Draw, Moment, Subject, agents_gamma, visits_of
+from gridworld.visualization.sheet import (
+    BLUES,
+    DISAGREES,
+    NEVER_VISITED,
+    ORANGES,
+    PAPER,
+    UNKNOWN_INK,
+    VIRIDIS,
+    Scale,
+    Sheet,
+    Swatch,
+    counting,
+    is_dark,
+    linear,
+    short,
+)
+from gridworld.visualization.state_table import StateTable, table_states
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+from gridworld.world.solver import Solution, solved
+
+_UNKNOWN_DISAGREES: Colour = (226, 178, 174)
+_SMALLEST_ARROW_CELL = 12  # pixels; below it an arrow is a blot
+_ARROW = (  # its corners along and across its way, in its lengths
+    *((-0.28, 0.05), (0.04, 0.05), (0.04, 0.17), (0.3, 0.0)),
+    *((0.04, -0.17), (0.04, -0.05), (-0.28, -0.05)),
+)
+_LEARNING_SIDE, _LEARNING_MOSAIC_SIDE = 320, 640  # pixels of the animation, with one panel or several
+_NO_OPTIMUM = "no finite optimum"
+
+
+def policy(subject: Subject) -> Draw:
+    """The map of the subject's greedy policy."""
+    mdp, snapshot, visits = subject.evaluator.mdp, subject.snapshot, visits_of(subject)
+    optimal, known = subject.evaluator.solution.optimal, explored(mdp, visits)
+    caption = _policy_caption(subject, subject.steps)
+    if board_of(mdp).panels:
+        return lambda cell_size: draw_policy_map(
+            mdp, snapshot.values, snapshot.greedy, optimal, caption, cell_size, known=known
+        ).frame()
+    states = table_states(mdp, visits)
+    if snapshot.q is None:
+        name, numbers, scale = "probability", snapshot.sampled, Scale(VIRIDIS, 0.0, 1.0)
+    else:
+        name, numbers, scale = "Q", snapshot.q, linear(VIRIDIS, snapshot.q[states[known[states]]])
+    table = StateTable(mdp, states, mdp.action_names, legend_rows=2)
+    table.paint(numbers, scale, known)
+    picture = _finish_policy_table(table, states, name, scale, snapshot.greedy, optimal, known, caption)
+    return lambda cell_size: picture.frame()
+
+
+def learning(subject: Subject) -> Draw:
+    """The policy map, or table, over training as an animation of one size, with one scale of colours."""
+    assert subject.history is not None
+    mdp, optimal = subject.evaluator.mdp, subject.evaluator.solution.optimal
+    moments = subject.history.moments()
+    board, known = board_of(mdp), explored(mdp, subject.visits)
+    states = np.flatnonzero(board.floor) if board.panels else table_states(mdp, subject.visits)
+    visited = states[known[states]]
+    scale = linear(VIRIDIS, np.stack([moment.values[visited] for moment in moments]))
+    cell_size = fitting_cell_size(mdp, _LEARNING_SIDE if len(board.panels) <= 1 else _LEARNING_MOSAIC_SIDE)
+
+    def sheet(moment: Moment) -> Sheet:
+        values, greedy = moment.values.astype(np.float64), moment.greedy
+        caption = _policy_caption(subject, moment.step)
+        if board.panels:
+            return draw_policy_map(mdp, values, greedy, optimal, caption, cell_size, scale, known)
+        numbers = np.full(optimal.shape, np.nan)
+        np.put_along_axis(numbers, greedy[:, None].astype(np.intp), values[:, None], axis=1)
+        table = StateTable(mdp, states, mdp.action_names, legend_rows=2)
+        table.paint(numbers, scale, known, written=False)
+        return _finish_policy_table(table, states, "value", scale, greedy, optimal, known, caption)
+
+    frames = (sheet(moment).packed() for moment in moments)
+    animation = animation_of_frames(frames, [PAPER, *scale.ramp.tolist()])
+    return lambda cell_size: animation
+
+
+def q_error(subject: Subject) -> Draw:
+    """The map of |Q - Q*|, or |V - V*| without Q.
+
+    Q* is the optimum under the discount that the agent learns with, which may differ from the evaluation's.
+    """
+    mdp, snapshot, gamma = subject.evaluator.mdp, subject.snapshot, agents_gamma(subject)
+    best = subject.evaluator.solution
+    error = value_error(snapshot, best if gamma == best.gamma else solved(mdp, gamma))
+    name = "|V - V*|" if snapshot.q is None else "|Q - Q*|"
+    caption = f"{name} after {subject.steps:,} steps, at the agent's gamma {gamma:g}"
+    if board_of(mdp).panels:
+        return lambda cell_size: draw_error_map(mdp, error, caption, cell_size)
+    states = table_states(mdp, visits_of(subject))
+    scale = linear(ORANGES, error[states], low=0.0)
+    table = StateTable(mdp, states, ["V"] if snapshot.q is None else mdp.action_names)
+    picture = table.draw_numbers(error, scale, "error 0", short(scale.high), _NO_OPTIMUM, caption)
+    return lambda cell_size: picture
+
+
+def visits(subject: Subject) -> Draw:
+    """The map of how often training took an action in each state."""
+    mdp, counts = subject.evaluator.mdp, subject.visits
+    caption = f"where {counts.sum():,} training steps were taken"
+    if board_of(mdp).panels:
+        return lambda cell_size: draw_visit_map(mdp, counts, caption, cell_size)
+    states = table_states(mdp, counts)
+    scale = counting(BLUES, counts[states])
+    table = StateTable(mdp, states, mdp.action_names)
+    numbers = np.where(counts > 0, counts, np.nan)
+    picture = table.draw_numbers(numbers, scale, *_visit_ends(scale), "never", caption)
+    return lambda cell_size: picture
+
+
+def explored(mdp: Mdp, visits: NDArray[np.int64] | None) -> BoolArray:
+    """The states (S,) that training acted in; without visits (S, A), those that can be reached."""
+    if visits is not None and visits.any():
+        return np.asarray(visits.any(axis=1))
+    return mdp.reachable
+
+
+def _policy_caption(subject: Subject, steps: int) -> str:
+    return f"greedy policy after {steps:,} steps, the agent's gamma {agents_gamma(subject):g}"
+
+
+def draw_policy_map(
+    mdp: Mdp,
+    values: FloatArray,
+    greedy: IntArray,
+    optimal: BoolArray,
+    caption: str = "",
+    cell_size: int | None = None,
+    scale: Scale | None = None,
+    known: BoolArray | None = None,
+) -> Canvas:
+    """Draw values (S,) as colours, greedy actions (S,) as arrows, and the greedy path from the start.
+
+    A cell whose greedy action is not one of the `optimal` (S, A) has a red frame, and one that is not `known`
+    (S,) is grey. With a `scale`, for pictures that are to be compared, no numbers are written.
+    """
+    canvas = Canvas(mdp, cell_size, legend_rows=2)
+    playable = canvas.board.floor
+    known = playable if known is None else known & playable
+    own = linear(VIRIDIS, values[known])
+    ends = scale or own
+    colours = ends.colours(values)
+    colours[~known] = UNKNOWN
+    canvas.paint(colours[:, None])
+    canvas.draw_world()
+    with_numbers = scale is None and len(canvas.board.panels) <= 1  # of several panels the cells are small
+    texts = {value: short(value, own.high) for value in set(values[known].tolist()) if with_numbers}
+    size = canvas.number_size(0.8, texts.values())
+    inks = np.where(known[:, None], np.where(is_dark(colours)[:, None], PAPER, INK), UNKNOWN_INK).tolist()
+    middle = 0.5 if size is None else 0.4  # of the arrows, above the numbers
+    paths = greedy_paths(mdp, greedy)
+    ways = directions(mdp)[np.arange(mdp.num_states), greedy].tolist()
+    canvas.draw_paths(paths, ways, middle)
+    length = canvas.cell if size is None else 0.85 * canvas.cell
+    letter = min(round(0.32 * length), 20)
+    draw = drawing.import_pygame().draw
+    for state in np.flatnonzero(playable).tolist() if canvas.cell >= _SMALLEST_ARROW_CELL else []:
+        point = canvas.point(state, 0.5, middle)
+        if any(ways[state]):
+            draw.polygon(canvas.world, inks[state], _arrow(*point, *ways[state], length))
+            continue
+        draw.circle(canvas.world, inks[state], point, round(0.2 * length))
+        if letter >= SMALLEST_TEXT:
+            name = mdp.action_names[greedy[state]]
+            canvas.number(name[:1].upper(), point, letter, colours[state].tolist())
+    on_path = set().union(*paths)
+    for state in np.flatnonzero(known).tolist() if size is not None else []:
+        plate = colours[state] if state in on_path else None
+        below = canvas.point(state, 0.5, 0.83)
+        canvas.number(texts[float(values[state])], below, size or 0, inks[state], plate)
+    wrong = playable & ~optimal[np.arange(mdp.num_states), greedy]
+    canvas.mark(np.flatnonzero(wrong & ~known), _UNKNOWN_DISAGREES)
+    canvas.mark(np.flatnonzero(wrong & known), DISAGREES)
+    canvas.caption(caption)
+    path = Swatch("greedy path from the start" if canvas.cell >= 24 else "greedy path", AGENT, PAPER)
+    swatches = [path] if paths else []
+    swatches.append(Swatch("not optimal in this cell", frame=DISAGREES, thick=2))
+    swatches += [] if known[playable].all() and not canvas.hidden else [NEVER_VISITED]
+    canvas.legend(ends, f"value {short(ends.low, ends.high)}", short(ends.high), swatches)
+    return canvas
+
+
+@functools.lru_cache(maxsize=1 << 13)  # the same arrows are drawn in every picture of an animation
+def _arrow(x: float, y: float, down: int, right: int, size: float) -> list[Point]:
+    length = math.hypot(down, right)
+    to_down, to_right = down / length, right / length
+    return [
+        (x + size * (along * to_right - across * to_down), y + size * (along * to_down + across * to_right))
+        for along, across in _ARROW
+    ]
+
+
+def _finish_policy_table(
+    table: StateTable,
+    states: IntArray,
+    name: str,
+    scale: Scale,
+    greedy: IntArray,
+    optimal: BoolArray,
+    known: BoolArray,
+    caption: str,
+) -> Sheet:
+    """Frame the greedy action of each state, and add caption and legend."""
+    for row, state in enumerate(states.tolist()):
+        action = int(greedy[state])
+        table.mark(row, action, AGENT if optimal[state, action] else DISAGREES)
+    table.caption(caption)
+    swatches = [Swatch("greedy action", frame=AGENT, thick=2)]
+    swatches.append(Swatch("greedy, not optimal", frame=DISAGREES, thick=2))
+    swatches += [] if known[states].all() else [NEVER_VISITED]
+    table.legend(scale, f"{name} {short(scale.low, scale.high)}", short(scale.high), swatches)
+    return table
+
+
+def value_error(snapshot: PolicySnapshot, best: Solution) -> FloatArray:
+    """|Q - Q*| (S, A), or |V - V*| (S, 1) for an agent without Q; NaN where the optimum is not finite."""
+    theirs, ours = (snapshot.values[:, None], best.v[:, None]) if snapshot.q is None else (snapshot.q, best.q)
+    return np.abs(np.where(np.isfinite(ours), theirs - ours, np.nan))
+
+
+def draw_error_map(mdp: Mdp, error: FloatArray, caption: str = "", cell_size: int | None = None) -> Frame:
+    """Draw errors (S, A) as four triangles in each cell, or (S, 1) as its colour.
+
+    Where the cells are too small, or the actions are not the four moves, a cell shows the largest error.
+    """
+    canvas = Canvas(mdp, cell_size)
+    moves = moving_actions(mdp) if error.shape[1] > 1 and canvas.has_grid else None
+    error = error.max(axis=1, keepdims=True) if moves is None else error[:, moves]
+    scale = linear(ORANGES, error[canvas.board.floor], low=0.0)
+    return canvas.draw_numbers(error, scale, "error 0", short(scale.high), _NO_OPTIMUM, caption)
+
+
+def draw_visit_map(
+    mdp: Mdp, visits: NDArray[np.int64], caption: str = "", cell_size: int | None = None
+) -> Frame:
+    """Draw counts (S, A) as colours, on a logarithmic scale where they span decades."""
+    counts = visits.sum(axis=1, keepdims=True)
+    scale = counting(BLUES, counts[board_of(mdp).floor])
+    numbers = np.where(counts > 0, counts, np.nan)
+    return Canvas(mdp, cell_size).draw_numbers(numbers, scale, *_visit_ends(scale), "never", caption)
+
+
+def _visit_ends(scale: Scale) -> tuple[str, str]:
+    return f"visits {short(scale.low)}", short(scale.high) + (", log scale" if scale.logarithmic else "")
