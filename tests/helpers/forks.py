@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 _SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-_FRESH = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+_FRESH = dict(os.environ)
 
 
 @dataclass(frozen=True)
