@@ -11,7 +11,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from helpers.forks import run_watched
+from helpers import forks
 from helpers.hostile import CATALOGUE, FINE, SECRET, Hostile
 from helpers.support import ROOT, SHORT, train_in
 from PIL import Image
@@ -95,7 +95,7 @@ def test_nothing_of_a_hostile_run_gets_out(case: Hostile, good: Path, tmp_path: 
     looked_at = -1
     for command, words in WORDS.items():
         variables = {**AWAY, "PYTHONPATH": f"{ROOT}{os.pathsep}{base}"}
-        ended = run_watched(
+        ended = forks.run(
             SCRIPTS[command], *words, cwd=place, secret=base / "secret", environment=variables, timeout=60
         )
         where = f"{command}: {ended.output[-2000:]}"
