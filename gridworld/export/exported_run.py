@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gridworld.config.plain_settings import read_config
-from gridworld.config.settings import flat
+from gridworld.config.settings import flat, read_config
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import MapConfig
 from gridworld.errors import InputError
