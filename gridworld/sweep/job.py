@@ -75,7 +75,7 @@ def run_in_sweep(
         raise JobError(one_line(reason(error))) from None
     except Exception as error:
         why = one_line(reason(error))
-        with contextlib.suppress(OSError, FolderLostError):
+        with contextlib.suppress(OSError):
             mark_failed(folder, why, "" if isinstance(error, InputError) else traceback.format_exc())
         if stop_at_failure:
             raise StopSweep(why) from None
