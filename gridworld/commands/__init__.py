@@ -17,7 +17,6 @@ from gridworld.bounds import Bounds
 from gridworld.config.composition.words import digits
 from gridworld.errors import EXIT_CODE, InputError, failure
 from gridworld.process.console import prepare, printing, program, tell_error
-from gridworld.process.memory_budget import collect_less_often
 from gridworld.process.signals import at_work
 
 Main = Callable[[Sequence[str]], None]
@@ -69,7 +68,6 @@ def run(main: Main) -> None:
 
     So does output that could not be written, whatever exit code `main` ends with.
     """
-    collect_less_often()
     prepare()
     try:
         with at_work(), printing():

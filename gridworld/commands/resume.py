@@ -12,7 +12,6 @@ from pathlib import Path
 
 from gridworld.config.composition.words import digits
 from gridworld.errors import InputError
-from gridworld.process.console import result_is_in_files
 from gridworld.process.memory_budget import limited
 from gridworld.run.folder import alone_in, check_inside
 from gridworld.run.reader import check_is_run
@@ -24,7 +23,6 @@ _SWITCHES = {"logging.progress": "true", "trust": "false", "anyway": "false"}  #
 @limited()
 def main(arguments: Sequence[str]) -> None:
     """Resume, and print the result as a new run does."""
-    result_is_in_files()
     words = _parse(arguments)
     total_timesteps = _step_count(words[STEPS]) if STEPS in words else None
     progress, trust, anyway = ((words.get(name) or usual) == "true" for name, usual in _SWITCHES.items())

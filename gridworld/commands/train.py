@@ -33,13 +33,10 @@ from gridworld.process.console import (
     prepare,
     printable,
     printing,
-    result_is_in_files,
     tell_error,
 )
-from gridworld.process.memory_budget import collect_less_often
 from gridworld.process.signals import at_work
 from gridworld.run.folder import SWEEP_JSON, claimed, shown
-from gridworld.storage.safe_read import check_yaml
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 _job_started = threading.Event()  # set when this process starts its first job
@@ -50,11 +47,9 @@ class RefuseUsedFolders(Callback):
     """Checks the output folder before Hydra writes to it, and ends the program if it cannot be used."""
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        result_is_in_files()
         _exit_on_error(lambda: _claim_run_folder(config))
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        result_is_in_files()
         _exit_on_error(lambda: check_sweep_folder(config))
         _at_end.push(partial(_sum_up, Path(config.hydra.sweep.dir)))
 
@@ -85,7 +80,6 @@ def _claim_run_folder(config: DictConfig) -> None:
 def main() -> None:
     """Run the command line in `sys.argv`."""
     conf = conf_folder()
-    collect_less_often()
     prepare()
     if {"--help", "-h"} & set(sys.argv[1:]):
         run(lambda _: print(manual(conf)))
@@ -123,8 +117,6 @@ def _prepare_command_line(conf: Path) -> None:
         from gridworld.config.composition.recipe_file import with_recipe
 
         sys.argv[1:] = with_recipe(sys.argv[1:])
-    for folder in own_conf_folders(sys.argv[1:]):
-        check_yaml(folder)
     sys.argv[1:] = completed(sys.argv[1:], conf)
 
 

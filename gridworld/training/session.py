@@ -223,7 +223,6 @@ class Session:
         if not (asked or is_last or self._pace.is_due(steps)) or steps == self.checkpoints.newest:
             self._stop.obey()
             return
-        self._stop.take_time()
         started = clock()
         try:
             self._save(steps, is_last)

@@ -49,7 +49,6 @@ import gridworld
 from gridworld.config.composition.compose import compose
 from gridworld.envs.rendering import import_pygame
 from gridworld.process import console
-from gridworld.process.memory_budget import collect_less_often
 from gridworld.report import page
 from gridworld.tune import search as tune_search
 
@@ -276,7 +275,7 @@ if __name__ == "__main__":
     _end_without_finalizers()
     gc.freeze()  # so that a fork shares what is there
     huge_pages.collapse()
-    collect_less_often()
+    gc.set_threshold(50_000)
     gc.enable()
     listener = socket.socket(fileno=int(sys.argv[1]))
     listener.set_inheritable(False)
