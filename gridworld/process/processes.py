@@ -130,6 +130,8 @@ def _result_of(connection: Any, process: Any) -> Any:
         except (EOFError, OSError):
             process.join()
             return LostError(f"exit code {process.exitcode}")
+        finally:
+            process.join()
 
 
 def _work(task: Callable[[], Any], connection: Connection[Any, Any], parent: int) -> None:

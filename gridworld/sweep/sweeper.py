@@ -15,8 +15,8 @@ from pathlib import Path
 from hydra.types import HydraContext
 from omegaconf import DictConfig
 
-from gridworld.config.composition.words import prepared
 from gridworld.config.sweep import SweepConfig
+from gridworld.config.words import prepared
 from gridworld.errors import InputError
 from gridworld.process.console import ProgressLine, tell, time_left
 from gridworld.process.processes import LostError, worker_count
