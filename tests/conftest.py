@@ -16,7 +16,6 @@ from helpers.quickly import collapse_memory, compose_quickly
 from hypothesis import settings
 
 from gridworld.process import console
-from gridworld.process.memory_budget import collect_less_often
 
 # The package and the tests are compiled once, not in every process.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -99,7 +98,7 @@ def pytest_collection_finish() -> None:
         sys.modules["gridworld.agents.sb3.factory"].keep_compiler_out()
     compose_quickly()
     gc.freeze()
-    collect_less_often()
+    gc.set_threshold(50_000)
     collapse_memory()
 
 

@@ -41,7 +41,6 @@ import gridworld
 from gridworld.config.compose import compose
 from gridworld.envs.rendering import import_pygame
 from gridworld.process import console
-from gridworld.process.memory_budget import collect_less_often
 from gridworld.report import page
 from gridworld.tune import search as tune_search
 
@@ -96,7 +95,7 @@ def _prepare() -> None:
         finalizer.atexit = False  # what imported modules do at the end, for torch half of a script's time
     gc.freeze()  # so that a fork shares what is there
     collapse_memory()
-    collect_less_often()
+    gc.set_threshold(50_000)
     gc.enable()
 
 
