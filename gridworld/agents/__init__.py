@@ -81,7 +81,7 @@ class Agent(Protocol):
         Args:
             total_timesteps: environment steps, from the very start; a whole last batch counts.
             on_step: called with the steps so far after a batch of steps; it returns the steps by which it is
-                to be called again at the latest, and 0 where learning is to end. It may be called sooner.
+                to be called again at the latest, and 0 where learning is to end.
             on_safe_point: called with the steps so far where nothing is half done, so that `get_state` is
                 complete, and once more at the end if that is such a point.
             state: of `get_state`, to continue from; None: from the start.

@@ -18,7 +18,7 @@ from torch import nn
 
 import gridworld.engine
 from gridworld.config.agents import Decay
-from gridworld.engine.networks import Inputs, Kind, copy_row, cut
+from gridworld.engine.networks import Inputs, copy_row, cut
 from gridworld.engine.population import Population, Run
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.statistics_env import StatisticsVectorEnv
@@ -42,7 +42,6 @@ def make_run(
     observation: ObservationTable,
     envs: StatisticsVectorEnv,
     seed: int,
-    kind: Kind,
     reward_scale: float = 1.0,
     falling: Mapping[str, Decay] = MappingProxyType({}),
     log_interval: int = 1,
@@ -54,7 +53,6 @@ def make_run(
         observation: what it sees of a state.
         envs: what it learns in.
         seed: of the run.
-        kind: of its features extractors.
         reward_scale: see `Run`, as for the others.
     """
     torch_generator, numpy_generator = torch.Generator(), np.random.RandomState()
@@ -63,7 +61,7 @@ def make_run(
     envs.np_random = independent_generator(seed)
     envs.reset()
     policy: Any = model.policy
-    nets, inputs = _inputs(policy, observation, kind)
+    nets, inputs = _inputs(policy, observation)
     run = Run(
         model,
         policy.optimizer.param_groups[0]["params"],
@@ -72,13 +70,13 @@ def make_run(
     )
     for name in ("q_net_target", "quantile_net_target"):
         if hasattr(policy, name):
-            _, run.target = _inputs(policy, observation, kind, getattr(policy, name))
+            _, run.target = _inputs(policy, observation, getattr(policy, name))
             run.target_parameters = list(getattr(policy, name).parameters())
     return run
 
 
 def _inputs(
-    policy: Any, observation: ObservationTable, kind: Kind, network: Any = None
+    policy: Any, observation: ObservationTable, network: Any = None
 ) -> tuple[Sequence[Sequence[nn.Module]], Inputs]:
     """The layers of each output, and what feeds them; `network`: None for the policy's own."""
     if isinstance(policy, ActorCriticPolicy):
@@ -88,12 +86,12 @@ def _inputs(
         if not policy.share_features_extractor:
             names = ["pi_features_extractor", "vf_features_extractor"]
         extractors = [getattr(policy, name) for name in names]
-        return nets, Inputs(policy, observation, nets, extractors, policy.extract_features, kind)
+        return nets, Inputs(policy, observation, nets, extractors, policy.extract_features)
     network = network or (policy.q_net if hasattr(policy, "q_net") else policy.quantile_net)
     nets = [[*(network.q_net if hasattr(network, "q_net") else network.quantile_net)]]
     extractor = network.features_extractor
     return nets, Inputs(
-        policy, observation, nets, [extractor], lambda rows: network.extract_features(rows, extractor), kind
+        policy, observation, nets, [extractor], lambda rows: network.extract_features(rows, extractor)
     )
 
 

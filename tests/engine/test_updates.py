@@ -10,10 +10,9 @@ from sb3_contrib import QRDQN, TRPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.logger import KVWriter, Logger
 
-from gridworld.agents.sb3.agent import extractors_kind
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.engine import a2c, dqn, on_policy, population
+from gridworld.engine import dqn, on_policy, population
 from gridworld.engine.population import Run
 from gridworld.engine.sb3_format import algorithm_of, make_run, put_weights
 from gridworld.envs.observations import make_observation
@@ -50,7 +49,7 @@ def twins(algorithm: type, kind: str, **arguments: Any) -> tuple[Run, Any]:
         model._setup_learn(10_000)
         models.append(model)
     models[1].policy.load_state_dict(models[0].policy.state_dict())
-    run = make_run(models[0], observation, envs, 0, extractors_kind(models[0]))
+    run = make_run(models[0], observation, envs, 0)
     run.begin(10_000)
     found = algorithm_of(algorithm)
     assert found is not None
@@ -144,7 +143,7 @@ ON_POLICY: list[tuple[type, str, dict[str, Any]]] = [
 def test_updates_from_rollouts(
     algorithm: Any, kind: str, arguments: dict[str, Any], few_states: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (population, on_policy, a2c):
+    for module in (population, on_policy):
         monkeypatch.setattr(module, "FEW_STATES", few_states)
     n_steps = STEPS
     if algorithm is PPO:

@@ -129,14 +129,13 @@ def test_a_callback_goes_on_to_the_bit(agent: str, tmp_path: Path) -> None:
     ("callbacks", "name"),
     [
         (SAMPLING, "own_callbacks.Sampling"),
-        ("callbacks=[{_target_: own_callbacks.Recording}]", "own_callbacks.Recording"),
         (
             "callbacks=[{_target_: stable_baselines3.common.callbacks.EveryNTimesteps, n_steps: 9, "
             "callback: {_target_: own_callbacks.Recording}}]",
             "own_callbacks.Recording",
         ),
     ],
-    ids=["sampling", "recording", "held"],
+    ids=["sampling", "held"],
 )
 def test_what_says_no_state_trains_without_checkpoints(
     callbacks: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -165,25 +164,19 @@ def test_it_is_called_as_sb3_calls_it_and_may_end_training(
 
 
 def test_callbacks_of_sb3_may_hold_others(tmp_path: Path) -> None:
-    path = "stable_baselines3.common.callbacks"
-    words = (
+    path, words = "stable_baselines3.common.callbacks", [*SHORT["a2c"], *LESS]
+    held = (
         f"{{_target_: {path}.EveryNTimesteps, n_steps: 200, callback: {{_target_: own_callbacks.Recording}}}}"
     )
-    begin(tmp_path / "run", *SHORT["a2c"], *LESS, f"callbacks=[{words}]")
+    begin(tmp_path / "run", *words, f"callbacks=[{held}]")
     assert [call for call in calls() if isinstance(call, bool)] == [True, True]
-    inner = "[{_target_: own_callbacks.Recording}]"
-    begin(
-        tmp_path / "list",
-        *SHORT["a2c"],
-        *LESS,
-        f"callbacks=[{{_target_: {path}.CallbackList, callbacks: {inner}}}]",
-    )
+    begin(tmp_path / "list", *words, f"callbacks=[{{_target_: {path}.CallbackList, callbacks: [{held}]}}]")
     assert calls().count("init") == 2
-    wrong = f"callbacks=[{words.replace('own_callbacks.Recording', 'torch.nn.ReLU')}]"
-    with pytest.raises(InputError, match=r"callbacks\[0\]: .*EveryNTimesteps cannot begin: .*'ReLU' object"):
-        begin(tmp_path / "wrong", *SHORT["a2c"], *LESS, wrong)
+    wrong = f"callbacks=[{held.replace('own_callbacks.Recording', 'torch.nn.ReLU')}]"
+    with pytest.raises(AttributeError, match="'ReLU' object"):
+        begin(tmp_path / "wrong", *words, wrong)
     limit = f"callbacks=[{{_target_: {path}.StopTrainingOnMaxEpisodes, max_episodes: 1}}]"
-    stopped_after(1, tmp_path / "limit", *SHORT["a2c"], *LESS, limit, "checkpoint.every=20")
+    stopped_after(1, tmp_path / "limit", *words, limit, "checkpoint.every=20")
     open_unfinished(tmp_path / "limit", trust=True).resume()
 
 
@@ -215,30 +208,20 @@ def test_callbacks_of_a_strangers_run_write_nothing_without_trust(tmp_path: Path
     assert not (tmp_path / "made.json").exists()
 
 
+OWN = "{_target_: own_callbacks."
+
+
 @pytest.mark.parametrize(
     ("callbacks", "told"),
     [
         ("[3]", r"callbacks\[0\]=3: must be a mapping of _target_"),
         ("[{every: 3}]", r"callbacks\[0\]={'every': 3}: must be a mapping of _target_"),
-        ("[{_target_: Stirring}]", r"must be a mapping of _target_, the import path"),
-        (
-            "[{_target_: own_callbacks.Stiring}]",
-            r"callbacks\[0\]\._target_=own_callbacks\.Stiring: must be the import path of a BaseCallback",
-        ),
-        ("[{_target_: torch.nn.ReLU}]", r"must be the import path of a BaseCallback class"),
-        ("[{_target_: nowhere.Stirring}]", r"there is no module nowhere; is the folder"),
-        (
-            "[{_target_: own_callbacks.Stirring}]",
-            r"callbacks\[0\]: .*Stirring cannot be built: .* missing 1 required positional argument: 'every'",
-        ),
-        (
-            "[{_target_: own_callbacks.Stirring, every: 3, evry: 3}]",
-            r"got an unexpected keyword argument 'evry'",
-        ),
-        (
-            "[{_target_: own_callbacks.Failing}]",
-            r"callbacks\[0\]: own_callbacks\.Failing cannot be built: no server",
-        ),
+        ("[{_target_: Stirring}]", "must be a mapping of _target_, the import path"),
+        (f"[{OWN}Stiring}}]", r"callbacks\[0\]\._target_=own_callbacks\.Stiring: must be the import path of"),
+        ("[{_target_: torch.nn.ReLU}]", "must be the import path of a BaseCallback class"),
+        ("[{_target_: nowhere.Stirring}]", "there is no module nowhere; is the folder"),
+        (f"[{OWN}Stirring, every: 3, evry: 3}}]", "got an unexpected keyword argument 'evry'"),
+        (f"[{OWN}Failing}}]", r"callbacks\[0\]: own_callbacks\.Failing cannot be built: .*no server"),
     ],
 )
 def test_mistakes_are_found_before_training(callbacks: str, told: str, tmp_path: Path) -> None:
@@ -253,15 +236,3 @@ def test_a_tabular_agent_has_none() -> None:
     )
     with pytest.raises(InputError, match=told):
         check_tabular(configure("agent=sarsa", STIRRING))
-
-
-def test_on_the_command_line(tmp_path: Path) -> None:
-    words = [*SHORT["a2c"], *LESS, STIRRING, "hydra.run.dir=run"]
-    assert script("train.py", *words, cwd=tmp_path, PYTHONPATH=str(tmp_path)).returncode == 0
-    evaluated = script("evaluate.py", "run", "--best", cwd=tmp_path)
-    assert evaluated.returncode == 0, evaluated.stderr
-    again = script("reproduce.py", "run", cwd=tmp_path, PYTHONPATH=str(tmp_path))
-    assert (again.returncode, "add --trust" in again.stderr) == (2, True)
-    again = script("reproduce.py", "run", "--trust", cwd=tmp_path, PYTHONPATH=str(tmp_path))
-    assert again.returncode == 0, again.stdout + again.stderr
-    assert "  best weights        identical  " in again.stdout

@@ -100,7 +100,7 @@ def test_in_sb3s_own_loop_every_transition_is_counted() -> None:
     assert (buffer.size(), buffer.counts.sum()) == (0, 0)
     other = ReplayCounts(10**9, model.observation_space, model.action_space, n_envs=NUM_ENVS)
     assert sum(each.nbytes for each in vars(other).values() if isinstance(each, np.ndarray)) < 10**6
-    with pytest.raises(InputError, match="optimize_memory_usage=true: ReplayCounts stores each transition"):
+    with pytest.raises(InputError, match="optimize_memory_usage=true: ReplayCounts has each transition once"):
         ReplayCounts(1, model.observation_space, model.action_space, optimize_memory_usage=True)
     other.set_state(state)
     assert kept(other) == model.told
