@@ -31,7 +31,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from torch import Tensor
 
 from gridworld.agents.sb3.settings import SCHEDULES
-from gridworld.config.agents import Decay
+from gridworld.config.fields import Decay
 from gridworld.engine.population import diverged, log_state, set_log_state
 from gridworld.process.console import tell
 from gridworld.storage.serialization import (

@@ -24,7 +24,7 @@ from gridworld.agents import TrainingContext
 from gridworld.agents.sb3.policy_outputs import CHUNK, why_unreadable
 from gridworld.agents.sb3.settings import FALLING, SCHEDULES, SB3ClassConfig, SB3Config
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.config.agents import falls, parse_schedule
+from gridworld.config.fields import falls, parse_schedule
 from gridworld.errors import InputError, in_short
 from gridworld.process.memory_budget import check_memory, is_limited
 from gridworld.process.user_input import imported
