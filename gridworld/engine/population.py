@@ -44,10 +44,10 @@ class Run:
     inputs: Inputs  # what the network sees of each state
     nets: Sequence[Sequence[nn.Module]]  # the layers of each output
     envs: StatisticsVectorEnv  # for their generator and their statistics
-    reward_scale: float  # that rewards are multiplied by
-    falling: Mapping[str, Decay]  # settings that fall over training in ways that SB3 has not
     torch_generator: torch.Generator  # in place of torch's own
     numpy_generator: np.random.RandomState  # in place of numpy's own
+    reward_scale: float = 1.0  # that rewards are multiplied by
+    falling: Mapping[str, Decay] = field(default_factory=dict)  # settings that fall as SB3 lets none fall
     log_interval: int = 1  # as SB3's `learn` takes it
     target: Inputs | None = None  # what its target network sees of each state, where it has one
     target_parameters: Sequence[nn.Parameter] = ()  # of that, in the same order
@@ -295,11 +295,9 @@ class Population:
 
     def safe_point(self) -> Self | None:
         """Let all runs be saved, as nothing is half done; returns the population of those that go on."""
-        sums = [each.weights.sum(dim=1).cpu().numpy() for each in self.all_networks]
-        finite: BoolArray = np.isfinite(np.stack(sums)).all(axis=0)
+        finite = [torch.isfinite(each.weights).all(dim=1).cpu().numpy() for each in self.all_networks]
         for run in self.going():
-            rows = [each.weights[run.row] for each in self.all_networks]
-            if finite[run.row] or all(bool(torch.isfinite(row).all()) for row in rows):
+            if all(of_runs[run.row] for of_runs in finite):
                 run.safe_point(self.num_timesteps)
             else:
                 run.fail(diverged(run.model, "a weight"))

@@ -5,8 +5,7 @@ from __future__ import annotations
 import importlib
 import io
 import pkgutil
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from stable_baselines3.common.utils import FloatSchedule
 from torch import nn
 
 import gridworld.engine
-from gridworld.config.fields import Decay
 from gridworld.engine.networks import Inputs, copy_row, cut
 from gridworld.engine.population import Population, Run
 from gridworld.envs.observations import ObservationTable
@@ -42,18 +40,11 @@ def make_run(
     observation: ObservationTable,
     envs: StatisticsVectorEnv,
     seed: int,
-    reward_scale: float = 1.0,
-    falling: Mapping[str, Decay] = MappingProxyType({}),
-    log_interval: int = 1,
+    **options: Any,
 ) -> Run:
     """A run of a model that SB3 has just made, so that its generators are where `learn` would find them.
 
-    Args:
-        model: SB3's.
-        observation: what it sees of a state.
-        envs: what it learns in.
-        seed: of the run.
-        reward_scale: see `Run`, as for the others.
+    `observation` is what it sees of a state, `options` are other fields of `Run`.
     """
     torch_generator, numpy_generator = torch.Generator(), np.random.RandomState()
     torch_generator.set_state(torch.get_rng_state())
@@ -62,12 +53,8 @@ def make_run(
     envs.reset()
     policy: Any = model.policy
     nets, inputs = _inputs(policy, observation)
-    run = Run(
-        model,
-        policy.optimizer.param_groups[0]["params"],
-        *(inputs, nets, envs, reward_scale, falling),
-        *(torch_generator, numpy_generator, log_interval),
-    )
+    parameters = policy.optimizer.param_groups[0]["params"]
+    run = Run(model, parameters, inputs, nets, envs, torch_generator, numpy_generator, **options)
     for name in ("q_net_target", "quantile_net_target"):
         if hasattr(policy, name):
             _, run.target = _inputs(policy, observation, getattr(policy, name))

@@ -17,7 +17,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from torch import nn
 
-from gridworld.agents import Learning, PolicySnapshot, TrainingContext, WriteScalars
+from gridworld.agents import Learning, PolicySnapshot, TrainingContext, WriteScalars, misfit
 from gridworld.agents.sb3.callbacks import RunCallback, check_finite, class_without_state
 from gridworld.agents.sb3.factory import (
     Arguments,
@@ -28,7 +28,7 @@ from gridworld.agents.sb3.factory import (
     unfit,
 )
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
-from gridworld.agents.sb3.model_file import misfit, read_model
+from gridworld.agents.sb3.model_file import read_model
 from gridworld.agents.sb3.policy_outputs import explored, read_table, why_no_table
 from gridworld.agents.sb3.replay_counts import ReplayCounts
 from gridworld.agents.sb3.settings import SB3Config
@@ -208,8 +208,12 @@ class SB3Agent:
         size = sum(weights.nbytes for state in own.values() for weights in state.values())
         kind = f"a model of {self.config.name}"
         found, rate = read_model(path, _SPARE_BYTES + _BYTES_A_BYTE * size, kind)
-        for module, expected in own.items():
-            if (reason := misfit(found.get(module, {}), expected)) is not None:
+        for module in own:
+            arrays, expected = (
+                {name: tensor.cpu().numpy() for name, tensor in of_all.get(module, {}).items()}
+                for of_all in (found, own)
+            )
+            if (reason := misfit(arrays, expected)) is not None:
                 raise InputError(f"{path}: not {kind} for this world and observation ({module}.{reason})")
         taken: Any = {module: found[module] for module in own}
         self._model.set_parameters(taken, exact_match=False, device=self._model.device)
@@ -233,15 +237,12 @@ class EngineAgent(SB3Agent):
         super().__init__(config, context, algorithm, arguments, with_buffers=False)
         self._algorithm, self._is_only_asked = ours, context.only_asked
         self.run = make_run(
-            self._model,
-            context.observation,
-            context.envs,
-            context.seed,
-            config.reward_factor,
-            config.falling(),
-            config.log_interval,
+            *(self._model, context.observation, context.envs, context.seed),
+            reward_scale=config.reward_factor,
+            falling=config.falling(),
+            log_interval=config.log_interval,
+            counts_transitions=config.counts_transitions,
         )
-        self.run.counts_transitions = config.counts_transitions
         self._algorithm([self.run], [None])
 
     @property

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import inspect
-import itertools
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, cast
 
@@ -40,11 +39,7 @@ _KINDS: dict[str, type] = {
     "rollout_buffer_class": BaseBuffer,
 }
 _MOST_LAYERS, _WIDEST_LAYER = 16, 4096  # what a processor's memory holds, whoever asks for them
-_CNN_FEATURES = 512  # of the last layer of SB3's NatureCNN
-_COPIES = 4  # of a weight: its gradient and what the optimiser keeps, or a file, its member and a tensor
-_NUMBER = 4  # bytes of a weight, and of an activation
-# A pass makes of each byte of an observation: numbers of 4 bytes, scaled, and the first layer's answer.
-_PIXEL_PASS, _NUMBER_PASS = 24, 2
+_PIXEL_PASS, _NUMBER_PASS = 24, 8  # bytes of a pass for a pixel, which becomes a scaled number, or a number
 _TARGET = "_target_"
 
 
@@ -161,7 +156,7 @@ def make_model(
     """Build a model on the context's environments; `with_buffers`: whether it keeps what it meets."""
     keep_compiler_out()
     if is_limited():
-        check_memory(f"agent={config.name}: its network", _network_bytes(arguments, context))
+        _check_network(config, context)
     device = _device(context.device)
     envs = GridWorldVecEnv(context.envs, context.observation, config.reward_factor)
     if not with_buffers:
@@ -186,28 +181,15 @@ def make_model(
     return model
 
 
-def _network_bytes(arguments: Arguments, context: TrainingContext) -> float:
-    """About the memory of a network, where every whole number of its settings is the width of a layer."""
+def _check_network(config: SB3Config, context: TrainingContext) -> None:
+    """Refuse a network that would take more than the memory budget, alone or in a pass over the states."""
     observation, space = context.observation, cast(Any, context.observation.space)
-    kwargs, shape = arguments.get("policy_kwargs", {}), space.shape or ()
-    size = math.prod(shape) if shape else int(space.n)
-    widths = [size, *_whole_numbers(kwargs), context.envs.mdp.num_actions * kwargs.get("n_quantiles", 1)]
-    if arguments["policy"].__name__.endswith("CnnPolicy"):
-        widths.insert(1, _CNN_FEATURES)
-    weights = 2 * sum(above * below for above, below in itertools.pairwise(widths))  # of two networks
-    per_byte = _PIXEL_PASS if space.dtype == np.uint8 else _NUMBER_PASS
-    row = per_byte * math.prod(shape) * np.dtype(space.dtype).itemsize + 3 * _NUMBER * max(widths[1:])
+    size = math.prod(space.shape) if space.shape else int(space.n)
+    per_number = _PIXEL_PASS if space.dtype == np.uint8 else _NUMBER_PASS
     table = 0 if observation.stored is None else observation.stored.nbytes
-    return float(table + _COPIES * _NUMBER * weights + min(observation.num_states, CHUNK) * row)
-
-
-def _whole_numbers(node: Any) -> Iterator[int]:
-    """Those in nested settings, in their order."""
-    if isinstance(node, dict | list | tuple):
-        for each in node.values() if isinstance(node, dict) else node:
-            yield from _whole_numbers(each)
-    elif type(node) is int and node > 0:
-        yield node
+    needed = config.memory(size, context.envs.num_envs, 0) + table
+    needed += min(observation.num_states, CHUNK) * per_number * size
+    check_memory(f"agent={config.name}: its network", needed)
 
 
 def _device(name: str) -> str:

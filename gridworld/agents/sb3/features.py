@@ -1,8 +1,7 @@
-"""Features extractors: functions of what an agent sees, which a network learns from.
+"""Features extractors, which make of each observation a vector that a small network can tell apart.
 
-Two numbers, or thousands of pixels of which few differ, are hard to tell apart for a small network. Here each
-observation becomes a vector of length 1, and those of different cells are at right angles, or nearly, as the
-unit vectors of `one_hot` are. They work in any model of Stable-Baselines3:
+Those of different cells are at right angles, or nearly, as the unit vectors of `one_hot` are. They work in
+any model of Stable-Baselines3:
 
     DQN("MlpPolicy", env, policy_kwargs={"features_extractor_class": FourierFeatures})
 """
@@ -82,8 +81,8 @@ class FourierFeatures(_Extractor):
 class AgentByColour(_Extractor):
     """The brightest colours of an image's squares, nearly where the agent stands: nothing is learned.
 
-    What counts of a pixel is by how much red, green or blue exceeds the other two: white and greys are 0. The
-    features are the largest of each colour in each square of pixels, divided by the length of all.
+    The features are by how much red, green or blue exceeds the other two, the most in each square of pixels,
+    divided by the length of all.
 
     Args:
         observation_space: of images, (3, height, width), channels first.
@@ -106,12 +105,11 @@ class PixelCNN(_Extractor):
     """A small convolutional network that learns from an image's pixels.
 
     Two convolutions, of squares of pixels side by side and of one square's channels. Each channel of each is
-    scaled to mean 0 and variance 1 over the image's squares, image by image, and rectified. So the sizes of
-    the weights do not matter, and no optimiser's step is too long for them. The third power lets what stands
-    out in an image, as the agent does, weigh more than what fills it. The features are scaled to one length.
+    scaled to mean 0 and variance 1 over the image's squares, image by image, and rectified, so that the sizes
+    of the weights do not matter. The third power lets what stands out in an image, as the agent does, weigh
+    more than what fills it. The features are scaled to one length.
 
-    The first convolution is computed as a product of matrices, since squares do not overlap. What depends on
-    no parameter (`patches`) is apart from what is learned (`learn`), so that it can be computed once.
+    What depends on no parameter (`patches`) is apart from what is learned (`learn`): it is computed once.
 
     D. Ulyanov, A. Vedaldi, V. Lempitsky: Instance Normalization, 2016.
 

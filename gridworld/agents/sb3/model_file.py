@@ -12,7 +12,6 @@ import io
 import pickletools
 import re
 import zipfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -63,19 +62,6 @@ def read_weights(path: Path, most: int) -> dict[str, NDArray[Any]]:
         for module, tensors in parameters.items()
         for name, tensor in tensors.items()
     }
-
-
-def misfit(found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> str | None:
-    """The first difference in names, types and shapes, or the first number that is not finite; None: none."""
-    for name in sorted(found.keys() ^ expected.keys()):
-        return f"{name[:80]} is {'missing' if name in expected else 'not part of it'}"
-    for name, like in expected.items():
-        is_now, must_be = (f"{each.dtype} {tuple(each.shape)}" for each in (found[name], like))
-        if is_now != must_be:
-            return f"{name} is {is_now}, it must be {must_be}"
-        if not torch.isfinite(found[name]).all():
-            return f"{name} holds numbers that are not finite"
-    return None
 
 
 def _members(content: bytes) -> dict[str, bytes]:

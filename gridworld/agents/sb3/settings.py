@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, is_dataclass
 from typing import Any, Optional
 
@@ -42,8 +41,9 @@ _NUMBERS = {
 }
 # Fields that are ours, not arguments of the algorithm's class.
 _OWN_FIELDS = {"name", "family", "algorithm", "engine", "log_interval", "reward_scale", "policy"}
-_COPIES, _NUMBER = 6, 4  # of each weight: its gradient, the optimiser's, a model file; bytes
+_BYTES_OF_A_WEIGHT = 24  # with its gradient, the optimiser's numbers and a model file
 _BYTES_OF_A_STEP = 64  # in a buffer, and while it is summed up
+_CNN_FEATURES = 512  # of the last layer of SB3's NatureCNN
 _MOST_RETURN = 1e15  # of an episode
 _LEAST_REWARD = 1e-30  # in networks' 32 bits
 _COUNT, _SHARE, _POSITIVE = bounds(1), bounds(0, 1), bounds(0, above=True)
@@ -77,6 +77,15 @@ class ActorCriticPolicyKwargs(PolicyKwargs):
     use_expln: Optional[bool] = None  # noqa: UP045
     squash_output: Optional[bool] = None  # noqa: UP045
     share_features_extractor: Optional[bool] = None  # noqa: UP045
+
+
+def _whole_numbers(node: Any) -> Iterator[int]:
+    """Those in nested settings, in their order."""
+    if isinstance(node, dict | list | tuple):
+        for each in node.values() if isinstance(node, dict) else node:
+            yield from _whole_numbers(each)
+    elif type(node) is int and node > 0:
+        yield node
 
 
 @dataclass
@@ -136,15 +145,15 @@ class SB3Config(AgentConfig):
         return repr({key: value for key, value in settings.items() if key not in _NUMBERS})
 
     def memory(self, num_states: int, num_envs: int, total_timesteps: int) -> int:
-        # its networks with their copies, and what it keeps of its steps
-        nets = self.policy_kwargs_given.get("net_arch") or [64, 64]
-        widths = [num_states, *(nets if isinstance(nets, list) else max(nets.values(), key=sum)), 1]
-        weights = 2 * sum(above * below for above, below in itertools.pairwise(widths))
+        # its networks with their copies, where any whole number may be a layer's width, and its steps
+        widths = list(_whole_numbers(self.policy_kwargs_given)) or [64, 64]
+        widths += [_CNN_FEATURES] if self.policy == "CnnPolicy" else []
+        weights = 2 * (num_states + sum(widths)) * max(widths)
         rollout = self.given.get("n_steps", 2048) * num_envs
         kept = min(self.given.get("buffer_size", rollout), total_timesteps)
-        if self.counts_transitions:
-            kept = num_envs
-        return int(_COPIES * _NUMBER * weights + _BYTES_OF_A_STEP * kept)
+        return _BYTES_OF_A_WEIGHT * weights + _BYTES_OF_A_STEP * (
+            num_envs if self.counts_transitions else kept
+        )
 
     def falling(self) -> dict[str, Decay]:
         """Its settings that fall over training."""

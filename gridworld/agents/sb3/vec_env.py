@@ -23,10 +23,7 @@ _MASKS = "action_masks"  # asked for by agents that respect them; here nothing i
 
 
 class GridWorldVecEnv(VecEnv):
-    """Observations looked up in a table, episodes reported in `infos` as SB3's Monitor would.
-
-    At an episode's end, its info has `terminal_observation`, `TimeLimit.truncated` and
-    `episode` = {"r": return, "l": length, "t": seconds since the start}; the other infos are empty.
+    """Observations looked up in a table; infos at an episode's end as of SB3's Monitor and DummyVecEnv.
 
     Args:
         envs: the batch. It must reset in the same step, which is how SB3 sees episodes.
@@ -55,9 +52,6 @@ class GridWorldVecEnv(VecEnv):
 
         SB3 seeds the action space, from which DQN explores, with the same number as the environments. These
         take an independent generator instead, so that slips and starts do not depend on the actions.
-
-        Returns:
-            (num_envs, *shape), the observations.
         """
         if self._seeds[0] is not None:
             self.envs.np_random = independent_generator(self._seeds[0])
@@ -115,7 +109,7 @@ class GridWorldVecEnv(VecEnv):
         raise InputError(f"{method_name}: the environments of a native batch have no methods of their own")
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """True for Monitor, whose `episode` entries are written here."""
+        """True for Monitor, whose `episode` entries the infos have."""
         return [wrapper_class is Monitor] * len(list(self._get_indices(indices)))
 
 

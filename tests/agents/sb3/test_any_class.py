@@ -6,7 +6,7 @@ import warnings
 from pathlib import Path
 
 import pytest
-from helpers.own_class import OWN_CLASS, any_class
+from helpers.own_class import OWN_CLASS, any_class, importable
 from helpers.support import NO_FILES, SHORT, configure, script
 
 from gridworld.errors import InputError
@@ -129,20 +129,6 @@ def test_classes_of_torch_are_taken_or_refused_in_a_sentence(
     assert "\n" not in told
 
 
-OWN_MODULE = """
-import torch
-from torch import nn
-
-class Drawn(nn.Module):  # in either mode
-    def forward(self, x):
-        return x + torch.randn_like(x)
-
-class Among(nn.Module):  # depends on the rest of the batch
-    def forward(self, x):
-        return (x - x.mean(dim=0)).tanh()
-"""
-
-
 @pytest.mark.parametrize(
     ("agent", "word", "sentence"),
     [
@@ -156,10 +142,10 @@ class Among(nn.Module):  # depends on the rest of the batch
         ("ppo", "agent.ent_coef=1e307", "training diverged at update 0"),
         ("ppo", "agent.learning_rate=1e307", "training diverged at update"),
         ("a2c", "+agent.arguments.vf_coef=1e307", "training diverged at update"),
-        ("dqn", "agent.policy_kwargs.activation_fn=learner.Drawn", "DQN does not always give the same"),
+        ("dqn", "agent.policy_kwargs.activation_fn=own_modules.Drawn", "DQN does not always give the same"),
         (
             "a2c",
-            "+agent.arguments.policy_kwargs.activation_fn=learner.Among",
+            "+agent.arguments.policy_kwargs.activation_fn=own_modules.Among",
             "agent=a2c: stable_baselines3.A2C does not always give the same",
         ),
     ],
@@ -168,9 +154,6 @@ class Among(nn.Module):  # depends on the rest of the batch
 def test_what_only_the_class_can_judge_is_refused_in_a_sentence(
     agent: str, word: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "modules").mkdir()
-    (tmp_path / "modules" / "learner.py").write_text(OWN_MODULE)
-    monkeypatch.syspath_prepend(str(tmp_path / "modules"))
-    monkeypatch.delitem(sys.modules, "learner", raising=False)
+    importable(tmp_path / "modules", monkeypatch)
     (tmp_path / "run").mkdir()
     assert sentence in outcome(tmp_path / "run", *SHORT[agent], word)

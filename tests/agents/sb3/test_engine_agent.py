@@ -1,13 +1,13 @@
 """Which settings the engine learns with, and SB3's own model that it leaves."""
 
 import contextlib
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from helpers.own_class import importable
 from helpers.support import SHORT, configure
 from sb3_contrib import QRDQN, TRPO
 from stable_baselines3 import A2C, DQN, PPO
@@ -51,26 +51,6 @@ def test_the_model_is_sb3s_own_and_learns_on(agent: str, tmp_path: Path) -> None
         assert each.num_timesteps >= before + 100
 
 
-OWN_MODULES = """
-import torch
-from stable_baselines3.dqn.policies import DQNPolicy
-from torch import nn
-
-class Drawn(nn.Module):  # at random, in either mode
-    def forward(self, x):
-        return x.relu() + 0.1 * torch.randn_like(x)
-
-class Among(nn.Module):  # looks at the other rows
-    def forward(self, x):
-        return x - x.mean(dim=0)
-
-class ReLU(nn.ReLU):  # is not what it is called
-    def forward(self, x):
-        return super().forward(x) + self.training
-
-class Policy(DQNPolicy): pass
-class Adam(torch.optim.Adam): pass
-"""
 UNKNOWN = [
     "agent.n_steps=3",
     *(f"agent.policy_kwargs.activation_fn=torch.nn.{name}" for name in ("RReLU", "Dropout", "Softmax")),
@@ -86,9 +66,7 @@ UNKNOWN = [
 def test_what_it_does_not_know_learns_in_sb3s_loop_and_a_line_says_why(
     setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "own_modules.py").write_text(OWN_MODULES)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.delitem(sys.modules, "own_modules", raising=False)
+    importable(tmp_path, monkeypatch)
     with contextlib.suppress(InputError):  # some cannot learn there either
         agent = built("agent=dqn", setting)
         assert type(agent) is SB3Agent
