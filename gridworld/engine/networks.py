@@ -218,35 +218,21 @@ class ModuleNetworks:
             torch.as_tensor(slope, dtype=output.dtype, device=output.device).view_as(output)
             for slope, output in zip(slopes, self._outputs, strict=True)
         ]
-        _pull(self._outputs, given, self._parameters, accumulate_grad=True)
+        torch.autograd.backward(self._outputs, given, retain_graph=True, inputs=self._parameters)
 
     def push(self, changes: Tensor) -> tuple[Array, ...]:
         """See `DenseNetworks.push`: a pass back through the pass back, which is linear in the slopes."""
         self._pulled = self._pulled or [self._pull(output) for output in self._outputs]
         given = cut(changes[0], [each.shape for each in self._parameters])
-        moved = [_pull(pulled, given, [slopes])[0] for slopes, pulled in self._pulled]
+        moved = [
+            torch.autograd.grad(pulled, slopes, given, retain_graph=True)[0]
+            for slopes, pulled in self._pulled
+        ]
         return tuple(each.cpu().numpy()[None] for each in moved)
 
     def _pull(self, output: Tensor) -> tuple[Tensor, Sequence[Tensor]]:
         slopes = torch.zeros_like(output, requires_grad=True)
-        return slopes, _pull([output], [slopes], self._parameters, create_graph=True)
-
-
-def _pull(
-    outputs: Sequence[Tensor],
-    slopes: Sequence[Tensor],
-    inputs: Sequence[Tensor],
-    create_graph: bool = False,
-    accumulate_grad: bool = False,
-) -> Sequence[Tensor]:
-    """What torch.autograd's own functions call once they have imported sympy; the graph is kept."""
-    engine: Any = torch.autograd.Variable._execution_engine
-    found: Sequence[Tensor] = engine.run_backward(
-        *(tuple(outputs), tuple(slopes), True, create_graph, tuple(inputs)),
-        allow_unreachable=accumulate_grad,
-        accumulate_grad=accumulate_grad,
-    )
-    return found
+        return slopes, torch.autograd.grad(output, self._parameters, slopes, create_graph=True)
 
 
 Networks = DenseNetworks | ModuleNetworks

@@ -127,7 +127,6 @@ ON_POLICY: list[tuple[type, str, dict[str, Any]]] = [
     (A2C, "one_hot", {"normalize_advantage": True, "use_rms_prop": False, **COEFFICIENTS}),
     *[(TRPO, "one_hot", {}), (TRPO, "none", LINEAR), (TRPO, "coordinates", TWO_SIZES)],
     *[(TRPO, "one_hot", RELU), (TRPO, "one_hot", ELU), (TRPO, "image", {**PIXELS, **FEW_PRODUCTS})],
-    *[(TRPO, "image", {**SEPARATE, **FEW_PRODUCTS})],
     (TRPO, "one_hot", {"normalize_advantage": False, "cg_max_steps": 3, "cg_damping": 1.0}),
     (TRPO, "one_hot", {"sub_sampling_factor": 3, "batch_size": 100, "n_critic_updates": 2}),
     (TRPO, "one_hot", {"target_kl": 0.5, "line_search_shrinking_factor": 0.5, "cg_damping": 1.0}),

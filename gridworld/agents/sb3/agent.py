@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import KVWriter, Logger
@@ -19,14 +18,7 @@ from torch import nn
 
 from gridworld.agents import Learning, PolicySnapshot, TrainingContext, WriteScalars, misfit
 from gridworld.agents.sb3.callbacks import RunCallback, check_finite, class_without_state
-from gridworld.agents.sb3.factory import (
-    Arguments,
-    algorithm_and_arguments,
-    failed,
-    make_callbacks,
-    make_model,
-    unfit,
-)
+from gridworld.agents.sb3.factory import algorithm_and_arguments, failed, make_callbacks, make_model, unfit
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
 from gridworld.agents.sb3.model_file import read_model
 from gridworld.agents.sb3.policy_outputs import explored, read_table, why_no_table
@@ -68,11 +60,15 @@ def build(config: SB3Config, context: TrainingContext) -> SB3Agent:
     ours = algorithm_of(algorithm) if config.engine == "tabulated" else None
     if ours is not None:
         unknown = "callbacks" if context.callbacks else unknown_to_engine(config, algorithm, arguments)
-        if unknown is None:
-            return EngineAgent(config, context, algorithm, arguments, ours)
-        if not context.only_asked:
-            tell(f"engine: stock, since the tabulated one does not cover {unknown}")
-    agent = SB3Agent(config, context, algorithm, arguments, not context.only_asked)
+        if unknown is not None:
+            ours = None
+            if not context.only_asked:
+                tell(f"engine: stock, since the tabulated one does not cover {unknown}")
+    keeps = ours is None and not context.only_asked
+    model = make_model(config, context, algorithm, arguments, with_buffers=keeps)
+    if ours is not None:
+        return EngineAgent(config, context, model, ours)
+    agent = SB3Agent(config, context, model)
     agent.check_table()
     return agent
 
@@ -106,20 +102,12 @@ def unknown_to_engine(
 class SB3Agent:
     """One SB3 model, which learns in SB3's own loop."""
 
-    def __init__(
-        self,
-        config: SB3Config,
-        context: TrainingContext,
-        algorithm: type[BaseAlgorithm],
-        arguments: Arguments,
-        with_buffers: bool,
-    ) -> None:
-        torch.set_num_threads(context.threads)
+    def __init__(self, config: SB3Config, context: TrainingContext, model: BaseAlgorithm) -> None:
         self.config = config
         self.observation = context.observation
         self._envs = context.envs
         self._loaded = False
-        self._model = make_model(config, context, algorithm, arguments, with_buffers)
+        self._model = model
         self._callbacks = make_callbacks(context.callbacks)
         writers = [] if context.write_scalars is None else [_ScalarsOnly(context.write_scalars)]
         self._model.set_logger(Logger(folder=None, output_formats=list(writers)))
@@ -227,14 +215,9 @@ class EngineAgent(SB3Agent):
     """One SB3 model, which learns in the engine."""
 
     def __init__(
-        self,
-        config: SB3Config,
-        context: TrainingContext,
-        algorithm: type[BaseAlgorithm],
-        arguments: Arguments,
-        ours: type[Population],
+        self, config: SB3Config, context: TrainingContext, model: BaseAlgorithm, ours: type[Population]
     ) -> None:
-        super().__init__(config, context, algorithm, arguments, with_buffers=False)
+        super().__init__(config, context, model)
         self._algorithm, self._is_only_asked = ours, context.only_asked
         self.run = make_run(
             *(self._model, context.observation, context.envs, context.seed),

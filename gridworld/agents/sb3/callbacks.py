@@ -192,17 +192,15 @@ class HasState(Protocol):
 
 def class_without_state(model: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> str | None:
     """The path of a class of which nobody knows what it keeps; None: all are known."""
-    for each in (*_custom_parts(model), *_flat(callbacks)):
-        if type(each) not in _OF_CALLBACKS and not isinstance(each, HasState):
-            return _path(each)
-    return None
+    unknown = [each for each in _parts(model) if type(each).__module__.partition(".")[0] not in _LIBRARIES]
+    unknown += [each for each in _flat(callbacks) if type(each) not in _OF_CALLBACKS]
+    return next((_path(each) for each in unknown if not isinstance(each, HasState)), None)
 
 
-def _custom_parts(model: Any) -> list[Any]:
-    """The model and those of its parts whose classes come from no library."""
+def _parts(model: Any) -> list[Any]:
+    """The model and all of which somebody may write a class."""
     buffers = [getattr(model, f"{kind}_buffer", None) for kind in ("replay", "rollout")]
-    parts = [model, *model.policy.modules(), model.policy.optimizer, *buffers]
-    return [part for part in parts if type(part).__module__.partition(".")[0] not in _LIBRARIES]
+    return [model, *model.policy.modules(), model.policy.optimizer, *buffers]
 
 
 def _flat(callbacks: Sequence[BaseCallback]) -> Iterator[BaseCallback]:
@@ -213,21 +211,24 @@ def _flat(callbacks: Sequence[BaseCallback]) -> Iterator[BaseCallback]:
         yield from _flat([each for each in held if isinstance(each, BaseCallback)])
 
 
+def _with_state(model: Any, callbacks: Sequence[BaseCallback]) -> list[HasState]:
+    return [each for each in (*_parts(model), *_flat(callbacks)) if isinstance(each, HasState)]
+
+
 def get_state(model: Any, callbacks: Sequence[BaseCallback]) -> State:
     """The state of a model that waits between a rollout and the next, and of its callbacks."""
-    buffer = getattr(model, "replay_buffer", None)
     return {
         **{name: getattr(model, name) for name in _NUMBERS if hasattr(model, name)},
         "parameters": _plain(model.get_parameters()),
-        "replay": None if buffer is None else _replay_state(buffer),
+        "replay": _replay(model),
         "environments": model.env.envs.get_state(),
         "last_episode_starts": model._last_episode_starts,
         **log_state(model),
         "global_generators": global_state(),
         "torch_generators": _torch_state(),
         "action_generator": generator_state(model.action_space.np_random),
-        "custom_parts": [part.get_state() for part in _custom_parts(model)],
-        "callbacks": [_callback_state(each) for each in _flat(callbacks)],
+        "own": [each.get_state() for each in _with_state(model, callbacks)],
+        "callbacks": [{name: getattr(each, name) for name in _counts(each)} for each in _flat(callbacks)],
     }
 
 
@@ -246,17 +247,24 @@ def set_state(model: Any, callbacks: Sequence[BaseCallback], state: State) -> No
         for key, array in expected[name].items():
             fill(array, state["parameters"][name].get(key), f"{name}.{key}")
     model.set_parameters(parameters, exact_match=True, device=model.device)
-    if getattr(model, "replay_buffer", None) is not None:
-        _set_replay_state(model.replay_buffer, state["replay"])
+    if _replay(model):
+        buffer, pos = model.replay_buffer, int(state["replay"]["pos"])
+        if not 0 <= pos < buffer.buffer_size:
+            raise StateError(f"the replay's pos must be from 0 to {buffer.buffer_size - 1}")
+        buffer.pos, buffer.full = pos, bool(state["replay"]["full"])
+        for name, rows in _replay(model).items():
+            if isinstance(rows, np.ndarray):
+                fill(rows, state["replay"][name], f"the replay's {name}")
     model.env.envs.set_state(state["environments"])
     model._last_obs = model.env.observation.rows(model.env.states)
     if model._last_episode_starts is not None:
         fill(model._last_episode_starts, state["last_episode_starts"], "last_episode_starts")
     set_log_state(model, state)
-    for part, own in zip(_custom_parts(model), state["custom_parts"], strict=True):
-        part.set_state(own)
-    for callback, own in zip(_flat(callbacks), state["callbacks"], strict=True):
-        _set_callback_state(callback, own)
+    for callback, counts in zip(_flat(callbacks), state["callbacks"], strict=True):
+        for name in _counts(callback):
+            setattr(callback, name, int(counts[name]))
+    for each, own in zip(_with_state(model, callbacks), state["own"], strict=True):
+        each.set_state(own)
     set_generator_state(model.action_space.np_random, state["action_generator"])
     set_global_state(state["global_generators"])
     torch.set_rng_state(torch.from_numpy(state["torch_generators"]["cpu"]))
@@ -271,41 +279,19 @@ def _torch_state() -> State:
     return state
 
 
-def _replay_state(buffer: Any) -> State:
-    if isinstance(buffer, HasState):
-        return buffer.get_state()
-    return {**_rows(buffer), "pos": int(buffer.pos), "full": bool(buffer.full)}
-
-
-def _set_replay_state(buffer: Any, state: State) -> None:
-    if isinstance(buffer, HasState):
-        buffer.set_state(state)
-        return
-    if not 0 <= state["pos"] < buffer.buffer_size:
-        raise StateError(f"the replay's pos must be from 0 to {buffer.buffer_size - 1}")
-    buffer.pos, buffer.full = int(state["pos"]), bool(state["full"])
-    for name, rows in _rows(buffer).items():
-        fill(rows, state[name], f"the replay's {name}")
-
-
-def _rows(buffer: Any) -> dict[str, Any]:
-    """Views of a replay buffer's arrays, of the steps that it holds."""
+def _replay(model: Any) -> State:
+    """Views of the steps in a replay buffer of SB3's, and where it is; {} where there is none."""
+    buffer = getattr(model, "replay_buffer", None)
+    if buffer is None or isinstance(buffer, HasState):
+        return {}
     count = buffer.buffer_size if buffer.full else buffer.pos
     arrays = {name: each for name, each in vars(buffer).items() if isinstance(each, np.ndarray)}
-    return {name: each[:count] for name, each in arrays.items() if len(each) == buffer.buffer_size}
+    rows = {name: each[:count] for name, each in arrays.items() if len(each) == buffer.buffer_size}
+    return {**rows, "pos": int(buffer.pos), "full": bool(buffer.full)}
 
 
-def _callback_state(callback: BaseCallback) -> State:
-    counted = {name: getattr(callback, name) for name in _OF_CALLBACKS.get(type(callback), ())}
-    own = callback.get_state() if isinstance(callback, HasState) else None
-    return {"n_calls": callback.n_calls, "num_timesteps": callback.num_timesteps, **counted, "own": own}
-
-
-def _set_callback_state(callback: BaseCallback, state: State) -> None:
-    for name in ("n_calls", "num_timesteps", *_OF_CALLBACKS.get(type(callback), ())):
-        setattr(callback, name, int(state[name]))
-    if isinstance(callback, HasState):
-        callback.set_state(state["own"])
+def _counts(callback: BaseCallback) -> tuple[str, ...]:
+    return ("n_calls", "num_timesteps", *_OF_CALLBACKS.get(type(callback), ()))
 
 
 def _plain(node: Any) -> Any:

@@ -155,6 +155,7 @@ def make_model(
 ) -> BaseAlgorithm:
     """Build a model on the context's environments; `with_buffers`: whether it keeps what it meets."""
     keep_compiler_out()
+    torch.set_num_threads(context.threads)
     if is_limited():
         _check_network(config, context)
     device = _device(context.device)

@@ -26,37 +26,27 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 
 CALLS = []
 
-class Stirring(BaseCallback):
-    # Changes learning by what it has counted, and draws random numbers.
-    def __init__(self, every, scale=0.5):
+class Stirring(BaseCallback):  # changes learning by what it has counted
+    def __init__(self, every):
         super().__init__()
-        self.every, self.scale = every, scale
-        self.counts = {"rollouts": 0, "ends": 0}
-        self.rates = []
+        self.every, self.rollouts, self.rates = every, 0, []
 
     def get_state(self):
-        return {"counts": self.counts, "rates": self.rates}
+        return {"rollouts": self.rollouts, "rates": self.rates}
 
     def set_state(self, state):
-        self.counts, self.rates = dict(state["counts"]), list(state["rates"])
+        self.rollouts, self.rates = state["rollouts"], list(state["rates"])
         if self.rates:
             self.model.gamma = self.model.ent_coef = self.rates[-1]
 
-    def _on_training_start(self):
-        self.start = len(self.locals)
-
     def _on_rollout_start(self):
-        self.counts["rollouts"] += 1
-
-    def _on_rollout_end(self):
-        self.counts["ends"] += 1
+        self.rollouts += 1
 
     def _on_step(self):
         if self.n_calls % self.every == 0:
-            rate = 1e-3 * (1 + self.scale * (self.counts["rollouts"] * 7 + self.counts["ends"]) % 3)
-            self.rates.append(rate)
-            self.model.gamma = self.model.ent_coef = rate
-            self.logger.record("mine/rate", rate)
+            self.rates.append(1e-3 * (1 + 3.5 * self.rollouts % 3))
+            self.model.gamma = self.model.ent_coef = self.rates[-1]
+            self.logger.record("mine/rate", self.rates[-1])
         return True
 
 class Recording(BaseCallback):
@@ -69,8 +59,6 @@ class Recording(BaseCallback):
     def _on_step(self):
         CALLS.append("new_obs" in self.locals)
         return self.num_timesteps < 300
-    def _on_rollout_end(self):
-        CALLS.append("rollout end")
     def _on_training_end(self):
         CALLS.append("end")
 
@@ -114,8 +102,7 @@ def test_a_callback_goes_on_to_the_bit(agent: str, tmp_path: Path) -> None:
     calm, run = left_behind(tmp_path / "calm"), left_behind(tmp_path / "run")
     assert differences(run, calm) == []
     assert "mine/rate" in {tag for tag, _, _ in calm["points"]}
-    (callback,) = calm["state"]["agent"]["callbacks"]
-    assert len(callback["own"]["rates"]) > 3
+    assert len(calm["state"]["agent"]["own"][-1]["rates"]) > 3
     mine, others = (read_weights(tmp_path / name / "model.zip", 10**8) for name in ("run", "without"))
     weights = [name for name in mine if name.startswith("policy.") and name.endswith(".weight")]
     assert weights
