@@ -239,7 +239,7 @@ def _parallel(tuning: TuningStudy, done: Sequence[TrialRow]) -> Chart:
     scores, low, high, marks = _scale(ranked)
     heights = _on_axis(np.array([*marks, *scores]), low, high, is_log=True)
     columns = [(heights[len(marks) :], list(zip([f"{mark:.3g}" for mark in marks], heights, strict=False)))]
-    columns += [_axis(tuning.space[key], [trial.values[key] for trial in ranked]) for key in keys]
+    columns += [_axis(tuning.space[key], [trial.row[key] for trial in ranked]) for key in keys]
     title = "What the best tenth of the finished trials chose, and the winner"
     figure, axes = chart.new_figure(title, 250, width=WIDE)
     axes.set(xlim=(0, max(1, len(keys))), ylim=(0, 1), xticks=[], yticks=[])

@@ -50,7 +50,7 @@ from gridworld.config.composition.compose import compose
 from gridworld.envs.rendering import import_pygame
 from gridworld.process import console
 from gridworld.process.memory_budget import collect_less_often
-from gridworld.report import page
+from gridworld.report import writer
 from gridworld.tune import search as tune_search
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -67,7 +67,7 @@ _LATE = (
     *("sb3_contrib", "torch.utils.tensorboard", "torch.utils.serialization", "torch._dynamo", "av"),
     *("optuna.storages._rdb.storage", "optuna.storages._rdb.models", "sqlalchemy.orm"),
     *("sqlalchemy.dialects.sqlite.pysqlite", "alembic.command", "alembic.config", "alembic.migration"),
-    "optuna.importance._fanova",
+    *("optuna.importance._fanova", "gridworld.report.agent_charts", "gridworld.report.setting_charts"),
     *("hydra._internal.hydra", "hydra._internal.logging_config", "hydra.core.plugins", "encodings.cp437"),
     *("matplotlib.backends.backend_svg", "matplotlib.backends.backend_pdf", "fontTools.subset"),
 )
@@ -272,7 +272,7 @@ if __name__ == "__main__":
         with file.open(encoding="utf-8") as opened:
             OmegaConf.load(opened)  # which `compose_quickly` keeps
     OverridesParser.create().parse_overrides(list(_WORDS))
-    page.template()
+    writer.template()
     _end_without_finalizers()
     gc.freeze()  # so that a fork shares what is there
     huge_pages.collapse()
