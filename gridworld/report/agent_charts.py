@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator
 
 from gridworld.report import chart
 from gridworld.report.analysis import METRICS, Band, Overall, Result, TaskAnalysis
@@ -143,10 +143,17 @@ def _draw_curves(
     axes.set(ylim=bounds, ylabel=label)
     axes.yaxis.set_major_formatter(form)
     first = -math.inf
-    if levels is None:
-        first = _set_steps(axes, list(bands.values()), log_steps)
-    else:
+    if levels is not None:
         axes.set(xlim=levels, xlabel="optimality: 0 is random, 1 is optimal")
+    else:
+        end = max(1.0, *(float(band.steps[-1]) for band in bands.values()))
+        first = min((float(step) for band in bands.values() for step in band.steps[1:2]), default=end)
+        if log_steps and 0 < first < end:  # it begins at the first after 0
+            chart.log_axis(axes, "x", first, end)
+            axes.set(xlabel="environment steps, logarithmic")
+        else:
+            axes.set(xlim=(0, end), xlabel="environment steps")
+            first = 0.0
     for later, band, look in zip(range(len(bands))[::-1], bands.values(), looks, strict=False):
         steps = np.maximum(band.steps, first)
         values, low, high = (np.clip(numbers, *bounds) for numbers in (band.point, band.low, band.high))
@@ -163,22 +170,6 @@ def _draw_curves(
     for level, look in zip(seen.values(), looks[len(bands) :], strict=True):
         axes.axhline(level, linewidth=1, zorder=4, clip_on=False, **look)
     return Chart(name, title, description, figure)
-
-
-def _set_steps(axes: Axes, bands: Sequence[Band], log_steps: bool) -> float:
-    """Lay out the axis of the steps; returns its first. A logarithmic one begins at the first after 0."""
-    end = max(1.0, *(float(band.steps[-1]) for band in bands))
-    first = min((float(step) for band in bands for step in band.steps[1:2]), default=end)
-    if not log_steps or first <= 0 or first >= end:
-        axes.set(xlim=(0, end), xlabel="environment steps")
-        return 0.0
-    axes.set_xscale("log")
-    factors = (1, 2, 5) if end < 60 * first else (1, 3) if end < 600 * first else (1,)
-    axes.xaxis.set_major_locator(LogLocator(10, factors))
-    axes.xaxis.set_major_formatter(chart.compact)
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.set(xlim=(first, end), xlabel="environment steps, logarithmic")
-    return first
 
 
 @house_style()
