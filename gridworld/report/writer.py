@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from gridworld.config.pictures import PICTURES
+from gridworld.config.train import PICTURES
 from gridworld.errors import InputError, reason
 from gridworld.process.console import plain, tell
 from gridworld.report import statistics, tables
