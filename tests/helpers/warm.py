@@ -41,7 +41,7 @@ import gridworld
 from gridworld.config.compose import compose
 from gridworld.envs.rendering import import_pygame
 from gridworld.process import console
-from gridworld.report import page
+from gridworld.report import writer
 from gridworld.tune import search as tune_search
 
 _CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -58,7 +58,7 @@ _LATE = (
     *("sb3_contrib", "torch.utils.tensorboard", "torch.utils.serialization", "torch._dynamo", "av"),
     *("optuna.storages._rdb.storage", "optuna.storages._rdb.models", "sqlalchemy.orm"),
     *("sqlalchemy.dialects.sqlite.pysqlite", "alembic.command", "alembic.config", "alembic.migration"),
-    "optuna.importance._fanova",
+    *("optuna.importance._fanova", "gridworld.report.agent_charts", "gridworld.report.setting_charts"),
     *("hydra._internal.hydra", "hydra._internal.logging_config", "hydra.core.plugins", "encodings.cp437"),
     *("matplotlib.backends.backend_svg", "matplotlib.backends.backend_pdf", "fontTools.subset"),
 )
@@ -90,7 +90,7 @@ def _prepare() -> None:
         with file.open(encoding="utf-8") as opened:
             OmegaConf.load(opened)  # which `compose_quickly` keeps
     OverridesParser.create().parse_overrides(list(_WORDS))
-    page.template()
+    writer.template()
     for finalizer in list(weakref.finalize._registry):  # type: ignore[attr-defined]
         finalizer.atexit = False  # what imported modules do at the end, for torch half of a script's time
     gc.freeze()  # so that a fork shares what is there
