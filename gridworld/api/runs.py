@@ -21,7 +21,7 @@ from gridworld.agents import Agent, PolicySnapshot
 from gridworld.api.settings import Override, compose_words, words
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError, failure
-from gridworld.process.memory_budget import limited, unlimited
+from gridworld.process.memory_budget import limited
 from gridworld.process.signals import Interrupted
 from gridworld.report.evidence import read_columns
 from gridworld.restore.resume import unfinished_of
@@ -195,7 +195,7 @@ def _finished(place: Path, config: TrainConfig, given: list[str], folder: Path |
         unfinished_of(place, config).resume(on_built=agents.append)
     else:
         train_in(config, place, given, on_built=agents.append)
-    with unlimited():
+    with limited(is_own=True):
         result = RunResult(SavedRun(place, trust=True), folder, agents.pop)
         _ = result.policy, result.evaluator  # before the model is trained further, or the folder is gone
     return result

@@ -46,17 +46,10 @@ class RunWriter(RunFolder):
     def start(
         cls, folder: Path, config: dict[str, Any], world: Mdp, overrides: list[str], replace: bool = False
     ) -> Self:
-        """Write the manifest of a new run.
+        """Write the manifest of a new run, with its resolved settings, its world and its command line.
 
         A new run loses nothing by a power cut before its first checkpoint, so its manifest is durable only
-        from then on (see `settle`); where it replaces another run, from the start.
-
-        Args:
-            folder: the run's folder, which exists.
-            config: the resolved settings.
-            world: the compiled world, which the manifest or the folder keeps.
-            overrides: the settings given on the command line.
-            replace: remove what the folder has of an earlier run; without it, a run there is refused.
+        from then on (see `settle`); where it is to `replace` another run in the folder, from the start.
         """
         content = {
             "status": "running",
@@ -83,13 +76,10 @@ class RunWriter(RunFolder):
 
     @classmethod
     def resume(cls, earlier: RunReader, step: int, total_timesteps: int, differs: list[str]) -> Self:
-        """Write the manifest of a run that is resumed from a checkpoint.
+        """Write the manifest of a run that is resumed from the checkpoint after `step` environment steps.
 
-        Args:
-            earlier: the run as its folder has it.
-            step: environment steps at the checkpoint.
-            total_timesteps: the run's length from here on.
-            differs: how the environment differs from the one that the run was started in.
+        `total_timesteps` is its length from here on; `differs`, how its environment differs from the one that
+        it was started in.
         """
         again: dict[str, Any] = {"at": _now(), "step": step, "command": recorded_command_line()}
         again |= _mixed_runs()
@@ -115,13 +105,11 @@ class RunWriter(RunFolder):
 
     def settle(self, *files: Path) -> None:
         """Make the manifest, then these files, and all names in the folder survive a power cut."""
-        if self._is_settled and not files:
+        if self._is_settled:
+            sync(files, self.folder)
             return
-        own = [] if self._is_settled else [self.manifest_file, self.world_file]
-        own += [] if self._is_settled else self.folder.glob("source*.diff")
-        sync([*own, *files], self.folder)
-        if not self._is_settled:
-            sync_folder(self.folder.parent)
+        sync([self.manifest_file, self.world_file, *self.folder.glob("source*.diff"), *files], self.folder)
+        sync_folder(self.folder.parent)
         self._is_settled = True
 
     @property
@@ -130,13 +118,9 @@ class RunWriter(RunFolder):
         return self._manifest
 
     def end(self, status: str, error: str | None = None, **progress: int | None) -> None:
-        """Record how the run ended.
+        """Record that the run "finished", which has its results settled, or was "interrupted", or "failed".
 
-        Args:
-            status: "finished", "interrupted" or "failed". The results of a finished run are durable already:
-                see `settle`.
-            error: why it did not finish.
-            progress: environment steps `reached`, and those at the newest `checkpoint`.
+        `error` says why; `progress`, environment steps `reached`, and those at the newest `checkpoint`.
         """
         self._manifest |= {"status": status, "ended": _now(), **progress}
         if error is not None:
@@ -174,14 +158,8 @@ def clear(folder: Path) -> None:
 def write_evaluations(path: Path, curve: Mapping[str, NDArray[Any]], **more: NDArray[Any]) -> None:
     """Write a learning curve as SB3's `EvalCallback` does, for the scripts that plot its `evaluations.npz`.
 
-    SB3 has a column per sampled episode. An exact evaluation has one number, the expectation, so there is one
-    column, whose mean is exact and whose standard deviation is 0.
-
-    Args:
-        path: the file.
-        curve: (n,) by name, those of `NEEDED`: they become `timesteps` (n,) and, (n, 1) each, `results`,
-            which are not discounted, `ep_lengths` and `successes`, the probability of the goal.
-        more: other arrays to put beside them.
+    SB3 has a column per sampled episode. Here is one, of expectations, which is exact. `curve` has (n,) by
+    name, those of `NEEDED`; the returns are not discounted.
     """
     columns = {
         **more,
@@ -208,11 +186,10 @@ def _now() -> str:
 
 
 class TrainLog:
-    """`train.log`: Python's warnings, what is logged as one, and what is told on standard error in its block.
+    """`train.log`: warnings, Python's and logged ones, and what is told on standard error in its block.
 
     The lines are kept until there is a file. What goes to the terminal is the same as without it. Of runs
-    that train together (`training.together`), each has its own, which takes what comes while its
-    run is at work.
+    that train together, each has its own, which takes what comes while its run is at work.
     """
 
     _all: ClassVar[list[TrainLog]] = []  # inside whose blocks the process is
