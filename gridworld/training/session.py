@@ -90,7 +90,7 @@ class Parts:
 
 PARTS = tuple(field.name for field in dataclasses.fields(Parts))
 LOGS = {"curve": CURVE, "events": EVENTS}  # that a checkpoint has marks of, and the pattern of their names
-FORMAT = 5  # of a checkpoint; a number more where a part's state has other keys or another meaning
+FORMAT = 6  # of a checkpoint; a number more where a part's state has other keys or another meaning
 CONTENT = {  # the type of each key of a checkpoint
     "format": int,
     "identity": str,
