@@ -122,7 +122,7 @@ def train(
         overrides: words as on the command line, `"agent=dqn"`, or dictionaries, `{"agent.gamma": 0.9}`.
         folder: where the run's files go, an ordinary run for all commands. It must be new, or hold this
             run unfinished. None: nothing stays on disk, and no pictures are drawn.
-        progress: whether to show a progress bar; None: as `logging.progress` says, which is to show it.
+        progress: whether to show progress; None: as `logging.progress` says, which is to show it.
         settings: settings whose name has no dot, `seed=3`, `total_timesteps=20_000`.
 
     Returns:

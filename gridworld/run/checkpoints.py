@@ -2,7 +2,7 @@
 
     checkpoints/000000012032.state    after 12,032 steps; `numpy.load` opens it
 
-A power cut harms none, since the files that a checkpoint has marks of (`storage.append_log`) are written
+A power cut harms none, since the files that a checkpoint has marks of (`storage.atomic_write`) are written
 first. A checkpoint that is damaged, or whose files are, is passed over for the one before.
 """
 

@@ -30,8 +30,6 @@ from gridworld.world.mdp import Mdp
 from gridworld.world.sources.arrays import world_bytes
 
 NEEDED = ("step", "return", "length", "goal_probability")  # columns of a learning curve
-_WARNINGS = "py.warnings"  # the logger to which Python's warnings are sent
-_printed: set[str] = set()  # warnings that this process has printed
 
 
 class RunWriter(RunFolder):
@@ -199,6 +197,8 @@ class TrainLog:
         self._handler.addFilter(self._takes)
 
     def __enter__(self) -> Self:
+        if logging.lastResort is not None and not logging.getLogger().handlers:
+            logging.getLogger().addHandler(logging.lastResort)  # which prints only where there is no other
         for logger in (logging.getLogger(), TOLD):
             logger.addHandler(self._handler)
         with warnings.catch_warnings():  # forgets what was warned about before, in another run
@@ -211,9 +211,12 @@ class TrainLog:
     def __exit__(self, *error: object) -> None:
         _current.reset(self._token)
         self._all.remove(self)
-        logging.captureWarnings(bool(self._all))
         for logger in (logging.getLogger(), TOLD):
             logger.removeHandler(self._handler)
+        if not self._all:
+            logging.captureWarnings(False)
+            if logging.lastResort is not None:
+                logging.getLogger().removeHandler(logging.lastResort)
         if self._handler.target is not None:
             self._handler.target.close()
 
@@ -233,20 +236,10 @@ class TrainLog:
         self._handler.emit(TOLD.makeRecord(TOLD.name, level, "", 0, text, (), None))
 
     def _takes(self, record: logging.LogRecord) -> bool:
-        """Whether a record is for this run's log; what would be printed without the log still is."""
+        """Whether a record is for this run's log."""
         # In a thread, the log of the only run is meant, if there is one only.
         at_work = _current.get() or (self._all[0] if len(self._all) == 1 else None)
-        if at_work is not self or (record.name != TOLD.name and record.levelno < logging.WARNING):
-            return False
-        text, last = record.getMessage(), logging.lastResort
-        handlers = [*logging.getLogger().handlers, *logging.getLogger(record.name).handlers]
-        others = [each for each in handlers if not isinstance(each, MemoryHandler | logging.NullHandler)]
-        is_new = record.name != _WARNINGS or text not in _printed
-        if record.name == _WARNINGS:
-            _printed.add(text)
-        if last is not None and record.levelno >= last.level and not others and is_new:
-            last.handle(record)
-        return True
+        return at_work is self and (record.name == TOLD.name or record.levelno >= logging.WARNING)
 
 
 class _Lines(logging.Formatter):

@@ -139,7 +139,7 @@ def test_a_short_run_waits_for_the_disk_at_its_end_only(tmp_path: Path) -> None:
     disk.close()
     names = [Path(path).name.split(".")[0] for path in disk.syncs if "source" not in path]
     assert names[-1] == "run"
-    assert len(names) == len(set(names)) + 1 == 13  # the run's folder with its results, and with its end
+    assert len(names) == len(set(names)) + 1 == 14  # the run's folder with its results, and with its end
 
 
 DAMAGES: dict[str, Callable[[bytes], bytes]] = {
