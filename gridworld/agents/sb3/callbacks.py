@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -31,6 +31,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import FloatSchedule
 
+from gridworld.agents import Hook, SafePoint
 from gridworld.agents.sb3.model_file import load_tensors
 from gridworld.agents.sb3.settings import SCHEDULES
 from gridworld.config.fields import Decay
@@ -68,8 +69,8 @@ class RunCallback(CallbackList):
 
     def __init__(
         self,
-        on_step: Callable[[int], int],
-        on_safe_point: Callable[[int], None] | None,
+        on_step: Hook,
+        on_safe_point: SafePoint,
         state: State | None,
         log_interval: int,
         others: Sequence[BaseCallback],

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import PolicySnapshot, TrainingContext, misfit
+from gridworld.agents import Hook, PolicySnapshot, SafePoint, TrainingContext, misfit
 from gridworld.bounds import Bounds
 from gridworld.config.fields import MOST_KEPT, Effect, Schedule, Word, affects, bounds, parse_schedule, rate
 from gridworld.config.train import AgentConfig
@@ -119,11 +119,7 @@ class TabularControl(ABC):
         return self._act(states)
 
     def learn(
-        self,
-        total_timesteps: int,
-        on_step: Callable[[int], int],
-        on_safe_point: Callable[[int], None] | None = None,
-        state: State | None = None,
+        self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
     ) -> None:
         """See `gridworld.agents.Agent.learn`."""
         envs, config = self._context.envs, self.config
