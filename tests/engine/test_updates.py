@@ -8,7 +8,7 @@ import pytest
 import torch
 from sb3_contrib import QRDQN, TRPO
 from stable_baselines3 import A2C, DQN, PPO
-from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.logger import Logger
 
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
@@ -24,19 +24,6 @@ NUM_ENVS, STEPS = 16, 32
 KINDS = ["one_hot", "coordinates", "none", "image"]
 
 
-class Keep(KVWriter):
-    """Keeps what was logged."""
-
-    def __init__(self) -> None:
-        self.values: dict[str, Any] = {}
-
-    def write(self, key_values: dict[str, Any], key_excluded: Any, step: int = 0) -> None:
-        self.values.update(key_values)
-
-    def close(self) -> None:
-        pass
-
-
 def twins(algorithm: type, kind: str, **arguments: Any) -> tuple[Run, Any]:
     """A run of the engine and SB3's model with the same weights and generators, in a slippery world."""
     envs = StatisticsVectorEnv(NUM_ENVS, slip=0.2, max_episode_steps=12)
@@ -47,7 +34,7 @@ def twins(algorithm: type, kind: str, **arguments: Any) -> tuple[Run, Any]:
         model = algorithm(
             policy, GridWorldVecEnv(envs, observation), seed=0, device="cpu", **copy.deepcopy(arguments)
         )
-        model.set_logger(Logger(None, [Keep()]))
+        model.set_logger(Logger(None, []))
         model._setup_learn(10_000)
         models.append(model)
     models[1].policy.load_state_dict(models[0].policy.state_dict())
@@ -81,14 +68,8 @@ def assert_same(run: Run, theirs: Any) -> None:
     put_weights(run)
     for mine, peer in zip(run.model.policy.parameters(), theirs.policy.parameters(), strict=True):
         assert torch.allclose(mine, peer, rtol=1e-5, atol=1e-6)
-    for model in (run.model, theirs):
-        model.logger.dump()
     logged, expected = (
-        {
-            key: value
-            for key, value in model.logger.output_formats[0].values.items()
-            if key.startswith("train/")
-        }
+        {key: value for key, value in model.logger.name_to_value.items() if key.startswith("train/")}
         for model in (run.model, theirs)
     )
     of_the_rollout = {"train/explained_variance", "train/n_updates", "train/learning_rate"}
@@ -176,7 +157,7 @@ def test_updates_from_rollouts(
     assert run.error is None
     assert_same(run, theirs)
     if algorithm is TRPO:
-        is_improved = run.model.logger.output_formats[0].values["train/is_line_search_success"]
+        is_improved = run.model.logger.name_to_value["train/is_line_search_success"]
         assert is_improved == ("line_search_max_iter" not in arguments)
         kept = run.model.policy.optimizer.state_dict()["state"].keys()  # those of the values alone
         assert kept == theirs.policy.optimizer.state_dict()["state"].keys()

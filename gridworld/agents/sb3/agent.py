@@ -221,6 +221,7 @@ class EngineAgent(SB3Agent):
             falling=config.falling(),
             log_interval=config.log_interval,
             counts_transitions=config.counts_transitions,
+            shape=config.shape,
         )
         self._algorithm([self.run], [None])
 
