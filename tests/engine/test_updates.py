@@ -16,7 +16,6 @@ from gridworld.engine import dqn, on_policy, population
 from gridworld.engine.networks import aligned
 from gridworld.engine.population import Run
 from gridworld.engine.sb3_format import algorithm_of, make_run, put_weights
-from gridworld.engine.trpo import conjugate_gradients
 from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 
@@ -288,39 +287,3 @@ def test_products_with_the_jacobian_agree_from_both_sides(
         networks.weights.copy_(weights - length * change)
         (behind,) = networks.run(states)
         assert np.allclose((ahead - behind) / (2 * length), moved, atol=0.02 * np.abs(moved).max())
-
-
-def test_the_longest_steps_end_at_the_border_of_the_trust_region() -> None:
-    """Where a step is short and nothing damps it, the divergence is what its second derivative says."""
-    short = {"target_kl": 1e-4, "cg_damping": 1e-4, "cg_max_steps": 10, "line_search_shrinking_factor": 0.99}
-    run, _ = twins(TRPO, "one_hot", batch_size=512, n_steps=32, **short)
-    states, actions, advantages, returns = samples(run, 512)
-    pairs = states * run.population.num_actions + actions
-    ours: Any = run.population
-    ours.update(ours.log_policy(), pairs[None], advantages[None], returns[None])
-    logged = run.model.logger.name_to_value
-    assert logged["train/is_line_search_success"] == 1
-    assert 0.95e-4 < logged["train/kl_divergence_loss"] < 1e-4
-
-
-def test_conjugate_gradients_solve_each_system_as_alone() -> None:
-    """Also where one ends earlier than the others, and rows have no round length."""
-    rng, width = np.random.default_rng(0), 21
-    roots = rng.normal(size=(4, width, width)).astype(np.float32)
-    matrices = torch.from_numpy(roots @ roots.transpose(0, 2, 1)) + 5 * torch.eye(width)
-    matrices[2] = torch.eye(width)  # which takes a single step
-    wanted = torch.from_numpy(rng.normal(size=(4, width)).astype(np.float32))
-    guess = 1e-4 * torch.ones_like(wanted)
-
-    def solve(rows: slice) -> torch.Tensor:
-        def product(vectors: torch.Tensor) -> torch.Tensor:
-            found = [matrix @ row for matrix, row in zip(matrices[rows], vectors, strict=True)]
-            return aligned(torch.stack(found))
-
-        right = product(wanted[rows])
-        return conjugate_gradients(product, right, guess[rows], 60)
-
-    solved = solve(slice(None))
-    assert torch.allclose(solved, wanted, atol=1e-3)
-    for row in range(4):
-        assert torch.equal(solve(slice(row, row + 1))[0], solved[row])
