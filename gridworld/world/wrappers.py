@@ -204,29 +204,25 @@ class Wrapped:
     @cached_property
     def _copied(self) -> gym.Env[Any, Any]:
         """A copy of the environment to ask and to step, without what draws and what only shows more."""
-        real = copied(self._env.unwrapped)
-        seen: dict[int, Any] = {id(self._env.unwrapped): real}
+        env: Any = _Probe(copied(self._env.unwrapped))
+        self._probe, seen = env, {id(self._env.unwrapped): env.unwrapped}
         for wrapper in list(wrappers_of(self._env))[::-1]:
             kind = type(wrapper)
             only_adds = kind.step is gym.Wrapper.step and kind.reset is gym.Wrapper.reset
             if wrapper in self.transforms or kind.__name__ in _COPIED or only_adds:
                 seen[id(getattr(wrapper, "results_writer", None))] = None  # an open file, of a Monitor
                 try:
-                    real = copy.deepcopy(wrapper, seen)
+                    other = copy.deepcopy(wrapper, seen)
                 except Exception as error:
                     raise InputError(
-                        f"{self._where}: its wrapper {type(wrapper).__name__} cannot be copied "
-                        f"({in_short(error)}), so what it changes cannot be found out; leave it out"
+                        f"{self._where}: its wrapper {kind.__name__} cannot be copied ({in_short(error)}), "
+                        "so what it changes cannot be found out; leave it out"
                     ) from None
-            seen[id(wrapper)] = real
-        wrappers, self._probe = list(wrappers_of(real)), _Probe(real.unwrapped)
-        if wrappers:
-            wrappers[-1].env = self._probe
-        else:
-            real = self._probe
+                other.env, env = env, other
+            seen[id(wrapper)] = env
         with self._refusing("cannot be reset"):
-            real.reset()
-        return real
+            env.reset()
+        return env  # type: ignore[no-any-return]
 
     @contextmanager
     def _refusing(self, what: str) -> Iterator[None]:
@@ -372,12 +368,7 @@ def _plain(value: Any) -> Any:
 def _changed(mdp: Mdp, **changes: Any) -> Mdp:
     """A world with other tables, which is not that of a map any more."""
     kept = {field.name: getattr(mdp, field.name) for field in fields(Mdp)} | changes
-    tables = {key: frozen(kept[key]) for key in ("next_state", "probability", "reward")}
-    return Mdp(
-        **kept
-        | tables
-        | {
-            "thresholds": frozen(thresholds_of(kept["probability"])),
-            "absorbing": frozen(absorbing_states(**tables, terminal=mdp.terminal)),
-        }
-    )
+    tables = {key: kept[key] for key in ("next_state", "probability", "reward")}
+    tables["absorbing"] = absorbing_states(**tables, terminal=mdp.terminal)
+    tables["thresholds"] = thresholds_of(tables["probability"])
+    return Mdp(**kept | {key: frozen(table) for key, table in tables.items()})
