@@ -20,8 +20,7 @@ import pickle
 import random
 import sys
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection, Iterable
 from enum import Enum
 from types import BuiltinFunctionType, FunctionType, ModuleType, SimpleNamespace
 from typing import Any
@@ -239,9 +238,9 @@ class _AnotherEnvError(Exception):
 
 
 class _Reader(cloudpickle.Pickler):  # type: ignore[misc]
-    """Writes what an object holds. `known` are not read; other environments are refused, or `skips_envs`."""
+    """Writes what objects hold. `known` are not read; other environments are refused, or `skips_envs`."""
 
-    def __init__(self, write: Any, known: Iterable[Any], skips_envs: bool = False) -> None:
+    def __init__(self, write: Any, known: Iterable[Any], skips_envs: bool) -> None:
         super().__init__(SimpleNamespace(write=write), protocol=5)
         self._known = {id(each): place for place, each in enumerate(known)}
         self._skips_envs = skips_envs
@@ -269,9 +268,9 @@ def _is_library(thing: Any) -> bool:
     return str(getattr(thing, "__module__", None)).partition(".")[0] in _LIBRARIES
 
 
-@contextmanager
-def _code_is_read() -> Iterator[None]:
-    """Functions and classes are read with what they refer to, but for those of libraries."""
+def _content(value: Any, known: Iterable[Any], skips_envs: bool = False) -> bytes:
+    """A digest of what a value holds, and of the code that it refers to, but for that of libraries."""
+    found = hashlib.sha256()
     modules = {
         module.__name__: module
         for name, module in list(sys.modules.items())
@@ -281,10 +280,11 @@ def _code_is_read() -> Iterator[None]:
     for name in names:
         cloudpickle.register_pickle_by_value(modules[name])
     try:
-        yield
+        _Reader(found.update, known, skips_envs).dump(value)
     finally:
         for name in names:
             cloudpickle.unregister_pickle_by_value(modules[name])
+    return found.digest()
 
 
 def _held(owner: Any, without: Collection[str]) -> list[tuple[str, Any]]:
@@ -295,16 +295,11 @@ def alike(one: Any, other: Any, without: Collection[str] = ()) -> bool:
     """Whether two objects of one class hold the same values and functions, but for some attributes."""
     if type(one) is not type(other):
         return False
-    digests = []
     try:
-        with _code_is_read():
-            for each in (one, other):
-                found = hashlib.sha256()
-                _Reader(found.update, [each], skips_envs=True).dump(_held(each, without))
-                digests.append(found.digest())
+        mine, theirs = (_content(_held(each, without), [each], skips_envs=True) for each in (one, other))
     except Exception:  # what cannot be read may differ
         return False
-    return digests[0] == digests[1]
+    return mine == theirs
 
 
 def remembered(where: str, name: str, owner: Any, chain: Iterable[Any] = ()) -> list[Any]:
@@ -312,14 +307,11 @@ def remembered(where: str, name: str, owner: Any, chain: Iterable[Any] = ()) -> 
     known = [*chain, owner]
     envs = [each for each in known if isinstance(each, gym.Env)]
     generators = [(env.np_random, env.action_space, env.observation_space) for env in envs]
-    found = hashlib.sha256()
     try:
-        with _code_is_read():
-            _Reader(found.update, known).dump((generators, _held(owner, ("env",)), type(owner)))
+        found = _content((generators, _held(owner, ("env",)), type(owner)), known)
     except _AnotherEnvError:
         raise InputError(f"{where}: {name} looks into an environment{SO_UNKNOWN}") from None
-    except Exception as error:  # locks, open files, iterators
-        raise InputError(
-            f"{where}: what {name} refers to cannot be read ({in_short(error)}){SO_UNKNOWN}"
-        ) from error
-    return [found.digest(), *random_states()]
+    except Exception as error:  # locks, open files, generators
+        cannot = f"what {name} refers to cannot be read ({in_short(error)})"
+        raise InputError(f"{where}: {cannot}{SO_UNKNOWN}") from error
+    return [found, *random_states()]
