@@ -27,7 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 from gridworld.bounds import digits
 from gridworld.commands import run
 from gridworld.commands.manual import manual
-from gridworld.config.compose import VERSION_BASE, completed, register_schemas, to_config, without_hydra
+from gridworld.config.compose import VERSION_BASE, completed, register_schemas, to_config
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import conf_folder, own_conf_folders, refuse_dashes, sentence, unreadable_file
 from gridworld.errors import EXIT_CODE, InputError
@@ -113,8 +113,7 @@ def main() -> None:
         if asked_for_traceback or not mistake:
             raise
         if isinstance(error, UnicodeDecodeError | RecursionError):
-            found = unreadable_file(error, [conf, *own_conf_folders(sys.argv[1:])])
-            error = error if found is None else InputError(found)
+            error = InputError(unreadable_file(error, [conf, *own_conf_folders(sys.argv[1:])]))
         sys.exit(_tell(error))
     except KeyboardInterrupt:
         print("interrupted before training began", file=sys.stderr)
@@ -130,7 +129,7 @@ def _prepare_command_line(conf: Path) -> None:
         sys.argv[1:] = with_recipe(sys.argv[1:])
     for folder in own_conf_folders(sys.argv[1:]):
         check_yaml(folder)
-    sys.argv[1:] = completed(sys.argv[1:], conf)
+    sys.argv[1:] = completed(sys.argv[1:])
 
 
 def run_job(settings: DictConfig) -> float:
@@ -193,7 +192,7 @@ def check_settings_of(config: DictConfig) -> None:
     # An interpolation may need what Hydra knows only in the job, where the settings are compared again.
     with contextlib.suppress(OmegaConfBaseException):
         if is_started(folder):
-            unfinished_of(folder, without_hydra(copy.deepcopy(config)))
+            unfinished_of(folder, to_config(copy.deepcopy(config)))
 
 
 def check_sweep_folder(config: DictConfig) -> None:

@@ -13,7 +13,7 @@ import pytest
 from helpers.support import CONF, configure, script
 
 from gridworld.commands import train as train_command
-from gridworld.config.compose import register_schemas, without_hydra
+from gridworld.config.compose import register_schemas, to_config
 from gridworld.config.recipe_file import harmless_words, overrides, with_recipe
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import BuiltConfig
@@ -53,7 +53,7 @@ def test_a_winner_is_the_same_by_hydra_and_as_data(agent: str, tmp_path: Path) -
     words = [*(f"{group}={choice}" for group, choice in choices.items()), *WINNERS[agent]]
     path = write_recipe(tmp_path, ConfFolders(CONF), choices, configure(*words), "a winner")
     by_hydra = compose_in(ConfFolders(CONF, (tmp_path,)), "train", ["experiment=winner"])
-    assert of_words(f"recipe={path}") == without_hydra(by_hydra) == configure(*words)
+    assert of_words(f"recipe={path}") == to_config(by_hydra) == configure(*words)
     assert of_words(f"recipe={tmp_path}") == configure(*words)
 
 

@@ -267,7 +267,7 @@ if __name__ == "__main__":
     tune_search._SECONDS_BETWEEN_TABLES = 0.3
     _wait_less_for_slurm()
     compose_quickly()
-    compose(CONF, [])
+    compose([])
     for file in CONF.rglob("*.yaml"):
         with file.open(encoding="utf-8") as opened:
             OmegaConf.load(opened)  # which `compose_quickly` keeps
