@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from helpers.support import CONF, configure, script
 
-from gridworld.commands import train as train_command
+from gridworld.commands import call
 from gridworld.config.compose import register_schemas, to_config
 from gridworld.config.recipe_file import harmless_words, overrides, with_recipe
 from gridworld.config.train import TrainConfig
@@ -213,7 +213,7 @@ def test_nothing_is_written_for_a_recipe_that_is_refused(
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)  # which main sets
     monkeypatch.setattr(sys, "argv", ["train.py", "recipe=winner.yaml", *words])
     with pytest.raises(SystemExit) as end:
-        train_command.main()
+        call("train")
     told = capsys.readouterr().err
     assert end.value.code == 2
     assert told.startswith("error: ")
