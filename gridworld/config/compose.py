@@ -80,11 +80,11 @@ def completed(words: Sequence[str]) -> list[str]:
     if {word.partition("=")[0] for word in found} & _NO_SINGLE_RUN or not (own or may_need_preset(values)):
         return found
     folders = [search_path([conf_folder()])] if own else []
+    chosen: list[str] = []
     with contextlib.suppress(Exception):  # Hydra composes again, and says what is wrong
         chosen = compose_whole([*own, conf_folder()][0], "train", [*folders, *values])[1]
-        end = places[-1] + 1 if places else len(found)
-        return [*found[:end], *chosen, *found[end:]]  # options may follow
-    return found
+    end = places[-1] + 1 if places else len(found)  # options may follow
+    return [*found[:end], *chosen, *found[end:]]
 
 
 def search_path(folders: Sequence[Path]) -> str:
@@ -126,13 +126,12 @@ def to_config(settings: DictConfig) -> TrainConfig:
 def _refuse_added_keys(settings: DictConfig, prefix: str = "") -> None:
     """Refuse keys that `+key=value` added, which gets past the schema while Hydra composes."""
     schema = OmegaConf.get_type(settings)
-    known = {field.name for field in dataclasses.fields(schema)} if dataclasses.is_dataclass(schema) else None
+    known = [field.name for field in dataclasses.fields(schema)] if dataclasses.is_dataclass(schema) else None
     for key in map(str, settings):
         if known is not None and key not in known:
             raise InputError(f"{prefix}{key}: there is no such key{meant(key, sorted(known))}")
-        if OmegaConf.is_missing(settings, key) or OmegaConf.is_interpolation(settings, key):
-            continue
-        if isinstance(child := settings[key], DictConfig):
+        is_value = not (OmegaConf.is_missing(settings, key) or OmegaConf.is_interpolation(settings, key))
+        if is_value and isinstance(child := settings[key], DictConfig):
             _refuse_added_keys(child, f"{prefix}{key}.")
 
 

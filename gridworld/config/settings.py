@@ -238,10 +238,13 @@ def _leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
 
 
 def _texts_at(name: str) -> frozenset[Text]:
-    """What the schemas declare a text to be, at this setting or around it; what none knows may be code."""
+    """What the schemas declare a text to be, at this setting or around it; what none knows may be code.
+
+    A number's setting has none: its type refuses a text.
+    """
     while name and name not in _texts():
         name = name.rpartition(".")[0]
-    return _texts().get(name) or frozenset([Text.CODE])
+    return _texts().get(name, frozenset([Text.CODE]))
 
 
 @functools.cache

@@ -1,5 +1,6 @@
 """The console command `gridworld`, in the checkout and from a wheel; what both tell people to type."""
 
+import contextlib
 import json
 import os
 import re
@@ -14,6 +15,7 @@ from helpers.support import CONF, ROOT, SHORT, script
 
 from gridworld import __version__
 from gridworld.commands import COMMANDS
+from gridworld.commands import console as main
 from gridworld.config.words import conf_folder
 from gridworld.errors import DISTRIBUTION
 from gridworld.process import console
@@ -29,46 +31,41 @@ def gridworld(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_command_for_each_script() -> None:
-    assert {path.stem for path in (ROOT / "scripts").glob("*.py")} == set(COMMANDS)
-
-
-@pytest.mark.parametrize("words", [[], ["--help"], ["-h"], ["help"]])
-def test_help_has_a_line_for_each_command(words: list[str], tmp_path: Path) -> None:
-    done = gridworld(*words, cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    for name, about in COMMANDS.items():
-        assert re.search(rf"^  {name} +{re.escape(about)}$", done.stdout, re.MULTILINE)
-
-
-def test_version_and_checkout(tmp_path: Path) -> None:
+    for name in COMMANDS:
+        assert f'call("{name}")' in (ROOT / "scripts" / f"{name}.py").read_text("utf-8")
+    assert len(list((ROOT / "scripts").glob("*.py"))) == len(COMMANDS)
     assert conf_folder() == CONF
-    assert gridworld("--version", cwd=tmp_path).stdout == f"gridworld {__version__}\n"
 
 
-@pytest.mark.parametrize(
-    ("word", "advice"),
-    [
+def test_help_version_and_words_that_are_no_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def told(*words: str, code: int = 0) -> tuple[str, str]:
+        monkeypatch.setattr(sys, "argv", ["gridworld", *words])
+        with pytest.raises(SystemExit) if code else contextlib.nullcontext():
+            main()
+        return capsys.readouterr()
+
+    assert told("--version") == (f"gridworld {__version__}\n", "")
+    for words in ((), ("--help",), ("-h",), ("help",)):
+        out, errors = told(*words)
+        for name, about in COMMANDS.items():
+            assert re.search(rf"^  {name} +{re.escape(about)}$", out, re.MULTILINE)
+    for word, advice in (
         ("trian", "did you mean gridworld train?"),
         ("evaluate.py", "did you mean gridworld evaluate?"),
         ("agent=dqn", "settings stand after a command: gridworld train agent=dqn"),
         ("x\x1b[1m", f"it is one of {', '.join(COMMANDS)}"),
-    ],
-)
-def test_a_word_that_is_no_command(word: str, advice: str, tmp_path: Path) -> None:
-    done = gridworld(word, cwd=tmp_path)
-    shown = word.replace("\x1b", "\\x1b")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f"error: gridworld: there is no command {shown}; {advice}\n"
+    ):
+        out, errors = told(word, code=2)
+        shown = word.replace("\x1b", "\\x1b")
+        assert (out, errors) == ("", f"error: gridworld: there is no command {shown}; {advice}\n")
 
 
-def test_asking_imports_nothing_heavy(tmp_path: Path) -> None:
-    command = [sys.executable, "-X", "importtime", "-m", "gridworld", "--help"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    loaded = {line.split("|")[-1].strip() for line in done.stderr.splitlines()}
-    assert "gridworld.commands" in loaded
-    assert not loaded & {"numpy", "hydra", "torch", "gymnasium", "scipy"}
-    ours = (ROOT / "gridworld" / "__main__.py").read_text()
-    assert ours.index("listen()  # before") < ours.index("from gridworld.commands")
+def test_signals_are_listened_for_before_what_takes_time() -> None:
+    for file in (ROOT / "gridworld" / "__main__.py", *(ROOT / "scripts").glob("*.py")):
+        text = file.read_text("utf-8")
+        assert text.index("listen()  # before") < text.index("from gridworld.commands import")
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
