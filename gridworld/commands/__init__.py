@@ -18,7 +18,7 @@ from gridworld.bounds import Bounds, digits
 from gridworld.errors import EXIT_CODE, InputError, failure
 from gridworld.process.console import CONSOLE, prepare, printing, program, tell_error
 from gridworld.process.memory_budget import collect_less_often
-from gridworld.process.signals import at_work
+from gridworld.process.signals import Interrupted, at_work
 
 # By name, in the order of the manual: what it does.
 COMMANDS = {
@@ -111,6 +111,9 @@ def run(main: Callable[[Sequence[str]], None]) -> None:
     except (InputError, OSError) as error:
         tell_error(str(error) if isinstance(error, InputError) else failure(error))
         sys.exit(EXIT_CODE)
+    except Interrupted as interruption:
+        print(str(interruption), file=sys.stderr)
+        sys.exit(interruption.exit_code)
     except KeyboardInterrupt:
         sys.exit(130)
 

@@ -15,11 +15,8 @@ from gridworld.run.reader import read_run, stored_world
 from gridworld.world.sources.gymnasium_table import compile_gymnasium
 
 TRAINED = (
-    "agent=q_learning",
-    "env=frozen_lake_v1",
-    "env.kwargs.is_slippery=false",
-    "evaluation.every=1000",
-    "tuned=none",
+    *("agent=q_learning", "env=frozen_lake_v1", "env.kwargs.is_slippery=false"),
+    *("evaluation.every=1000", "tuned=none", "recording.frames=false", "recording.learning=false"),
 )
 
 
@@ -29,7 +26,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("worlds")
     few = (*TRAINED, "total_timesteps=2000")
     for words in (
-        ("-m", *few, "seed=0,1", "hydra.sweep.dir=sweep", "recording.gif=false", "recording.frames=false"),
+        ("-m", *few, "seed=0,1", "hydra.sweep.dir=sweep", "recording.gif=false"),
         (*few, "hydra.run.dir=short"),
         (*few, "hydra.run.dir=longer", "checkpoint.every=500"),
         ("resume=longer", "total_timesteps=4000"),

@@ -5,15 +5,12 @@ Settings that would run code or read files are in test_fields.py.
 
 import dataclasses
 import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from helpers.support import CONF, configure, script
 
-import gridworld
-from gridworld.commands import call
 from gridworld.config.compose import register_schemas, to_config
 from gridworld.config.recipe_file import harmless_words, overrides, with_recipe
 from gridworld.config.train import TrainConfig
@@ -95,14 +92,6 @@ def test_a_sweep_of_a_recipe_and_a_search_from_one(tmp_path: Path) -> None:
     assert (asked.choices["env"], asked.settings.trials) == ("cliff", 3)
 
 
-def test_a_class_of_others_needs_trust(tmp_path: Path) -> None:
-    path = tmp_path / "winner.yaml"
-    path.write_text("defaults:\n- override /agent: a2c\nagent: {algorithm: evil.Agent}\n")
-    with pytest.raises(InputError, match=r"algorithm=evil\.Agent is from none of .* add trust=true if you"):
-        of_words(f"recipe={path}")
-    assert of_words(f"recipe={path}", "trust=true").agent.algorithm == "evil.Agent"
-
-
 BOMB = "\n".join(["a0: &a0 [x, x]", *(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]" for i in range(1, 40))])
 CONTENTS = {
     "hydra: {callbacks: {x: {_target_: os.system}}}": "has an unknown key 'hydra'; a recipe has the settings",
@@ -136,33 +125,19 @@ CONTENTS = {
     "defaults: [{override /agent: dqn, b: 1}]": "defaults has",
     "null: 3": "key",
 }
-OF_ANOTHER_TYPE = {  # which Hydra refuses
-    "seed: three": "'three' of type 'str' could not be converted to Integer",
-    "seed: 2020-01-01": "'2020-01-01' of type 'str' could not be converted to Integer",
-    "env: {slip: {a: 1}}": "slip",
-    "evaluation: {stop_after: often}": "'often' of type 'str' could not be converted to Integer",
-}
 
 
-@pytest.mark.parametrize("content", CONTENTS, ids=lambda content: content[:40].encode().hex()[:20])
-def test_what_is_no_settings_is_refused_in_a_sentence(content: str, tmp_path: Path) -> None:
+def test_what_is_no_settings_is_refused_in_a_sentence(tmp_path: Path) -> None:
     path = tmp_path / "winner.yaml"
-    path.write_text(content)
-    with pytest.raises(InputError) as refused:
-        overrides(path)
-    told = str(refused.value)
-    assert told.startswith(f"{path}: ")
-    assert CONTENTS[content] in told
-    assert "\n" not in told
-    assert len(told) < len(str(path)) + 300
-
-
-@pytest.mark.parametrize("content", OF_ANOTHER_TYPE)
-def test_a_value_of_another_type_is_refused_when_it_is_composed(content: str, tmp_path: Path) -> None:
-    (tmp_path / "winner.yaml").write_text(content)
-    with pytest.raises(InputError) as refused:
-        gridworld.compose(f"recipe={tmp_path}/winner.yaml")
-    assert OF_ANOTHER_TYPE[content] in str(refused.value)
+    for content, expected in CONTENTS.items():
+        path.write_text(content)
+        with pytest.raises(InputError) as refused:
+            overrides(path)
+        told = str(refused.value)
+        assert told.startswith(f"{path}: ")
+        assert expected in told
+        assert "\n" not in told
+        assert len(told) < len(str(path)) + 300
 
 
 def large(path: Path) -> None:
@@ -203,33 +178,24 @@ def test_a_study_whose_recipe_is_elsewhere_is_refused(tmp_path: Path) -> None:
             with_recipe([word])
 
 
-@pytest.mark.parametrize(
-    ("content", "words", "expected"),
-    [
-        ("hydra: {run: {dir: evil}}", ["hydra.run.dir=out"], "winner.yaml: has an unknown key 'hydra'"),
-        ("agent: {n_steps: 3}", ["-m", "agent=q_learning,sarsa"], "'agent.n_steps': Key 'n_steps' not in"),
-        ("defaults: [{override /agent: mine}]", [], "agent=mine: there is no such choice"),
-    ],
-)
-def test_nothing_is_written_for_a_recipe_that_is_refused(
-    content: str,
-    words: list[str],
-    expected: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+REFUSED = {
+    "hydra: {run: {dir: evil}}": ("hydra.run.dir=out", "winner.yaml: has an unknown key 'hydra'"),
+    "agent: {n_steps: 3}": ("-m agent=q_learning,sarsa", "'agent.n_steps': Key 'n_steps' not in"),
+    "defaults: [{override /agent: mine}]": ("seed=1", "agent=mine: there is no such choice"),
+    "evaluation: {stop_after: often}": ("seed=1", "'often' of type 'str' could not be converted to Integer"),
+    "env: {slip: {a: 1}}": ("seed=1", "slip"),
+    "seed: 2020-01-01": ("n_envs=2", "'2020-01-01' of type 'str' could not be converted to Integer"),
+}
+
+
+@pytest.mark.parametrize("content", REFUSED)
+def test_nothing_is_written_for_a_recipe_that_is_refused(content: str, tmp_path: Path) -> None:
     (tmp_path / "winner.yaml").write_text(content)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)  # which main sets
-    monkeypatch.setattr(sys, "argv", ["train.py", "recipe=winner.yaml", *words])
-    with pytest.raises(SystemExit) as end:
-        call("train")
-    told = capsys.readouterr().err
-    assert end.value.code == 2
-    assert told.startswith("error: ")
-    assert told.count("\n") == 1
-    assert expected in told
+    words, expected = REFUSED[content]
+    done = script("train.py", "recipe=winner.yaml", *words.split(), cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert done.stderr.startswith("error: ")
+    assert expected in done.stderr
     assert os.listdir(tmp_path) == ["winner.yaml"]
 
 

@@ -35,7 +35,7 @@ def test_an_agent_in_a_world_brings_its_recipe() -> None:
         family(config.agent).check(config)
         assert (config.recipe, config.preset, config.agent.name) == (recipe, "auto", agent)
         assert configure(f"experiment={recipe}") == config  # as it was called before
-        without = configure(*words, "tuned=none")
+        without = configure(*words, "tuned=none", "preset=none")
         assert (without.recipe, without.env) == (None, config.env)
         assert dataclasses.replace(without, recipe=recipe, preset="auto") != config  # it says something
         text = (CONF / "tuned" / f"{recipe}.yaml").read_text("utf-8")
