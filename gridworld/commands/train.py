@@ -47,7 +47,7 @@ _at_end = contextlib.ExitStack()  # lets go of a single run's folder, sums a swe
 def main(words: Sequence[str]) -> None:
     """Train, resume a run, or run a sweep."""
     if {"--help", "-h"} & set(words):
-        print(manual(conf_folder()))
+        print(manual())
     elif any(word.startswith(f"{_RESUME}=") for word in words):
         resume(words)
     else:

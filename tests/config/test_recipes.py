@@ -92,7 +92,7 @@ def test_the_command_line_chooses_over_an_experiment() -> None:
 
 
 def test_the_manual_has_a_line_per_world() -> None:
-    _, shown = manual(CONF).split("tuned=...\n", 1)
+    _, shown = manual().split("tuned=...\n", 1)
     shown = shown.split("\n\n", 1)[0]
     assert max(map(len, shown.splitlines())) <= 100
     found = set()
