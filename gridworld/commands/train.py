@@ -29,12 +29,11 @@ from gridworld.config.compose import VERSION_BASE, completed, register_schemas, 
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import conf_folder, own_conf_folders, refuse_dashes, sentence, unreadable_file
 from gridworld.errors import EXIT_CODE, InputError
-from gridworld.process.console import called_from, printable, result_is_in_files, tell_error
+from gridworld.process.console import called_from, printable, tell_error
 from gridworld.process.memory_budget import limited
 from gridworld.run.folder import MANIFEST, SWEEP_JSON, alone_in, check_inside, claimed, shown
 from gridworld.run.reader import check_free, check_is_run, is_started
 from gridworld.storage.atomic_write import check_no_links
-from gridworld.storage.safe_read import check_yaml
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 _RESUME, _STEPS = "resume", "total_timesteps"
@@ -67,7 +66,7 @@ def _call_hydra() -> None:
             )()
     except Exception as error:
         # Until a job starts, whatever goes wrong is the fault of the command line or a yaml file.
-        mistake = isinstance(error, CompactHydraException) or not _job_started.is_set()
+        mistake = isinstance(error, CompactHydraException | InputError) or not _job_started.is_set()
         if asked_for_traceback or not mistake:
             raise
         if isinstance(error, UnicodeDecodeError | RecursionError):
@@ -86,8 +85,6 @@ def _prepare_command_line() -> None:
         from gridworld.config.recipe_file import with_recipe
 
         sys.argv[1:] = with_recipe(sys.argv[1:])
-    for folder in own_conf_folders(sys.argv[1:]):
-        check_yaml(folder)
     sys.argv[1:] = completed(sys.argv[1:])
 
 
@@ -129,7 +126,6 @@ class RefuseUsedFolders(Callback):
 
 def _check_place(config: DictConfig, kind: str) -> None:
     """Refuse a folder that is not below the current one, and names that lead out of it."""
-    result_is_in_files()
     check_inside(Path(config.hydra[kind].dir), f"hydra.{kind}.dir")
     for key, name in (
         ("hydra.output_subdir", config.hydra.output_subdir),
@@ -188,7 +184,6 @@ def resume(words: Sequence[str]) -> None:
     `total_timesteps=N` makes it longer, `logging.progress=false` hides its progress. `trust=true` imports
     classes from anywhere, `anyway=true` accepts other versions or another processor.
     """
-    result_is_in_files()
     given = _resume_words(words)
     steps = _step_count(given[_STEPS]) if _STEPS in given else None
     progress, trust, anyway = (given.get(name, usual) == "true" for name, usual in _SWITCHES.items())
