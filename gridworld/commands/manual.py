@@ -67,11 +67,8 @@ Hydra's own options: python scripts/train.py --hydra-help
 def manual() -> str:
     """The help text, with the choices in the folder of the yaml files."""
     conf, lines = conf_folder(), []
-    hidden = {
-        conf,
-        conf / "tune",
-        conf / "preset" / "settings",
-    }  # tune.py's; chosen by the presets' own names
+    # Spaces are tune.py's, and settings are chosen by the names of the presets.
+    hidden = {conf, conf / "tune", conf / "preset" / "settings"}
     for group in sorted({file.parent for file in conf.glob("**/*.yaml")} - hidden):
         lines.append(f"  {group.relative_to(conf).as_posix()}=...")
         lines += _recipes(group) if group.name == "tuned" else choices(group)

@@ -114,15 +114,10 @@ WholeNumbers = Annotated[Any, Text.WORD, "a whole number, or lists and dicts of 
 
 @dataclass(frozen=True)
 class Decay:
-    """A rate over training.
+    """A rate over training."""
 
-    Attributes:
-        initial: at the start, finite and not negative.
-        power: of the share of training that is left, with which it falls to 0; with 0 it stays.
-    """
-
-    initial: float
-    power: float
+    initial: float  # at the start, finite and not negative
+    power: float  # of the share of training that is left, with which it falls to 0; with 0 it stays
 
     def at(self, progress: float) -> float:
         """The rate after this share of training, from 0 to 1."""
@@ -135,12 +130,9 @@ def falls(value: object) -> bool:
 
 
 def parse_schedule(key: str, value: Schedule, linear_only: bool = False) -> Decay:
-    """Read a rate that may fall over training.
+    """Read a rate: a number, or one of `lin_NUMBER`, `sqrt_NUMBER` and `quad_NUMBER`, which fall.
 
-    Args:
-        key: the setting's dotted name, for the message.
-        value: a number, or one of `lin_NUMBER`, `sqrt_NUMBER` and `quad_NUMBER`.
-        linear_only: whether the last two are refused.
+    `key` is for the message; with `linear_only` the last two are refused.
     """
     form, digits = "", value
     if isinstance(value, str):

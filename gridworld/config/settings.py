@@ -49,10 +49,7 @@ Hints = tuple[Any, ...]  # types of a setting: several where the schemas of agen
 
 @functools.cache
 def agent_schemas() -> dict[str, type[AgentConfig]]:
-    """The schemas of all agents by their names in Hydra's group `agent/schema`.
-
-    The only place where this room reaches a room above it, by a package's name.
-    """
+    """The schemas of all agents by their names in Hydra's group `agent/schema`, from a room above this one."""
     found: dict[str, type[AgentConfig]] = {}
     agents = importlib.import_module("gridworld.agents")
     for family in pkgutil.iter_modules(agents.__path__):
@@ -149,13 +146,8 @@ def with_effects(
 ) -> dict[str, Any]:
     """Select the settings that have one of these effects, and are not among `NEWER` and empty.
 
-    Args:
-        effects: e.g. `ON_RESULT`.
-        settings: a run's, as plain values; they may come from a manifest, and be anything.
-        section: where they are in a run's settings, with a dot at its end.
-
-    Returns:
-        The selected settings, nested as they are; a section without any is left out.
+    They are plain values of a run, or of a `section` ("agent."); of a manifest, they may be anything. A
+    section of which nothing is selected is left out.
     """
     found = {}
     for key, value in settings.items():
@@ -169,11 +161,7 @@ def with_effects(
 
 
 def privileges(settings: Mapping[str, Any]) -> list[str]:
-    """The names of what a simulator allowed a run, and a learner in the world would not have.
-
-    Args:
-        settings: a run's, as plain values; they may come from a manifest, and be anything.
-    """
+    """The names of what a simulator allowed a run with these plain values, and a learner would not have."""
     given, found = dict(flat(settings)), []
     for name, (called, value) in _privileges().items():
         if given.get(name) == value if value is not None else given.get(name):
@@ -188,12 +176,9 @@ def _privileges() -> dict[str, tuple[str, Any]]:
 
 
 def check_foreign(settings: Mapping[str, Any], where: str, allow: str) -> None:
-    """Refuse settings by which a stranger would run code, or have a file read, on the reader's machine.
+    """Refuse plain values by which a stranger would run code, or have a file read, on the reader's machine.
 
-    Args:
-        settings: of a run, or a part of them, as plain values.
-        where: they were read, for the message.
-        allow: the word that would allow it, for the message.
+    `where` they were read, and the word that would `allow` them, are for the message.
     """
     for name, value, harm in foreign(settings):
         setting = printable(f"{name[:200]}={str(value)[:80]}")
@@ -238,10 +223,7 @@ def _leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
 
 
 def _texts_at(name: str) -> frozenset[Text]:
-    """What the schemas declare a text to be, at this setting or around it; what none knows may be code.
-
-    A number's setting has none: its type refuses a text.
-    """
+    """What a text is at this setting, or around it: code where no schema knows; nothing for a number."""
     while name and name not in _texts():
         name = name.rpartition(".")[0]
     return _texts().get(name, frozenset([Text.CODE]))

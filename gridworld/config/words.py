@@ -76,9 +76,7 @@ def is_override(words: Sequence[str], index: int) -> bool:
 def prepared(words: Sequence[str], own: Sequence[Path] = ()) -> list[str]:
     """A command line as Hydra takes it: 1e5 as 100000, experiment=ENV_AGENT as the choice of the two.
 
-    Args:
-        words: the command line, lists of values for a sweep included.
-        own: the folders of `--config-dir`, which may have recipes too.
+    There may be recipes in the folders of `--config-dir` too, which are `own`.
     """
     found: list[str] = []
     chosen = {word.lstrip("+").partition("=")[0] for word in words if "=" in word}
@@ -157,11 +155,9 @@ def sentence(error: BaseException) -> str:
 
 
 def unreadable_file(error: Exception, folders: Iterable[Path]) -> str:
-    """A sentence on the first yaml file for which reading raises an error like this one.
+    """A sentence on the first yaml file that raises an error like this one, for which Hydra names no file.
 
-    Args:
-        error: a `UnicodeDecodeError` or a `RecursionError`, for which Hydra does not name the file.
-        folders: of the yaml files.
+    It is a `UnicodeDecodeError` or a `RecursionError`.
     """
     from omegaconf import OmegaConf  # here, since --help takes no longer than it must
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from helpers.runs_folder import Maker
-from helpers.support import CONF, configure
+from helpers.support import configure
 
 from gridworld.config.fields import Effect
 from gridworld.config.settings import agent_schemas, effect_of, flat, with_effects
@@ -20,9 +20,8 @@ from gridworld.report.evidence import Evidence, read
 from gridworld.report.grouping import arrange, learning_key, task_key
 from gridworld.run.provenance import identity, settings_hash
 from gridworld.training.tensorboard import hparams
-from gridworld.tune.recipe import _relevant, write_recipe
+from gridworld.tune.recipe import _relevant
 from gridworld.tune.search_space import SearchSpace
-from gridworld.tune.study_spec import ConfFolders
 
 DECLARED = {
     Effect.LENGTH: {"total_timesteps"},
@@ -174,11 +173,3 @@ def test_runs_that_differ_in_nothing_that_is_learnt_are_one_configuration(tmp_pa
     assert groups("dqn", [{}, *({key: 7} for key in sorted(keys))]) == [len(keys) + 1]
     arguments: list[dict[str, Any]] = [{}, {"stats_window_size": 7}, {"n_steps": 7}]
     assert groups("a2c_sb3_defaults", [{"agent__arguments": each} for each in arguments]) == [1, 2]
-
-
-def test_a_recipe_has_no_checkpoints_and_comes_to_the_winner(tmp_path: Path) -> None:
-    config = configure("agent=q_learning", "checkpoint.every=150", "agent.gamma=0.5", "seed=9")
-    choices = {"agent": "q_learning", "env": "classic", "observation": "one_hot"}
-    recipe = write_recipe(tmp_path, ConfFolders(CONF), choices, config, "a winner").read_text()
-    assert "gamma: 0.5" in recipe
-    assert "checkpoint" not in recipe
