@@ -10,6 +10,7 @@ import copy
 import os
 import sys
 import threading
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -67,7 +68,10 @@ def _call_hydra() -> None:
     except Exception as error:
         # Until a job starts, whatever goes wrong is the fault of the command line or a yaml file.
         mistake = isinstance(error, CompactHydraException | InputError) or not _job_started.is_set()
-        if asked_for_traceback or not mistake:
+        if asked_for_traceback:
+            traceback.print_exc()
+            sys.exit(1)
+        if not mistake:
             raise
         if isinstance(error, UnicodeDecodeError | RecursionError):
             folders = [conf_folder(), *own_conf_folders(sys.argv[1:])]

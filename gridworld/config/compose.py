@@ -54,7 +54,7 @@ def compose(words: Sequence[str]) -> TrainConfig:
 
 
 def compose_whole(conf: Path, name: str, overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:
-    """Compose `name` with Hydra's own part and the preset that a run's world needs; returns its words, too."""
+    """Compose `name` with Hydra's own part, and the preset that the world needs; return its words, too."""
     words = prepared(overrides)
 
     def again(more: list[str]) -> DictConfig:

@@ -49,7 +49,7 @@ Hints = tuple[Any, ...]  # types of a setting: several where the schemas of agen
 
 @functools.cache
 def agent_schemas() -> dict[str, type[AgentConfig]]:
-    """The schemas of all agents by their names in Hydra's group `agent/schema`, from a room above this one."""
+    """The schemas of all agents, from a room above this one, by their names in the group `agent/schema`."""
     found: dict[str, type[AgentConfig]] = {}
     agents = importlib.import_module("gridworld.agents")
     for family in pkgutil.iter_modules(agents.__path__):
