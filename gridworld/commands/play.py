@@ -44,10 +44,13 @@ _WORLD: dict[str, tuple[Any, str]] = {  # a setting of the world: its type, and 
 
 
 class Player:
-    """An episode in progress, of at most `limit` steps, and its return so far."""
+    """An episode in progress and its return so far; an agent's has a policy, (S, A), and a step limit."""
 
-    def __init__(self, evaluator: Evaluator, name: str, limit: int | None = None) -> None:
-        self.evaluator, self.name, self._limit = evaluator, name, limit
+    def __init__(
+        self, evaluator: Evaluator, name: str, policy: FloatArray | None = None, limit: int | None = None
+    ) -> None:
+        self.evaluator, self.name = evaluator, name
+        self._policy, self._limit = policy, limit
         self._env = GridWorldEnv(mdp=evaluator.mdp)
         self.state = self.steps = 0
         self.value = self.optimum = 0.0  # discounted return so far, and the best expected from the start
@@ -56,8 +59,15 @@ class Player:
     def restart(self, seed: int) -> None:
         """Start an episode; players with the same seed start in the same cell."""
         self.state, _ = self._env.reset(seed=seed)
+        self._chance = independent_generator(seed)  # the world uses the seed's own generator
         self.steps, self.value, self.over = 0, 0.0, False
         self.optimum = float(self.evaluator.solution.v[self.state])
+
+    def act(self) -> None:
+        """Take an action of the policy, if there is one."""
+        if self._policy is not None:
+            row = self._policy[self.state]
+            self.step(int(self._chance.choice(len(row), p=row)))
 
     def step(self, action: int) -> None:
         """Take an action, unless the episode is over."""
@@ -90,28 +100,12 @@ class Player:
 
 
 class Game:
-    """A person's board and perhaps an agent's.
+    """A person's board and perhaps an agent's; a restart adds 1 to the seed of the start and the slips."""
 
-    Args:
-        evaluator: of the world.
-        seed: of the start and the slips; a restart adds 1.
-        policy: the agent's, (S, A); None: there is no agent.
-        agent: the agent's name.
-        limit: the most steps of an agent's episode.
-    """
-
-    def __init__(
-        self,
-        evaluator: Evaluator,
-        seed: int = 0,
-        policy: FloatArray | None = None,
-        agent: str = "agent",
-        limit: int | None = None,
-    ) -> None:
+    def __init__(self, evaluator: Evaluator, seed: int = 0, agent: Player | None = None) -> None:
         self.person = Player(evaluator, "you")
-        self.agent = None if policy is None else Player(evaluator, agent, limit)
-        self.players = [self.person] if self.agent is None else [self.person, self.agent]
-        self._policy, self._seed = policy, seed - 1
+        self.players = [self.person] if agent is None else [self.person, agent]
+        self._seed = seed - 1
         self.restart()
 
     @property
@@ -122,7 +116,6 @@ class Game:
     def restart(self) -> None:
         """Start the next episodes, from the same cell."""
         self._seed += 1
-        self._chance = independent_generator(self._seed)  # the world uses the seed's own generator
         for player in self.players:
             player.restart(self._seed)
 
@@ -130,17 +123,12 @@ class Game:
         """Take the person's action, and the agent's."""
         if not self.person.over:
             self.person.step(action)
-            self._agent_steps()
+            self.players[-1].act()
 
     def tick(self) -> None:
         """Let the agent take a step if the person's episode is over."""
         if self.person.over:
-            self._agent_steps()
-
-    def _agent_steps(self) -> None:
-        if self.agent is not None and self._policy is not None:
-            row = self._policy[self.agent.state]
-            self.agent.step(int(self._chance.choice(len(row), p=row)))
+            self.players[-1].act()
 
 
 def draw(game: Game, cell_size: int) -> Frame:
@@ -238,4 +226,5 @@ def _game(options: argparse.Namespace) -> Game:
     mdp = dataclasses.replace(config.env, **given).compile_on(world.layout)
     gamma = config.evaluation.gamma if options.gamma is None else options.gamma
     evaluator, policy = Evaluator(mdp, gamma, config.env.step_limit(mdp)), saved.snapshot().greedy_policy()
-    return Game(evaluator, options.seed, policy, config.agent.name, evaluator.max_episode_steps)
+    agent = Player(evaluator, config.agent.name, policy, evaluator.max_episode_steps)
+    return Game(evaluator, options.seed, agent)

@@ -8,7 +8,7 @@ import pytest
 from helpers.support import SHORT, train_in
 
 from gridworld.commands import play as command
-from gridworld.commands.play import Game, draw
+from gridworld.commands.play import Game, Player, draw
 from gridworld.envs.rendering import AGENT, draw_frame
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
@@ -43,28 +43,28 @@ def test_keys_are_the_actions_and_returns_are_discounted() -> None:
 
 
 def test_the_agent_keeps_step_and_walks_on_alone() -> None:
-    game = Game(CLASSIC, 0, CLASSIC.optimal_policy(), "dqn", limit=100)
-    assert game.agent is not None
+    agent = Player(CLASSIC, "dqn", CLASSIC.optimal_policy(), 100)
+    game = Game(CLASSIC, 0, agent)
     game.tick()
-    assert game.agent.steps == 0  # it waits for the person
+    assert agent.steps == 0  # it waits for the person
     moved(game, DOWN, UP, *[RIGHT] * 4, DOWN)
     assert game.person.over
-    assert (game.agent.steps, game.over) == (7, False)
+    assert (agent.steps, game.over) == (7, False)
     game.tick()
     assert game.over
     game.tick()
-    assert game.agent.verdict() == "goal after 8 steps: nobody could do better"
+    assert agent.verdict() == "goal after 8 steps: nobody could do better"
 
 
 def test_an_agent_that_finds_no_end_gives_up() -> None:
     still = np.zeros((30, 4))
     still[:, 0] = 1.0
-    game = moved(Game(CLASSIC, 0, still, "dqn", limit=20), *SHORTEST)
+    agent = Player(CLASSIC, "dqn", still, 20)
+    game = moved(Game(CLASSIC, 0, agent), *SHORTEST)
     for _ in range(30):
         game.tick()
     assert game.over
-    assert game.agent is not None
-    assert game.agent.verdict() == "no end after 20 steps: 0.9321 less than the optimum"
+    assert agent.verdict() == "no end after 20 steps: 0.9321 less than the optimum"
 
 
 def test_in_a_slippery_world_the_optimum_is_a_mean() -> None:
@@ -82,11 +82,11 @@ def test_in_a_slippery_world_the_optimum_is_a_mean() -> None:
 
 def test_both_begin_in_the_same_cell_and_each_game_in_its_own() -> None:
     evaluator = Evaluator(compile_mdp(parse("SSSS\nSSSS\n...G", "many")), 0.9, 100)
-    game = Game(evaluator, 0, evaluator.optimal_policy())
+    agent = Player(evaluator, "dqn", evaluator.optimal_policy())
+    game = Game(evaluator, 0, agent)
     begun = []
     for _ in range(12):
-        assert game.agent is not None
-        assert game.person.state == game.agent.state
+        assert game.person.state == agent.state
         assert game.person.optimum == pytest.approx(evaluator.solution.v[game.person.state])
         begun.append(game.person.state)
         game.restart()
@@ -94,7 +94,7 @@ def test_both_begin_in_the_same_cell_and_each_game_in_its_own() -> None:
 
 
 def test_the_boards_are_the_environments_own_frames() -> None:
-    game = moved(Game(CLASSIC, 0, CLASSIC.optimal_policy()), DOWN, RIGHT)
+    game = moved(Game(CLASSIC, 0, Player(CLASSIC, "dqn", CLASSIC.optimal_policy())), DOWN, RIGHT)
     picture = draw(game, 60)
     assert picture.shape == (7 * 60, 2 * 8 * 60, 3)
     grid = (slice(60, 6 * 60 + 1), slice(60, 7 * 60 + 1))  # without the border, where the words are
