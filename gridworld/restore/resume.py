@@ -32,10 +32,10 @@ from gridworld.storage.append_log import holds
 from gridworld.storage.safe_read import open_ordinary
 from gridworld.storage.serialization import State, StateError
 from gridworld.training.learning_curve import CURVE_COLUMNS
-from gridworld.training.session import CONTENT, FORMAT, LOGS
+from gridworld.training.session import CONTENT, FORMAT, LOGS, OnBuilt, ignore
 from gridworld.training.setup import check_settings
-from gridworld.training.together import Training, run_alone
-from gridworld.training.train import OnBuilt, carry_out, ignore
+from gridworld.training.together import Training, alone
+from gridworld.training.train import carry_out
 from gridworld.world.mdp import Mdp
 
 _LONGEST_HEADER = 2**12  # bytes
@@ -80,13 +80,13 @@ class Unfinished:
     mdp: Mdp
     is_trusted: bool
 
-    def resume(
+    def resumption(
         self,
         total_timesteps: int | None = None,
         anyway: bool = False,
         progress: bool = True,
         on_built: OnBuilt = ignore,
-    ) -> Summary:
+    ) -> Training[Summary]:
         """Train to the end.
 
         Args:
@@ -99,16 +99,6 @@ class Unfinished:
             InputError: the run cannot be resumed in this way.
             Interrupted: training was asked to stop.
         """
-        return run_alone(self.resumption(total_timesteps, anyway, progress, on_built))
-
-    def resumption(
-        self,
-        total_timesteps: int | None = None,
-        anyway: bool = False,
-        progress: bool = True,
-        on_built: OnBuilt = ignore,
-    ) -> Training[Summary]:
-        """The same as a generator, for `run_together`."""
         run, folder, old_total = self.run, self.run.folder, self.config.total_timesteps
         total = old_total if total_timesteps is None else total_timesteps
         logging = self.config.logging
@@ -129,6 +119,8 @@ class Unfinished:
                 state = _newest_state(run, identity(config, mdp.text()))
             begin = partial(self._restart, config) if state is None else self._continue(config, state, anyway)
             return (yield from carry_out(config, folder, mdp, begin, log, self.is_trusted, state, on_built))
+
+    resume = alone(resumption)
 
     def _restart(self, config: TrainConfig) -> RunWriter:
         """Start again, which a finished run is too good for."""

@@ -57,22 +57,21 @@ def make_context(
     `write_scalars` takes the agent's own training metrics.
     """
     share = config.exploring_starts
-    envs = StatisticsVectorEnv(
-        config.n_envs,
-        exploration_bonus=config.exploration_bonus,
-        max_episode_steps=config.env.step_limit(mdp),
-        mdp=_with_exploring_starts(mdp, share) if share else mdp,
-        stratified=config.stratified_draws,
-    )
     return TrainingContext(
-        envs,
-        observation,
-        config.seed,
-        config.device,
-        config.threads,
-        write_scalars,
-        config.callbacks,
-        config.observation.policy_kwargs(),
+        envs=StatisticsVectorEnv(
+            config.n_envs,
+            exploration_bonus=config.exploration_bonus,
+            max_episode_steps=config.env.step_limit(mdp),
+            mdp=_with_exploring_starts(mdp, share) if share else mdp,
+            stratified=config.stratified_draws,
+        ),
+        observation=observation,
+        seed=config.seed,
+        device=config.device,
+        threads=config.threads,
+        write_scalars=write_scalars,
+        callbacks=config.callbacks,
+        features=config.observation.policy_kwargs(),
     )
 
 

@@ -4,7 +4,6 @@ import csv
 import json
 import sys
 import time
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -243,9 +242,7 @@ def test_the_default_job_is_certified(agent: str, tmp_path: Path) -> None:
     for seed in range(10):
         (tmp_path / str(seed)).mkdir()
     configs = [configure(f"agent={agent}", f"seed={seed}", *NO_FILES) for seed in range(10)]
-    summaries = run_together(
-        [partial(training, config, tmp_path / str(config.seed), []) for config in configs]
-    )
+    summaries = run_together([training(config, tmp_path / str(config.seed), []) for config in configs])
     assert len(summaries) == 10
     for seed, summary in enumerate(summaries):
         assert isinstance(summary, dict), summary
