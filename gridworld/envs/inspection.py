@@ -288,8 +288,7 @@ def observation_like(mdp: Mdp, space: gym.Space[Any]) -> ObservationTable:
         if kind == "image":
             if not isinstance(mdp, GridMdp) or space.dtype != np.uint8 or len(space.shape or ()) != 3:
                 continue
-            border, width = frame_size(mdp, 1)[0], (space.shape or (1,))[-1]
-            cell_size = max(1, (width - border) // (frame_size(mdp, 2)[0] - border) + 1)
+            cell_size = max(1, (space.shape or (1,))[-1] // frame_size(mdp, 1)[0])
         elif kind in needs and needs[kind] is None:
             continue
         table = make_observation(mdp, kind, cell_size)
