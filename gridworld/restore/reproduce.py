@@ -117,19 +117,10 @@ def repeat(
     trust: bool = False,
     members: Sequence[RunReader] = (),
 ) -> None:
-    """Train a run again.
+    """Train a run again in `folder`, which exists, with the members of its `population` elsewhere.
 
-    Args:
-        then: the run.
-        folder: where the new run is written; it exists.
-        config: the settings to train with.
-        mdp: the world.
-        trust: import the classes that the settings name, wherever they are from.
-        members: of `population`; they are trained with it, in a temporary folder.
-
-    Raises:
-        InputError: it cannot be trained here.
-        Interrupted: training was asked to stop.
+    `trust` imports the classes that its settings name, wherever they are from. It is an `InputError` if it
+    cannot be trained here.
     """
     first, *longer = lengths(then, config)
     overrides = then.manifest.get("overrides") or []

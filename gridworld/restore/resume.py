@@ -94,10 +94,6 @@ class Unfinished:
             anyway: accept an environment in which the last bits of the numbers may differ.
             progress: show progress, where the run's settings do so.
             on_built: takes the agent before it learns.
-
-        Raises:
-            InputError: the run cannot be resumed in this way.
-            Interrupted: training was asked to stop.
         """
         run, folder, old_total = self.run, self.run.folder, self.config.total_timesteps
         total = old_total if total_timesteps is None else total_timesteps

@@ -89,13 +89,7 @@ class LearningCurve:
     """Evaluates an agent every so many environment steps, and at the end.
 
     The evaluation at the end may come soon after the one before, with few episodes of its own; it takes those
-    of the one before too.
-
-    Args:
-        evaluator: scores policies exactly.
-        agent: the one that learns.
-        config: the run's settings; `evaluation` and `total_timesteps` say when an evaluation is due.
-        envs: those that the agent learns in, which count the returns of its episodes.
+    of the one before too. `envs`, in which the agent learns, count the returns of its episodes.
     """
 
     def __init__(
@@ -141,7 +135,7 @@ class LearningCurve:
         }
 
     def set_state(self, state: State) -> None:
-        """Continue from a state; inside `storage.serialization.fitting`."""
+        """Mirrors `get_state`; inside `storage.serialization.fitting`."""
         self._next = int(state["next"])
         self.certificate = Certificate(
             int(state["streak"]), state["first_certified_step"], state["certified_since_step"]
@@ -162,18 +156,11 @@ class LearningCurve:
             self._write_held()
 
     def on_step(self, step: int) -> int:
-        """Evaluate if it is due.
+        """Evaluate if it is due; returns as `Agent.learn` wants it, 0 after `evaluation.stop_after`.
 
         The last step is left to the evaluation after training, since an update may still follow it. Which one
         is the last, training alone knows: from the configured end on, an evaluation is held until a step
         follows. So a run that is made longer later has it where the longer run has it.
-
-        Args:
-            step: environment steps so far.
-
-        Returns:
-            The steps by which it is to be called again; 0 once the certificate has held for long enough
-            (`evaluation.stop_after`).
         """
         self._write_held()
         if self._next <= step:

@@ -24,7 +24,7 @@ from gridworld.storage.serialization import State
 from gridworld.training.learning_curve import Evaluation
 from gridworld.training.tensorboard import EventWriter
 from gridworld.visualization.animation import Animation
-from gridworld.visualization.files import encode_gif, save
+from gridworld.visualization.files import encode_gif, encode_png, save
 from gridworld.visualization.picture import Draw, PolicyHistory, drawer
 from gridworld.world.evaluation import Evaluator
 
@@ -49,16 +49,7 @@ class _Subject:
 
 
 class Pictures:
-    """Draws evaluations.
-
-    Args:
-        config: the run's settings; `recording` and `logging` say what is drawn.
-        folder: that the files go to.
-        evaluator: the evaluator of the run's world.
-        visits: (S, A), the environments' own counts, which grow.
-        events: where TensorBoard's pictures go, if anywhere.
-        is_trusted: see `visualization.picture.Subject`.
-    """
+    """Draws evaluations, as the run's `recording` and `logging` say; `visits` (S, A) grow meanwhile."""
 
     def __init__(
         self,
@@ -77,7 +68,7 @@ class Pictures:
         self._too_large: set[str] = set()
 
     def get_state(self) -> State:
-        """What was kept and shown."""
+        """What was kept and shown; a picture is told once to be too large."""
         return {
             "history": None if self._history is None else self._history.get_state(),
             "evaluations": self._evaluations,
@@ -147,6 +138,7 @@ class Pictures:
         drawn = draw(fitting_cell_size(self._evaluator.mdp, side))
         tag = f"{_GROUP}/{picture.name}"
         if isinstance(drawn, Animation):
-            self._events.animation(tag, encode_gif(drawn, self._config.recording.fps), drawn.size, step)
+            encoded, size = encode_gif(drawn, self._config.recording.fps), drawn.size
         else:
-            self._events.image(tag, drawn, step)
+            encoded, size = encode_png(drawn), (drawn.shape[1], drawn.shape[0])
+        self._events.image(tag, encoded, size, step)

@@ -77,18 +77,10 @@ def ignore(agent: Agent) -> None:
 
 
 class Session:
-    """The training of one run, new or continued; nothing is written before `run`.
+    """The training of one run, new or continued from a checkpoint's `state`; nothing is written before `run`.
 
-    Args:
-        config: the run's settings, which were checked.
-        folder: the run's.
-        mdp: its world.
-        is_trusted: whether the environment that the settings name may be made, which runs its code.
-        state: the content of a checkpoint to continue from; None: from the start.
-        on_built: takes the agent before it learns.
-
-    Raises:
-        StateError: for a state that does not fit.
+    `is_trusted`: the environment that the settings name may be made, which runs its code. `on_built` takes
+    the agent before it learns. A state that does not fit is a `StateError`.
     """
 
     def __init__(

@@ -21,15 +21,7 @@ _QUICKLY_SOLVED = 6000  # outcomes of all states and actions
 
 
 def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = compiled) -> Mdp:
-    """Check everything that can be checked without the agent's library.
-
-    Args:
-        config: the settings of a run.
-        world: makes the world, or returns one that several runs share.
-
-    Returns:
-        The run's world.
-    """
+    """Check everything that can be checked without the agent's library; returns the run's world."""
     check(config)
     family(config.agent).check(config)
     mdp = world(config.env)
@@ -52,10 +44,7 @@ def make_context(
     observation: ObservationTable,
     write_scalars: WriteScalars | None = None,
 ) -> TrainingContext:
-    """Make `config.n_envs` fresh environments, and what else an agent is built from.
-
-    `write_scalars` takes the agent's own training metrics.
-    """
+    """Make `config.n_envs` fresh environments, and what else an agent is built from."""
     share = config.exploring_starts
     return TrainingContext(
         envs=StatisticsVectorEnv(
