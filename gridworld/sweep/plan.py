@@ -24,8 +24,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig
 
-from gridworld.config.composition.presets import with_preset
-from gridworld.config.plain_settings import foreign, has_own_code
+from gridworld.config.presets import with_preset
+from gridworld.config.settings import foreign, has_own_code
 from gridworld.config.sweep import SweepConfig
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.config.worlds import EnvConfig
@@ -36,7 +36,7 @@ from gridworld.run.provenance import settings_hash
 from gridworld.training.setup import check_settings, notes
 from gridworld.world.mdp import Mdp
 
-RUNS_FILES = 5  # that a run has open: its lock, its curve, its events, its log
+RUNS_FILES = 4  # that a run has open: its lock, its curve, its events, its log
 _SHARE_OF_MEMORY = 4  # a population takes a fourth of what is free, shared by the workers
 _RUNS_BYTES = 16 * 2**20  # of a run beside its agent, with its pictures
 _OTHER_FILES = 64  # of the process

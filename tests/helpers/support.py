@@ -12,14 +12,14 @@ from pathlib import Path
 
 import hydra
 from helpers import forks
-from helpers.composing import compose_quickly
+from helpers.quickly import compose_quickly
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from gridworld.config.composition.compose import register_schemas
-from gridworld.config.composition.presets import with_preset
+from gridworld.config.compose import register_schemas
+from gridworld.config.presets import with_preset
 from gridworld.config.train import TrainConfig
 from gridworld.sweep.configurations import Configurations
 from gridworld.training.train import train
@@ -119,7 +119,7 @@ def script(
         arguments: The words on its command line.
         cwd: The folder to run it in.
         real: Start Python for it. Otherwise it runs in a fork of a process that has imported everything,
-            which takes seconds less; see `helpers.warm_process` for the difference.
+            which takes seconds less; see `helpers.warm` for the difference.
         stdout: A file that a fork prints to, instead of to what comes back.
         timeout: The seconds that it may take.
         environment: Variables beside those of this process. One that Python reads when it starts makes
