@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from gridworld.config.fields import falls
-from gridworld.config.settings import flat, foreign
+from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
-from gridworld.config.worlds import BuiltConfig, GymnasiumConfig
+from gridworld.config.worlds import MapConfig
 from gridworld.errors import InputError
 from gridworld.process.console import printable, tell, telling_if_slow
 from gridworld.restore.saved_run import settings_of
@@ -109,7 +110,7 @@ class Unfinished:
                     f"total_timesteps={2 * old_total}"
                 )
             mdp = check_settings(config, lambda env: self.mdp)
-            self._tell_if_world_changed()
+            self._tell_if_map_changed()
             with telling_if_slow(f"reading the checkpoints of {folder}"):
                 state = _newest_state(run, identity(config, mdp.text()))
             begin = partial(self._restart, config) if state is None else self._continue(config, state, anyway)
@@ -129,7 +130,7 @@ class Unfinished:
         overrides = self.run.manifest.get("overrides", [])
         return RunWriter.start(self.run.folder, dataclasses.asdict(config), self.mdp, overrides, replace=True)
 
-    def _continue(self, config: TrainConfig, state: State, anyway: bool) -> partial[RunWriter]:
+    def _continue(self, config: TrainConfig, state: State, anyway: bool) -> Callable[[], RunWriter]:
         """Check that a state may be continued from, and tell what differs; what is returned does so."""
         run, folder, steps = self.run, self.run.folder, state["steps"]
         total, old_total = config.total_timesteps, self.config.total_timesteps
@@ -154,12 +155,16 @@ class Unfinished:
             scheduled = [key for key, value in agent if falls(value) or (value and key.endswith("_fraction"))]
             spread = f"; as in a run of that length: {', '.join(scheduled)}" if scheduled else ""
             tell(f"{folder}: {total:,} steps instead of {old_total:,}{spread}")
-        return partial(_continued, run, steps, total, differs)
 
-    def _tell_if_world_changed(self) -> None:
+        def begin() -> RunWriter:
+            Checkpoints(folder).forget_after(steps)
+            return RunWriter.resume(run, steps, total, differs)
+
+        return begin
+
+    def _tell_if_map_changed(self) -> None:
         env = self.config.env
-        is_foreign = not self.is_trusted and any(foreign({"env": dataclasses.asdict(env)}))
-        if is_foreign or isinstance(env, BuiltConfig | GymnasiumConfig):  # which would run their code
+        if not isinstance(env, MapConfig):
             return
         try:
             changed = env.compile().text() != self.mdp.text()
@@ -170,11 +175,6 @@ class Unfinished:
                 f"{self.run.folder}: its world {env.name} has changed since; it continues with the one that "
                 "it began with"
             )
-
-
-def _continued(run: RunReader, steps: int, total_timesteps: int, differs: list[str]) -> RunWriter:
-    Checkpoints(run.folder).forget_after(steps)
-    return RunWriter.resume(run, steps, total_timesteps, differs)
 
 
 def _resume_command(run: RunReader) -> str:
