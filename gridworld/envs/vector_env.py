@@ -157,14 +157,11 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[StateArray, dict[str, Any]]:
-        """Start new episodes; those under way are given up.
+        """Start new episodes; those under way are given up. Returns states (num_envs,) and empty infos.
 
         Args:
             seed: one number, from which `np_random` begins anew; None: it continues.
             options: `reset_mask`, (num_envs,) booleans, says which environments; without it, all.
-
-        Returns:
-            (num_envs,) states, int64, and empty infos.
         """
         if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int | np.integer)):
             raise InputError(
@@ -187,10 +184,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         return self._state.copy(), {}
 
     def step(self, actions: NDArray[Any]) -> Step:
-        """Move all environments once.
-
-        Args:
-            actions: (num_envs,), integers from 0 to 3.
+        """Move all environments once, by integer actions (num_envs,).
 
         Returns:
             (num_envs,) states (int64), rewards (float64), terminated and truncated (bool), and infos.
@@ -319,8 +313,7 @@ def stratified_numbers(groups: IntArray, rng: np.random.Generator) -> FloatArray
     """Random numbers (n,) that the members of each of the `groups` (n,), integers, share out evenly.
 
     Those of a group of m are 1/m apart, from a random one on, so that an outcome of probability p meets np of
-    n environments, rounded down or up. Each number by itself is uniform in [0, 1), and independent of all
-    that came before; so each episode has the probabilities that it has anyway.
+    n environments, rounded down or up. Each by itself is uniform in [0, 1) and independent of earlier ones.
 
     References: R. Cranley and T. Patterson, Randomization of Number Theoretic Methods for Multiple
     Integration, 1976; P. L'Ecuyer, C. Lécot and B. Tuffin, A Randomized Quasi-Monte Carlo Simulation Method
