@@ -19,9 +19,9 @@ from hydra.core.override_parser.types import Override, OverrideType
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gridworld.config.composition.compose import drop_hydra, to_config
-from gridworld.config.composition.words import prepared
+from gridworld.config.compose import drop_hydra, to_config
 from gridworld.config.train import TrainConfig
+from gridworld.config.words import prepared
 from gridworld.errors import InputError
 
 _MOST_BASES = 64

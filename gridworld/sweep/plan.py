@@ -24,8 +24,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig
 
-from gridworld.config.composition.presets import with_preset
-from gridworld.config.plain_settings import foreign, has_own_code
+from gridworld.config.presets import with_preset
+from gridworld.config.settings import foreign, has_own_code
 from gridworld.config.sweep import SweepConfig
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.config.worlds import EnvConfig

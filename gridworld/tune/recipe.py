@@ -16,9 +16,9 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from gridworld.config.composition.compose import without_hydra
-from gridworld.config.composition.recipe_file import IN_A_STUDY, overrides
+from gridworld.config.compose import without_hydra
 from gridworld.config.fields import Effect
+from gridworld.config.recipe_file import IN_A_STUDY, overrides
 from gridworld.config.settings import ON_RESULT, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.storage.atomic_write import make_inside, write_text
