@@ -12,6 +12,7 @@ import signal
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -69,10 +70,13 @@ def run_in_processes(
     ended: Callable[[int, Any], None],
     tick: Callable[[], None] = lambda: None,
 ) -> None:
-    """Run tasks until all have ended. A process takes the next task when it has ended one.
+    """Run each task in a process of its own, `count` at once, until all have ended.
+
+    The first signal to stop is passed on, so that tasks stop at a safe point; the second too, so that they
+    stop soon; at a third they are killed.
 
     Args:
-        tasks: they begin in this order. They and what they return are pickled; they raise `SystemExit` only.
+        tasks: they begin in this order. What they return is pickled, and without `forks` they are too.
         count: how many processes.
         forks: whether these are forks, with what this process has imported.
         ended: called with the number of each task and what it returned, or a `LostError`.
@@ -81,83 +85,61 @@ def run_in_processes(
     Raises:
         SystemExit: this process was told to stop by SIGINT or SIGTERM, and so was each; all have ended.
     """
-    _Workers(tasks, forks, ended).run(min(count, len(tasks)), tick)
+    context: Any = multiprocessing.get_context("fork" if forks else "spawn")
+    waiting = deque(enumerate(tasks))
+    at_work: dict[Any, tuple[int, Any]] = {}  # by connection: the task's number, its process
+    received: list[int] = []  # signals
 
-
-class _Workers:
-    def __init__(
-        self, tasks: Sequence[Callable[[], Any]], forks: bool, ended: Callable[[int, Any], None]
-    ) -> None:
-        self._waiting = list(enumerate(tasks))
-        self._context: Any = multiprocessing.get_context("fork" if forks else "spawn")
-        self._ended = ended
-        self._at_work: dict[Connection[Any, Any], tuple[Any, int | None]] = {}  # (process, its task)
-        self._received: list[int] = []  # signals
-
-    def run(self, count: int, tick: Callable[[], None]) -> None:
-        for stream in (sys.stdout, sys.stderr):
-            stream.flush()  # or a fork would write it once more
-        gc.freeze()  # so that forks share what there is
-        with handling(dict.fromkeys(_SIGNALS, self._stop)):
-            try:
-                for _ in range(count):
-                    self._start()
-                while self._at_work:
-                    for connection in wait(list(self._at_work), _SECONDS_BETWEEN_TICKS):
-                        self._take(connection)  # type: ignore[arg-type]
-                    tick()
-            finally:
-                for process, _ in self._at_work.values():
-                    process.kill()
-        if self._received:
-            raise SystemExit(128 + self._received[0])
-
-    def _start(self) -> None:
-        ours, theirs = self._context.Pipe()
-        process = self._context.Process(target=_work, args=(theirs, os.getpid()))
-        process.start()
-        theirs.close()
-        self._give(ours, process)
-
-    def _give(self, connection: Connection[Any, Any], process: Any) -> None:
-        """Let a process begin the next task, or end."""
-        number, task = (None, None) if self._received or not self._waiting else self._waiting.pop(0)
-        self._at_work[connection] = process, number
-        with contextlib.suppress(OSError):  # it has ended
-            connection.send(task)
-
-    def _take(self, connection: Connection[Any, Any]) -> None:
-        """Take a result, or note that the process has ended; another takes the place of a lost one."""
-        process, number = self._at_work[connection]
-        try:
-            result = connection.recv()
-        except (EOFError, OSError):
-            del self._at_work[connection]
-            connection.close()
-            process.join()
-            if number is not None and not self._received:
-                self._ended(number, LostError(f"exit code {process.exitcode}"))
-                if self._waiting:
-                    self._start()
-        else:
-            self._ended(number, result)  # type: ignore[arg-type]
-            self._give(connection, process)
-
-    def _stop(self, number: int, frame: FrameType | None) -> None:
-        """Pass a signal on: the first stops tasks at a safe point, the second soon, a third at once."""
-        self._received.append(number)
-        for process, _ in self._at_work.values():
+    def stop(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        for _, process in at_work.values():
             with contextlib.suppress(ProcessLookupError):
-                os.kill(process.pid, signal.SIGKILL if len(self._received) > 2 else number)
+                os.kill(process.pid, signal.SIGKILL if len(received) > 2 else number)
+
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()  # or a fork would write it once more
+    gc.freeze()  # so that forks share what there is
+    with handling(dict.fromkeys(_SIGNALS, stop)):
+        try:
+            while at_work or (waiting and not received):
+                while waiting and len(at_work) < count and not received:
+                    number, task = waiting.popleft()
+                    connection, theirs = context.Pipe(duplex=False)
+                    process = context.Process(target=_work, args=(task, theirs, os.getpid()))
+                    process.start()
+                    theirs.close()
+                    at_work[connection] = number, process
+                for connection in wait(list(at_work), _SECONDS_BETWEEN_TICKS):
+                    number, process = at_work.pop(connection)
+                    result = _result_of(connection, process)
+                    if not (received and isinstance(result, LostError)):
+                        ended(number, result)
+                tick()
+        finally:
+            for _, process in at_work.values():
+                process.kill()
+    if received:
+        raise SystemExit(128 + received[0])
 
 
-def _work(connection: Connection[Any, Any], parent: int) -> None:
+def _result_of(connection: Any, process: Any) -> Any:
+    """What a task returned, or a `LostError`, once its process has ended."""
+    with connection:
+        try:
+            return connection.recv()
+        except (EOFError, OSError):
+            process.join()
+            return LostError(f"exit code {process.exitcode}")
+        finally:
+            process.join()
+
+
+def _work(task: Callable[[], Any], connection: Connection[Any, Any], parent: int) -> None:
     """What a process does."""
     os.setpgrp()  # a terminal's Ctrl-C reaches the parent, which passes it on once
     threading.Thread(target=_end_with, args=(parent,), daemon=True, name="watch on the parent").start()
-    with exiting(*_SIGNALS), contextlib.suppress(EOFError):
-        while (task := connection.recv()) is not None:
-            connection.send(task())
+    with exiting(*_SIGNALS):
+        connection.send(task())
 
 
 def _end_with(parent: int) -> None:

@@ -21,7 +21,7 @@ from gridworld.config.fields import Effect
 from gridworld.config.recipe_file import IN_A_STUDY, overrides
 from gridworld.config.settings import ON_RESULT, with_effects
 from gridworld.config.train import TrainConfig
-from gridworld.storage.atomic_write import make_inside, write_text
+from gridworld.storage.atomic_write import inside, write_text
 from gridworld.tune.study_spec import ConfFolders, compose_in
 
 EXPERIMENT, _FILE = IN_A_STUDY
@@ -39,7 +39,8 @@ def write_recipe(
     lines = ["# @package _global_", f"# {about}", "defaults:"]
     lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
     lines += ["  - _self_", ""]
-    path = make_inside(folder, EXPERIMENT) / _FILE
+    path = inside(folder, EXPERIMENT) / _FILE
+    path.parent.mkdir(exist_ok=True)
     own = dataclasses.replace(folders, own=(*folders.own, folder))
     text = OmegaConf.to_yaml(values) if values else ""
     write_text(path, "\n".join([*lines, text]), durable=True)
