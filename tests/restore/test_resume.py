@@ -21,7 +21,7 @@ CASES = {
     ],
     "dqn stock that stores an observation once": [
         *(*SHORT["dqn"], "agent.engine=stock", "n_envs=8", "agent.optimize_memory_usage=true"),
-        "+agent.replay_buffer_kwargs.handle_timeout_termination=false",
+        *("+agent.replay_buffer_kwargs.handle_timeout_termination=false", "agent.gradient_steps=4"),
     ],
     "ppo": [
         *SHORT["ppo"],
@@ -44,8 +44,9 @@ def calm(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, object
     return {}
 
 
-@pytest.mark.parametrize("number", [1, 3])
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    ("case", "number"), [(case, n) for case in CASES for n in ((1, 3) if case in SHORT else (2,))]
+)
 def test_every_agent_goes_on_to_the_bit(
     case: str,
     number: int,
