@@ -1,6 +1,7 @@
 """A run's folder is data: nothing that a stranger puts into one is run, leaks, or writes elsewhere.
 
-Every entry of the catalogue in hostile.py meets every command that reads a run. CI takes a third of it:
+Every entry of the catalogue in hostile.py meets every command that reads a run. CI takes a third of it,
+and one of the READERS in turn:
 GRIDWORLD_HOSTILE=all python -m pytest tests/commands/test_hostile_runs.py
 takes all.
 """
@@ -26,6 +27,7 @@ WORDS = {
     "play": ["--agent", "run"],
     "resume": ["resume=run", "total_timesteps=2500"],  # last, since it writes there
 }
+READERS = ("export", "diagnose", "reproduce", "play")
 SCRIPTS = {command: f"{command}.py" for command in WORDS} | {"resume": "train.py"}
 AWAY = {"SDL_VIDEODRIVER": "", "DISPLAY": "", "WAYLAND_DISPLAY": "", "GRIDWORLD_SECRET": SECRET}
 NO_DISPLAY = "there is no display to open a window on"
@@ -93,7 +95,10 @@ def test_nothing_of_a_hostile_run_gets_out(case: Hostile, good: Path, tmp_path: 
     assert not (base / "canary").exists()
 
     looked_at = -1
+    one = READERS[CASES.index(case) % len(READERS)]
     for command, words in WORDS.items():
+        if command in READERS and command != one and not ALL:
+            continue
         variables = {**AWAY, "PYTHONPATH": f"{ROOT}{os.pathsep}{base}"}
         ended = forks.run(
             SCRIPTS[command], *words, cwd=place, secret=base / "secret", environment=variables, timeout=60

@@ -32,6 +32,7 @@ from typing import Any, NoReturn
 import numpy as np
 import PIL.Image
 import torch
+from helpers.forks import megabytes
 from helpers.quickly import collapse_memory, compose_quickly
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
@@ -255,11 +256,6 @@ def _watch(cwd: str, secret: str, report: str) -> None:
                 deeds.append(f"{event} {arguments}"[:300])
 
     sys.addaudithook(hook)
-
-
-def megabytes(name: str) -> float:
-    """A number of this process's memory, as /proc has it."""
-    return int(Path("/proc/self/status").read_text().split(f"{name}:")[1].split()[0]) / 1024
 
 
 if process.parent_process() is None:  # in the server, not in one of its forks
