@@ -53,7 +53,7 @@ LONG = (
     *("diagnosis/test_sabotage.py", "restore/test_reproduce.py", "restore/test_resume.py"),
     *("checking/test_check.py", "restore/test_resume_commands.py", "commands/test_train_on_worlds.py"),
     *("commands/test_benchmark.py", "export/test_export.py", "training/test_training.py"),
-    *("agents/sb3/test_resume_own_classes.py", "engine/test_updates.py", "restore/test_resume_states.py"),
+    *("agents/sb3/test_custom_code.py", "engine/test_updates.py", "restore/test_resume_states.py"),
     *("commands/test_console.py", "docs/test_examples.py", "config/test_presets.py"),
     *("agents/tabular/test_tabular.py", "process/test_forks.py", "api/test_runs.py"),
 )

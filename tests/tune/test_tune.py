@@ -203,7 +203,7 @@ FLOAT = "agent.learning_rate: {type: float, low: 1e-3, high: 1e-2}"
             "Key 'agent.learning_rate' not in 'TuneConfig'",
         ),  # without the line that says where it goes
         ("", "there is nothing to search"),
-        ("agent.x: {type: float\n b", "bad.yaml: line 3, column 3: cannot be read"),
+        ("agent.x: {type: float\n b", "bad.yaml: line 3, column 3: is not valid YAML"),
         ("agent.gamma: 3", "int is not a subclass of DimensionConfig"),
         ("agent.gamma: {type: flaot, low: 0, high: 1}", "type=flaot must be"),
         ("agent.gamma: {type: float, lo: 0}", "Key 'lo' not in 'DimensionConfig'"),
