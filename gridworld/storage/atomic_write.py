@@ -17,6 +17,7 @@ lead to any folder of the reader's: `inside` goes through none.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import json
@@ -36,7 +37,7 @@ from gridworld.storage.safe_read import check_no_link, open_ordinary
 
 _SECONDS_BETWEEN_TRIES = 0.02
 _PIECE = 1 << 20  # bytes of a log that are read at once
-_PART = re.compile(r"\..+\.(\d+)\.(old\.)?part", re.DOTALL)
+_PART = re.compile(r"\..+\.(\d{1,9})\.(old\.)?part", re.DOTALL)
 
 
 @contextmanager
@@ -139,10 +140,8 @@ def tidy(folder: Path) -> None:
 def _is_alive(process: int) -> bool:
     try:
         os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:  # it is another user's
-        pass
+    except OSError as error:
+        return error.errno == errno.EPERM  # it is another user's
     return True
 
 
