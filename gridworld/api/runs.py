@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot
-from gridworld.api.settings import Override, compose_words, words
+from gridworld.api.settings import Override, words
+from gridworld.config.compose import compose as compose_words
 from gridworld.config.train import TrainConfig
 from gridworld.diagnosis import verdict
 from gridworld.diagnosis.evidence import Evidence
