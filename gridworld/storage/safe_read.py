@@ -66,6 +66,11 @@ def read_bytes(path: Path, most: int, copies: int = 1) -> bytes:
             raise InputError(f"{path}: cannot be read ({error.strerror})") from None
 
 
+def read_table(path: Path) -> str:
+    """Read the text of a table (CSV) of at most `LARGEST_CSV` bytes."""
+    return as_table(read_bytes(path, LARGEST_CSV), path)
+
+
 def read_object(path: Path, most: int = LARGEST_JSON) -> dict[str, Any]:
     """Read a JSON object from a file of at most `most` bytes."""
     return as_object(read_bytes(path, most), path)
