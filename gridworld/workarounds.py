@@ -69,10 +69,10 @@ def blas_threads() -> tuple[Callable[[], int], Callable[[int], Any]]:
 
 
 def keep_compiler_out() -> None:
-    """Spare a run the import of torch's compiler: 2 s of the 6 s that a short one then takes.
+    """Spare a run of the engine the import of torch's compiler: 2 s of the 6 s that a short one then takes.
 
-    Optimisers import it to exempt some methods from compilation. Nothing here is compiled, so these are
-    marked as exempt beforehand.
+    Optimisers import it as they are made, to exempt some methods from compilation, and with their first
+    step, which such a run never makes. Nothing here is compiled, so the methods are marked beforehand.
     """
     import torch
 
