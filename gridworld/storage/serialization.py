@@ -30,10 +30,6 @@ _TREE = "state.json"
 _ARRAY = "@"
 _KINDS = "bfiu"  # of arrays, as numpy abbreviates them
 _PLAIN = frozenset((bool, int, float, str))
-_MISFITS = (  # what setting an object to a state that is not its own may raise
-    *(ArithmeticError, AttributeError, LookupError, MemoryError),
-    *(RuntimeError, TypeError, ValueError),
-)
 _MOST = 1 << 38  # bytes of arrays
 
 
@@ -87,7 +83,7 @@ def fitting() -> Iterator[None]:
         yield
     except StateError:
         raise
-    except _MISFITS as error:
+    except Exception as error:
         raise StateError(f"{type(error).__name__}: {error}") from error
 
 
