@@ -35,7 +35,8 @@ from typing import Any
 from gridworld.config import train as schema
 from gridworld.config.settings import foreign
 from gridworld.errors import InputError
-from gridworld.process.console import command, printable, users_folder
+from gridworld.process.console import command, printable
+from gridworld.process.user_input import users_folder
 from gridworld.storage.atomic_write import inside, locked, make_folder, remove_path, tidy
 
 MANIFEST = "manifest.json"

@@ -24,7 +24,7 @@ from typing import Any, BinaryIO, cast
 
 from gridworld.bounds import LARGEST_INTEGER
 from gridworld.errors import InputError
-from gridworld.process.memory_budget import check_memory
+from gridworld.process.user_input import check_memory
 
 LARGEST_JSON = 4 * 2**20  # bytes
 LARGEST_CSV = 64 * 2**20

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError
-from gridworld.process.memory_budget import BudgetError, check_memory
-from gridworld.process.user_input import npz_arrays
+from gridworld.process.user_input import BudgetError, check_memory, npz_arrays
 from gridworld.storage.safe_read import AS_JSON
 
 State = dict[str, Any]

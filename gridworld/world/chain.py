@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from gridworld.bounds import discount
 from gridworld.errors import InputError
-from gridworld.process.memory_budget import check_memory
+from gridworld.process.user_input import check_memory
 from gridworld.workarounds import blas_threads
 from gridworld.world.layout import positive_int
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, steps_from

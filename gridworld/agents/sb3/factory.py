@@ -25,8 +25,7 @@ from gridworld.agents.sb3.settings import FALLING, SCHEDULES, SB3ClassConfig, SB
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.config.fields import falls, parse_schedule
 from gridworld.errors import InputError, in_short
-from gridworld.process.memory_budget import check_memory, is_limited
-from gridworld.process.user_input import imported
+from gridworld.process.user_input import check_memory, imported, is_limited
 from gridworld.workarounds import generator_of, keep_compiler_out
 
 Arguments = dict[str, Any]
