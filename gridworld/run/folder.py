@@ -135,9 +135,7 @@ def alone_in(folder: Path) -> Iterator[None]:
 def claimed(folder: Path) -> Iterator[None]:
     """Make a run's folder and hold it for this process; afterwards, undo that where no run was started.
 
-    Raises:
-        InputError: another process holds the folder.
-        OSError: the folder could not be made; or one of the block, which then names the folder.
+    An `OSError` of the block names the folder, if it names nothing.
     """
     make_folder(folder.parent)
     folder.mkdir(exist_ok=True)

@@ -53,12 +53,7 @@ def encode(state: State, compress: bool = False) -> memoryview:
 
 
 def decode(data: bytes | memoryview, name: object = "a state") -> State:
-    """Decode the bytes of a state; `name` says whose it is, for the error's sentence.
-
-    Raises:
-        StateError: they are no such bytes.
-        BudgetError: it would take more memory than the budget.
-    """
+    """Decode the bytes of a state, or raise `StateError`; `name` says whose it is, for a `BudgetError`."""
     try:
         members: dict[str, Any] = npz_arrays(name, data, "a state", _MOST)
         tree = members.pop(_TREE)
@@ -87,11 +82,7 @@ def fitting() -> Iterator[None]:
 
 
 def fill(target: NDArray[Any], value: Any, where: str) -> None:
-    """Copy an array of a state into `target`.
-
-    Raises:
-        StateError: `value` is no array of the same shape and dtype; the sentence begins with `where`.
-    """
+    """Copy an array of a state into `target`; a `StateError` where shape or dtype differ names `where`."""
     if not isinstance(value, np.ndarray) or value.shape != target.shape or value.dtype != target.dtype:
         found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
         raise StateError(f"{where} must be {target.dtype} {target.shape}, is {found}")
