@@ -46,10 +46,7 @@ def table(title: str) -> list[tuple[str, str]]:
 
 
 # In a process each; the others are in forks of one, see `script`.
-REAL = (
-    *("env.layout={maps}/ragged.txt", "agent.learning_rat=1", "--frobnicate"),
-    *("--config-dir {conf} agent=broken", "--config-dir {conf} agent=mine"),
-)
+REAL = (*("env.layout={maps}/ragged.txt", "--config-dir {conf} agent=mine"),)
 
 
 OUT_OF_SIZE = "must be 0 or of a size from"

@@ -98,9 +98,9 @@ def test_progress_is_a_bar_on_a_terminal_only(finished: Path, tmp_path: Path) ->
                 shown += part
     os.close(main)
     assert process.returncode == 0
-    assert b"sarsa on classic: 100%" in shown
+    assert b"of 2,000 (100%)" in shown
     assert b"regret" in shown
-    assert "%|" not in (finished.parent / "output.txt").read_text()
+    assert "(100%)" not in (finished.parent / "output.txt").read_text()
 
 
 def test_help_is_a_manual_with_every_choice(tmp_path: Path) -> None:
