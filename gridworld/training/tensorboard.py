@@ -31,7 +31,7 @@ from gridworld.config.settings import ON_RESULT, flat, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import check_memory
-from gridworld.storage.append_log import AppendLog
+from gridworld.storage.atomic_write import AppendLog
 from gridworld.storage.safe_read import open_ordinary
 
 HParamValue = bool | float | str | None
