@@ -20,6 +20,8 @@ import pickle
 import random
 import sys
 import sysconfig
+import threading
+import weakref
 from collections import deque
 from collections.abc import Collection, Iterable
 from enum import Enum
@@ -48,6 +50,7 @@ _TRUSTED = {
 }
 _INSTALLED = ("site-packages", "dist-packages", sysconfig.get_path("stdlib"))  # in a library's path
 _DATA = (int, float, str, list, dict, set, np.ndarray, *_GENERATORS)  # of a module
+_LOCKS = (type(threading.Lock()), type(threading.RLock()))
 _CALLS = 1000  # at least
 SO_UNKNOWN = (
     ", so what it makes of the task is not exactly known; "
@@ -268,6 +271,8 @@ class _Reader(cloudpickle.Pickler):  # type: ignore[misc]
             held = {name: value for name, value in vars(obj).items() if isinstance(value, _DATA)}
             held.pop("__builtins__", None)
             return object, (), held
+        if isinstance(obj, (weakref.ref, *_LOCKS)):  # `cached_property` and `singledispatch` have them
+            return object, (), obj() if isinstance(obj, weakref.ref) else repr(obj)
         if kind.__module__ in self._modules and not isinstance(obj, (type, *_REDUCED)):
             # also what its own way of being pickled hides
             return object, (), (kind, object.__getstate__(obj), obj.__reduce_ex__(pickle.HIGHEST_PROTOCOL))
@@ -327,7 +332,7 @@ def remembered(where: str, name: str, owner: Any, chain: Iterable[Any] = ()) -> 
         found = _content(owner, (generators, _held(owner, ("env",)), type(owner)), known)
     except _AnotherEnvError:
         raise InputError(f"{where}: {name} looks into an environment{SO_UNKNOWN}") from None
-    except Exception as error:  # locks, open files, generators
+    except Exception as error:  # open files, generators, sockets
         cannot = f"what {name} refers to cannot be read ({in_short(error)})"
         raise InputError(f"{where}: {cannot}{SO_UNKNOWN}") from error
     return [found, *random_states()]
