@@ -47,11 +47,6 @@ class GridMdp(Mdp):
         """Row and column."""
         return divmod(state, self.layout.num_cols)
 
-    def state_name(self, state: int) -> str:
-        """See `Mdp`."""
-        row, col = self.coordinates(state)
-        return f"row {row + 1}, column {col + 1}"
-
 
 def compile_mdp(
     layout: Layout,
