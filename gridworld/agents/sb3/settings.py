@@ -289,6 +289,11 @@ def check(config: TrainConfig) -> None:
             f"agent.learning_starts={agent.learning_starts}: nothing would be learned; "
             f"must be below total_timesteps={config.total_timesteps}"
         )
+    if isinstance(agent, PPOConfig) and (rollout := agent.n_steps * config.n_envs) % agent.batch_size:
+        raise InputError(
+            f"agent.batch_size={agent.batch_size}: must divide the rollout, "
+            f"agent.n_steps={agent.n_steps} x n_envs={config.n_envs} = {rollout} steps"
+        )
     if (frequency := agent.given.get("train_freq")) is not None:
         _check_train_freq(agent.key("train_freq"), frequency, config.n_envs)
 
