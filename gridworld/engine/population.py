@@ -28,7 +28,6 @@ from gridworld.storage.serialization import (
     fitting,
     generator_state,
     set_generator_state,
-    set_plain_state,
 )
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
@@ -138,7 +137,7 @@ class Run:
         if state["num_timesteps"] < 0 or state["num_updates"] < 0 or state["num_episodes"] < 0:
             raise StateError("counters must be at least 0")
         self.torch_generator.set_state(torch.from_numpy(state["torch_generator"]))
-        set_plain_state(self.numpy_generator, state["numpy_generator"])
+        self.numpy_generator.set_state(state["numpy_generator"])
         set_generator_state(model.action_space.np_random, state["action_generator"])
         self.envs.set_state(state["environments"])
         model.num_timesteps, model._n_updates = int(state["num_timesteps"]), int(state["num_updates"])

@@ -70,13 +70,13 @@ def run_in_processes(
     ended: Callable[[int, Any], None],
     tick: Callable[[], None] = lambda: None,
 ) -> None:
-    """Run each task in a process of its own, `count` at once, until all have ended.
+    """Run tasks until all have ended. A process takes the next task when it has ended one.
 
     The first signal to stop is passed on, so that tasks stop at a safe point; the second too, so that they
     stop soon; at a third they are killed.
 
     Args:
-        tasks: they begin in this order. What they return is pickled, and without `forks` they are too.
+        tasks: they begin in this order. They and what they return are pickled; they raise `SystemExit` only.
         count: how many processes.
         forks: whether these are forks, with what this process has imported.
         ended: called with the number of each task and what it returned, or a `LostError`.
@@ -87,14 +87,21 @@ def run_in_processes(
     """
     context: Any = multiprocessing.get_context("fork" if forks else "spawn")
     waiting = deque(enumerate(tasks))
-    at_work: dict[Any, tuple[int, Any]] = {}  # by connection: the task's number, its process
+    at_work: dict[Any, tuple[Any, int | None]] = {}  # by connection: a process, and its task's number
     received: list[int] = []  # signals
 
     def stop(number: int, frame: FrameType | None) -> None:
         received.append(number)
-        for _, process in at_work.values():
+        for process, _ in at_work.values():
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process.pid, signal.SIGKILL if len(received) > 2 else number)
+
+    def give(connection: Any, process: Any) -> None:
+        """Let a process begin the next task, or end."""
+        number, task = waiting.popleft() if waiting and not received else (None, None)
+        at_work[connection] = process, number
+        with contextlib.suppress(OSError):  # it has ended
+            connection.send(task)
 
     for stream in (sys.stdout, sys.stderr):
         stream.flush()  # or a fork would write it once more
@@ -102,44 +109,40 @@ def run_in_processes(
     with handling(dict.fromkeys(_SIGNALS, stop)):
         try:
             while at_work or (waiting and not received):
-                while waiting and len(at_work) < count and not received:
-                    number, task = waiting.popleft()
-                    connection, theirs = context.Pipe(duplex=False)
-                    process = context.Process(target=_work, args=(task, theirs, os.getpid()))
+                while waiting and not received and len(at_work) < count:
+                    connection, theirs = context.Pipe()
+                    process = context.Process(target=_work, args=(theirs, os.getpid()))
                     process.start()
                     theirs.close()
-                    at_work[connection] = number, process
-                for connection in wait(list(at_work), _SECONDS_BETWEEN_TICKS):
-                    number, process = at_work.pop(connection)
-                    result = _result_of(connection, process)
-                    if not (received and isinstance(result, LostError)):
+                    give(connection, process)
+                for connection in list[Any](wait(list(at_work), _SECONDS_BETWEEN_TICKS)):
+                    process, number = at_work[connection]
+                    try:
+                        result = connection.recv()
+                    except (EOFError, OSError):
+                        del at_work[connection]
+                        process.join()
+                        if number is not None and not received:
+                            ended(number, LostError(f"exit code {process.exitcode}"))
+                    else:
+                        assert number is not None
                         ended(number, result)
+                        give(connection, process)
                 tick()
         finally:
-            for _, process in at_work.values():
+            for process, _ in at_work.values():
                 process.kill()
     if received:
         raise SystemExit(128 + received[0])
 
 
-def _result_of(connection: Any, process: Any) -> Any:
-    """What a task returned, or a `LostError`, once its process has ended."""
-    with connection:
-        try:
-            return connection.recv()
-        except (EOFError, OSError):
-            process.join()
-            return LostError(f"exit code {process.exitcode}")
-        finally:
-            process.join()
-
-
-def _work(task: Callable[[], Any], connection: Connection[Any, Any], parent: int) -> None:
+def _work(connection: Connection[Any, Any], parent: int) -> None:
     """What a process does."""
     os.setpgrp()  # a terminal's Ctrl-C reaches the parent, which passes it on once
     threading.Thread(target=_end_with, args=(parent,), daemon=True, name="watch on the parent").start()
-    with exiting(*_SIGNALS):
-        connection.send(task())
+    with exiting(*_SIGNALS), contextlib.suppress(EOFError):
+        while (task := connection.recv()) is not None:
+            connection.send(task())
 
 
 def _end_with(parent: int) -> None:

@@ -27,7 +27,7 @@ from gridworld.run.provenance import environment, git, identity, settings, sourc
 from gridworld.run.reader import RunReader, read_run, stored_world
 from gridworld.run.summary import Summary
 from gridworld.run.writer import RunWriter, TrainLog
-from gridworld.storage.append_log import holds
+from gridworld.storage.atomic_write import holds
 from gridworld.storage.safe_read import open_ordinary
 from gridworld.storage.serialization import State, StateError
 from gridworld.training.learning_curve import CURVE_COLUMNS

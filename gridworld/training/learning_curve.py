@@ -22,7 +22,7 @@ from gridworld.config.train import TrainConfig
 from gridworld.envs.statistics_env import NO_EPISODES, Returns, StatisticsVectorEnv
 from gridworld.errors import InputError
 from gridworld.process.together import clock
-from gridworld.storage.append_log import AppendLog
+from gridworld.storage.atomic_write import AppendLog
 from gridworld.storage.csv_text import csv_text
 from gridworld.storage.serialization import State
 from gridworld.world.evaluation import Evaluator, Score
@@ -274,7 +274,7 @@ def read_curve(log: AppendLog, columns: Sequence[str]) -> dict[str, NDArray[np.f
 
 
 def show_progress(progress: Progress, evaluation: Evaluation) -> None:
-    """Show how good the greedy policy is, next to the progress bar."""
+    """Show how good the greedy policy is, next to the progress."""
     greedy = evaluation.greedy
     note = f"regret {greedy.regret:.3g}, goal {greedy.outcome.goal:.0%}"
     progress.update(evaluation.step, note + (", certified optimal" if greedy.certified else ""))

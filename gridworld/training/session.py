@@ -30,8 +30,7 @@ from gridworld.run.folder import CURVE, EVENTS
 from gridworld.run.provenance import environment, identity
 from gridworld.run.summary import MOST_NAMED, Summary
 from gridworld.run.writer import NEEDED, RunWriter, write_evaluations
-from gridworld.storage.append_log import AppendLog
-from gridworld.storage.atomic_write import sync, write_bytes, write_json
+from gridworld.storage.atomic_write import AppendLog, sync, write_bytes, write_json
 from gridworld.storage.serialization import State, fitting, npy_bytes
 from gridworld.training.learning_curve import (
     CHARTS,

@@ -32,7 +32,7 @@ from gridworld.config.train import TrainConfig
 from gridworld.envs.rendering import Frame
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import check_memory
-from gridworld.storage.append_log import AppendLog
+from gridworld.storage.atomic_write import AppendLog
 from gridworld.storage.safe_read import open_ordinary
 from gridworld.visualization.files import encode_png
 
@@ -64,7 +64,7 @@ class EventWriter:
 
     Args:
         folder: where the file is.
-        mark: where a file ended that is to be continued, see `storage.append_log`; None: a new one.
+        mark: where a file ended that is to be continued, see `storage.atomic_write`; None: a new one.
     """
 
     def __init__(self, folder: Path, mark: dict[str, Any] | None = None) -> None:

@@ -20,8 +20,7 @@ from gridworld.run import provenance as identity
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.folder import LOCK, RunFolder
 from gridworld.run.provenance import Source
-from gridworld.storage.append_log import AppendLog
-from gridworld.storage.atomic_write import locked, write_json
+from gridworld.storage.atomic_write import AppendLog, locked, write_json
 from gridworld.storage.safe_read import sealed
 from gridworld.storage.serialization import decode, encode
 from gridworld.sweep.job import run_in_sweep

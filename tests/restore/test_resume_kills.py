@@ -21,7 +21,7 @@ from helpers.support import SHORT
 from gridworld.run import checkpoints as checkpoint
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.storage import atomic_write as files
-from gridworld.storage.append_log import AppendLog
+from gridworld.storage.atomic_write import AppendLog
 from gridworld.training import session
 from gridworld.training.pictures import Pictures
 
