@@ -28,15 +28,10 @@ def check(config: TrainConfig) -> None:
     """See `gridworld.agents.Family.check`."""
     agent = config.agent
     if config.observation.kind != "none":
-        raise InputError(
-            f"observation={config.observation.kind}: agent={agent.name} keeps a table over the states "
-            "themselves and would never look at it; must be none"
-        )
+        what = f"observation={config.observation.kind}"
+        raise InputError(f"{what}: agent={agent.name} keeps a table over the states themselves; must be none")
     if config.callbacks:
-        raise InputError(
-            f"callbacks: are Stable-Baselines3's, agent={agent.name} calls none; leave them out, or choose "
-            "an agent of Stable-Baselines3, e.g. agent=dqn"
-        )
+        raise InputError(f"callbacks: are Stable-Baselines3's, agent={agent.name} calls none; leave them out")
     if config.device not in ("cpu", "auto"):
         raise InputError(f"device={config.device}: agent={agent.name} runs on the processor; must be cpu")
 
