@@ -73,8 +73,8 @@ def _walk(schema: type, section: str = "") -> Iterator[tuple[str, Any, dict[str,
         hint = hints[name]
         yield section + name, hint, metadata
         if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-            others = {AgentConfig: agent_schemas(), EnvConfig: SOURCES}.get(hint, {})
-            for each in (hint, *others.values()):
+            others: dict[type, Mapping[str, Any]] = {AgentConfig: agent_schemas(), EnvConfig: SOURCES}
+            for each in (hint, *others.get(hint, {}).values()):
                 yield from _walk(each, f"{section}{name}.")
 
 

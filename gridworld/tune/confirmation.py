@@ -14,7 +14,6 @@ import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -134,7 +133,7 @@ class HeldOutRuns:
     runs: tuple[HeldOutRun, ...]
 
     def __call__(self, ask: Ask) -> bool:
-        for result in run_together([partial(_run, run) for run in self.runs]):
+        for result in run_together([_run(run) for run in self.runs]):
             if isinstance(result, Exception):
                 raise result
         return True

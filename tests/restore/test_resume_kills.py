@@ -104,6 +104,7 @@ POINTS: list[tuple[Any, str, bool, int]] = [
     (Checkpoints, "keep", False, 4),
     (session, "write_bytes", True, 1),
     (session, "write_json", False, 1),
+    (Pictures, "finish", False, 1),
 ]
 
 
@@ -143,17 +144,3 @@ def dying_at(original: Callable[..., Any], number: int, after: bool) -> Callable
         return answer
 
     return dying
-
-
-def test_the_final_part_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = RUNS["q_learning"]
-    begin(tmp_path / "calm", *words)
-
-    def die() -> None:
-        Pictures.finish = lambda *arguments: os.kill(os.getpid(), signal.SIGKILL)  # type: ignore[method-assign]
-        begin(tmp_path / "run", *words)
-
-    assert in_a_process(die) == -signal.SIGKILL
-    assert (tmp_path / "run" / "summary.json").exists()
-    go_on(tmp_path / "run")
-    assert differences(left_behind(tmp_path / "run"), left_behind(tmp_path / "calm")) == []
