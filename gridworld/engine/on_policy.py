@@ -64,7 +64,6 @@ class OnPolicy(Population):
         return log_softmax(logits), values
 
     def snapshot(self, run: Run) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
-        """See `Population.snapshot`."""
         logits, values = self.outputs
         probabilities = torch.as_tensor(logits[run.row]).softmax(dim=-1).numpy()
         return values[run.row].astype(np.float64), probabilities.astype(np.float64), None

@@ -155,7 +155,6 @@ class SB3Config(AgentConfig):
         )
 
     def falling(self) -> dict[str, Decay]:
-        """Its settings that fall over training."""
         return {
             name: parse_schedule(name, self.given[name]) for name in FALLING if falls(self.given.get(name))
         }

@@ -25,7 +25,6 @@ def schemas() -> dict[str, type[AgentConfig]]:
 
 
 def check(config: TrainConfig) -> None:
-    """See `gridworld.agents.Family.check`."""
     agent = config.agent
     if config.observation.kind != "none":
         what = f"observation={config.observation.kind}"
@@ -41,12 +40,10 @@ def import_for(config: AgentConfig) -> None:
 
 
 def on_processor(device: str) -> bool:
-    """See `gridworld.agents.Family.on_processor`."""
     return True
 
 
 def build(config: AgentConfig, context: TrainingContext) -> Agent:
-    """See `gridworld.agents.Family.build`."""
     from gridworld.agents.tabular.algorithms import ALGORITHMS
 
     agent: Agent = ALGORITHMS[config.algorithm][1](config, context)
@@ -54,7 +51,6 @@ def build(config: AgentConfig, context: TrainingContext) -> Agent:
 
 
 def weights(path: Path, most: int) -> dict[str, NDArray[Any]]:
-    """See `gridworld.agents.Family.weights`."""
     from gridworld.agents.tabular.td_control import read_arrays
 
     return read_arrays(path, most)
