@@ -126,11 +126,10 @@ class OnPolicy(Population):
             yield from ((None, sums.of(number)) for number in range(pairs.shape[1]))
             return
         for number in range(pairs.shape[1]):
-            which, pair = self.distinct(pairs[0, number])
-            yield (
-                which,
-                sum_up(pair[None], advantages[:, number], returns[:, number], (len(which), self.num_actions)),
-            )
+            states, actions = np.divmod(pairs[0, number], self.num_actions)
+            which, index = np.unique(states, return_inverse=True)
+            pair, shape = (index * self.num_actions + actions)[None], (len(which), self.num_actions)
+            yield which, sum_up(pair, advantages[:, number], returns[:, number], shape)
 
     def _count(self, run: Run, rollout: Rollout) -> None:
         """Count a run's steps, and call what wants to be called after one of them."""

@@ -249,12 +249,6 @@ class Population:
         """The runs that have not ended, of those that are chosen (P,)."""
         return list(itertools.compress(self.runs, (self.active & chosen).tolist()))
 
-    def distinct(self, pairs: IntArray) -> tuple[IntArray, IntArray]:
-        """The states (U,) that occur in a batch of pairs (B,), and the pairs with these numbered in turn."""
-        states, actions = np.divmod(pairs, self.num_actions)
-        which, index = np.unique(states, return_inverse=True)
-        return which, index * self.num_actions + actions
-
     def end(self, run: Run) -> None:
         """Let a run take no further part."""
         self.active[run.row], run.has_ended = False, True
