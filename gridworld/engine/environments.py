@@ -125,7 +125,6 @@ class Environments:
         return [(step[part], returns[part], lengths[part]) for part in of_runs]
 
     def _outcomes(self, pairs: StateArray) -> StateArray:
-        """(P · E,), drawn where an environment moves."""
         moving = np.flatnonzero(~self._terminal.take(self.states))
         situations = pairs[moving]
         draws = self._by_run(moving, lambda batch, part: batch.draw_numbers(situations[part]))
