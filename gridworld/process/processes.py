@@ -12,13 +12,16 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from gridworld.process.signals import exiting, handling, send_sigterm
+from gridworld.process.signals import blocking, exiting, handling, send_sigterm
+
+Task = Callable[..., Any]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _SECONDS_BETWEEN_TICKS = 0.5
@@ -63,85 +66,103 @@ class LostError(Exception):
 
 
 def run_in_processes(
-    tasks: Sequence[Callable[[], Any]],
+    next_task: Callable[[], Task | None],
     count: int,
     forks: bool,
-    ended: Callable[[int, Any], None],
+    ended: Callable[[Any, Any], None],
     tick: Callable[[], None] = lambda: None,
+    answer: Callable[[Any], Any] | None = None,
 ) -> None:
     """Run tasks until all have ended. A process takes the next task when it has ended one.
 
     Args:
-        tasks: they begin in this order. They and what they return are pickled; they raise `SystemExit` only.
-        count: how many processes.
+        next_task: returns a task, or None if there is none; it is asked again whenever one has ended. Tasks
+            and what they return are pickled; they raise `SystemExit` only.
+        count: how many processes there are at once.
         forks: whether these are forks, with what this process has imported.
-        ended: called with the number of each task and what it returned, or a `LostError`.
+        ended: called with each task and what it returned, or a `LostError`.
         tick: called every now and then.
+        answer: returns the answer to a message. Tasks are then called with a function that sends a message,
+            and returns the answer.
 
     Raises:
         SystemExit: this process was told to stop by SIGINT or SIGTERM, and so was each; all have ended.
     """
-    _Workers(tasks, forks, ended).run(min(count, len(tasks)), tick)
+    _Workers(next_task, count, forks, ended, answer).run(tick)
 
 
 class _Workers:
     def __init__(
-        self, tasks: Sequence[Callable[[], Any]], forks: bool, ended: Callable[[int, Any], None]
+        self,
+        next_task: Callable[[], Task | None],
+        count: int,
+        forks: bool,
+        ended: Callable[[Any, Any], None],
+        answer: Callable[[Any], Any] | None,
     ) -> None:
-        self._waiting = list(enumerate(tasks))
+        self._next_task, self._count, self._ended, self._answer = next_task, count, ended, answer
         self._context: Any = multiprocessing.get_context("fork" if forks else "spawn")
-        self._ended = ended
-        self._at_work: dict[Connection[Any, Any], tuple[Any, int | None]] = {}  # (process, its task)
+        self._at_work: dict[Connection[Any, Any], tuple[Any, Task | None]] = {}  # (process, its task)
         self._received: list[int] = []  # signals
+        if not forks:
+            resource_tracker.ensure_running()  # which else would unblock signals while a process starts
 
-    def run(self, count: int, tick: Callable[[], None]) -> None:
+    def run(self, tick: Callable[[], None]) -> None:
         for stream in (sys.stdout, sys.stderr):
             stream.flush()  # or a fork would write it once more
         gc.freeze()  # so that forks share what there is
         with handling(dict.fromkeys(_SIGNALS, self._stop)):
             try:
-                for _ in range(count):
-                    self._start()
+                self._start_missing()
                 while self._at_work:
                     for connection in wait(list(self._at_work), _SECONDS_BETWEEN_TICKS):
                         self._take(connection)  # type: ignore[arg-type]
+                    self._start_missing()
                     tick()
             finally:
                 for process, _ in self._at_work.values():
                     process.kill()
+                    process.join()
         if self._received:
             raise SystemExit(128 + self._received[0])
 
-    def _start(self) -> None:
-        ours, theirs = self._context.Pipe()
-        process = self._context.Process(target=_work, args=(theirs, os.getpid()))
-        process.start()
-        theirs.close()
-        self._give(ours, process)
+    def _next(self) -> Task | None:
+        return None if self._received else self._next_task()
 
-    def _give(self, connection: Connection[Any, Any], process: Any) -> None:
-        """Let a process begin the next task, or end."""
-        number, task = (None, None) if self._received or not self._waiting else self._waiting.pop(0)
-        self._at_work[connection] = process, number
+    def _start_missing(self) -> None:
+        while len(self._at_work) < self._count and (task := self._next()) is not None:
+            ours, theirs = self._context.Pipe()
+            with blocking(*_SIGNALS):  # until the process has handlers of its own
+                process = self._context.Process(target=_work, args=(theirs, os.getpid(), bool(self._answer)))
+                process.start()
+                self._give(ours, process, task)
+            theirs.close()
+
+    def _give(self, connection: Connection[Any, Any], process: Any, task: Task | None) -> None:
+        """Let a process begin a task; None: let it end."""
+        self._at_work[connection] = process, task
         with contextlib.suppress(OSError):  # it has ended
             connection.send(task)
 
     def _take(self, connection: Connection[Any, Any]) -> None:
-        """Take a result, or note that the process has ended; another takes the place of a lost one."""
-        process, number = self._at_work[connection]
+        """Take a result, answer a message, or note that the process has ended."""
+        process, task = self._at_work[connection]
         try:
-            result = connection.recv()
+            is_result, content = connection.recv()
         except (EOFError, OSError):
             del self._at_work[connection]
             connection.close()
             process.join()
-            if number is not None and not self._received:
-                self._ended(number, LostError(f"exit code {process.exitcode}"))
-                if self._waiting:
-                    self._start()
-        else:
-            self._ended(number, result)  # type: ignore[arg-type]
-            self._give(connection, process)
+            if task is not None and not self._received:
+                self._ended(task, LostError(f"exit code {process.exitcode}"))
+            return
+        if is_result:
+            self._ended(task, content)
+            self._give(connection, process, self._next())
+        elif self._answer is not None:
+            answer = self._answer(content)
+            with contextlib.suppress(OSError):
+                connection.send(answer)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         """Pass a signal on: the first stops tasks at a safe point, the second soon, a third at once."""
@@ -151,13 +172,19 @@ class _Workers:
                 os.kill(process.pid, signal.SIGKILL if len(self._received) > 2 else number)
 
 
-def _work(connection: Connection[Any, Any], parent: int) -> None:
+def _work(connection: Connection[Any, Any], parent: int, may_ask: bool) -> None:
     """What a process does."""
     os.setpgrp()  # a terminal's Ctrl-C reaches the parent, which passes it on once
     threading.Thread(target=_end_with, args=(parent,), daemon=True, name="watch on the parent").start()
-    with exiting(*_SIGNALS), contextlib.suppress(EOFError):
+
+    def ask(message: Any) -> Any:
+        connection.send((False, message))
+        return connection.recv()
+
+    with exiting(*_SIGNALS), contextlib.suppress(EOFError, BrokenPipeError):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
         while (task := connection.recv()) is not None:
-            connection.send(task())
+            connection.send((True, task(ask) if may_ask else task()))
 
 
 def _end_with(parent: int) -> None:

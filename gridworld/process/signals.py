@@ -17,7 +17,7 @@ from contextvars import ContextVar
 from types import FrameType
 from typing import Any, ClassVar
 
-Handler = Callable[[int, FrameType | None], Any]
+Handler = Callable[[int, FrameType | None], Any] | signal.Handlers
 
 _SECONDS_TO_SAFE_POINT = 1.0  # training may continue for so long to come to where it can be saved
 

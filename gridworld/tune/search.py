@@ -14,7 +14,6 @@ import json
 import math
 import os
 import socket
-import sys
 import time
 import uuid
 import warnings
@@ -30,13 +29,13 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
 from gridworld.errors import InputError
-from gridworld.process.console import ProgressLine, program, time_left
+from gridworld.process.console import ProgressLine, tell, time_left
 from gridworld.sweep.console import shell_path
-from gridworld.sweep.job_table import one_line
-from gridworld.tune.confirmation import FINAL
+from gridworld.sweep.folder import one_line
 from gridworld.tune.objective import (
     DRAW,
     ERROR,
+    FINAL,
     SEEDS,
     WORKER,
     Outcome,
@@ -85,10 +84,7 @@ def _connect(url: str) -> optuna.storages.RDBStorage:
     options = {"timeout": _LOCKED_SECONDS} if is_sqlite else {"connect_timeout": _CONNECT_SECONDS}
     try:
         return optuna.storages.RDBStorage(url, engine_kwargs={"connect_args": options})
-    except ImportError as error:
-        cause, driver = error.__cause__ or error, parsed.drivername
-        raise InputError(f"{_shown(url)}: {cause}; pip install the driver for {driver}") from None
-    except (SQLAlchemyError, OptunaError, RuntimeError) as error:
+    except (ImportError, SQLAlchemyError, OptunaError, RuntimeError) as error:
         raise InputError(f"{_shown(url)}: cannot be reached ({_first_line(error)})") from None
 
 
@@ -106,14 +102,9 @@ def open_study(
                 "or choose another tune.folder"
             )
         study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True)
-        trials, attributes = study.get_trials(deepcopy=False), study.user_attrs
-        if ABOUT not in attributes:
-            if trials:
-                raise InputError(
-                    f"tune.study={name}: is there, but not of {program('tune')}; choose another tune.study"
-                )
+        if ABOUT not in study.user_attrs:
             study.set_user_attr(ABOUT, about)
-        _check_same(name, attributes.get(ABOUT, about), about)
+        _check_same(name, study.user_attrs[ABOUT], about)
         _check_readable(study, space)
     except InputError:
         raise
@@ -176,8 +167,8 @@ def _first_line(error: BaseException) -> str:
 def search(spec: StudySpec, study: optuna.Study, workers: Workers) -> None:
     """Run trials until there are enough or it is time to end; keeps trials.csv up to date."""
     run, line = Search(spec, study), ProgressLine(spec.base.logging.progress)
-    asked, begun, before = spec.settings.trials, time.monotonic(), len(study.get_trials(deepcopy=False))
-    wrote = begun
+    asked, before = spec.settings.trials, len(study.get_trials(deepcopy=False))
+    begun = wrote = time.monotonic()
 
     def text() -> str:
         states = [trial.state for trial in study.get_trials(deepcopy=False)]
@@ -199,11 +190,9 @@ def search(spec: StudySpec, study: optuna.Study, workers: Workers) -> None:
     try:
         if before < asked:
             more = f", {before} of them there already" if before else ""
-            print(
+            tell(
                 f"study {spec.name} in {shell_path(spec.folder)}: {asked} trials of {spec.settings.seeds} "
-                f"seeds{more}, {workers.count * (spec.settings.together or 1)} at once",
-                file=sys.stderr,
-                flush=True,
+                f"seeds{more}, {workers.count * (spec.settings.together or 1)} at once"
             )
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", ExperimentalWarning)  # of multivariate sampling
@@ -231,7 +220,7 @@ class Search:
 
     def next(self) -> Trials | None:
         """As many trials as train at once, or are missing."""
-        begun: dict[int, Values] = {}
+        begun: dict[int, tuple[Values, tuple[int, ...]]] = {}
         while len(begun) < (self._settings.together or 1) and time.monotonic() < self._deadline:
             ended = self._study.get_trials(deepcopy=False)
             if len(ended) + len(self.running) >= self._settings.trials:
@@ -249,7 +238,7 @@ class Search:
             new = self._memory.ask(self._spec.space.distributions)
             new.set_user_attr(DRAW, draw)
             new.set_user_attr(WORKER, self._name)
-            begun[new.number] = self._spec.space.values(new.params)
+            begun[new.number] = self._spec.space.values(new.params), self._objective.seeds
             self.running[new.number] = new
         return Trials(self._objective, begun) if begun else None
 
@@ -262,7 +251,7 @@ class Search:
     def end(self, trials: Trials, outcomes: Sequence[Outcome] | None) -> None:
         """Store how trials ended; None where they have killed too many workers."""
         killed = Outcome(error="the workers that ran it were killed")
-        for number, outcome in zip(trials.values, outcomes or [killed] * len(trials.values), strict=True):
+        for number, outcome in zip(trials.trials, outcomes or [killed] * len(trials.trials), strict=True):
             trial = self.running.pop(number)
             if outcome.seeds:
                 trial.set_user_attr(SEEDS, [dataclasses.asdict(seed) for seed in outcome.seeds])

@@ -15,7 +15,7 @@ import json
 import math
 import random
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -51,12 +51,11 @@ class SearchSpace:
     name: str  # of its file
 
     def __post_init__(self) -> None:
-        if not self.dimensions:
+        if not self.distributions:
             raise InputError(
                 f"tune={self.name}: there is nothing to search; its file needs the first line "
                 "'# @package tune.space' and a line for each key"
             )
-        assert self.distributions
 
     @cached_property
     def distributions(self) -> dict[str, BaseDistribution]:
@@ -80,25 +79,21 @@ class SearchSpace:
                 return error
             return None
 
-        for key in self.dimensions:
-            for value in self._extremes(key):
-                found = mistake({key: value})
-                if found and all(mistake({**others, key: value}) for others in self._corners()):
-                    raise InputError(f"tune={self.name}: {found}")
+        extremes = {key: self._extremes(key) for key in self.dimensions}
+        rng = random.Random(0)
+        alone = [{key: value} for key, values in extremes.items() for value in values]
+        corners = ({key: rng.choice(values) for key, values in extremes.items()} for _ in range(_CORNERS))
+        others = [*alone, *corners]
+        for values in alone:
+            found = mistake(values)
+            if found and all(mistake(other | values) for other in others):
+                raise InputError(f"tune={self.name}: {found}")
 
     def _extremes(self, key: str) -> list[Any]:
         distribution = self.distributions[key]
         if isinstance(distribution, FloatDistribution | IntDistribution):
             return [distribution.low, distribution.high]
         return self.dimensions[key].choices or []
-
-    def _corners(self) -> Iterator[dict[str, Any]]:
-        """Each value alone, then some points that have an extreme value for every key."""
-        extremes = {key: self._extremes(key) for key in self.dimensions}
-        yield from ({key: value} for key, values in extremes.items() for value in values)
-        rng = random.Random(0)
-        for _ in range(_CORNERS):
-            yield {key: rng.choice(values) for key, values in extremes.items()}
 
     def values(self, parameters: Values) -> dict[str, Any]:
         """The values of a trial's parameters, which are as Optuna stores them."""
@@ -135,16 +130,13 @@ def _distribution(key: str, dimension: DimensionConfig) -> BaseDistribution:
     if effect is not Effect.LEARNING:
         raise InputError(f"{key}: changes nothing about what is learnt, so there is nothing to search")
     if kind == "categorical":
-        are_different = choices and len(set(map(json.dumps, choices))) == len(choices)
-        if not choices or not are_different or (low, high, step, log) != (None, None, None, False):
-            raise InputError(
-                f"{key}: type=categorical takes choices, a list of different values, and nothing else"
-            )
+        if not choices or len(set(map(json.dumps, choices))) < len(choices):
+            raise InputError(f"{key}: type=categorical takes choices, a list of different values")
         return CategoricalDistribution([_token(choice) for choice in choices])
     if kind not in ("float", "int"):
         raise InputError(f"{key}: type={kind} must be float, int or categorical")
-    if choices is not None or low is None or high is None or not -math.inf < low < high < math.inf:
-        raise InputError(f"{key}: type={kind} takes two numbers, low={low} below high={high}, and no choices")
+    if low is None or high is None or not -math.inf < low < high < math.inf:
+        raise InputError(f"{key}: type={kind} takes two numbers, low={low} below high={high}")
     if kind == "int" and not all(float(number).is_integer() for number in (low, high, step or 1.0)):
         raise InputError(f"{key}: type=int takes whole numbers; it has low={low}, high={high}, step={step}")
     try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import shlex
-import sys
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,15 @@ from gridworld.config.composition.compose import search_path
 from gridworld.config.composition.recipe_file import TRUST, overrides
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.console import command, printable
-from gridworld.process.signals import StopRequest
+from gridworld.process.console import command, printable, tell
+from gridworld.process.processes import can_fork
+from gridworld.process.signals import Interrupted, exiting
 from gridworld.report.writer import write_over_seeds
 from gridworld.run.folder import LOCK
 from gridworld.storage.atomic_write import is_locked
 from gridworld.sweep.console import shell_path
+from gridworld.sweep.plan import may_fork
+from gridworld.training.setup import import_for
 from gridworld.training.tensorboard import hparams
 from gridworld.tune.confirmation import (
     CONFIRM,
@@ -36,9 +39,15 @@ from gridworld.tune.confirmation import (
     verdict_on,
 )
 from gridworld.tune.objective import ERROR, with_values
-from gridworld.tune.recipe import write_recipe
 from gridworld.tune.search import in_reach, open_study, search, study_url
-from gridworld.tune.study_folder import at_work_in, check_study_folder, claim, is_claimed, write_study
+from gridworld.tune.study_folder import (
+    at_work_in,
+    check_study_folder,
+    claim,
+    is_claimed,
+    write_recipe,
+    write_study,
+)
 from gridworld.tune.study_spec import StudySpec
 from gridworld.tune.workers import SearchError, Workers
 
@@ -46,25 +55,32 @@ from gridworld.tune.workers import SearchError, Workers
 def tune(spec: StudySpec) -> None:
     """Run what the study lacks, confirm the winner, and write and print what came of it."""
     check_study_folder(spec.folder)
-    with (
-        at_work_in(spec.folder, is_shared=spec.settings.storage is not None),
-        StopRequest().listening(),
-        Workers(int(spec.settings.workers)) as workers,
-    ):
-        url, about = study_url(spec), _about(spec)
-        is_begun = is_claimed(spec.folder, spec.name)
-        study = open_study(url, spec.name, about, spec.space, must_exist=is_begun)
-        claim(spec.folder, spec.name, about)
-        with in_reach(url):
-            search(spec, study, workers)
-            trials = choose_finalists(study, spec)
-            if not trials:
-                errors = [error for trial in study.trials if (error := trial.user_attrs.get(ERROR))]
-                why = f"all {len(errors)} failed, the first: {errors[0]}" if errors else "there was no time"
-                raise SearchError(f"{shell_path(spec.folder)}: no trial came to a score; {why}")
-            ranked = rank_finalists(spec, study, trials, workers)
-            best = next(trial for trial in trials if trial.number == ranked[0].trial)
-            _conclude(spec, study, best, ranked, workers)
+    is_shared = spec.settings.storage is not None
+    try:
+        with at_work_in(spec.folder, is_shared), exiting(signal.SIGINT, signal.SIGTERM):
+            _tune(spec)
+    except SystemExit as stop:
+        raise Interrupted(int(str(stop.code)) - 128) from None
+
+
+def _tune(spec: StudySpec) -> None:
+    url, about = study_url(spec), _about(spec)
+    is_begun = is_claimed(spec.folder, spec.name)
+    study = open_study(url, spec.name, about, spec.space, must_exist=is_begun)
+    claim(spec.folder, spec.name, about)
+    workers = Workers(int(spec.settings.workers), can_fork() and may_fork(spec.base))
+    if workers.forks:
+        import_for(spec.base)  # once for all of them
+    with in_reach(url):
+        search(spec, study, workers)
+        trials = choose_finalists(study, spec)
+        if not trials:
+            errors = [error for trial in study.trials if (error := trial.user_attrs.get(ERROR))]
+            why = f"all {len(errors)} failed, the first: {errors[0]}" if errors else "there was no time"
+            raise SearchError(f"{shell_path(spec.folder)}: no trial came to a score; {why}")
+        ranked = rank_finalists(spec, study, trials, workers)
+        best = next(trial for trial in trials if trial.number == ranked[0].trial)
+        _conclude(spec, study, best, ranked, workers)
 
 
 def _about(spec: StudySpec) -> dict[str, Any]:
@@ -139,15 +155,12 @@ def _confirm(
     """Run both and compare them; an empty `winner` is for settings that the search began from."""
     runs = [run for pair in itertools.zip_longest(began_from, winner) for run in pair if run is not None]
     count = len(began_from)
-    print(f"{len(runs)} runs on {count} held-out seeds confirm the winner", file=sys.stderr, flush=True)
+    tell(f"{len(runs)} runs on {count} held-out seeds confirm the winner")
     prepare(spec.folder, runs)
-    waiting = [HeldOutRuns(tuple(part)) for part in workers.shares(runs, spec.base.agent.shape is not None)]
-
-    def on_end(task: HeldOutRuns, result: object) -> None:
-        if elsewhere := [run for run in task.runs if is_locked(run.folder / LOCK)]:
-            waiting.append(HeldOutRuns(tuple(elsewhere)))  # another machine is at work on them
-
-    workers.run(lambda: waiting.pop(0) if waiting else None, on_end)
+    while runs:
+        shares = workers.shares(runs, spec.base.agent.shape is not None)
+        workers.run_all(HeldOutRuns(tuple(share)) for share in shares)
+        runs = [run for run in runs if is_locked(run.folder / LOCK)]  # another machine is at work on them
     before = read_results(began_from)
     if winner:
         return verdict_on(read_results(winner), before, "the winner")

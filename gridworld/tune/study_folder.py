@@ -1,10 +1,10 @@
-"""A study's folder: whose it is, and what it says of the search.
+"""A study's folder: whose it is, and what it says of the search and its winner.
 
 search.json     the study's name and what makes its trials comparable, from its beginning on
 trials.csv      a row per trial that has ended
 study.json      what was searched and what came of it, with the checksum of trials.csv
 confirm/        the held-out runs; see `confirmation`
-experiment/     the winner as a recipe; see `recipe`
+experiment/     the winner as a recipe, which train.py takes: recipe=runs/STUDY
 study.db        Optuna's storage, unless tune.storage names another
 .lock           held by the command at work, unless the study is in a database that others share
 
@@ -15,6 +15,7 @@ that it needs neither Optuna nor the database.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 import os
 from collections.abc import Iterator, Mapping
@@ -23,23 +24,38 @@ from statistics import fmean
 from typing import Any
 
 import optuna
+from omegaconf import OmegaConf
 from optuna.trial import FrozenTrial, TrialState
 
+from gridworld.config.composition.compose import without_hydra
+from gridworld.config.composition.recipe_file import IN_A_STUDY, overrides
+from gridworld.config.fields import Effect
+from gridworld.config.settings import ON_RESULT, with_effects
+from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console import recorded_command_line
 from gridworld.report.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
 from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, alone_in, check_writable
 from gridworld.run.provenance import versions
-from gridworld.storage.atomic_write import check_no_links, make_folder, noted, tidy, write_json, write_text
+from gridworld.storage.atomic_write import (
+    check_no_links,
+    make_folder,
+    make_inside,
+    noted,
+    tidy,
+    write_json,
+    write_text,
+)
 from gridworld.storage.csv_text import csv_text
 from gridworld.storage.safe_read import LARGEST_CSV, file_sha256, read_sealed, sealed
 from gridworld.tune.confirmation import CONFIRM
 from gridworld.tune.objective import ERROR, SEEDS, WORKER
-from gridworld.tune.recipe import EXPERIMENT
 from gridworld.tune.search_space import SearchSpace
-from gridworld.tune.study_spec import StudySpec
+from gridworld.tune.study_spec import ConfFolders, StudySpec, compose_in
 
 SEARCH_JSON = "search.json"
+_EXPERIMENT, _WINNER = IN_A_STUDY
+_OF_A_RECIPE = ON_RESULT - {Effect.SEED, Effect.MACHINE}
 _STATUSES = {TrialState.COMPLETE: "done", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
 
 
@@ -49,7 +65,7 @@ def check_study_folder(folder: Path) -> None:
         if (folder / name).exists():
             raise InputError(f"{folder}: is the folder of {kind}; choose another tune.folder")
     check_writable(folder, "tune.folder")
-    for names in ((), (CONFIRM,), (EXPERIMENT,)):
+    for names in ((), (CONFIRM,), (_EXPERIMENT,)):
         check_no_links(folder, *names)
 
 
@@ -145,3 +161,45 @@ def _importances(study: optuna.Study) -> dict[str, float]:
     evaluator = optuna.importance.PedAnovaImportanceEvaluator()
     found = optuna.importance.get_param_importances(study, evaluator=evaluator)
     return {key: round(float(share), 6) for key, share in found.items() if math.isfinite(share)}
+
+
+def write_recipe(
+    folder: Path, folders: ConfFolders, choices: Mapping[str, str], config: TrainConfig, about: str
+) -> Path:
+    """Write the winner as a recipe, and check that it composes to `config` again.
+
+    It names the agent, the world and the observation, and every value in which the winner differs from
+    these. `config.recipe_file` reads it as data. In a study of one's own, Hydra takes it as well:
+    --config-dir runs/STUDY experiment=winner.
+    """
+
+    def composed(words: list[str], more: tuple[Path, ...] = ()) -> dict[str, Any]:
+        own = dataclasses.replace(folders, own=(*folders.own, *more))
+        return _relevant(without_hydra(compose_in(own, "train", words)))
+
+    bare = composed([f"{group}={choice}" for group, choice in choices.items()])
+    values = _difference(bare, _relevant(config))
+    lines = ["# @package _global_", f"# {about}", "defaults:"]
+    lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
+    lines += ["  - _self_", "", OmegaConf.to_yaml(OmegaConf.create(values)) if values else ""]
+    path = make_inside(folder, _EXPERIMENT) / _WINNER
+    write_text(path, "\n".join(lines), durable=True)
+    for words in ([f"experiment={path.stem}"], overrides(path, trust=True)):
+        assert composed(words, (folder,)) == _relevant(config), f"{path} does not say what the winner is"
+    return path
+
+
+def _relevant(config: TrainConfig) -> dict[str, Any]:
+    return with_effects(_OF_A_RECIPE, dataclasses.asdict(config))
+
+
+def _difference(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+    found = {}
+    for key, value in after.items():
+        was = before.get(key)
+        if isinstance(value, dict) and isinstance(was, dict):
+            if inner := _difference(was, value):
+                found[key] = inner
+        elif key not in before or value != was:
+            found[key] = value
+    return found

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -110,13 +110,8 @@ def compose_study(folders: ConfFolders, words: Sequence[str]) -> StudySpec:
         search = compose_in(folders, "tune", of_search)
         space_name = str(search.hydra.runtime.choices["tune"])
         settings = cast(TuneConfig, OmegaConf.to_object(search.tune))
-    except YAMLError as error:
-        mark: Any = getattr(error, "problem_mark", None)
-        where = f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}" if mark else "a yaml file"
-        raise InputError(f"{where}: cannot be read ({getattr(error, 'problem', None) or error})") from None
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, YAMLError) as error:
         raise InputError(sentence(error)) from None
-    _check(settings)
     settings = _completed(settings, choices["agent"], base)
     space = SearchSpace(settings.space, space_name)
     space.check(base, check_settings(base))
@@ -157,16 +152,14 @@ def _parse(words: Sequence[str]) -> list[Override]:
     return OverridesParser.create().parse_overrides(list(words))
 
 
-def _check(settings: TuneConfig) -> None:
+def _completed(settings: TuneConfig, agent: str, base: TrainConfig) -> TuneConfig:
+    """Check the settings, and fill in what follows from the rest."""
     check_bounds(settings, "tune.")
     if settings.workers == 0:
         raise InputError("tune.workers=0: must be at least 1, or -1 for one on each core")
     for key, known in _KNOWN.items():
         if (value := getattr(settings, key)) not in known:
             raise InputError(f"tune.{key}={value}: must be {', '.join(known[:-1])} or {known[-1]}")
-
-
-def _completed(settings: TuneConfig, agent: str, base: TrainConfig) -> TuneConfig:
     study = settings.study or f"tune_{slug(agent)}_{slug(base.env.name)}"
     if slug(study) != study:
         raise InputError(f"tune.study={study}: must be of letters, digits and _.,=+-, e.g. {slug(study)}")

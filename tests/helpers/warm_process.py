@@ -161,7 +161,7 @@ def _run(
         os.close(file)
     if session:
         os.setsid()
-    if "tune.py" in script or any(word.endswith("launcher=joblib") for word in words):
+    if any(word.endswith("launcher=joblib") for word in words):
         reserve.keep(_IN_RESERVE, _run_as)
 
     def program() -> None:

@@ -28,7 +28,6 @@ from gridworld.storage.atomic_write import (
 )
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.job import run_in_sweep
-from gridworld.sweep.job_table import JobTable
 from gridworld.training.pictures import Pictures
 from gridworld.training.together import run_alone
 from gridworld.visualization.animation import animation_of_states
@@ -98,7 +97,7 @@ def writers(folder: Path) -> list[Callable[[], Any]]:
         journal.close,
         lambda: Checkpoints(folder).save(1, {}),
         lambda: remove_path(folder / "mine"),
-        lambda: JobTable(folder).write({}),
+        lambda: SweepFolder(folder).write({}),
         lambda: locked(folder / "deeper" / LOCK).__enter__(),
         lambda: clear(folder),
         lambda: RunWriter(folder, {}).end("failed"),

@@ -25,7 +25,6 @@ from omegaconf import OmegaConf
 from gridworld.agents import family
 from gridworld.commands import reproduce as command
 from gridworld.config.sweep import SweepConfig
-from gridworld.config.train import TrainConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.process.together import mixing
@@ -202,7 +201,8 @@ def test_a_run_that_went_on_says_with_whom_and_cannot_be_repeated(tmp_path: Path
 def test_runs_that_no_fork_takes_are_not_divided_among_forks(
     population: int | str, in_fork: bool, sizes: list[int]
 ) -> None:
-    jobs = [Job((), (), str(n), None, TrainConfig(), shape="", in_fork=in_fork) for n in range(10)]
+    config = configure("agent=ppo", f"device={'cpu' if in_fork else 'cuda'}")
+    jobs = [Job((), (), str(n), None, config) for n in range(10)]
     hydra = OmegaConf.create({"job": {"chdir": None}})
     groups = populations(jobs, SweepConfig(population=population), "forks", {"n_jobs": 4}, hydra)
     assert sorted(map(len, groups), reverse=True) == sizes

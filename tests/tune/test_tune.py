@@ -203,7 +203,7 @@ FLOAT = "agent.learning_rate: {type: float, low: 1e-3, high: 1e-2}"
             "Key 'agent.learning_rate' not in 'TuneConfig'",
         ),  # without the line that says where it goes
         ("", "there is nothing to search"),
-        ("agent.x: {type: float\n b", "bad.yaml: line 3, column 3: cannot be read"),
+        ("agent.x: {type: float\n b", "bad.yaml: line 3, column 3: is not valid YAML"),
         ("agent.gamma: 3", "int is not a subclass of DimensionConfig"),
         ("agent.gamma: {type: flaot, low: 0, high: 1}", "type=flaot must be"),
         ("agent.gamma: {type: float, lo: 0}", "Key 'lo' not in 'DimensionConfig'"),
@@ -322,7 +322,7 @@ def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path
         killed = wait_for_workers(process.pid, 2)[0]
         os.kill(killed, signal.SIGKILL)
         told = next(line for line in process.stderr if "lost" in line)
-        assert told.strip() == "a worker was lost to SIGKILL; its task is run again"
+        assert told.strip() == "a worker was lost (exit code -9), attempt 1 of 4 at its task"
         others = wait_for_workers(process.pid, 2, but=killed)
         process.send_signal(signal.SIGINT)
         told = process.stderr.read()  # until the last worker has let go of it

@@ -20,7 +20,7 @@ import pytest
 from helpers.hostile import seal
 from helpers.runs_folder import Maker
 from helpers.support import CONF, SHORT, configure
-from helpers.worker_tasks import Killed, fail
+from helpers.worker_tasks import Killed
 from hypothesis import given
 from hypothesis import strategies as st
 from optuna.trial import FrozenTrial, TrialState, create_trial
@@ -41,7 +41,6 @@ from gridworld.tune.confirmation import (
     verdict_on,
 )
 from gridworld.tune.objective import (
-    FinalRuns,
     Objective,
     Outcome,
     Report,
@@ -185,7 +184,8 @@ def reported(objective: Objective, rates: dict[int, float]) -> tuple[list[Outcom
         reports.append(report)
         return report.can_prune and report.step >= ENDS.get(report.trial, 99)
 
-    trials = Trials(objective, {number: {"agent.learning_rate": rate} for number, rate in rates.items()})
+    values = {number: {"agent.learning_rate": rate} for number, rate in rates.items()}
+    trials = Trials(objective, {number: (each, objective.seeds) for number, each in values.items()})
     return trials(answer), sorted(reports, key=lambda report: (report.trial, report.step))
 
 
@@ -211,21 +211,22 @@ def test_final_runs_that_train_together_are_those_alone() -> None:
     base = configure(*SHORT["ppo"], "total_timesteps=512")
     objective = Objective(base, (0,), 4, None)
     runs: dict[str, Any] = {
-        f"{rate} {seed}": ({"agent.learning_rate": rate}, seed) for rate in (0.01, 0.02) for seed in (7, 8)
+        f"{rate} {seed}": ({"agent.learning_rate": rate}, (seed,)) for rate in (0.01, 0.02) for seed in (7, 8)
     }
-    runs["fails"] = {"agent.learning_rate": 1e30}, 7
-    found = FinalRuns(objective, runs)(lambda message: None)
-    assert "diverged" in str(found.pop("fails"))
-    for name, result in found.items():
-        values, seed = runs[name]
-        assert result == run_alone(learning(objective.config(values), seed))
+    runs["fails"] = {"agent.learning_rate": 1e30}, (7,)
+    outcomes = Trials(objective, runs)(lambda message: None)
+    found = dict(zip(runs, outcomes, strict=True))
+    assert "diverged" in found.pop("fails").error
+    for name, outcome in found.items():
+        values, (seed,) = runs[name]
+        assert outcome.seeds == [run_alone(learning(objective.config(values), seed))]
 
 
 class Inline(Workers):
     """Runs tasks in this process; in place of trials, a function of their values where there is one."""
 
     def __init__(self, function: Callable[[Any, Callable[[Any], bool]], Outcome] | None = None) -> None:
-        super().__init__(1)
+        super().__init__(1, True)
         self._function = function
 
     def run(
@@ -239,10 +240,8 @@ class Inline(Workers):
             if self._function is None:
                 on_end(task, task(answer))
                 continue
-            on_end(
-                task,
-                [self._function(values, answer_of(answer, number)) for number, values in task.values.items()],
-            )
+            trials = task.trials.items()
+            on_end(task, [self._function(values, answer_of(answer, name)) for name, (values, _) in trials])
 
 
 def answer_of(answer: Callable[[Report], bool], number: int) -> Callable[[Any], bool]:
@@ -354,10 +353,10 @@ def test_a_final_run_that_fails_is_named_and_counted_as_failed(
 
     class Results(Inline):
         def run(self, next_task: Any, on_end: Any, *more: Any) -> None:
-            results: list[Any] = ["training diverged", SeedScore(3, 100, 0.0), None]
+            results = [Outcome(error="training diverged"), Outcome(0.1, "", [SeedScore(3, 100, 0.0)]), None]
             while (task := next_task()) is not None:
                 result = results.pop(0)
-                on_end(task, result and dict.fromkeys(task.runs, result))
+                on_end(task, result and [result])
 
     (finalist,) = rank_finalists(spec, study, choose_finalists(study, spec), Results())
     error = capsys.readouterr().err
@@ -374,23 +373,19 @@ def test_a_task_whose_worker_is_killed_is_run_again_until_it_has_killed_four(
 ) -> None:
     tasks = [Killed("never", 0, tmp_path), Killed("once", 1, tmp_path), Killed("ever", 9, tmp_path)]
     found = {}
-    with Workers(2) as workers:
-        workers.run(
-            lambda: tasks.pop(0) if tasks else None,
-            lambda task, result: found.update({task.name: result}),
-            lambda message: f"heard {message}",
-        )
-        assert found == {"never": "never heard never", "once": "once heard once", "ever": None}
-        assert capsys.readouterr().err.count("a worker was lost to SIGKILL; its task is run again\n") == 5
-        tasks = [fail]  # type: ignore[list-item]
-        with pytest.raises(SearchError, match="a worker failed, with the reason above"):
-            workers.run(lambda: tasks.pop(0) if tasks else None, lambda task, result: None)
+    Workers(2, forks=True).run(
+        lambda: tasks.pop(0) if tasks else None,
+        lambda task, result: found.update({task.name: result}),
+        lambda message: f"heard {message}",
+    )
+    assert found == {"never": "never heard never", "once": "once heard once", "ever": None}
+    assert capsys.readouterr().err.count("a worker was lost (exit code -9)") == 5
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 40])
 @pytest.mark.parametrize("can_join", [True, False])
 def test_workers_share_all_runs(count: int, can_join: bool) -> None:
-    shares = list(Workers(count).shares(range(60), can_join))
+    shares = list(Workers(count, True).shares(range(60), can_join))
     assert [run for share in shares for run in share] == list(range(60))
     assert max(map(len, shares)) == (min(32, math.ceil(60 / count)) if can_join else 1)
 

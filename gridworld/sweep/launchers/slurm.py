@@ -8,7 +8,6 @@ only works where accounting is set up.
 from __future__ import annotations
 
 import contextlib
-import functools
 import math
 import re
 import subprocess
@@ -24,7 +23,7 @@ from gridworld.errors import InputError
 from gridworld.process.console import printable
 from gridworld.process.processes import LostError
 from gridworld.storage.atomic_write import make_inside, remove_inside
-from gridworld.sweep.launchers import Group, Launch, Task, collect
+from gridworld.sweep.launchers import Group, Launch, collect
 
 _FOLDER = ".slurm"  # in the sweep's: what submitit writes
 _POLL_SECONDS = 1.0
@@ -32,61 +31,59 @@ _SECONDS_BETWEEN_QUESTIONS = 5.0  # to Slurm, which answers others too
 _FILES_ARRIVE_WITHIN = 15.0  # seconds, over a network
 _SLURMS_NAMES = {"array_parallelism", "partition", "account", "qos", "constraint", "setup", "signal_delay_s"}
 
-
-class SlurmTask:
-    """A task of the array."""
-
-    def __init__(self, job: submitit.Job[list[str]]) -> None:
-        self.job = job
-        self._left: float | None = None  # when it was first not in the queue
-
-    def done(self) -> bool:
-        """See `Task`."""
-        if self.job.paths.result_pickle.exists():
-            return True
-        queue = _queue(time.monotonic() // _SECONDS_BETWEEN_QUESTIONS)
-        if queue is None or self.job.job_id in queue:
-            return False
-        self._left = self._left or time.monotonic()
-        return time.monotonic() > self._left + _FILES_ARRIVE_WITHIN
-
-    def result(self) -> list[str]:
-        """See `Task`."""
-        if not self.job.paths.result_pickle.exists():
-            lines = [line for line in (self.job.stderr() or "").splitlines() if line.strip()]
-            why = lines[-1].strip() if lines else f"nothing was written to {self.job.paths.stderr}"
-        elif (error := self.job.exception()) is not None:
-            why = str(error).strip().splitlines()[-3]
-        else:
-            return self.job.result()
-        print(printable(f"slurm: task {self.job.job_id} was lost: {why}"), file=sys.stderr, flush=True)
-        raise LostError(why)
-
-
-@functools.lru_cache(maxsize=1)  # asked once in a while
-def _queue(moment: float) -> tuple[str, ...] | None:
-    """The user's tasks in Slurm's queue; None where the question failed."""
-    command = ["squeue", "--me", "--noheader", "--array", "--format=%i"]
-    answer = subprocess.run(command, capture_output=True, text=True, check=False)
-    return tuple(answer.stdout.split()) if answer.returncode == 0 else None
+SlurmTask = submitit.Job[list[str]]
 
 
 def run(launch: Launch, settings: Mapping[str, Any]) -> None:
-    """Run populations. Raises as `launchers.local.run`, and `InputError` where Slurm takes no jobs."""
+    """Run populations; see `run_groups`."""
     chunks = _chunks(launch.groups, settings["jobs_per_task"])
     _refuse_too_many(len(chunks), sum(map(len, launch.groups)))
     folder = make_inside(launch.worker.sweep, _FOLDER)
-    jobs = _submit(folder, settings, launch, chunks)
+    tasks = _submit(folder, settings, launch, chunks)
     of_task = [[job for group in chunk for job in group] for chunk in chunks]
-    tasks: dict[Task, Group] = dict(zip(map(SlurmTask, jobs), of_task, strict=True))
     try:
-        collect(launch, tasks, _POLL_SECONDS)
+        collect(launch, dict(zip(tasks, of_task, strict=True)), _IsDone(), _result, _POLL_SECONDS)
     except BaseException:
-        _cancel(jobs[0].job_id.partition("_")[0])
+        _cancel(tasks[0].job_id.partition("_")[0])
         raise
-    if all(job.paths.result_pickle.exists() for job in jobs):
+    if all(task.paths.result_pickle.exists() for task in tasks):
         with contextlib.suppress(OSError):
             remove_inside(folder.parent, folder.name)  # of a lost task the logs are kept
+
+
+class _IsDone:
+    """Whether a task has ended: by its files, or as it is not in the queue any more."""
+
+    def __init__(self) -> None:
+        self._queue: tuple[str, ...] = ()  # the user's tasks
+        self._due = 0.0  # when Slurm is asked again
+        self._left: dict[str, float] = {}  # when a task was first not in the queue
+
+    def __call__(self, task: SlurmTask) -> bool:
+        if task.paths.result_pickle.exists():
+            return True
+        now = time.monotonic()
+        if now >= self._due:
+            command = ["squeue", "--me", "--noheader", "--array", "--format=%i"]
+            answer = subprocess.run(command, capture_output=True, text=True, check=False)
+            if answer.returncode != 0:
+                return False
+            self._queue, self._due = tuple(answer.stdout.split()), now + _SECONDS_BETWEEN_QUESTIONS
+        if task.job_id in self._queue:
+            return False
+        return now > self._left.setdefault(task.job_id, now) + _FILES_ARRIVE_WITHIN
+
+
+def _result(task: SlurmTask) -> list[str]:
+    if not task.paths.result_pickle.exists():
+        lines = [line for line in (task.stderr() or "").splitlines() if line.strip()]
+        why = lines[-1].strip() if lines else f"nothing was written to {task.paths.stderr}"
+    elif (error := task.exception()) is not None:
+        why = str(error).strip().splitlines()[-3]
+    else:
+        return task.result()
+    print(printable(f"slurm: task {task.job_id} was lost: {why}"), file=sys.stderr, flush=True)
+    raise LostError(why)
 
 
 def _chunks(groups: Sequence[Group], most: int) -> list[list[Group]]:
@@ -102,7 +99,7 @@ def _chunks(groups: Sequence[Group], most: int) -> list[list[Group]]:
 
 def _submit(
     folder: Path, settings: Mapping[str, Any], launch: Launch, chunks: list[list[Group]]
-) -> list[submitit.Job[list[str]]]:
+) -> list[SlurmTask]:
     executor = submitit.AutoExecutor(folder=folder, cluster="slurm")
     parameters = {
         f"slurm_{key}" if key in _SLURMS_NAMES else key: value
