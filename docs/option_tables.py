@@ -18,12 +18,11 @@ from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from gridworld.commands.console import COMMANDS
-from gridworld.config.agents import AgentConfig, agent_schemas
-from gridworld.config.composition.conf_folder import conf_folder
-from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig
-from gridworld.config.train import TrainConfig
-from gridworld.config.tune import DimensionConfig, TuneConfig
+from gridworld.commands import COMMANDS
+from gridworld.config.settings import agent_schemas
+from gridworld.config.sweep import LAUNCHER_SCHEMAS, DimensionConfig, SweepConfig, TuneConfig
+from gridworld.config.train import AgentConfig, TrainConfig
+from gridworld.config.words import conf_folder
 from gridworld.config.worlds import SOURCES, EnvConfig
 from gridworld.envs.env import GridWorldEnv
 from gridworld.envs.vector_env import GridWorldVectorEnv

@@ -1,4 +1,4 @@
-"""The console command `gridworld`, also `python -m gridworld`; see `gridworld.commands.console`."""
+"""The console command `gridworld`, also `python -m gridworld`; see `gridworld.commands`."""
 
 from gridworld.process.signals import listen
 
@@ -6,9 +6,9 @@ from gridworld.process.signals import listen
 def main() -> None:
     """Run the command line in `sys.argv`."""
     listen()  # before what takes time to import
-    from gridworld.commands.console import main
+    from gridworld.commands import console
 
-    main()
+    console()
 
 
 if __name__ == "__main__":

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from gridworld.errors import InputError
 
 STEP_LIMIT = 100  # steps of an episode, where neither the world nor a setting says another
 MOST_STEPS = 100_000  # of an episode; an evaluation goes through all of them
 LARGEST_INTEGER = 2**63  # beyond, neither arrays nor the files of a run have them
+_LARGEST_EXACT = 2.0**53  # a float beyond may stand for several whole numbers
 NEAREST_GAMMA = 1 - 1e-11  # to 1, but for 1 itself
 
 
@@ -50,3 +52,21 @@ def discount(key: str, value: float) -> None:
             f"{key}={value}: is so near to 1 that rounding hides what a step costs; must be 1, or at most "
             f"{NEAREST_GAMMA}"
         )
+
+
+def digits(text: str) -> str:
+    """A number as people write it; a whole one without point and exponent: 1e5 as 100000.
+
+    Raises:
+        ValueError: it is not a number.
+    """
+    whole = as_whole(float(text))
+    return text if text.lstrip("+-").isdecimal() or isinstance(whole, float) else str(whole)
+
+
+def as_whole(value: Any) -> Any:
+    """A float that is a whole number as an int, in lists too; anything else as it is."""
+    if isinstance(value, list):
+        return [as_whole(each) for each in value]
+    is_whole = isinstance(value, float) and value.is_integer() and abs(value) <= _LARGEST_EXACT
+    return int(value) if is_whole else value

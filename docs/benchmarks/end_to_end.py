@@ -96,8 +96,8 @@ def _certified(agent: str, seeds: range) -> Callable[[], float]:
 
     def measure() -> float:
         from gridworld.agents import family
-        from gridworld.config.composition.compose import compose
-        from gridworld.config.composition.conf_folder import conf_folder
+        from gridworld.config.compose import compose
+        from gridworld.config.words import conf_folder
         from gridworld.envs.observations import make_observation
         from gridworld.training.learning_curve import LearningCurve
         from gridworld.training.setup import make_context

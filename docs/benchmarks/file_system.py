@@ -18,7 +18,7 @@ from pathlib import Path
 
 from benchmarks.measure import Comparison, Workload
 
-from gridworld.config.pictures import PICTURES
+from gridworld.config.train import PICTURES
 
 _RUN = ("agent=dqn", "total_timesteps=2000", "evaluation.every=500", "logging.progress=false")
 _NO_PICTURES = tuple(f"recording.{picture.setting}=false" for picture in PICTURES)

@@ -106,8 +106,8 @@ def learner(words: Sequence[str], steps: int, mdp: Mdp | None = None) -> Callabl
 
 def steps_per_second(commands: Sequence[Sequence[str]], mdp: Mdp | None = None) -> float:
     """Environment steps a second of agents that learn together, without evaluations."""
-    from gridworld.config.composition.compose import compose
-    from gridworld.config.composition.conf_folder import conf_folder
+    from gridworld.config.compose import compose
+    from gridworld.config.words import conf_folder
 
     learnings, made = [], [0] * len(commands)
     for number, words in enumerate(commands):

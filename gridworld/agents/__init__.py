@@ -14,14 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from gridworld.config.agents import MISSING
+from gridworld.config.fields import MISSING
 from gridworld.errors import InputError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from gridworld.config.agents import AgentConfig
-    from gridworld.config.train import TrainConfig
+    from gridworld.config.train import AgentConfig, TrainConfig
     from gridworld.envs.observations import ObservationTable
     from gridworld.envs.statistics_env import StatisticsVectorEnv
     from gridworld.storage.serialization import State

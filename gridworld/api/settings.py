@@ -14,12 +14,11 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from gridworld.config.composition import compose as composition
-from gridworld.config.composition.conf_folder import conf_folder
-from gridworld.config.composition.hydra_errors import sentence
-from gridworld.config.composition.recipe_file import literal, with_recipe
+from gridworld.config import compose as composition
+from gridworld.config.recipe_file import literal, with_recipe
 from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
+from gridworld.config.words import conf_folder, sentence
 from gridworld.errors import InputError
 
 Override = str | Mapping[str, Any]

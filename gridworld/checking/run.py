@@ -14,7 +14,7 @@ from typing import Any
 
 from gridworld.checking.probes import PROBES, Probe, UnmetError
 from gridworld.checking.training import build, settings, subject, train
-from gridworld.config.agents import AgentConfig
+from gridworld.config.train import AgentConfig
 from gridworld.errors import InputError, in_short
 from gridworld.process.console import aligned
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from gridworld.agents import Agent, TrainingContext, family
 from gridworld.agents.sb3.settings import SB3ClassConfig, SB3Config
 from gridworld.checking.probes import Probe, Trained
-from gridworld.config.agents import AgentConfig
+from gridworld.config.train import AgentConfig
 from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
@@ -124,8 +124,8 @@ def subject(algorithm: Any) -> AgentConfig:
     name = str(algorithm)
     if "." in name:
         return SB3ClassConfig(name=name, algorithm=name, engine="stock")
-    from gridworld.config.composition.compose import compose
-    from gridworld.config.composition.conf_folder import conf_folder
+    from gridworld.config.compose import compose
+    from gridworld.config.words import conf_folder
 
     known = sorted(file.stem for file in (conf_folder() / "agent").glob("*.yaml"))
     if name not in known:

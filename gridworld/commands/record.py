@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.commands import parser_of, whole
-from gridworld.config.pictures import PICTURES
+from gridworld.config.train import PICTURES
 from gridworld.envs.rendering import frame_size
 from gridworld.envs.rollout import play
 from gridworld.process.console import printable, telling_if_slow

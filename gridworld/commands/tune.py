@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from gridworld.commands import parser_of
 from gridworld.commands.manual import choices
-from gridworld.config.composition.conf_folder import conf_folder
-from gridworld.config.composition.words import refuse_dashes
+from gridworld.config.words import conf_folder, refuse_dashes
 from gridworld.errors import InputError, install_command
 from gridworld.process.console import (
     as_called,

@@ -1,9 +1,8 @@
 """What a schema declares at a field beside its default: its effect, its bounds, what its text is.
 
-`gridworld.config.settings` reads effects and privileges, `gridworld.config.train` bounds, and
-`gridworld.config.plain_settings` what texts are. A field that declares no effect has that of the section that
-it is in, and affects learning where that declares none either. A subclass with another default for a field
-need not repeat what its base class declares.
+`gridworld.config.settings` reads effects, privileges and what texts are, `gridworld.config.train` bounds. A
+field that declares no effect has that of the section that it is in, and affects learning where that declares
+none either. A subclass with another default for a field need not repeat what its base class declares.
 """
 
 from __future__ import annotations
@@ -11,12 +10,17 @@ from __future__ import annotations
 import functools
 import math
 import re
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum, auto
-from typing import Annotated, Any
+from typing import Annotated, Any, Union
 
 from gridworld.bounds import Bounds
+from gridworld.errors import InputError
 
+MISSING = "???"  # OmegaConf's sign for a value that has to be given
+MOST_KEPT = 10**9  # episodes that a mean is taken over
+LINEAR = "lin_"  # lin_0.003: from 0.003 at the start, linearly, to 0 at the end, as RL Zoo writes it
+_POWERS = {LINEAR: 1.0, "sqrt_": 0.5, "quad_": 2.0}  # of what is left of training, by a schedule's prefix
 EFFECTS, PRIVILEGE, BOUNDS, RATE = "effects", "privilege", "bounds", "rate"  # keys of a field's metadata
 
 LIBRARIES = (  # of classes that an agent is made of
@@ -62,7 +66,7 @@ def bounds(
 
 
 def rate(high: float = math.inf, above: bool = False, linear_only: bool = False) -> dict[str, Any]:
-    """Metadata: the same from 0, of a number that may fall over training (`config.agents.parse_schedule`)."""
+    """Metadata: the same from 0, of a number that may fall over training (`parse_schedule`)."""
     return bounds(0, high, above) | {RATE: linear_only}
 
 
@@ -99,3 +103,51 @@ EnvId = Annotated[str, Text.ENV]
 Callback = Annotated[Any, Text.CODE]
 Arguments = Annotated[dict[str, Any], Text.ARGUMENTS]
 Kwargs = Annotated[dict[str, Any], Text.KWARGS]
+Schedule = Union[int, float, Word]  # noqa: UP007  # OmegaConf reads it at run time
+WholeNumbers = Annotated[Any, Text.WORD, "a whole number, or lists and dicts of them"]
+
+
+@dataclass(frozen=True)
+class Decay:
+    """A rate over training.
+
+    Attributes:
+        initial: at the start, finite and not negative.
+        power: of the share of training that is left, with which it falls to 0; with 0 it stays.
+    """
+
+    initial: float
+    power: float
+
+    def at(self, progress: float) -> float:
+        """The rate after this share of training, from 0 to 1."""
+        return float(self.initial * (1 - progress) ** self.power)
+
+
+def falls(value: object) -> bool:
+    """Whether a setting's value is written as a rate that falls, as `lin_NUMBER` is."""
+    return isinstance(value, str) and value.startswith(tuple(_POWERS))
+
+
+def parse_schedule(key: str, value: Schedule, linear_only: bool = False) -> Decay:
+    """Read a rate that may fall over training.
+
+    Args:
+        key: the setting's dotted name, for the message.
+        value: a number, or one of `lin_NUMBER`, `sqrt_NUMBER` and `quad_NUMBER`.
+        linear_only: whether the last two are refused.
+    """
+    form, digits = "", value
+    if isinstance(value, str):
+        form = next((form for form in _POWERS if value.startswith(form)), "")
+        digits = value.removeprefix(form) if form and "_" not in value.removeprefix(form) else "nan"
+    try:
+        number = float(digits)
+    except (ValueError, OverflowError):
+        number = math.nan
+    if not 0 <= number < math.inf or (linear_only and form not in ("", LINEAR)):
+        others = "" if linear_only else " (sqrt_, quad_: for one by a root or a square)"
+        raise InputError(
+            f"{key}={value}: must be a number of at least 0, or {LINEAR}NUMBER for a linear decay{others}"
+        )
+    return Decay(number, _POWERS.get(form, 0.0))

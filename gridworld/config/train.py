@@ -7,13 +7,14 @@ a wrong type by name; `check` refuses numbers outside of the bounds that their f
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
 from typing import Any, Optional, Union
 
 from gridworld.bounds import LARGEST_INTEGER, discount
-from gridworld.config.agents import AgentConfig, parse_schedule
 from gridworld.config.fields import (
     BOUNDS,
+    MISSING,
     RATE,
     Callback,
     ClassPath,
@@ -22,9 +23,9 @@ from gridworld.config.fields import (
     affects,
     bounds,
     declared,
+    parse_schedule,
     privilege,
 )
-from gridworld.config.pictures import RecordingConfig
 from gridworld.config.worlds import SOURCES, EnvConfig, MapConfig
 from gridworld.errors import InputError
 
@@ -33,7 +34,35 @@ from gridworld.errors import InputError
 MOST_ENVS = 2**17  # eight times the largest batch that any measurement here is faster with
 MOST_BONUS = 10**6  # of exploration; any reward beside it would be lost in the numbers of a network
 MOST_THREADS = 1024
+_PICTURE = "picture"  # in a field's metadata
 AUTO = "auto"  # checkpoints as often as they cost next to nothing
+
+
+@dataclass
+class AgentConfig:
+    """The settings of any agent."""
+
+    name: Word = field(default=MISSING, metadata=affects(Effect.LABELS))  # in tables and folders
+    family: Word = MISSING  # the package in `gridworld.agents`
+    algorithm: ClassPath = MISSING  # the class, by its import path where it is none of ours
+
+    @property
+    def libraries(self) -> tuple[str, ...]:
+        """Distributions whose versions its results depend on, besides those that every run depends on."""
+        return ()
+
+    @property
+    def shape(self) -> str | None:
+        """What must be equal for runs of it to train as one population; None: each trains by itself."""
+        return None
+
+    def key(self, name: str) -> str:
+        """What the command line calls one of the algorithm's settings, which may not be given yet."""
+        return f"agent.{name}"
+
+    def memory(self, num_states: int, num_envs: int, total_timesteps: int) -> int:
+        """About the bytes that a run of it takes while it trains, the larger part at least."""
+        return 0
 
 
 @dataclass
@@ -74,6 +103,80 @@ class LoggingConfig:
     progress: bool = field(default=True, metadata=affects(Effect.NOTHING))
 
 
+@dataclass(frozen=True)
+class Picture:
+    """A file, or a folder of numbered PNGs, that is drawn when training is over."""
+
+    file: str  # in the run's folder; its ending says what it is written as
+    drawer: str  # "module.function" in `gridworld.visualization`, which draws it
+    caption: str | None = None  # in a report's page; None: it has no place there
+    while_training: bool = False  # TensorBoard has it every `logging.policy_map_every` evaluations
+    setting: str = ""  # its name in `recording.*`
+
+    @property
+    def name(self) -> str:
+        """What `record.py --format` and TensorBoard call it."""
+        return Path(self.file).stem
+
+    @property
+    def label(self) -> str:
+        """What a warning calls it: the files of one episode have one name, so that it is told once."""
+        return self.file if self.caption else f"the {self.drawer.partition('.')[0]}"
+
+    @property
+    def is_map(self) -> bool:
+        """Whether it is a still picture of the whole world."""
+        return self.file.endswith(".png")
+
+    @property
+    def is_in_tensorboard(self) -> bool:
+        """Whether TensorBoard can show it."""
+        return self.file.endswith((".png", ".gif"))
+
+
+def picture(
+    file: str, drawer: str, caption: str | None = None, while_training: bool = False
+) -> dict[str, Any]:
+    """A field's metadata; the arguments are those of `Picture`."""
+    return {_PICTURE: Picture(file, drawer, caption, while_training)}
+
+
+@dataclass
+class RecordingConfig:
+    """Pictures in the run's folder; TensorBoard gets them too."""
+
+    # values and greedy actions
+    policy_map: bool = field(
+        default=True, metadata=picture("policy.png", "maps.policy", "policy", while_training=True)
+    )
+    # how far the values are from the true ones
+    q_error: bool = field(
+        default=True, metadata=picture("q_error.png", "maps.q_error", "error of its values")
+    )
+    # where training has been
+    visits: bool = field(
+        default=True, metadata=picture("visits.png", "maps.visits", "visits while it learnt")
+    )
+    # the policy over training
+    learning: bool = field(
+        default=True, metadata=picture("learning.gif", "maps.learning", "policy while it learnt")
+    )
+    # the final greedy policy's episode; MP4 needs the extra `video`
+    frames: bool = field(default=True, metadata=picture("frames", "episode.episode"))
+    gif: bool = field(default=True, metadata=picture("episode.gif", "episode.episode"))
+    mp4: bool = field(default=False, metadata=picture("episode.mp4", "episode.episode"))
+    # pixels of the episode's; null: 100, less on large maps
+    cell_size: Optional[int] = field(default=None, metadata=bounds(2))  # noqa: UP045
+    fps: int = field(default=4, metadata=bounds(1, 100))  # frames a second
+
+
+PICTURES: tuple[Picture, ...] = tuple(
+    replace(each.metadata[_PICTURE], setting=each.name)
+    for each in fields(RecordingConfig)
+    if _PICTURE in each.metadata
+)
+
+
 @dataclass
 class CheckpointConfig:
     """What it takes to go on after an interruption."""
@@ -87,7 +190,7 @@ class TrainConfig:
 
     # the tuned settings of the agent in the world, a file in conf/tuned, that went into this; null: none
     recipe: Optional[Word] = field(default=None, metadata=affects(Effect.NOTHING))  # noqa: UP045
-    # of conf/preset, whose numbers went into this; auto: none was needed (`config.composition.presets`)
+    # of conf/preset, whose numbers went into this; auto: none was needed (`config.presets`)
     preset: Word = field(default="none", metadata=affects(Effect.NOTHING))
     # what came of these settings when they were tried, where they do not solve the task
     known_failure: Optional[Word] = field(default=None, metadata=affects(Effect.NOTHING))  # noqa: UP045

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Optional
 
 from gridworld.bounds import MOST_STEPS, STEP_LIMIT
-from gridworld.config.agents import MISSING
-from gridworld.config.fields import CodePath, EnvId, FilePath, Kwargs, Word, bounds
+from gridworld.config.fields import MISSING, CodePath, EnvId, FilePath, Kwargs, Word, bounds
 from gridworld.errors import InputError
 
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot
-from gridworld.config.agents import falls, parse_schedule
+from gridworld.config.fields import falls, parse_schedule
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.report.evidence import read_columns

@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from gridworld.config.agents import LINEAR
+from gridworld.config.fields import LINEAR
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.world.chain import Chain, discounted_visits, stopping_states
 from gridworld.world.evaluation import Evaluator

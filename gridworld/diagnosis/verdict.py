@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gridworld.config.plain_settings import check_foreign
+from gridworld.config.settings import check_foreign
 from gridworld.config.train import TrainConfig
 from gridworld.diagnosis.causes import CAUSES, PHRASES
 from gridworld.diagnosis.causes.objective import recommended_gamma
@@ -160,9 +160,8 @@ def try_offers(saved: SavedRun, found: Diagnosis, folder: Path, trust: bool = Fa
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from gridworld.config.composition.compose import compose
-    from gridworld.config.composition.conf_folder import conf_folder
-    from gridworld.config.composition.hydra_errors import sentence
+    from gridworld.config.compose import compose
+    from gridworld.config.words import conf_folder, sentence
     from gridworld.run.folder import claimed
     from gridworld.training.train import train
 

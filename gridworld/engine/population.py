@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gridworld.config.agents import Decay
+from gridworld.config.fields import Decay
 from gridworld.engine.environments import Environments
 from gridworld.engine.networks import DenseNetworks, Inputs, ModuleNetworks, Networks
 from gridworld.engine.optimizer import Optimizer

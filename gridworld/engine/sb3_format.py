@@ -17,7 +17,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from torch import nn
 
 import gridworld.engine
-from gridworld.config.agents import Decay
+from gridworld.config.fields import Decay
 from gridworld.engine.networks import Inputs, Kind, copy_row, cut
 from gridworld.engine.population import Population, Run
 from gridworld.envs.observations import ObservationTable

@@ -15,10 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gridworld.config.pictures import PICTURES
-from gridworld.config.plain_settings import read_config
-from gridworld.config.settings import flat
-from gridworld.config.train import TrainConfig
+from gridworld.config.settings import flat, read_config
+from gridworld.config.train import PICTURES, TrainConfig
 from gridworld.config.worlds import MapConfig
 from gridworld.errors import InputError
 from gridworld.process.console import plain, printable, tell

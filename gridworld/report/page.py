@@ -15,7 +15,7 @@ import jinja2
 from markupsafe import Markup, escape
 from PIL import Image
 
-from gridworld.config.pictures import PICTURES
+from gridworld.config.train import PICTURES
 from gridworld.process.console import plain
 from gridworld.report import tables
 from gridworld.report.agent_charts import overall_charts, task_charts

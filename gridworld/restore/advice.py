@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gridworld.config.composition.conf_folder import conf_folder, own_conf_folders
-from gridworld.config.composition.presets import fitting_preset, is_world
+from gridworld.config.presets import fitting_preset, is_world
 from gridworld.config.train import AUTO, TrainConfig
+from gridworld.config.words import conf_folder, own_conf_folders
 from gridworld.errors import InputError
 from gridworld.process.console import aligned, command
 from gridworld.restore.saved_run import SavedRun

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from gridworld.config.agents import falls
-from gridworld.config.plain_settings import foreign
-from gridworld.config.settings import flat
+from gridworld.config.fields import falls
+from gridworld.config.settings import flat, foreign
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import BuiltConfig, GymnasiumConfig
 from gridworld.errors import InputError

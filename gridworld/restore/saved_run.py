@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot, family
-from gridworld.config.plain_settings import check_foreign, read_config
+from gridworld.config.settings import check_foreign, read_config
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import MapConfig
 from gridworld.envs.observations import make_observation
@@ -64,7 +64,7 @@ class SavedRun:
         Of a run that is not trusted they are made of its settings, and what would run code is left out.
         """
         # here, with Hydra, which takes its time
-        from gridworld.config.composition.recipe_file import harmless_words
+        from gridworld.config.recipe_file import harmless_words
 
         words: list[str] = self.run.manifest.get("overrides") or []
         kept = list(words) if self._trust else list(harmless_words(words, self.config))

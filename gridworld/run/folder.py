@@ -32,8 +32,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from gridworld.config import pictures
-from gridworld.config.plain_settings import foreign
+from gridworld.config import train as schema
+from gridworld.config.settings import foreign
 from gridworld.errors import FolderLostError, InputError
 from gridworld.process.console import command, printable, users_folder
 from gridworld.storage.atomic_write import check_ours, locked, make_folder, remove_inside, tidy
@@ -48,7 +48,7 @@ WORLD = "world.npz"
 BEST_MODEL = "best_model.zip"  # these two as SB3's EvalCallback names them
 EVALUATIONS = "evaluations.npz"
 RESULTS = (CURVE, SUMMARY, MODEL, BEST_MODEL, VISITS, EVALUATIONS)
-PICTURES = tuple(each.file for each in pictures.PICTURES if Path(each.file).suffix)  # those of one file
+PICTURES = tuple(each.file for each in schema.PICTURES if Path(each.file).suffix)  # those of one file
 CHECKED = (*RESULTS, WORLD, *PICTURES)  # what has a checksum in the manifest of a finished run
 CHECKPOINTS = "checkpoints"
 EVENTS = "events.out.tfevents.*"
@@ -60,7 +60,7 @@ SWEEP_JSON = "sweep.json"  # a sweep's folder has this instead of a manifest
 
 # Patterns of all that training writes, except the manifest.
 OUTPUTS = (
-    *(*RESULTS, WORLD, *(each.file for each in pictures.PICTURES)),
+    *(*RESULTS, WORLD, *(each.file for each in schema.PICTURES)),
     *(CHECKPOINTS, TRAIN_LOG, ERROR_FILE, EVENTS, "source*.diff"),
 )
 

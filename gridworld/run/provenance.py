@@ -20,10 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gridworld.config.agents import AgentConfig
 from gridworld.config.fields import Effect
 from gridworld.config.settings import ON_RESULT, with_effects
-from gridworld.config.train import TrainConfig
+from gridworld.config.train import AgentConfig, TrainConfig
 from gridworld.errors import DISTRIBUTION
 from gridworld.run.folder import SOURCE_DIFF
 from gridworld.storage.safe_read import sha256

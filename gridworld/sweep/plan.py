@@ -26,12 +26,12 @@ from hydra.core.override_parser.types import Override, OverrideType
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gridworld.config.composition.compose import drop_hydra, to_config
-from gridworld.config.composition.presets import with_preset
-from gridworld.config.composition.words import prepared
-from gridworld.config.plain_settings import foreign, has_own_code
+from gridworld.config.compose import drop_hydra, to_config
+from gridworld.config.presets import with_preset
+from gridworld.config.settings import foreign, has_own_code
 from gridworld.config.sweep import SweepConfig
 from gridworld.config.train import AUTO, TrainConfig
+from gridworld.config.words import prepared
 from gridworld.config.worlds import EnvConfig
 from gridworld.errors import InputError
 from gridworld.process.processes import file_limit, free_memory, worker_count

@@ -15,8 +15,8 @@ from pathlib import Path
 from hydra.types import HydraContext
 from omegaconf import DictConfig, open_dict, read_write
 
-from gridworld.config.composition.words import prepared
 from gridworld.config.sweep import SweepConfig
+from gridworld.config.words import prepared
 from gridworld.errors import EXIT_CODE, FolderLostError, InputError
 from gridworld.process.console import ProgressLine, tell, tell_error, time_left
 from gridworld.process.processes import LostError

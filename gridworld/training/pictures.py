@@ -1,6 +1,6 @@
 """When a run's pictures are drawn, and where they go.
 
-Every picture (`gridworld.config.pictures`) is a file in the run's folder and, in a size that TensorBoard does
+Every picture (`gridworld.config.train`) is a file in the run's folder and, in a size that TensorBoard does
 not have to scale, in its Images tab: the policy while it develops, the others when training is over.
 """
 
@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
-from gridworld.config.pictures import PICTURES, Picture
-from gridworld.config.train import TrainConfig
+from gridworld.config.train import PICTURES, Picture, TrainConfig
 from gridworld.envs.rendering import Frame, fitting_cell_size
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State

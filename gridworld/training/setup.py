@@ -7,9 +7,8 @@ import functools
 from collections.abc import Callable
 
 from gridworld.agents import TrainingContext, WriteScalars, family
-from gridworld.config.composition.presets import LARGE, STOCHASTIC, fitting_preset, is_recipe_for
-from gridworld.config.pictures import PICTURES
-from gridworld.config.train import AUTO, TrainConfig, check
+from gridworld.config.presets import LARGE, STOCHASTIC, fitting_preset, is_recipe_for
+from gridworld.config.train import AUTO, PICTURES, TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.statistics_env import StatisticsVectorEnv

@@ -31,7 +31,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.agents import Learning, family
 from gridworld.bounds import LARGEST_INTEGER
-from gridworld.config.composition.compose import to_config
+from gridworld.config.compose import to_config
 from gridworld.config.train import TrainConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError, reason

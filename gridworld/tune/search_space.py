@@ -31,8 +31,8 @@ from optuna.distributions import (
 
 from gridworld.config.fields import Effect
 from gridworld.config.settings import effect_of
+from gridworld.config.sweep import DimensionConfig
 from gridworld.config.train import TrainConfig
-from gridworld.config.tune import DimensionConfig
 from gridworld.errors import InputError
 from gridworld.training.setup import check_settings
 from gridworld.tune.objective import Values, with_values

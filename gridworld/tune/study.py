@@ -12,8 +12,8 @@ from typing import Any
 import optuna
 from optuna.trial import FrozenTrial
 
-from gridworld.config.composition.compose import search_path
-from gridworld.config.composition.recipe_file import TRUST, overrides
+from gridworld.config.compose import search_path
+from gridworld.config.recipe_file import TRUST, overrides
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console import command, printable, tell

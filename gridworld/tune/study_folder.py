@@ -27,9 +27,9 @@ import optuna
 from omegaconf import OmegaConf
 from optuna.trial import FrozenTrial, TrialState
 
-from gridworld.config.composition.compose import without_hydra
-from gridworld.config.composition.recipe_file import IN_A_STUDY, overrides
+from gridworld.config.compose import without_hydra
 from gridworld.config.fields import Effect
+from gridworld.config.recipe_file import IN_A_STUDY, overrides
 from gridworld.config.settings import ON_RESULT, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError

@@ -21,17 +21,11 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from gridworld.config.composition.compose import (
-    compose_whole,
-    register_schemas,
-    search_path,
-    slug,
-    without_hydra,
-)
-from gridworld.config.composition.hydra_errors import sentence
-from gridworld.config.composition.recipe_file import CHOSEN, with_recipe
+from gridworld.config.compose import compose_whole, register_schemas, search_path, slug, without_hydra
+from gridworld.config.recipe_file import CHOSEN, with_recipe
+from gridworld.config.sweep import TuneConfig
 from gridworld.config.train import AUTO, TrainConfig, check_bounds
-from gridworld.config.tune import TuneConfig
+from gridworld.config.words import sentence
 from gridworld.errors import InputError
 from gridworld.process.console import program
 from gridworld.process.processes import core_count

@@ -1,6 +1,6 @@
 """What the pictures of a run are drawn from, and how the function that draws one is found.
 
-Which pictures there are is declared in `gridworld.config.pictures`. Each names a function of this package
+Which pictures there are is declared in `gridworld.config.train`. Each names a function of this package
 that takes a `Subject` and returns a `Draw`.
 """
 

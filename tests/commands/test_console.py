@@ -13,8 +13,8 @@ import pytest
 from helpers.support import CONF, ROOT, SHORT, script
 
 from gridworld import __version__
-from gridworld.commands.console import COMMANDS
-from gridworld.config.composition.conf_folder import conf_folder
+from gridworld.commands import COMMANDS
+from gridworld.config.words import conf_folder
 from gridworld.errors import DISTRIBUTION
 from gridworld.process import console
 from gridworld.run.provenance import code
@@ -65,7 +65,7 @@ def test_asking_imports_nothing_heavy(tmp_path: Path) -> None:
     command = [sys.executable, "-X", "importtime", "-m", "gridworld", "--help"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     loaded = {line.split("|")[-1].strip() for line in done.stderr.splitlines()}
-    assert "gridworld.commands.console" in loaded
+    assert "gridworld.commands" in loaded
     assert not loaded & {"numpy", "hydra", "torch", "gymnasium", "scipy"}
     ours = (ROOT / "gridworld" / "__main__.py").read_text()
     assert ours.index("listen()  # before") < ours.index("from gridworld.commands")
@@ -163,7 +163,7 @@ def test_it_trains_from_the_wheel(wheel: Path, tmp_path: Path) -> None:
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    where = "from gridworld.config.composition.conf_folder import conf_folder as f; print(f())"
+    where = "from gridworld.config.words import conf_folder as f; print(f())"
     assert run(sys.executable, "-c", where).strip() == str(site / "gridworld" / "conf")
     same = "from gridworld.run.provenance import code; print(code())"
     assert run(sys.executable, "-c", same).strip() == code()  # a run may go on in a checkout

@@ -12,7 +12,7 @@ import pytest
 from helpers.support import ROOT, SHORT, train_in
 
 from gridworld.commands import play as command
-from gridworld.commands.game import Game, Key, draw
+from gridworld.commands.play import Game, Key, draw
 from gridworld.envs.rendering import AGENT, draw_frame
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp

@@ -11,10 +11,9 @@ import stable_baselines3
 from helpers.support import CONF, DEEP, configure
 
 from gridworld.agents import family
-from gridworld.config.agents import agent_schemas
-from gridworld.config.composition.words import pairs
-from gridworld.config.plain_settings import read_config
+from gridworld.config.settings import agent_schemas, read_config
 from gridworld.config.train import TrainConfig, check
+from gridworld.config.words import pairs
 from gridworld.config.worlds import SOURCES
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError

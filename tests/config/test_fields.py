@@ -12,14 +12,11 @@ from helpers.support import CONF, NO_FILES, configure, train_in
 
 from gridworld.bounds import Bounds
 from gridworld.commands.report import main as report
-from gridworld.config.agents import agent_schemas
-from gridworld.config.composition.recipe_file import with_recipe
-from gridworld.config.composition.words import settings_of_a_run
 from gridworld.config.fields import BOUNDS, RATE, Text, declared
-from gridworld.config.plain_settings import foreign, texts_in
-from gridworld.config.settings import privileges
+from gridworld.config.recipe_file import with_recipe
+from gridworld.config.settings import agent_schemas, foreign, privileges, settings_of_a_run, texts_in
+from gridworld.config.sweep import TuneConfig
 from gridworld.config.train import TrainConfig, check_bounds
-from gridworld.config.tune import TuneConfig
 from gridworld.config.worlds import SOURCES
 from gridworld.errors import InputError
 from gridworld.run.summary import summary_text

@@ -7,7 +7,7 @@ import pytest
 from helpers.support import CONF, NO_FILES, configure, script, train_in
 
 import gridworld
-from gridworld.config.agents import REPLAY_COUNTS
+from gridworld.agents.sb3.settings import REPLAY_COUNTS
 from gridworld.config.train import TrainConfig, check
 from gridworld.training.setup import check_settings, notes
 

@@ -13,8 +13,8 @@ import pytest
 from helpers.support import CONF, configure, script
 
 from gridworld.commands import train as train_command
-from gridworld.config.composition.compose import register_schemas, without_hydra
-from gridworld.config.composition.recipe_file import harmless_words, overrides, with_recipe
+from gridworld.config.compose import register_schemas, without_hydra
+from gridworld.config.recipe_file import harmless_words, overrides, with_recipe
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import BuiltConfig
 from gridworld.errors import InputError

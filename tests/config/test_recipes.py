@@ -16,8 +16,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from gridworld.agents import family
 from gridworld.agents.sb3.factory import algorithm_and_arguments
 from gridworld.commands.manual import manual
-from gridworld.config.composition.words import pairs
 from gridworld.config.train import check
+from gridworld.config.words import pairs
 
 RECIPES = sorted(file.stem for file in (CONF / "tuned").glob("*.yaml") if file.stem != "none")
 STUDIES = sorted(file.stem for file in (CONF / "experiment").glob("*.yaml"))

@@ -11,11 +11,10 @@ import pytest
 from helpers.runs_folder import Maker
 from helpers.support import CONF, configure
 
-from gridworld.config.agents import agent_schemas
 from gridworld.config.fields import Effect
-from gridworld.config.settings import effect_of, flat, with_effects
+from gridworld.config.settings import agent_schemas, effect_of, flat, with_effects
+from gridworld.config.sweep import DimensionConfig
 from gridworld.config.train import TrainConfig
-from gridworld.config.tune import DimensionConfig
 from gridworld.errors import InputError
 from gridworld.report.evidence import Evidence, read
 from gridworld.report.grouping import arrange, learning_key, task_key

@@ -8,9 +8,8 @@ from helpers.support import configure
 from hydra.errors import HydraException
 
 import gridworld
-from gridworld.config.composition.hydra_errors import sentence
-from gridworld.config.composition.recipe_file import overrides
-from gridworld.config.composition.words import prepared, refuse_dashes, takes_whole_numbers
+from gridworld.config.recipe_file import overrides
+from gridworld.config.words import prepared, refuse_dashes, sentence, takes_whole_numbers
 from gridworld.errors import InputError
 
 

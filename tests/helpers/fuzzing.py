@@ -20,7 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gridworld.agents import family
 from gridworld.commands import jobs as jobs_command
-from gridworld.config.composition.compose import to_config
+from gridworld.config.compose import to_config
 from gridworld.config.train import TrainConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError

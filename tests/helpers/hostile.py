@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gridworld.config.plain_settings import read_config
+from gridworld.config.settings import read_config
 from gridworld.process.user_input import npz_bytes
 from gridworld.run.provenance import identity
 from gridworld.storage.safe_read import sealed

@@ -14,10 +14,9 @@ import yaml
 from helpers.support import ROOT, configure, script
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from gridworld.config.composition.conf_folder import conf_folder
-from gridworld.config.pictures import PICTURES
-from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig
-from gridworld.config.tune import TuneConfig
+from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig, TuneConfig
+from gridworld.config.train import PICTURES
+from gridworld.config.words import conf_folder
 
 README = ROOT / "README.md"
 PAGES = [README, *sorted(path for path in (ROOT / "docs").rglob("*.md") if "_build" not in path.parts)]

@@ -18,8 +18,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from gridworld.config.composition.compose import register_schemas
-from gridworld.config.composition.presets import with_preset
+from gridworld.config.compose import register_schemas
+from gridworld.config.presets import with_preset
 from gridworld.config.train import TrainConfig
 from gridworld.sweep.plan import Configurations
 from gridworld.training.train import train

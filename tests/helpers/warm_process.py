@@ -46,7 +46,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 import gridworld
-from gridworld.config.composition.compose import compose
+from gridworld.config.compose import compose
 from gridworld.envs.rendering import import_pygame
 from gridworld.process import console
 from gridworld.process.memory_budget import collect_less_often

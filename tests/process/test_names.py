@@ -13,7 +13,7 @@ from helpers.hostile import manifest
 from helpers.support import SHORT, train_in
 
 from gridworld.commands import evaluate, jobs, record, report, reproduce, run
-from gridworld.commands import resume as resume_command
+from gridworld.commands import train as train_command
 from gridworld.config.train import TrainConfig
 from gridworld.process.console import prepare
 from gridworld.report.tables import Table, to_captioned_markdown, to_csv, to_markdown
@@ -53,7 +53,7 @@ def test_what_commands_say_of_a_run(good: Path, tmp_path: Path, capsys: pytest.C
     (line,) = told(record.main, capsys, place, "--format", "policy")
     assert line.endswith("/recording/policy.png")
     assert SHOWN in told(reproduce.main, capsys, place)[0]
-    (line,) = told(resume_command.main, capsys, f"resume={place}")
+    (line,) = told(train_command.resume, capsys, f"resume={place}")
     assert line.startswith("error: ")
     (line,) = told(report.main, capsys, place)
     assert line.endswith("/report/report.html")

@@ -25,7 +25,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.custom_scalar import layout_pb2
 
 from gridworld.commands import report as command
-from gridworld.config.pictures import PICTURES
+from gridworld.config.train import PICTURES
 from gridworld.errors import InputError
 from gridworld.process.console import plain
 from gridworld.report import tables

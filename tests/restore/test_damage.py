@@ -25,7 +25,7 @@ from helpers.support import SHORT, train_in
 
 from gridworld.commands import jobs as jobs_command
 from gridworld.commands import record as record_command
-from gridworld.config.pictures import PICTURES
+from gridworld.config.train import PICTURES
 from gridworld.errors import InputError
 from gridworld.report import tuning_study as tuning
 from gridworld.report.analysis import gather

@@ -17,9 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import DictConfig
 
-from gridworld.config.composition.compose import register_schemas, to_config
-from gridworld.config.composition.hydra_errors import sentence
+from gridworld.config.compose import register_schemas, to_config
 from gridworld.config.train import TrainConfig
+from gridworld.config.words import sentence
 from gridworld.errors import InputError
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import read_run

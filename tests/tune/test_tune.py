@@ -396,7 +396,7 @@ def test_no_worker_outlives_a_search_that_is_killed(tmp_path: Path) -> None:
 def test_every_key_of_the_settings_stands_in_its_yaml() -> None:
     from omegaconf import OmegaConf
 
-    from gridworld.config.tune import TuneConfig
+    from gridworld.config.sweep import TuneConfig
 
     given = OmegaConf.load(CONF / "tune.yaml")["tune"]
     assert set(given) == {field.name for field in dataclasses.fields(TuneConfig)} - {"space"}

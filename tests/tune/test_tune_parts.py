@@ -25,7 +25,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
-from gridworld.config.tune import DimensionConfig
+from gridworld.config.sweep import DimensionConfig
 from gridworld.errors import InputError
 from gridworld.report import statistics
 from gridworld.storage.safe_read import sealed

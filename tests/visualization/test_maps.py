@@ -9,7 +9,7 @@ from helpers.support import SHORT, train_in
 from PIL import Image
 
 from gridworld.agents import PolicySnapshot
-from gridworld.config.pictures import PICTURES
+from gridworld.config.train import PICTURES
 from gridworld.envs.rendering import AGENT, CLIFF, GOAL, TRAP, UNKNOWN, WALL, Frame
 from gridworld.visualization.canvas import Canvas, greedy_paths
 from gridworld.visualization.maps import (

@@ -12,8 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
-from gridworld.config.pictures import PICTURES
-from gridworld.config.train import TrainConfig
+from gridworld.config.train import PICTURES, TrainConfig
 from gridworld.config.worlds import EnvConfig, GymnasiumConfig
 from gridworld.envs.rendering import (
     AGENT,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from gridworld.agents import Agent, TrainingContext
-    from gridworld.config.agents import AgentConfig
+    from gridworld.config.train import AgentConfig
 
 __all__ = ["build", "check", "import_for", "on_processor", "schemas", "weights"]
 

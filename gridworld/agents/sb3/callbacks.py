@@ -33,7 +33,7 @@ from torch import Tensor
 
 from gridworld.agents.sb3.factory import first_line
 from gridworld.agents.sb3.settings import SCHEDULES
-from gridworld.config.agents import Decay
+from gridworld.config.fields import Decay
 from gridworld.errors import InputError
 from gridworld.process.console import tell
 from gridworld.storage.serialization import (

@@ -34,7 +34,7 @@ from gridworld.agents.sb3.settings import (
     as_dict,
 )
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.config.agents import falls, parse_schedule
+from gridworld.config.fields import falls, parse_schedule
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import check_memory, is_limited
 from gridworld.process.user_input import imported

@@ -8,34 +8,31 @@ from dataclasses import asdict, dataclass, field, is_dataclass
 from typing import Any, Optional
 
 from gridworld.bounds import MOST_STEPS, Bounds
-from gridworld.config.agents import (
-    MOST_KEPT,
-    REPLAY_COUNTS,
-    AgentConfig,
-    Decay,
-    Schedule,
-    WholeNumbers,
-    falls,
-    parse_schedule,
-)
 from gridworld.config.fields import (
     BOUNDS,
+    MOST_KEPT,
     Arguments,
     ClassPath,
+    Decay,
     Effect,
+    Schedule,
+    WholeNumbers,
     Word,
     affects,
     bounds,
     declared,
+    falls,
+    parse_schedule,
     rate,
 )
-from gridworld.config.train import ObservationConfig, TrainConfig
+from gridworld.config.train import AgentConfig, ObservationConfig, TrainConfig
 from gridworld.errors import InputError
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
 
 SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf")  # what SB3 has a linear schedule for
 FALLING = ("ent_coef", "gae_lambda", "learning_rate")  # see `agents.sb3.callbacks` for all other ones
+REPLAY_COUNTS = "gridworld.agents.sb3.replay_counts.ReplayCounts"  # a replay buffer that counts transitions
 # Arguments of SB3's classes that are a number to compute with: runs of one population may differ in them.
 _NUMBERS = {
     *("learning_rate", "gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm", "clip_range", "tau"),

@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from gridworld.agents import Agent, TrainingContext
-    from gridworld.config.agents import AgentConfig
-    from gridworld.config.train import TrainConfig
+    from gridworld.config.train import AgentConfig, TrainConfig
 
 
 def schemas() -> dict[str, type[AgentConfig]]:

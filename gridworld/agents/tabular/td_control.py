@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot, TrainingContext
 from gridworld.bounds import Bounds
-from gridworld.config.agents import MOST_KEPT, AgentConfig, Schedule, parse_schedule
-from gridworld.config.fields import Effect, Word, affects, bounds, rate
+from gridworld.config.fields import MOST_KEPT, Effect, Schedule, Word, affects, bounds, parse_schedule, rate
+from gridworld.config.train import AgentConfig
 from gridworld.errors import InputError
 from gridworld.process.user_input import npz_arrays, npz_bytes
 from gridworld.storage.safe_read import read_bytes

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from gridworld.agents import family
 from gridworld.agents.sb3.settings import SB3ClassConfig
-from gridworld.config.agents import AgentConfig
+from gridworld.config.train import AgentConfig
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.diagnosis.finding import Finding
 from gridworld.envs.observations import make_observation

@@ -13,7 +13,7 @@ from helpers.support import SHORT, configure, script
 
 from gridworld.agents.sb3.model_file import read_weights
 from gridworld.agents.tabular import check as check_tabular
-from gridworld.config.composition.recipe_file import overrides
+from gridworld.config.recipe_file import overrides
 from gridworld.errors import InputError
 from gridworld.restore.resume import open_unfinished
 from gridworld.restore.saved_run import SavedRun

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import re
 import secrets
@@ -18,15 +19,13 @@ from hydra.types import RunMode
 from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from gridworld.config.agents import agent_schemas
-from gridworld.config.composition.conf_folder import is_override, own_conf_folders
-from gridworld.config.composition.hydra_errors import refuse_added_keys
-from gridworld.config.composition.presets import may_need_preset, with_preset
-from gridworld.config.composition.words import prepared
-from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig
+from gridworld.config.presets import may_need_preset, with_preset
+from gridworld.config.settings import agent_schemas
+from gridworld.config.sweep import LAUNCHER_SCHEMAS, SearchConfig, SweepConfig
 from gridworld.config.train import TrainConfig
-from gridworld.config.tune import SearchConfig
+from gridworld.config.words import is_override, meant, own_conf_folders, prepared
 from gridworld.config.worlds import SOURCES, EnvConfig
+from gridworld.errors import InputError
 
 VERSION_BASE = "1.3"
 _LONGEST_NAME = 100  # characters of a job's folder
@@ -123,8 +122,21 @@ def drop_hydra(whole: DictConfig) -> DictConfig:
 
 def to_config(settings: DictConfig) -> TrainConfig:
     """Convert Hydra's settings to the dataclasses that everything below takes."""
-    refuse_added_keys(settings)
+    _refuse_added_keys(settings)
     return cast(TrainConfig, OmegaConf.to_object(settings))
+
+
+def _refuse_added_keys(settings: DictConfig, prefix: str = "") -> None:
+    """Refuse keys that `+key=value` added, which gets past the schema while Hydra composes."""
+    schema = OmegaConf.get_type(settings)
+    known = {field.name for field in dataclasses.fields(schema)} if dataclasses.is_dataclass(schema) else None
+    for key in map(str, settings):
+        if known is not None and key not in known:
+            raise InputError(f"{prefix}{key}: there is no such key{meant(key, sorted(known))}")
+        if OmegaConf.is_missing(settings, key) or OmegaConf.is_interpolation(settings, key):
+            continue
+        if isinstance(child := settings[key], DictConfig):
+            _refuse_added_keys(child, f"{prefix}{key}.")
 
 
 def register_schemas() -> None:

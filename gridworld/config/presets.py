@@ -26,9 +26,9 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gridworld.config.composition.conf_folder import conf_folder
-from gridworld.config.plain_settings import has_own_code
+from gridworld.config.settings import has_own_code
 from gridworld.config.train import AUTO, TrainConfig
+from gridworld.config.words import conf_folder
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.errors import InputError
 

@@ -17,13 +17,11 @@ import yaml
 from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import OmegaConf
 
-from gridworld.bounds import LARGEST_INTEGER
-from gridworld.config.agents import MISSING
-from gridworld.config.composition.conf_folder import is_override
-from gridworld.config.composition.words import as_whole
-from gridworld.config.plain_settings import check_foreign, fits, foreign, shown
-from gridworld.config.settings import alternatives
+from gridworld.bounds import LARGEST_INTEGER, as_whole
+from gridworld.config.fields import MISSING
+from gridworld.config.settings import alternatives, check_foreign, fits, foreign, shown
 from gridworld.config.train import TrainConfig
+from gridworld.config.words import is_override
 from gridworld.errors import InputError
 from gridworld.storage.safe_read import as_text, read_bytes
 

@@ -1,27 +1,110 @@
-"""Hydra's error messages about a command line, each in one sentence.
+"""A command line: the yaml files that it chooses from, its words as Hydra takes them, and Hydra's errors.
 
 Hydra says what went wrong over several lines and advises to append an unknown key with `+`, which the
-schema would refuse as well. The fact is kept; what would have been right is added.
+schema would refuse as well. `sentence` keeps the fact, and adds what would have been right.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 
-from hydra.errors import OverrideParseException
-from omegaconf import DictConfig, OmegaConf
-from yaml import MarkedYAMLError, YAMLError
-
-from gridworld.config.composition.words import OF_THE_COMMAND, pairs, settings_of_a_run
-from gridworld.config.sweep import SweepConfig
-from gridworld.config.tune import TuneConfig
+from gridworld.bounds import digits
+from gridworld.config.fields import MISSING
+from gridworld.config.settings import settings_of_a_run, takes_whole_numbers
+from gridworld.config.sweep import SweepConfig, TuneConfig
 from gridworld.errors import InputError, failure
 
+OF_THE_COMMAND = ("experiment", "recipe", "resume", "trust", "anyway")  # words that look like settings
+_FLOAT = re.compile(r"(?<![\w.$'\"])[-+]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.'\"])")
 _LISTED = 24  # choices of a group that are listed at most; of more, those with a similar name
+_PACKAGE = Path(__file__).parents[1]
+_WITH_VALUE = (  # Hydra's options that the next word belongs to
+    *("--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp", "--package", "-p"),
+    *("--cfg", "-c", "--info", "-i", "--experimental-rerun"),
+)
+
+
+def conf_folder() -> Path:
+    """The folder of the yaml files: of the installed package, or `conf/` of the checkout."""
+    installed = _PACKAGE / "conf"
+    return installed if installed.is_dir() else _PACKAGE.parent / "conf"
+
+
+def own_conf_folders(words: Sequence[str]) -> Iterator[Path]:
+    """The folders that `--config-dir` names in a command line."""
+    for word, following in pairwise([*words, ""]):
+        option, _, value = word.partition("=")
+        if option in ("--config-dir", "-cd"):
+            yield Path(value or following)
+
+
+def is_override(words: Sequence[str], index: int) -> bool:
+    """Whether a word of a command line is neither an option of Hydra's nor an option's value."""
+    return not words[index].startswith("-") and (index == 0 or words[index - 1] not in _WITH_VALUE)
+
+
+def prepared(words: Sequence[str], own: Sequence[Path] = ()) -> list[str]:
+    """A command line as Hydra takes it: 1e5 as 100000, experiment=ENV_AGENT as the choice of the two.
+
+    Args:
+        words: the command line, lists of values for a sweep included.
+        own: the folders of `--config-dir`, which may have recipes too.
+    """
+    found: list[str] = []
+    chosen = {word.lstrip("+").partition("=")[0] for word in words if "=" in word}
+    for word in words:
+        key, _, value = word.partition("=")
+        if key == "tuned" and "hydra.searchpath" not in chosen:
+            _check_recipe(value, [conf_folder(), *own])
+        if key.lstrip("+") == "experiment" and value in pairs():
+            pair = zip(("env", "agent"), pairs()[value], strict=True)
+            found += [f"{group}={name}" for group, name in pair if group not in chosen]
+        elif takes_whole_numbers(key.lstrip("+")) and re.search(r"[.eE]", value):
+            found.append(f"{key}={_FLOAT.sub(lambda number: digits(number.group()), value)}")
+        else:
+            found.append(word)
+    return found
+
+
+def _check_recipe(name: str, folders: Sequence[Path]) -> None:
+    """Refuse a missing recipe, which the defaults list would leave out without a word."""
+    known = sorted(file.stem for folder in folders for file in (folder / "tuned").glob("*.yaml"))
+    if re.fullmatch(r"\w+", name) and name not in known:
+        near = difflib.get_close_matches(name, known)
+        hint = f"; close to it are {', '.join(near)}" if near else ""
+        raise InputError(f"tuned={name}: there is no such recipe{hint}; --help lists them all")
+
+
+@functools.cache
+def pairs() -> dict[str, tuple[str, str]]:
+    """Every shipped world with every shipped agent, by the names that experiments for them have."""
+    conf = conf_folder()
+    envs = [file for file in sorted((conf / "env").glob("*.yaml")) if MISSING not in file.read_text("utf-8")]
+    found = {
+        f"{env.stem}_{agent.stem}": (env.stem, agent.stem)
+        for env in envs
+        for agent in sorted((conf / "agent").glob("*.yaml"))
+    }
+    return {name: pair for name, pair in found.items() if not (conf / "experiment" / f"{name}.yaml").exists()}
+
+
+def refuse_dashes(words: Sequence[str]) -> None:
+    """Refuse settings that are written as the options of other programs are: `--seed 3`."""
+    known = {*OF_THE_COMMAND, *settings_of_a_run()}
+    for word, following in pairwise([*words, ""]):
+        option, equals, value = word.partition("=")
+        name = option[2:].replace("-", "_")
+        if option.startswith("--") and (name in known or any(each.startswith(f"{name}.") for each in known)):
+            takes_next = not equals and following and not following.startswith("-") and "=" not in following
+            given = f"{word} {following}" if takes_next else word
+            value = (following if takes_next else value) or "VALUE"
+            raise InputError(f"{given}: a setting is written without dashes; write {name}={value}")
 
 
 def sentence(error: BaseException) -> str:
@@ -31,11 +114,9 @@ def sentence(error: BaseException) -> str:
         return message
     if isinstance(error, OSError) and error.strerror:
         return failure(error)
-    if isinstance(error, MarkedYAMLError) and error.problem_mark is not None:
-        mark = error.problem_mark
-        return (
-            f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}: is not valid YAML: {error.problem}"
-        )
+    if (mark := getattr(error, "problem_mark", None)) is not None:  # of yaml
+        problem = getattr(error, "problem", None)
+        return f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}: is not valid YAML: {problem}"
     if missing := re.search(r"[Mm]issing mandatory value: (\S+)", message):
         key = missing.group(1)
         key = key if "." in key else getattr(error, "full_key", None) or key
@@ -62,7 +143,7 @@ def sentence(error: BaseException) -> str:
     facts[0] = facts[0].removeprefix("Error merging override ").removeprefix("Error parsing override ")
     facts += str(error.__cause__ or "").splitlines()[:1]
     override = getattr(error, "override", None)
-    if isinstance(error, OverrideParseException) and override and override not in facts[0]:
+    if override and override not in facts[0]:
         facts.insert(0, override)
     return ": ".join(fact.strip().rstrip(".:") for fact in facts) + _suggestion(" ".join(facts), message)
 
@@ -74,6 +155,9 @@ def unreadable_file(error: Exception, folders: Iterable[Path]) -> str | None:
         error: a `UnicodeDecodeError` or a `RecursionError`, for which Hydra does not name the file.
         folders: of the yaml files.
     """
+    from omegaconf import OmegaConf  # here, since --help takes no longer than it must
+    from yaml import YAMLError
+
     for file in sorted(file for folder in folders for file in folder.rglob("*.yaml")):
         try:
             OmegaConf.load(file)
@@ -88,19 +172,6 @@ def unreadable_file(error: Exception, folders: Iterable[Path]) -> str | None:
     return None
 
 
-def refuse_added_keys(settings: DictConfig, prefix: str = "") -> None:
-    """Refuse keys that `+key=value` added, which gets past the schema while Hydra composes."""
-    schema = OmegaConf.get_type(settings)
-    known = {field.name for field in dataclasses.fields(schema)} if dataclasses.is_dataclass(schema) else None
-    for key in map(str, settings):
-        if known is not None and key not in known:
-            raise InputError(f"{prefix}{key}: there is no such key{_meant(key, sorted(known))}")
-        if OmegaConf.is_missing(settings, key) or OmegaConf.is_interpolation(settings, key):
-            continue
-        if isinstance(child := settings[key], DictConfig):
-            refuse_added_keys(child, f"{prefix}{key}.")
-
-
 def _unknown_choice(message: str) -> str:
     missing = re.search(r"Could not find '([^']*)'", message)
     group = re.search(r"Available options in '([^']*)':((?:\n\t\S+)*)", message)
@@ -111,7 +182,7 @@ def _unknown_choice(message: str) -> str:
         choices = sorted({*choices, *pairs()})
     fact = f"{where}={name}: there is no such choice"
     if len(choices) <= _LISTED:
-        return f"{fact}; there are {', '.join(choices)}{_meant(name, choices)}"
+        return f"{fact}; there are {', '.join(choices)}{meant(name, choices)}"
     near = [choice for choice in choices if choice.startswith(name)]
     near = near or difflib.get_close_matches(name, choices)
     hint = f"; close to it are {', '.join(near)}" if near else ""
@@ -142,14 +213,14 @@ def _alike(name: str, key: str) -> str:
     known = {*settings_of_a_run(), *others, *OF_THE_COMMAND} - {name}
     section = name.rpartition(".")[0]
     own = [each[len(section) + bool(section) :] for each in known if each.startswith(section)]
-    if near := _meant(key, sorted({each.partition(".")[0] for each in own} - {key})):
+    if near := meant(key, sorted({each.partition(".")[0] for each in own} - {key})):
         return near
     last = {each: each.rpartition(".")[2] for each in known if each.partition(".")[0] != section}
     alike = difflib.get_close_matches(key, set(last.values()), n=1, cutoff=0.8)
     return _or(sorted(each for each, part in last.items() if [part] == alike)) or "; --cfg job shows all keys"
 
 
-def _meant(key: str, known: list[str]) -> str:
+def meant(key: str, known: list[str]) -> str:
     """The names that `key` looks like, or is the initials of, as a question; "" if there is none."""
     initials = [name for name in known if "_" in name and "".join(w[:1] for w in name.split("_")) == key]
     return _or(initials or difflib.get_close_matches(key, known, n=3))
