@@ -169,6 +169,7 @@ def test_a_population_that_is_killed_comes_to_the_same(agent: str, seeds: int, t
 @pytest.mark.slow
 def test_the_memory_of_a_long_sweep_stays_flat(tmp_path: Path) -> None:
     words = ("-m", "agent=ppo", "seed=range(40)", *RUNS, "total_timesteps=512", "hydra.sweeper.population=4")
+    words += ("hydra/launcher=basic",)  # in the sweep's own process
     sizes: dict[int, int] = {}  # bytes, by the number of runs that are done
     with start("train.py", *words, "hydra.sweep.dir=long", cwd=tmp_path) as process:
         while process.poll() is None:

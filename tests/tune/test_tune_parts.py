@@ -56,7 +56,11 @@ from gridworld.tune.study_folder import SEARCH_JSON, is_claimed
 from gridworld.tune.study_spec import ConfFolders, StudySpec, compose_study
 from gridworld.tune.workers import SearchError, Workers
 
-SPACES = sorted(file.stem for file in (CONF / "tune").glob("*.yaml"))
+SPACES = sorted(
+    file.stem
+    for file in (CONF / "agent").glob("*.yaml")
+    if not file.stem.endswith("_sb3_defaults") and file.stem != "value_iteration"
+)
 FOLDERS = ConfFolders(CONF)
 TOTAL = 1000
 ONE_SEED = st.builds(
@@ -87,8 +91,7 @@ def test_the_score_of_known_seeds() -> None:
     seeds = [SeedScore(0, 500, 0.0), SeedScore(1, 250, 0.0), SeedScore(2, None, 1.0)]
     assert score(seeds, TOTAL, 3) == pytest.approx((1 + (0.25 + 0.125 + 0.75) / 3) / 4)
     assert score(seeds[:1], TOTAL, 3) == pytest.approx(0.25 / 4)
-    less_regret = [dataclasses.replace(seeds[2], regret=0.5)]
-    assert score(less_regret, TOTAL, 3) < score(seeds[2:], TOTAL, 3)
+    assert score([SeedScore(2, None, 0.5)], TOTAL, 3) < score(seeds[2:], TOTAL, 3)
 
 
 @pytest.mark.parametrize("name", SPACES)
@@ -98,17 +101,9 @@ def test_a_shipped_space_holds_the_shipped_settings_and_suggests_what_can_train(
     assert first is not None
     assert with_values(asked.base, asked.space.values(first)) == asked.base
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
-    for _ in range(20):
+    for _ in range(60):
         suggested = asked.space.values(study.ask(asked.space.distributions).params)
         check_settings(with_values(asked.base, suggested))
-
-
-def test_every_batch_of_ppo_divides_every_rollout() -> None:
-    asked = compose_study(FOLDERS, ["agent=ppo"])
-    keys = ("agent.n_steps", "agent.batch_size")
-    lists = [asked.space.dimensions[key].choices or [] for key in keys]
-    for choice in itertools.product(*lists):
-        check_settings(with_values(asked.base, dict(zip(keys, choice, strict=True))))
 
 
 def test_choices_that_need_each_other_are_no_mistake() -> None:
@@ -118,12 +113,6 @@ def test_choices_that_need_each_other_are_no_mistake() -> None:
         SearchSpace(batch, "own").check(base, check_settings(base))
     rollout = {"agent.n_steps": DimensionConfig("categorical", choices=[3, 16])}
     SearchSpace(batch | rollout, "own").check(base, check_settings(base))
-
-
-def test_there_is_a_space_for_every_agent_that_learns() -> None:
-    agents = {file.stem for file in (CONF / "agent").glob("*.yaml")}
-    learn = {name for name in agents if not name.endswith("_sb3_defaults")} - {"value_iteration"}
-    assert set(SPACES) == learn
 
 
 def test_lists_and_arguments_of_a_class_can_be_searched() -> None:
@@ -205,21 +194,9 @@ def test_trials_and_seeds_that_train_together_are_those_that_train_one_by_one(
     alone = [reported(objective, {number: rate}) for number, rate in enumerate(RATES)]
     assert [outcome for found, _ in alone for outcome in found] == outcomes
     assert [report for _, found in alone for report in found] == reports
-
-
-def test_final_runs_that_train_together_are_those_alone() -> None:
-    base = configure(*SHORT["ppo"], "total_timesteps=512")
-    objective = Objective(base, (0,), 4, None)
-    runs: dict[str, Any] = {
-        f"{rate} {seed}": ({"agent.learning_rate": rate}, (seed,)) for rate in (0.01, 0.02) for seed in (7, 8)
-    }
-    runs["fails"] = {"agent.learning_rate": 1e30}, (7,)
-    outcomes = Trials(objective, runs)(lambda message: None)
-    found = dict(zip(runs, outcomes, strict=True))
-    assert "diverged" in found.pop("fails").error
-    for name, outcome in found.items():
-        values, (seed,) = runs[name]
-        assert outcome.seeds == [run_alone(learning(objective.config(values), seed))]
+    assert outcomes[0].seeds == [
+        run_alone(learning(objective.config({"agent.learning_rate": RATES[0]}), seed)) for seed in range(3)
+    ]
 
 
 class Inline(Workers):
@@ -293,10 +270,7 @@ def test_a_trial_that_is_worse_than_the_median_is_pruned(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("words", [["tune.sampler=tpe"], ["tune.sampler=random"], ["tune.pruner=hyperband"]])
-@pytest.mark.parametrize("killed", [(0, 1, 1), (3, 11)])
-def test_a_search_of_one_worker_is_the_same_however_it_was_stopped(
-    words: list[str], killed: tuple[int, ...], tmp_path: Path
-) -> None:
+def test_a_search_of_one_worker_is_the_same_however_it_was_stopped(words: list[str], tmp_path: Path) -> None:
     def searched(name: str, kills: Sequence[int]) -> list[tuple[Any, ...]]:
         calls = itertools.count()
 
@@ -317,7 +291,7 @@ def test_a_search_of_one_worker_is_the_same_however_it_was_stopped(
     calm = searched("calm", ())
     assert len(calm) == 14
     assert len({str(trial[1]) for trial in calm}) == 14
-    assert searched("killed", killed) == calm
+    assert searched("killed", (0, 1, 1, 3, 11)) == calm
 
 
 def told(trial: FrozenTrial) -> tuple[Any, ...]:
@@ -382,12 +356,12 @@ def test_a_task_whose_worker_is_killed_is_run_again_until_it_has_killed_four(
     assert capsys.readouterr().err.count("a worker was lost (exit code -9)") == 5
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 7, 40])
-@pytest.mark.parametrize("can_join", [True, False])
-def test_workers_share_all_runs(count: int, can_join: bool) -> None:
-    shares = list(Workers(count, True).shares(range(60), can_join))
-    assert [run for share in shares for run in share] == list(range(60))
-    assert max(map(len, shares)) == (min(32, math.ceil(60 / count)) if can_join else 1)
+@given(st.integers(1, 40), st.integers(0, 80), st.booleans())
+def test_workers_share_all_runs(count: int, runs: int, can_join: bool) -> None:
+    shares = list(Workers(count, True).shares(range(runs), can_join))
+    assert [run for share in shares for run in share] == list(range(runs))
+    assert max(map(len, shares), default=1) <= (32 if can_join else 1)
+    assert len(shares) <= max(count, math.ceil(runs / (32 if can_join else 1)))
 
 
 def test_a_database_that_goes_away_is_one_sentence(tmp_path: Path) -> None:
