@@ -48,11 +48,11 @@ class SlurmConfig:
     """`hydra/launcher=slurm`; all but the first two are submitit's, by its names."""
 
     _target_: str = "gridworld.sweep.launchers.slurm"
-    jobs_per_task: int = 1
-    array_parallelism: int = 256
-    timeout_min: int = 60
-    signal_delay_s: int = 60
-    cpus_per_task: int = 1  # cores
+    jobs_per_task: int = field(default=1, metadata=bounds(1))
+    array_parallelism: int = field(default=256, metadata=bounds(1))
+    timeout_min: int = field(default=60, metadata=bounds(1))
+    signal_delay_s: int = field(default=60, metadata=bounds(1))
+    cpus_per_task: int = field(default=1, metadata=bounds(1))  # cores
     mem_gb: Optional[float] = None  # noqa: UP045
     partition: Optional[str] = None  # noqa: UP045  # of Slurm's, and so below; null: the default
     account: Optional[str] = None  # noqa: UP045  # that pays

@@ -19,8 +19,8 @@ from typing import Any
 from gridworld.config.fields import Effect
 from gridworld.config.settings import ON_RESULT, effect_of, flat, with_effects
 from gridworld.envs.rollout import wilson_interval
-from gridworld.errors import InputError, reason
-from gridworld.process.console import aligned, command, command_line, duration, printable, tell_error
+from gridworld.errors import InputError
+from gridworld.process.console import aligned, command, command_line, duration, printable
 from gridworld.run.reader import read_run
 from gridworld.sweep.folder import DONE, FAILED, INTERRUPTED, JOBS_CSV, PENDING, RUNNING, STATUSES, JobRow
 
@@ -28,7 +28,7 @@ _HEADINGS = ("agent", "task", "settings", "certified", "steps to certificate, me
 _OF_SETTINGS = ON_RESULT - {Effect.SEED, Effect.LABELS, Effect.MACHINE}
 _MOST_NAMED = 3  # jobs
 _LONGEST = 60  # characters of settings
-_MOST_LISTED = 50  # of a kind, on the terminal; jobs.csv has them all
+_MOST_LISTED = 50  # of a kind, on the terminal
 
 
 def counts_text(rows: Iterable[JobRow]) -> str:
@@ -47,46 +47,33 @@ def tell_end(
     folder: Path, rows: Sequence[JobRow], seconds: float, stopped: str, mistakes: Container[str]
 ) -> None:
     """Print the results, how the jobs stand, why some did not end well, and how to go on with the rest."""
-    print(f"sweep {shell_path(folder)}: {counts_text(rows)}, in {duration(seconds)}")
-    results = results_lines(folder, rows)
-    for line in ("", *results[: _MOST_LISTED + 1], "") if results else ():
-        print(printable(f"  {line}".rstrip()))
-    if len(results) > _MOST_LISTED + 1:
-        print(f"  and {len(results) - _MOST_LISTED - 1} more; the report has all")
-    print(f"  jobs: {shell_path(folder / JOBS_CSV)}\n  curves: tensorboard --logdir {shell_path(folder)}")
-    if results:
-        print(f"  report: {command('report')} {shell_path(folder)}")
-    sys.stdout.flush()
+    where, results = shell_path(folder), results_lines(folder, rows)
+    lines = [f"sweep {where}: {counts_text(rows)}, in {duration(seconds)}"]
+    lines += ["", *_most(f"  {line}".rstrip() for line in results), ""] if results else []
+    lines += [f"  jobs: {shell_path(folder / JOBS_CSV)}", f"  curves: tensorboard --logdir {where}"]
+    lines += [f"  report: {command('report')} {where}"] if results else []
+    print(*map(printable, lines), sep="\n", flush=True)
     failed = [row for row in rows if row.status == FAILED]
     halted = [row for row in rows if row.error and row.status in (PENDING, INTERRUPTED)]
-    _list("interrupted", halted)
-    _list("failed", failed)
+    lines = []
+    for what, listed in (("interrupted", halted), ("failed", failed)):
+        lines += [f"{what}:", *_most(f"  {row.overrides}: {row.error}" for row in listed)] if listed else []
     if stopped:
-        print(f"{stopped}; go on with: {resume_command(folder)}", file=sys.stderr)
+        lines.append(f"{stopped}; go on with: {resume_command(folder)}")
     elif any(row.job not in mistakes for row in failed):
-        retry = "hydra.sweeper.retry_failed=true"
-        print(f"to try them again: {resume_command(folder, retry)}", file=sys.stderr)
+        lines.append(f"to try them again: {resume_command(folder, 'hydra.sweeper.retry_failed=true')}")
     elif any(row.status == RUNNING for row in rows):
-        print(f"the rest runs elsewhere; to see how it goes: {resume_command(folder)}", file=sys.stderr)
+        lines.append(f"the rest runs elsewhere; to see how it goes: {resume_command(folder)}")
     elif any(row.status not in (DONE, FAILED) for row in rows):
-        print(f"the rest did not come to its end; go on with: {resume_command(folder)}", file=sys.stderr)
-    sys.stderr.flush()
+        lines.append(f"the rest did not come to its end; go on with: {resume_command(folder)}")
+    for line in lines:
+        print(printable(line), file=sys.stderr, flush=True)
 
 
-def _list(what: str, rows: Sequence[JobRow]) -> None:
-    if rows:
-        print(f"{what}:", file=sys.stderr)
-    for row in rows[:_MOST_LISTED]:
-        print(printable(f"  {row.overrides}: {row.error}"), file=sys.stderr)
-    if len(rows) > _MOST_LISTED:
-        print(f"  and {len(rows) - _MOST_LISTED} more; {JOBS_CSV} has all", file=sys.stderr)
-
-
-def tell_stopped_by(error: OSError, folder: Path) -> None:
-    """Print why the sweep cannot go on, such as a full disk, and how to go on once that is put right."""
-    tell_error(
-        f"{shell_path(folder)}: {reason(error)}; put that right, then go on with: {resume_command(folder)}"
-    )
+def _most(lines: Iterable[str]) -> list[str]:
+    first, *rest = list(lines)
+    more = len(rest) - _MOST_LISTED
+    return [first, *rest[:_MOST_LISTED], *([f"  and {more} more; {JOBS_CSV} has all"] if more > 0 else [])]
 
 
 def resume_command(folder: Path, *more: str) -> str:

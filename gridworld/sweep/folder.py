@@ -108,12 +108,7 @@ class SweepFolder:
     @contextlib.contextmanager
     def at_work(self) -> Iterator[None]:
         """Make the folder, and keep other sweeps out of it. Raises `InputError` if one is there."""
-        try:
-            make_folder(self.path)
-        except OSError as error:
-            raise InputError(
-                f"{self.path}: cannot be made ({error.strerror}); choose another hydra.sweep.dir"
-            ) from None
+        make_folder(self.path)
         with locked(self.path / LOCK, wait=1) as is_ours:
             if not is_ours:
                 raise InputError(f"{self.path}: another process runs this sweep; wait for it or stop it")

@@ -17,7 +17,7 @@ from typing import Any
 
 import yaml
 from hydra.core.utils import JobReturn, JobStatus, configure_log
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 
 from gridworld.agents import family
 from gridworld.config.train import AUTO, TrainConfig
@@ -103,16 +103,6 @@ def mark_failed(folder: Path, why: str, trace: str = "") -> None:
 
 
 @dataclass(frozen=True)
-class SweepJob:
-    """A job as its process needs it."""
-
-    planned: Job
-    folder: Path
-    number: int  # among those of this start of the sweep
-    replaces: bool  # a finished run in the folder, which is not the job's result
-
-
-@dataclass(frozen=True)
 class Worker:
     """Runs populations."""
 
@@ -121,19 +111,19 @@ class Worker:
     master: DictConfig  # the configuration of the sweep itself
     callbacks: Any  # Hydra's, if some are the user's
 
-    def __call__(self, jobs: Sequence[SweepJob]) -> list[str]:
+    def __call__(self, jobs: Sequence[Job]) -> list[str]:
         """Run the jobs of a population; returns the error of each, or ""."""
         collect_less_often()
         os.environ.update(self.master.hydra.job.env_set)
         configure_log(self.master.hydra.job_logging, self.master.hydra.verbose)
-        config = jobs[0].planned.config  # all have one device
+        config = jobs[0].config  # all have one device
         asked = self.master.hydra.sweeper.population != AUTO and len(jobs) > 1
         depend = asked and not family(config.agent).on_processor(config.device)
-        with mixing({job.folder.name: job.planned.hash for job in jobs} if depend else {}):
+        with mixing({job.folder.name: job.hash for job in jobs} if depend else {}):
             results = run_together([partial(self._run, job) for job in jobs])
         return [one_line(reason(result)) if isinstance(result, Exception) else "" for result in results]
 
-    def on_node(self, groups: Sequence[Sequence[SweepJob]]) -> list[str]:
+    def on_node(self, groups: Sequence[Sequence[Job]]) -> list[str]:
         """Run populations one after the other on a node of a cluster."""
         errors: list[str] = []
         # SIGUSR2 is Slurm's warning of its time limit. While training is on, it handles SIGTERM itself.
@@ -150,25 +140,22 @@ class Worker:
             pass
         return errors
 
-    def _run(self, job: SweepJob) -> Training[float]:
-        hydra, overrides = self.master.hydra, list(job.planned.overrides)
+    def _run(self, job: Job) -> Training[float]:
+        hydra, overrides = self.master.hydra, list(job.overrides)
         job.folder.mkdir(parents=True, exist_ok=True)
         if hydra.output_subdir is not None:
-            _save(job.planned, job.folder / hydra.output_subdir)
+            _save(job, job.folder / hydra.output_subdir)
         own_folder = contextlib.chdir(job.folder) if hydra.job.chdir else contextlib.nullcontext()
         with called_from(Path(self.where)), own_folder:
             stops = hydra.sweeper.stop_at_first_failure
-            run = run_in_sweep(job.planned.config, job.folder, overrides, stops, job.replaces)
+            run = run_in_sweep(job.config, job.folder, overrides, stops, job.replaces)
             return (yield from run if self.callbacks is None else self._between_callbacks(job, run))
 
-    def _between_callbacks(self, job: SweepJob, run: Training[float]) -> Training[float]:
-        overrides = list(job.planned.overrides)
-        whole = OmegaConf.create(dataclasses.asdict(job.planned.config))
-        with open_dict(whole):
-            whole.hydra = OmegaConf.to_container(self.master.hydra, resolve=False)
-            whole.hydra.runtime.output_dir = str(job.folder)
-            whole.hydra.job.num = job.number
-            whole.hydra.overrides.task = overrides
+    def _between_callbacks(self, job: Job, run: Training[float]) -> Training[float]:
+        overrides, hydra = list(job.overrides), OmegaConf.to_container(self.master.hydra, resolve=False)
+        whole = OmegaConf.create(dataclasses.asdict(job.config) | {"hydra": hydra})
+        whole.hydra.runtime.output_dir, whole.hydra.job.num = str(job.folder), job.number
+        whole.hydra.overrides.task = overrides
         self.callbacks.on_job_start(config=whole, task_function=None)
         done = JobReturn(overrides=overrides, status=JobStatus.FAILED)
         try:

@@ -17,6 +17,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, cast
 
 from hydra.core.config_loader import ConfigLoader
@@ -62,6 +63,10 @@ class Job:
     config: TrainConfig
     memory: int = 0  # bytes, about, that it takes while it trains
     notes: tuple[str, ...] = ()  # what to say before training
+    # Once it is to run:
+    folder: Path = Path()
+    number: int = 0  # among those of this start of the sweep
+    replaces: bool = False  # a finished run in the folder, which is not the job's result
 
     @property
     def shape(self) -> str | None:

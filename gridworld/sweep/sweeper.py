@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
 import os
 import signal
@@ -17,7 +18,7 @@ from omegaconf import DictConfig, open_dict, read_write
 
 from gridworld.config.sweep import SweepConfig
 from gridworld.config.words import prepared
-from gridworld.errors import EXIT_CODE, FolderLostError, InputError
+from gridworld.errors import EXIT_CODE, FolderLostError, InputError, reason
 from gridworld.process.console import ProgressLine, tell, tell_error, time_left
 from gridworld.process.processes import LostError
 from gridworld.process.signals import exiting, signal_name
@@ -25,7 +26,7 @@ from gridworld.run.folder import ERROR_FILE
 from gridworld.storage.atomic_write import make_inside, write_text
 from gridworld.sweep import console
 from gridworld.sweep.folder import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, STOP, JobRow, SweepFolder
-from gridworld.sweep.job import StopSweep, SweepJob, Worker, mark_failed, run_status
+from gridworld.sweep.job import StopSweep, Worker, mark_failed, run_status
 from gridworld.sweep.launchers import Group, Launch, launcher_settings, run_groups
 from gridworld.sweep.plan import Configurations, Job, expand, plan, populations, runs_in_turn
 
@@ -42,9 +43,8 @@ def run_sweep(words: list[str], context: HydraContext, master: DictConfig, setti
     folder = SweepFolder(Path(master.hydra.sweep.dir))
     launcher, own = launcher_settings(master)
     callbacks = context.callbacks if len(master.hydra.callbacks) > _OURS else None
-    if launcher == "forks" and (callbacks is not None or runs_in_turn(settings, master.hydra)):
-        launcher = "basic"
-    if launcher == "joblib" and settings.stop_at_first_failure:
+    in_turn = callbacks is not None or runs_in_turn(settings, master.hydra)
+    if (launcher == "forks" and in_turn) or (launcher == "joblib" and settings.stop_at_first_failure):
         launcher = "basic"
     divide = partial(populations, settings=settings, launcher=launcher, own=own, hydra=master.hydra)
     divide([])  # finds a mistake
@@ -56,11 +56,8 @@ def run_sweep(words: list[str], context: HydraContext, master: DictConfig, setti
         share = f" ({len(mistaken)} of {len(jobs)} jobs cannot run)" if len(jobs) > 1 else ""
         raise InputError(f"{mistaken[0].mistake}{share}")
     folder.check(jobs, settings.extend)
-    counts = Counter(note for job in jobs for note in job.notes)
-    for note, count in counts.most_common(_MOST_NOTES):
+    for note, count in Counter(note for job in jobs for note in job.notes).most_common(_MOST_NOTES):
         tell(f"{note} ({count} of {len(jobs)} jobs)")
-    if len(counts) > _MOST_NOTES:
-        tell(f"and {len(counts) - _MOST_NOTES} more notes on other jobs")
     try:
         with folder.at_work():
             here = folder.path.absolute()
@@ -72,7 +69,9 @@ def run_sweep(words: list[str], context: HydraContext, master: DictConfig, setti
     except ConnectionError:
         raise  # from a cluster, not from a disk
     except OSError as error:
-        console.tell_stopped_by(error, folder.path)
+        again = console.resume_command(folder.path)
+        where = console.shell_path(folder.path)
+        tell_error(f"{where}: {reason(error)}; put that right, then go on with: {again}")
         code = 1
     except FolderLostError as error:
         tell_error(str(error))
@@ -158,19 +157,20 @@ class _Sweep:
 
         def ended(jobs: Group, errors: list[str] | LostError) -> None:
             if isinstance(errors, LostError):
-                lost.update(dict.fromkeys([job.planned.hash for job in jobs], str(errors)))
+                lost.update(dict.fromkeys([job.hash for job in jobs], str(errors)))
                 return
             for job, error in zip(jobs, errors, strict=False):  # there are fewer where it was told to stop
                 self._reasons[job.folder.name] = error
 
         folder = self._folder.path.absolute()
-        found = [[self._sweep_job(job, folder) for job in group] for group in groups]
+        found = [[self._begun(job, folder) for job in group] for group in groups]
         self._run_groups(Launch(self._worker, found, folder / STOP, ended, self._tick))
         return lost
 
-    def _sweep_job(self, job: Job, folder: Path) -> SweepJob:
+    def _begun(self, job: Job, folder: Path) -> Job:
         row = self._rows.pop(self._names[job.hash])
-        return SweepJob(job, folder / row.job, next(self._numbers), row.status == FAILED)
+        number, replaces = next(self._numbers), row.status == FAILED
+        return dataclasses.replace(job, folder=folder / row.job, number=number, replaces=replaces)
 
     def _row(self, job: Job) -> JobRow:
         return self._rows[self._names[job.hash]]
@@ -203,11 +203,7 @@ class _Sweep:
         )
 
     def _text(self, counts: Counter[str]) -> str:
-        ended = counts[DONE] + counts[FAILED]
+        jobs, ended = len(self._jobs), counts[DONE] + counts[FAILED]
         failed = f", {counts[FAILED]} failed" if counts[FAILED] else ""
-        left = time_left(
-            ended - self._ended_before, len(self._jobs) - ended, time.monotonic() - self._started
-        )
-        return (
-            f"sweep: {counts[DONE]} of {len(self._jobs)} jobs done, {counts[RUNNING]} running{failed}{left}"
-        )
+        left = time_left(ended - self._ended_before, jobs - ended, time.monotonic() - self._started)
+        return f"sweep: {counts[DONE]} of {jobs} jobs done, {counts[RUNNING]} running{failed}{left}"

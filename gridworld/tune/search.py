@@ -20,16 +20,20 @@ import warnings
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import optuna
 from optuna.exceptions import ExperimentalWarning, OptunaError
-from optuna.trial import TrialState
+from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
 from gridworld.errors import InputError
 from gridworld.process.console import ProgressLine, tell, time_left
+from gridworld.report.tuning_study import TRIALS_CSV
+from gridworld.storage.atomic_write import write_text
+from gridworld.storage.csv_text import csv_text
 from gridworld.sweep.console import shell_path
 from gridworld.sweep.folder import one_line
 from gridworld.tune.objective import (
@@ -45,7 +49,6 @@ from gridworld.tune.objective import (
     read_score,
 )
 from gridworld.tune.search_space import SearchSpace
-from gridworld.tune.study_folder import write_trials
 from gridworld.tune.study_spec import StudySpec
 from gridworld.tune.workers import SearchError, Workers
 
@@ -56,6 +59,7 @@ _CONNECT_SECONDS = 10
 _LOCKED_SECONDS = 60  # to wait for others at an SQLite file
 _EXAMPLES = "sqlite:////shared/study.db or postgresql://user@host/name"
 _SECONDS_BETWEEN_TABLES = 2.0
+_STATUSES = {TrialState.COMPLETE: "done", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
 _DAMAGE = (
     *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, AssertionError),
     *(SQLAlchemyError, OptunaError),
@@ -281,3 +285,33 @@ class Search:
             return optuna.pruners.HyperbandPruner(min_resource=reports, max_resource=most)
         # Half a seed's budget is given to everybody: until then most have learnt nothing yet.
         return optuna.pruners.MedianPruner(n_warmup_steps=reports // 2)
+
+
+def write_trials(folder: Path, study: optuna.Study, space: SearchSpace, durable: bool = False) -> None:
+    """Write a row per trial, with its values as a run would get them; `durable` as for `replacing`."""
+    rows = []
+    for trial in study.get_trials(deepcopy=False, states=tuple(_STATUSES)):
+        values = space.values(trial.params)
+        rows.append(_row(trial) | {key: values.get(key, "") for key in space.dimensions})
+    head = [*_row(optuna.create_trial(state=TrialState.FAIL)), *space.dimensions]
+    write_text(folder / TRIALS_CSV, csv_text([head, *(list(row.values()) for row in rows)]), durable)
+
+
+def _row(trial: FrozenTrial) -> dict[str, Any]:
+    seeds = trial.user_attrs.get(SEEDS, [])
+    steps = [seed["certified_since"] for seed in seeds if seed["certified_since"] is not None]
+    value = trial.value
+    if trial.state == TrialState.PRUNED and trial.intermediate_values:
+        value = trial.intermediate_values[max(trial.intermediate_values)]
+    duration = trial.duration
+    return {
+        "trial": trial.number,
+        "status": _STATUSES[trial.state],
+        "score": "" if value is None or math.isnan(value) else f"{value:.6f}",
+        "certified": f"{len(steps)}/{len(seeds)}" if seeds else "",
+        "steps": round(fmean(steps)) if steps else "",
+        "regret": f"{fmean(seed['regret'] for seed in seeds):.6g}" if seeds else "",
+        "seconds": "" if duration is None else f"{duration.total_seconds():.2f}",
+        "worker": trial.user_attrs.get(WORKER, ""),
+        "error": trial.user_attrs.get(ERROR, ""),
+    }

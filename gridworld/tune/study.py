@@ -1,27 +1,58 @@
-"""A study from its beginning to its verdict: search, finalists, confirmation."""
+"""A study from its beginning to its verdict, and its folder.
+
+search.json     the study's name and what makes its trials comparable, from its beginning on
+trials.csv      a row per trial that has ended
+study.json      what was searched and what came of it, with the checksum of trials.csv
+confirm/        the held-out runs; see `confirmation`
+experiment/     the winner as a recipe, which train.py takes: recipe=runs/STUDY
+study.db        Optuna's storage, unless tune.storage names another
+.lock           held by the command at work, unless the study is in a database that others share
+
+The tables are made anew from the storage, which may be elsewhere, or be deleted. The report reads them, so
+that it needs neither Optuna nor the database.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
+import math
+import os
 import shlex
 import signal
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import optuna
-from optuna.trial import FrozenTrial
+from omegaconf import OmegaConf
+from optuna.trial import FrozenTrial, TrialState
 
-from gridworld.config.compose import search_path
-from gridworld.config.recipe_file import TRUST, overrides
+from gridworld.config.compose import search_path, without_hydra
+from gridworld.config.fields import Effect
+from gridworld.config.recipe_file import IN_A_STUDY, TRUST, overrides
+from gridworld.config.settings import ON_RESULT, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.console import command, printable, tell
+from gridworld.process.console import command, printable, recorded_command_line, tell
 from gridworld.process.processes import can_fork
 from gridworld.process.signals import Interrupted, exiting
+from gridworld.report.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
 from gridworld.report.writer import write_over_seeds
-from gridworld.run.folder import LOCK
-from gridworld.storage.atomic_write import is_locked
+from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, alone_in, check_writable
+from gridworld.run.provenance import versions
+from gridworld.storage.atomic_write import (
+    check_no_links,
+    is_locked,
+    make_folder,
+    make_inside,
+    noted,
+    tidy,
+    write_json,
+    write_text,
+)
+from gridworld.storage.safe_read import LARGEST_CSV, file_sha256, read_sealed, sealed
 from gridworld.sweep.console import shell_path
 from gridworld.sweep.plan import may_fork
 from gridworld.training.setup import import_for
@@ -40,16 +71,12 @@ from gridworld.tune.confirmation import (
 )
 from gridworld.tune.objective import ERROR, with_values
 from gridworld.tune.search import in_reach, open_study, search, study_url
-from gridworld.tune.study_folder import (
-    at_work_in,
-    check_study_folder,
-    claim,
-    is_claimed,
-    write_recipe,
-    write_study,
-)
-from gridworld.tune.study_spec import StudySpec
+from gridworld.tune.study_spec import ConfFolders, StudySpec, compose_in
 from gridworld.tune.workers import SearchError, Workers
+
+SEARCH_JSON = "search.json"
+_EXPERIMENT, _WINNER = IN_A_STUDY
+_OF_A_RECIPE = ON_RESULT - {Effect.SEED, Effect.MACHINE}
 
 
 def tune(spec: StudySpec) -> None:
@@ -169,3 +196,119 @@ def _confirm(
         "sentence": f"No trial came out better than the settings that the search began from: on {count} "
         f"held-out seeds these are {before.text()}.",
     }
+
+
+def check_study_folder(folder: Path) -> None:
+    """Raise `InputError` for a folder of something else, one that cannot be written, or links in it."""
+    for name, kind in ((MANIFEST, "a single run"), (SWEEP_JSON, "a sweep")):
+        if (folder / name).exists():
+            raise InputError(f"{folder}: is the folder of {kind}; choose another tune.folder")
+    check_writable(folder, "tune.folder")
+    for names in ((), (CONFIRM,), (_EXPERIMENT,)):
+        check_no_links(folder, *names)
+
+
+@contextlib.contextmanager
+def at_work_in(folder: Path, is_shared: bool = False) -> Iterator[None]:
+    """Make the folder and hold it, unless others share the study; one that stays empty is removed."""
+    make_folder(folder)
+    if is_shared:
+        (folder / LOCK).touch()
+    try:
+        with noted(folder / LOCK) if is_shared else alone_in(folder):
+            if not is_shared:
+                tidy(folder)
+            yield
+    finally:
+        with contextlib.suppress(OSError):
+            if [path.name for path in folder.iterdir()] == [LOCK]:
+                (folder / LOCK).unlink()
+            folder.rmdir()
+
+
+def is_claimed(folder: Path, name: str) -> bool:
+    """Whether the folder is the named study's already."""
+    if not os.path.lexists(folder / SEARCH_JSON):
+        return False
+    owner = read_sealed(folder / SEARCH_JSON).get("study")
+    if owner != name:
+        raise InputError(
+            f"{folder}: is the folder of the study {owner}; choose another tune.folder, or tune.study={owner}"
+        )
+    return True
+
+
+def claim(folder: Path, name: str, about: Mapping[str, Any]) -> None:
+    """Write that the folder is this study's."""
+    write_json(folder / SEARCH_JSON, sealed({"study": name, "about": about}), durable=True)
+
+
+def write_study(spec: StudySpec, study: optuna.Study, outcome: dict[str, Any]) -> None:
+    """Write what was searched, and the `outcome`: the winner, the finalists and the confirmation."""
+    content = {
+        "study": spec.name,
+        "agent": spec.base.agent.name,
+        "env": spec.base.env.name,
+        "command": recorded_command_line(),
+        "versions": versions() | {"optuna": optuna.__version__},
+        "total_timesteps": spec.base.total_timesteps,
+        "seeds": list(spec.objective.seeds),
+        "space": spec.space.plain(),
+        "began_from": spec.space.parameters_of(spec.base),
+        "importances": _importances(study),
+        **outcome,
+        TRIALS_SUM: file_sha256(spec.folder / TRIALS_CSV, LARGEST_CSV),
+    }
+    write_json(spec.folder / STUDY_JSON, sealed(content), durable=True)
+
+
+def _importances(study: optuna.Study) -> dict[str, float]:
+    """The importance of each key, by Optuna's PED-ANOVA; empty where there are too few trials for it."""
+    complete = study.get_trials(deepcopy=False, states=[TrialState.COMPLETE])
+    if len(complete) < 4 or len({trial.value for trial in complete}) < 2:
+        return {}
+    evaluator = optuna.importance.PedAnovaImportanceEvaluator()
+    found = optuna.importance.get_param_importances(study, evaluator=evaluator)
+    return {key: round(float(share), 6) for key, share in found.items() if math.isfinite(share)}
+
+
+def write_recipe(
+    folder: Path, folders: ConfFolders, choices: Mapping[str, str], config: TrainConfig, about: str
+) -> Path:
+    """Write the winner as a recipe, and check that it composes to `config` again.
+
+    It names the agent, the world and the observation, and every value in which the winner differs from
+    these. `config.recipe_file` reads it as data. In a study of one's own, Hydra takes it as well:
+    --config-dir runs/STUDY experiment=winner.
+    """
+
+    def composed(words: list[str], more: tuple[Path, ...] = ()) -> dict[str, Any]:
+        own = dataclasses.replace(folders, own=(*folders.own, *more))
+        return _relevant(without_hydra(compose_in(own, "train", words)))
+
+    bare = composed([f"{group}={choice}" for group, choice in choices.items()])
+    values = _difference(bare, _relevant(config))
+    lines = ["# @package _global_", f"# {about}", "defaults:"]
+    lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
+    lines += ["  - _self_", "", OmegaConf.to_yaml(OmegaConf.create(values)) if values else ""]
+    path = make_inside(folder, _EXPERIMENT) / _WINNER
+    write_text(path, "\n".join(lines), durable=True)
+    for words in ([f"experiment={path.stem}"], overrides(path, trust=True)):
+        assert composed(words, (folder,)) == _relevant(config), f"{path} does not say what the winner is"
+    return path
+
+
+def _relevant(config: TrainConfig) -> dict[str, Any]:
+    return with_effects(_OF_A_RECIPE, dataclasses.asdict(config))
+
+
+def _difference(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+    found = {}
+    for key, value in after.items():
+        was = before.get(key)
+        if isinstance(value, dict) and isinstance(was, dict):
+            if inner := _difference(was, value):
+                found[key] = inner
+        elif key not in before or value != was:
+            found[key] = value
+    return found

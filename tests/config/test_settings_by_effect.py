@@ -21,7 +21,7 @@ from gridworld.report.grouping import arrange, learning_key, task_key
 from gridworld.run.provenance import identity, settings_hash
 from gridworld.training.tensorboard import hparams
 from gridworld.tune.search_space import SearchSpace
-from gridworld.tune.study_folder import _relevant, write_recipe
+from gridworld.tune.study import _relevant, write_recipe
 from gridworld.tune.study_spec import ConfFolders
 
 DECLARED = {

@@ -20,7 +20,7 @@ from gridworld.run.reader import read_run
 from gridworld.storage.safe_read import sealed, sha256
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.plan import Job
-from gridworld.tune.study_folder import SEARCH_JSON
+from gridworld.tune.study import SEARCH_JSON
 from gridworld.world.evaluation import Evaluator
 
 _COLUMNS = ("value", "regret", "certified", "goal_probability", "trap_probability", "timeout_probability")

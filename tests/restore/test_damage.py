@@ -38,7 +38,7 @@ from gridworld.storage.safe_read import sealed
 from gridworld.storage.serialization import decode, encode
 from gridworld.sweep.folder import SweepFolder
 from gridworld.tune.confirmation import certified_since
-from gridworld.tune.study_folder import is_claimed
+from gridworld.tune.study import is_claimed
 
 Telling = Callable[[Path], str]  # all that a command makes of a folder; raises `InputError`
 

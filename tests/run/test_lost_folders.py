@@ -178,7 +178,7 @@ def test_two_commands_in_one_folder(tmp_path: Path) -> None:
 
 def test_a_study_that_lost_its_folder_stops(tmp_path: Path) -> None:
     pytest.importorskip("optuna", reason="optuna is not installed (extra `tune`)")
-    from gridworld.tune.study_folder import at_work_in, claim
+    from gridworld.tune.study import at_work_in, claim
 
     folder = tmp_path / "study"
     with at_work_in(folder):

@@ -13,7 +13,7 @@ from gridworld.storage.atomic_write import check_no_links, is_locked, make_insid
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.plan import Job
 from gridworld.tune import confirmation as confirm
-from gridworld.tune.study_folder import check_study_folder
+from gridworld.tune.study import check_study_folder
 
 REFUSED = "is a symbolic link, which is not written through; remove it"
 

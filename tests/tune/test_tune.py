@@ -20,7 +20,7 @@ from optuna.trial import TrialState, create_trial
 from gridworld.commands import report as report_command
 from gridworld.commands import tune as tune_command
 from gridworld.errors import InputError
-from gridworld.tune.study_folder import at_work_in
+from gridworld.tune.study import at_work_in
 
 QUICK = (
     *("agent=q_learning", "total_timesteps=1500", "recording.gif=false", "recording.learning=false"),
@@ -287,11 +287,14 @@ def wait_for_workers(process: int, count: int, but: int = 0) -> list[int]:
     raise AssertionError("no worker is at work")
 
 
-def is_alive(process: int) -> bool:
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+def check_ended(processes: list[int]) -> None:
+    """They are gone, or will be in a moment."""
+    end = time.monotonic() + 10
+    for process in processes:
+        with contextlib.suppress(OSError):
+            while Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z":
+                assert time.monotonic() < end
+                time.sleep(0.02)
 
 
 def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path: Path) -> None:
@@ -305,7 +308,7 @@ def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path
         told = process.stderr.read()  # until the last worker has let go of it
     assert process.returncode == 130
     assert "stopped by SIGINT; nothing that ended is lost; go on with: python" in told
-    assert not any(map(is_alive, others))
+    check_ended(others)
     ended = rows(tmp_path)
 
     again = script("tune.py", *QUICK, *LONG, cwd=tmp_path)
@@ -335,7 +338,7 @@ def test_a_search_of_one_worker_is_the_same_however_it_is_killed(tmp_path: Path)
                 workers = wait_for_workers(process.pid, 1, but=worker)
                 process.kill()
                 process.stderr.read()  # until the last worker has let go of it
-                assert not any(map(is_alive, workers))
+                check_ended(workers)
         done = script("tune.py", *words, cwd=tmp_path / name)
         assert done.returncode == 0, done.stderr
     assert outcome(tmp_path / "killed") == outcome(tmp_path / "calm")
@@ -360,7 +363,7 @@ def test_a_database_that_disappears_is_one_sentence_and_no_worker_is_left(tmp_pa
     assert len(errors) == 1
     assert errors[0].startswith("error: tune.storage=sqlite:////")
     assert not [line for line in told if "Traceback" in line or "Error" in line]
-    assert not any(map(is_alive, workers))
+    check_ended(workers)
 
 
 @pytest.mark.parametrize("threads", [1, 2])  # workers are forks, or new processes

@@ -52,7 +52,7 @@ from gridworld.tune.objective import (
 )
 from gridworld.tune.search import in_reach, open_study, search
 from gridworld.tune.search_space import SearchSpace
-from gridworld.tune.study_folder import SEARCH_JSON, is_claimed
+from gridworld.tune.study import SEARCH_JSON, is_claimed
 from gridworld.tune.study_spec import ConfFolders, StudySpec, compose_study
 from gridworld.tune.workers import SearchError, Workers
 

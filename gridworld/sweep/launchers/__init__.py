@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import shutil
 import threading
@@ -16,18 +17,18 @@ from typing import Any, TypeVar
 
 from omegaconf import DictConfig, OmegaConf
 
+from gridworld.config.train import check_bounds
 from gridworld.errors import InputError, install_command
 from gridworld.process.processes import LostError, can_fork, run_in_processes, worker_count
-from gridworld.sweep.job import StopSweep, SweepJob, Worker
-from gridworld.sweep.plan import may_fork
+from gridworld.sweep.job import StopSweep, Worker
+from gridworld.sweep.plan import Job, may_fork
 from gridworld.training.setup import import_for
 
 # By the launcher: the package that it needs, and commands.
 _NEEDS = {"slurm": ("submitit", ("sbatch", "srun", "squeue", "scancel")), "ray": ("ray", ())}
-_AT_LEAST_ONE = ("jobs_per_task", "array_parallelism", "timeout_min", "cpus_per_task", "signal_delay_s")
 _SECONDS_BETWEEN_TICKS = 1.0
 
-Group = Sequence[SweepJob]
+Group = Sequence[Job]
 Task = TypeVar("Task")  # populations that run on a cluster
 
 
@@ -52,15 +53,13 @@ class Launch:
 
 def launcher_settings(config: DictConfig) -> tuple[str, dict[str, Any]]:
     """The launcher that is chosen, and its settings. Raises `InputError` where it cannot work."""
-    settings = OmegaConf.to_container(config.hydra.launcher)
-    assert isinstance(settings, dict)
-    kind = str(settings.pop("_target_")).rpartition(".")[2]
+    settings: Any = OmegaConf.to_object(config.hydra.launcher)
+    check_bounds(settings, "hydra.launcher.")
+    own = dataclasses.asdict(settings)
+    kind = str(own.pop("_target_")).rpartition(".")[2]
     choice = f"hydra/launcher={config.hydra.runtime.choices['hydra/launcher']}"
-    if settings.get("n_jobs") == 0:
+    if own.get("n_jobs") == 0:
         raise InputError("hydra.launcher.n_jobs=0: must be the number of workers, or -1 for one on each core")
-    for key in _AT_LEAST_ONE:
-        if settings.get(key, 1) < 1:
-            raise InputError(f"hydra.launcher.{key}={settings[key]}: must be at least 1")
     if kind in _NEEDS:
         package, commands = _NEEDS[kind]
         if importlib.util.find_spec(package) is None:
@@ -70,7 +69,7 @@ def launcher_settings(config: DictConfig) -> tuple[str, dict[str, Any]]:
             raise InputError(
                 f"{choice}: there is no {missing[0]} on this machine; start the sweep on one of the cluster's"
             )
-    return "basic" if kind == "forks" and not can_fork() else kind, {str(k): v for k, v in settings.items()}
+    return "basic" if kind == "forks" and not can_fork() else kind, own
 
 
 def run_groups(launch: Launch, launcher: str, own: Mapping[str, Any]) -> None:
@@ -87,11 +86,11 @@ def run_groups(launch: Launch, launcher: str, own: Mapping[str, Any]) -> None:
     apart: list[partial[list[str]]] = []  # in other processes
     here: list[partial[list[str]]] = []  # in this one, when the others have ended
     for group in launch.groups:
-        is_apart = launcher == "joblib" or (launcher == "forks" and may_fork(group[0].planned.config))
+        is_apart = launcher == "joblib" or (launcher == "forks" and may_fork(group[0].config))
         (apart if is_apart else here).append(partial(launch.worker, group))
     if apart:
         if launcher == "forks":
-            import_for(apart[0].args[0][0].planned.config)  # once for all: forks share it
+            import_for(apart[0].args[0][0].config)  # once for all: forks share it
         run_in_processes(
             lambda: apart.pop(0) if apart else None,
             worker_count(own["n_jobs"]),

@@ -14,8 +14,9 @@ from ray.exceptions import RayError, TaskCancelledError
 from gridworld.errors import InputError
 from gridworld.process.processes import LostError
 from gridworld.process.signals import keeping
-from gridworld.sweep.job import StopSweep, SweepJob, Worker
+from gridworld.sweep.job import StopSweep, Worker
 from gridworld.sweep.launchers import Launch, collect
+from gridworld.sweep.plan import Job
 
 _POLL_SECONDS = 1.0
 _ENDED_WITHIN = 1.0  # seconds
@@ -39,7 +40,7 @@ def run(launch: Launch, settings: Mapping[str, Any]) -> None:
         raise
 
 
-def _run(worker: Worker, jobs: list[SweepJob]) -> list[str]:
+def _run(worker: Worker, jobs: list[Job]) -> list[str]:
     return worker.on_node([jobs])
 
 

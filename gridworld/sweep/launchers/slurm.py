@@ -8,8 +8,6 @@ only works where accounting is set up.
 from __future__ import annotations
 
 import contextlib
-import math
-import re
 import subprocess
 import sys
 import time
@@ -37,7 +35,6 @@ SlurmTask = submitit.Job[list[str]]
 def run(launch: Launch, settings: Mapping[str, Any]) -> None:
     """Run populations; see `run_groups`."""
     chunks = _chunks(launch.groups, settings["jobs_per_task"])
-    _refuse_too_many(len(chunks), sum(map(len, launch.groups)))
     folder = make_inside(launch.worker.sweep, _FOLDER)
     tasks = _submit(folder, settings, launch, chunks)
     of_task = [[job for group in chunk for job in group] for chunk in chunks]
@@ -111,18 +108,10 @@ def _submit(
         return executor.map_array(launch.worker.on_node, chunks)
     except (submitit.core.utils.FailedJobError, subprocess.SubprocessError, OSError) as error:
         last = (str(error).strip().splitlines() or [type(error).__name__])[-1]
-        raise InputError(f"hydra/launcher=slurm: Slurm took no jobs ({last})") from None
-
-
-def _refuse_too_many(tasks: int, jobs: int) -> None:
-    answer = subprocess.run(["scontrol", "show", "config"], capture_output=True, text=True, check=False)
-    known = re.search(r"MaxArraySize\s*=\s*(\d+)", answer.stdout)
-    if known and tasks >= (most := int(known.group(1))):
-        fitting = math.ceil(jobs / max(1, most - 1))
         raise InputError(
-            f"hydra/launcher=slurm: {tasks:,} tasks, but this cluster takes {most - 1:,} in an array; "
-            f"let each run several jobs: hydra.launcher.jobs_per_task={fitting}"
-        )
+            f"hydra/launcher=slurm: Slurm took no array of {len(chunks):,} tasks ({last}); there are fewer "
+            "tasks, of more jobs each, by hydra.launcher.jobs_per_task"
+        ) from None
 
 
 def _cancel(array: str) -> None:
