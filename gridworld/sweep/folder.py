@@ -17,6 +17,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path, PurePath
+from types import MappingProxyType
 from typing import Any
 
 from gridworld.errors import InputError
@@ -39,18 +40,14 @@ from gridworld.sweep.plan import Job
 
 JOBS_CSV = "jobs.csv"
 STOP = ".stop"  # in the sweep's folder: no more jobs begin, wherever they wait
-PENDING, RUNNING, DONE, FAILED, INTERRUPTED = STATUSES = (
-    "pending",
-    "running",
-    "done",
-    "failed",
-    "interrupted",
-)
+STATUSES = ("pending", "running", "done", "failed", "interrupted")
+PENDING, RUNNING, DONE, FAILED, INTERRUPTED = STATUSES
 _OF_A_RUN = {"finished": DONE, "failed": FAILED}  # by the manifest's status; any other was interrupted
 _JOB = re.compile(r"[\w=+,-][\w.,=+-]*", re.ASCII)  # as `folder_name` makes them: no other folder
 _LONGEST_NAME = 100  # characters of a job's folder
 _HASH_SHOWN = 6  # characters of the hash in a name that needs it
 _SEED = re.compile(r"\+*seed=")
+_NONE: Mapping[str, Any] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -139,7 +136,7 @@ class SweepFolder:
         return [self.entries[job.hash] for job in jobs]
 
     def rows(
-        self, reasons: Mapping[str, str] | None = None, ended: Mapping[str, JobRow] | None = None
+        self, reasons: Mapping[str, str] = _NONE, ended: Mapping[str, JobRow] = _NONE
     ) -> dict[str, JobRow]:
         """The rows of all jobs, as their folders have them.
 
@@ -147,13 +144,13 @@ class SweepFolder:
             reasons: why jobs cannot go on, which no folder has: a full disk, say.
             ended: rows that cannot change any more, and are not made anew.
         """
-        known = dict(ended or {})
+        found = {}
         for entry in self.entries.values():
-            if entry.job not in known:
-                row = job_row(self.path / entry.job, entry)
-                reason = (reasons or {}).get(entry.job, "") if row.status in (PENDING, INTERRUPTED) else ""
-                known[entry.job] = dataclasses.replace(row, error=row.error or reason)
-        return {entry.job: known[entry.job] for entry in self.entries.values()}
+            row = ended.get(entry.job) or job_row(self.path / entry.job, entry)
+            if row.status in (PENDING, INTERRUPTED) and not row.error:
+                row = dataclasses.replace(row, error=reasons.get(entry.job, ""))
+            found[entry.job] = row
+        return found
 
     def write(self, rows: Mapping[str, JobRow]) -> None:
         """Write jobs.csv anew."""
@@ -204,14 +201,13 @@ def job_row(folder: Path, entry: JobEntry | None = None) -> JobRow:
         if status in (PENDING, INTERRUPTED) and is_locked(folder / LOCK):
             return dataclasses.replace(row, status=RUNNING)
         if run is None:
-            reason = _first_line(folder / ERROR_FILE)
-            return dataclasses.replace(row, status=FAILED if reason else PENDING, error=reason)
-        row = dataclasses.replace(row, status=status, **_outcome(run))
+            error = _first_line(folder / ERROR_FILE)
+            return dataclasses.replace(row, status=FAILED if error else PENDING, error=error)
         if status == DONE and entry is not None and (other := _other_job(run.manifest, entry)):
-            return dataclasses.replace(row, status=FAILED, objective="", error=other)
+            return dataclasses.replace(row, status=FAILED, error=other)
+        return dataclasses.replace(row, status=status, **_outcome(run))
     except InputError as damage:  # a damaged file counts as a failed run's
         return dataclasses.replace(row, status=FAILED, error=one_line(damage))
-    return row
 
 
 def _outcome(run: RunReader) -> dict[str, str]:

@@ -226,10 +226,10 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda sweep: in_json(sweep / "sweep.json", jobs=[JOB, JOB | {"hash": "2"}]),
         r"error: .*sweep.json: damaged \(two jobs have one folder, or one hash\)",
     ),
-    "jobs.csv is a pipe": (lambda sweep: pipe(sweep / "jobs.csv"), "3 jobs: 2 pending, 1 done"),
+    "jobs.csv is a pipe": (lambda sweep: pipe(sweep / "jobs.csv"), "3 jobs: 1 pending, 1 done, 1 failed"),
     "jobs.csv is huge": (
         lambda sweep: (sweep / "jobs.csv").write_text('job,overrides\n"' + 10**6 * "x"),
-        "3 jobs: 2 pending, 1 done",
+        "3 jobs: 1 pending, 1 done, 1 failed",
     ),
     "summary.json is a pipe": (
         lambda sweep: pipe(sweep / "seed=0" / "summary.json"),

@@ -175,51 +175,20 @@ def test_a_search_that_comes_to_nothing_is_no_mistake_of_the_command_line(
     assert told == "error: study: no trial came to a score; all 1 failed, the first: training diverged"
 
 
-FLOAT = "agent.learning_rate: {type: float, low: 1e-3, high: 1e-2}"
+def refused(title: str) -> list[list[str]]:
+    """The cases of a section of `refused.txt`."""
+    sections = Path(__file__).with_name("refused.txt").read_text("utf-8").split("\n\n")
+    lines = next(section for section in sections if section.startswith(f"# {title}:")).splitlines()
+    return [line.split("  =>  ") for line in lines[1:]]
 
 
-@pytest.mark.parametrize(
-    ("yaml", "sentence"),
-    [
-        (f"\n{FLOAT}", "Key 'agent.learning_rate' not in 'TuneConfig'"),  # no line that says where it goes
-        ("", "there is nothing to search"),
-        ("agent.x: {type: float\n b", "bad.yaml: line 3, column 3: is not valid YAML"),
-        ("agent.gamma: 3", "int is not a subclass of DimensionConfig"),
-        ("agent.gamma: {type: flaot, low: 0, high: 1}", "type=flaot must be"),
-        ("agent.gamma: {type: float, lo: 0}", "Key 'lo' not in 'DimensionConfig'"),
-        ("agent.gamma: {type: float, low: 1, high: 0}", "takes two numbers, low=1.0 below high=0.0"),
-        ("agent.gamma: {type: float, low: 0, high: 1, log: true}", "`low > 0` must hold"),
-        ("agent.gamma: {type: float, low: 0, high: 1, step: 0.3}", "is not divisible by `step`"),
-        ("agent.gamma: {type: categorical, low: 1}", "a list of different values"),
-        ("n_envs: {type: int, low: 1.5, high: 3}", "takes whole numbers"),
-        ("n_envs: {type: categorical, choices: [many]}", "n_envs=many"),
-        ("agent.gamma: {type: float, low: 0.5, high: 5}", "agent.gamma=5.0: must be from"),
-        (
-            "agent.learning_rate: {type: float, low: -3, high: -1}",
-            "tune=bad: agent.learning_rate=-3.0: must be a number of at least 0",
-        ),
-        (
-            "agent.learning_rate: {type: categorical, choices: [0.1, abc]}",
-            "tune=bad: agent.learning_rate=abc",
-        ),
-        (
-            "observation.kind: {type: categorical, choices: [one_hot, coordinates]}",
-            "tune=bad: observation=one_hot: agent=q_learning keeps a table",
-        ),
-        ("agent.gama: {type: float, low: 0, high: 1}", "agent.gama"),
-        ("env.slip: {type: float, low: 0, high: 1}", "is part of the task"),
-        (
-            "checkpoint.every: {type: int, low: 100, high: 1000}",
-            "checkpoint.every: changes nothing about what is learnt",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("yaml", "sentence"), refused("search space"))
 def test_a_search_space_that_makes_no_sense(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, yaml: str, sentence: str
 ) -> None:
     (tmp_path / "tune").mkdir()
-    head = "" if yaml.startswith("\n") else "# @package tune.space\n"
-    (tmp_path / "tune" / "bad.yaml").write_text(head + yaml)
+    head = "" if yaml.startswith("# @") else "# @package tune.space\n"
+    (tmp_path / "tune" / "bad.yaml").write_text(head + yaml.replace("|", "\n"))
     monkeypatch.setattr("gridworld.tune.search_space._CORNERS", 5)  # it goes with none of them
     told = refusal(monkeypatch, tmp_path, "agent=q_learning", "tune=bad", "--config-dir", ".")
     assert sentence in told
@@ -227,29 +196,11 @@ def test_a_search_space_that_makes_no_sense(
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["agent=nobody"], "agent=nobody: there is no such choice; there are a2c"),
-        (["agent=value_iteration"], "tune=value_iteration: there is no such choice; there are a2c"),
-        (["agent=dqn,ppo"], "agent=dqn,ppo: a study searches from one configuration"),
-        (["tune.trails=3"], "Key 'trails' not in 'TuneConfig'; did you mean trials"),
-        (["tune.trials=0"], "tune.trials=0: must be at least 1"),
-        (["tune.pruner=axe"], "tune.pruner=axe: must be median, hyperband or none"),
-        (["tune.storage=nonsense"], "tune.storage=nonsense: is no URL of a database"),
-        (["tune.storage=sqlite:///:memory:"], "in memory; name a file, e.g. sqlite:////shared"),
-        (["tune.storage='sqlite:///file:x?mode=memory&uri=true'"], "is a database in memory"),
-        (["tune.storage=sqlite:////no/such/x.db"], "cannot be reached (unable to open database file)"),
-        (["tune.storage=postgresql://me:secret@127.0.0.1:1/x"], "tune.storage=postgresql://me:***@127.0.0.1"),
-        (["tune.study=a/b"], "tune.study=a/b: must be of letters"),
-        (["hydra.run.dir=x"], "tune.py makes its own folder"),
-        (["--config-dir", "nowhere", "env=cliff"], "--config-dir nowhere: no such folder"),
-    ],
-)
+@pytest.mark.parametrize(("words", "sentence"), refused("command line"))
 def test_a_command_line_that_cannot_be_meant(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], sentence: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, sentence: str
 ) -> None:
-    told = refusal(monkeypatch, tmp_path, "agent=q_learning", "env=classic", *words)
+    told = refusal(monkeypatch, tmp_path, "agent=q_learning", "env=classic", *words.split())
     assert sentence in told
     assert "secret" not in told
     assert not list(tmp_path.glob("runs/*"))

@@ -24,6 +24,7 @@ from helpers.worker_tasks import Killed
 from hypothesis import given
 from hypothesis import strategies as st
 from optuna.trial import FrozenTrial, TrialState, create_trial
+from test_tune import refused
 
 from gridworld.config.sweep import DimensionConfig
 from gridworld.errors import InputError
@@ -200,25 +201,17 @@ def test_trials_and_seeds_that_train_together_are_those_that_train_one_by_one(
 
 
 class Inline(Workers):
-    """Runs tasks in this process; in place of trials, a function of their values where there is one."""
+    """In place of trials, a function of their values; None is for a task that has killed its workers."""
 
-    def __init__(self, function: Callable[[Any, Callable[[Any], bool]], Outcome] | None = None) -> None:
+    def __init__(self, function: Callable[[Any, Callable[[Any], bool]], Outcome | None]) -> None:
         super().__init__(1, True)
         self._function = function
 
-    def run(
-        self,
-        next_task: Any,
-        on_end: Any,
-        answer: Any = lambda message: None,
-        on_tick: Any = lambda: None,
-    ) -> None:
+    def run(self, next_task: Any, on_end: Any, answer: Any = print, on_tick: Any = None) -> None:
         while (task := next_task()) is not None:
-            if self._function is None:
-                on_end(task, task(answer))
-                continue
             trials = task.trials.items()
-            on_end(task, [self._function(values, answer_of(answer, name)) for name, (values, _) in trials])
+            found = [self._function(values, answer_of(answer, name)) for name, (values, _) in trials]
+            on_end(task, None if None in found else found)
 
 
 def answer_of(answer: Callable[[Report], bool], number: int) -> Callable[[Any], bool]:
@@ -239,15 +232,8 @@ def outcome(value: float | None = None, error: str = "") -> Outcome:
 
 def test_what_fails_is_a_trial_with_its_reason_and_the_study_goes_on(tmp_path: Path) -> None:
     answers = iter([outcome(0.5), outcome(error="too\nlarge"), None, outcome(0.25)])
-
-    class Failing(Inline):
-        def run(self, next_task: Any, on_end: Any, *more: Any) -> None:
-            while (task := next_task()) is not None:
-                answer = next(answers)
-                on_end(task, answer and [answer])
-
     spec, study = asked(tmp_path, "tune.trials=4")
-    search(spec, study, Failing())
+    search(spec, study, Inline(lambda *_: next(answers)))
     states = [TrialState.COMPLETE, TrialState.FAIL, TrialState.FAIL, TrialState.COMPLETE]
     assert [trial.state for trial in study.trials] == states
     table = (tmp_path / "trials.csv").read_text()
@@ -325,21 +311,16 @@ def test_a_final_run_that_fails_is_named_and_counted_as_failed(
     spec, study = asked(tmp_path, "tune.trials=1", "tune.final_seeds=3")
     search(spec, study, Inline(lambda values, _: outcome(0.1)))
 
-    class Results(Inline):
-        def run(self, next_task: Any, on_end: Any, *more: Any) -> None:
-            results = [Outcome(error="training diverged"), Outcome(0.1, "", [SeedScore(3, 100, 0.0)]), None]
-            while (task := next_task()) is not None:
-                result = results.pop(0)
-                on_end(task, result and [result])
-
-    (finalist,) = rank_finalists(spec, study, choose_finalists(study, spec), Results())
+    results = iter([Outcome(error="training diverged"), Outcome(0.1, "", [SeedScore(3, 100, 0.0)]), None])
+    ranked = rank_finalists(spec, study, choose_finalists(study, spec), Inline(lambda *_: next(results)))
+    (finalist,) = ranked
     error = capsys.readouterr().err
     assert "trial=0,seed=2 failed, and counts as not certified: training diverged\n" in error
     assert (
         "trial=0,seed=4 failed, and counts as not certified: the workers that ran it were killed\n" in error
     )
     assert (finalist.certified, finalist.seeds, finalist.failed) == (2, 4, 2)
-    assert rank_finalists(spec, study, study.trials, Results()) == [finalist]  # nothing is run again
+    assert rank_finalists(spec, study, study.trials, Inline(lambda *_: next(results))) == ranked
 
 
 def test_a_task_whose_worker_is_killed_is_run_again_until_it_has_killed_four(
@@ -457,25 +438,6 @@ def test_the_verdict_says_which_runs_it_is_without(tmp_path: Path) -> None:
         read_results(winner)
 
 
-TRIALS, ATTRIBUTES = "UPDATE trials SET", "UPDATE trial_user_attributes SET value_json ="
-SQL = {
-    "a score that is no number": "UPDATE trial_values SET value = NULL",
-    "a score of a kind that there is not": "UPDATE trial_values SET value_type = 'x'",
-    "no score": "DELETE FROM trial_values",
-    "a choice that there is not": "UPDATE trial_params SET param_value = 77",
-    "a distribution that is no JSON": "UPDATE trial_params SET distribution_json = '{'",
-    "seeds that are no JSON": f"{ATTRIBUTES} '['",
-    "seeds without a regret": f"{ATTRIBUTES} '[{{\"seed\": 0}}]'",
-    "a state that there is not": f"{TRIALS} state = 'x'",
-    "what it is about, no object": "UPDATE study_user_attributes SET value_json = '[1]'",
-    "what it is about, nested as deep as Python goes": "UPDATE study_user_attributes SET value_json = '"
-    + 10**5 * "["
-    + "'",
-    "final seeds that are none": "INSERT INTO study_user_attributes (study_id, key, value_json) "
-    "VALUES (1, 'final trial=0,seed=9', '3')",
-    "another direction": "UPDATE study_directions SET direction = 'MAXIMIZE'",
-    "a database of nothing": "DROP TABLE studies",
-}
 ABOUT = {"objective": {"seeds": [0, 1]}}
 TWO = SearchSpace(
     {
@@ -504,13 +466,13 @@ def sqlite_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-@pytest.mark.parametrize("what", SQL)
+@pytest.mark.parametrize(("what", "statement"), refused("altered database"))
 def test_a_study_whose_database_was_altered_is_refused_in_a_sentence(
-    what: str, sqlite_study: Path, tmp_path: Path
+    what: str, statement: str, sqlite_study: Path, tmp_path: Path
 ) -> None:
     shutil.copy(sqlite_study, tmp_path / "study.db")
     with contextlib.closing(sqlite3.connect(tmp_path / "study.db")) as database, database:
-        database.execute(SQL[what])
+        database.execute(statement)
     with pytest.raises(InputError, match=r"^tune\.(storage|study)=.*") as caught:
         open_study(f"sqlite:///{tmp_path / 'study.db'}", "mine", ABOUT, TWO, must_exist=True)
     assert "\n" not in str(caught.value)
