@@ -138,11 +138,9 @@ class SweepFolder:
     def rows(
         self, reasons: Mapping[str, str] = _NONE, ended: Mapping[str, JobRow] = _NONE
     ) -> dict[str, JobRow]:
-        """The rows of all jobs, as their folders have them.
+        """The rows of all jobs as their folders have them, but for `reasons` that no folder has.
 
-        Args:
-            reasons: why jobs cannot go on, which no folder has: a full disk, say.
-            ended: rows that cannot change any more, and are not made anew.
+        Those that have `ended` cannot change, and are not made anew.
         """
         found = {}
         for entry in self.entries.values():

@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.hydra_config import HydraConfig
@@ -48,8 +48,6 @@ _OTHER_FILES = 64  # of the process
 _FEWEST = 4  # runs of a population for which another core is taken
 _MOST_BASES = 64
 _NUMBERED = "${hydra.job.num}"  # hydra.sweep.subdir unless it is set; the sweeper has its own names
-# Of Hydra's own part: what all jobs of a sweep have in common.
-_SHARED = ("sweep", "sweeper", "launcher", "callbacks", "job.chdir", "job.env_set", "output_subdir")
 
 
 @dataclass(frozen=True)
@@ -87,15 +85,10 @@ def may_fork(config: TrainConfig) -> bool:
 def expand(
     words: Sequence[str], loader: ConfigLoader, most: int, paired: Sequence[Any] = ()
 ) -> list[tuple[list[str], list[str]]]:
-    """Expand a command line to (overrides, the swept ones among them) of every job.
+    """Expand a command line to (overrides, the swept ones among them) of every job, the last key fastest.
 
-    The last key changes fastest.
-
-    Args:
-        words: the command line's overrides.
-        loader: Hydra's, which knows the groups that `glob` chooses from.
-        most: how many jobs are allowed.
-        paired: keys whose values vary together, or groups of such keys.
+    Hydra's `loader` knows the groups that `glob` chooses from. There may be `most` jobs. `paired` has keys
+    whose values vary together, or groups of such keys.
     """
     lines: dict[str, list[str]] = {}
     swept: dict[str, list[str]] = {}
@@ -167,15 +160,14 @@ class Configurations:
     """
 
     def __init__(self, loader: ConfigLoader, master: DictConfig) -> None:
-        subdir = _plain(master, "sweep")["subdir"]
+        self._loader, self._master, self._shared = loader, master, _shared(master)
+        subdir = self._shared["sweep"]["subdir"]
         if subdir != _NUMBERED:
             raise InputError(
                 f"hydra.sweep.subdir={subdir}: a sweep names the folders of its jobs itself, by the settings "
                 "in which they differ; leave it out"
             )
         HydraConfig.instance().set_config(master)  # settings may refer to it: ${hydra:runtime.cwd}
-        self._loader = loader
-        self._master = master
         self._base = functools.lru_cache(maxsize=_MOST_BASES)(self._by_hydra)
         self._is_group = functools.cache(lambda key: bool(loader.get_group_options(key)))
 
@@ -196,8 +188,8 @@ class Configurations:
 
     def _by_hydra(self, *words: str) -> DictConfig:
         whole = self._loader.load_sweep_config(self._master, list(words))
-        for key in _SHARED:
-            if _plain(whole, key) != _plain(self._master, key):
+        for key, value in _shared(whole).items():
+            if value != self._shared[key]:
                 raise InputError(
                     f"hydra.{key}: is set in a file that only some of the jobs choose, and all jobs of a "
                     "sweep have it in common; choose that file for all, or give it on the command line"
@@ -214,11 +206,11 @@ def _is_value(override: Override) -> bool:
     return is_change and not isinstance(override.value(), dict | list)
 
 
-def _plain(whole: DictConfig, key: str) -> Any:
-    """A part of Hydra's own, unresolved."""
-    *path, last = key.split(".")
-    node = functools.reduce(lambda part, name: part[name], path, whole.hydra)
-    return cast("dict[str, Any]", OmegaConf.to_container(node, resolve=False)).get(last)
+def _shared(whole: DictConfig) -> dict[str, Any]:
+    """Of Hydra's own part, what all jobs of a sweep have in common, unresolved."""
+    own: Any = OmegaConf.to_container(whole.hydra, resolve=False)
+    parts = {key: own[key] for key in ("sweep", "sweeper", "launcher", "callbacks", "output_subdir")}
+    return parts | {f"job.{key}": own["job"][key] for key in ("chdir", "env_set")}
 
 
 def plan(

@@ -196,11 +196,15 @@ def certified_since(folder: Path) -> float | None:
 class HeldOutResults:
     """What the held-out runs of one configuration came to."""
 
-    certified: statistics.Share
     steps: FloatArray  # (seeds,), environment steps until the certificate that held; infinite without one
     total: int  # environment steps of a run
     failed: tuple[str, ...] = ()  # runs that ended by an error: they count as not certified
     left_out: tuple[str, ...] = ()  # runs that have no result; in none of the numbers
+
+    @property
+    def certified(self) -> statistics.Share:
+        """The share of the runs that were certified."""
+        return statistics.share(int(np.isfinite(self.steps).sum()), len(self.steps))
 
     def text(self) -> str:
         """The share certified, and the median step, with their intervals, in a few words."""
@@ -241,12 +245,10 @@ def read_results(runs: Sequence[HeldOutRun]) -> HeldOutResults:
         failed += [run.folder.name] if found is None else []
     if not steps:
         raise InputError(f"{runs[0].folder.parent}: no held-out run has a result; run the command again")
-    share_of = statistics.share(int(np.isfinite(steps).sum()), len(steps))
-    total = runs[0].config.total_timesteps
-    return HeldOutResults(share_of, np.array(steps), total, tuple(failed), tuple(left_out))
+    return HeldOutResults(np.array(steps), runs[0].config.total_timesteps, tuple(failed), tuple(left_out))
 
 
-def verdict_on(winner: HeldOutResults, began_from: HeldOutResults, name: str) -> dict[str, Any]:
+def verdict_on(winner: HeldOutResults, began_from: HeldOutResults) -> dict[str, Any]:
     """Whether the winner is better than what the search began from.
 
     It goes by what the search minimises: first the share certified, then how soon. The latter is the
@@ -262,7 +264,7 @@ def verdict_on(winner: HeldOutResults, began_from: HeldOutResults, name: str) ->
     verdict = ("does not beat", "cannot be told apart from", "beats")[1 + side]
     asked = len(winner.steps) + len(winner.left_out)
     sentence = (
-        f"On {asked} held-out seeds {name} {verdict} the settings that the search began from: "
+        f"On {asked} held-out seeds the winner {verdict} the settings that the search began from: "
         f"{winner.text()}, against {began_from.text()}; a run of it is certified sooner with probability "
         f"{number(sooner.point)} [{number(sooner.low)}, {number(sooner.high)}]."
     )

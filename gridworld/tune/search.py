@@ -48,8 +48,7 @@ from gridworld.tune.objective import (
     Values,
     read_score,
 )
-from gridworld.tune.search_space import SearchSpace
-from gridworld.tune.study_spec import StudySpec
+from gridworld.tune.study_spec import SearchSpace, StudySpec
 from gridworld.tune.workers import SearchError, Workers
 
 # Attributes of the study.

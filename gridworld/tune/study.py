@@ -190,7 +190,7 @@ def _confirm(
         runs = [run for run in runs if is_locked(run.folder / LOCK)]  # another machine is at work on them
     before = read_results(began_from)
     if winner:
-        return verdict_on(read_results(winner), before, "the winner")
+        return verdict_on(read_results(winner), before)
     return {
         "verdict": "is",
         "sentence": f"No trial came out better than the settings that the search began from: on {count} "

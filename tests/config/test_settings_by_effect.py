@@ -20,9 +20,8 @@ from gridworld.report.evidence import Evidence, read
 from gridworld.report.grouping import arrange, learning_key, task_key
 from gridworld.run.provenance import identity, settings_hash
 from gridworld.training.tensorboard import hparams
-from gridworld.tune.search_space import SearchSpace
 from gridworld.tune.study import _relevant, write_recipe
-from gridworld.tune.study_spec import ConfFolders
+from gridworld.tune.study_spec import ConfFolders, SearchSpace
 
 DECLARED = {
     Effect.LENGTH: {"total_timesteps"},

@@ -189,7 +189,7 @@ def test_a_search_space_that_makes_no_sense(
     (tmp_path / "tune").mkdir()
     head = "" if yaml.startswith("# @") else "# @package tune.space\n"
     (tmp_path / "tune" / "bad.yaml").write_text(head + yaml.replace("|", "\n"))
-    monkeypatch.setattr("gridworld.tune.search_space._CORNERS", 5)  # it goes with none of them
+    monkeypatch.setattr("gridworld.tune.study_spec._CORNERS", 5)  # it goes with none of them
     told = refusal(monkeypatch, tmp_path, "agent=q_learning", "tune=bad", "--config-dir", ".")
     assert sentence in told
     assert "\n" not in told

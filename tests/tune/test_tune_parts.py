@@ -28,7 +28,6 @@ from test_tune import refused
 
 from gridworld.config.sweep import DimensionConfig
 from gridworld.errors import InputError
-from gridworld.report import statistics
 from gridworld.storage.safe_read import sealed
 from gridworld.training.setup import check_settings
 from gridworld.training.together import run_alone
@@ -52,9 +51,8 @@ from gridworld.tune.objective import (
     with_values,
 )
 from gridworld.tune.search import in_reach, open_study, search
-from gridworld.tune.search_space import SearchSpace
 from gridworld.tune.study import SEARCH_JSON, is_claimed
-from gridworld.tune.study_spec import ConfFolders, StudySpec, compose_study
+from gridworld.tune.study_spec import ConfFolders, SearchSpace, StudySpec, compose_study
 from gridworld.tune.workers import SearchError, Workers
 
 SPACES = sorted(
@@ -356,9 +354,7 @@ def test_a_database_that_goes_away_is_one_sentence(tmp_path: Path) -> None:
 
 
 def results(*steps: float) -> HeldOutResults:
-    found = np.array(steps, dtype=np.float64)
-    certified = int(np.isfinite(found).sum())
-    return HeldOutResults(statistics.share(certified, len(found)), found, TOTAL)
+    return HeldOutResults(np.array(steps, dtype=np.float64), TOTAL)
 
 
 def test_held_out_runs_of_other_settings_are_other_runs(tmp_path: Path) -> None:
@@ -401,7 +397,7 @@ UNCLEAR = "cannot be told apart from"
     ],
 )
 def test_the_verdict(winner: Sequence[float], began_from: Sequence[float], verdict: str) -> None:
-    found = verdict_on(results(*winner), results(*began_from), "the winner")
+    found = verdict_on(results(*winner), results(*began_from))
     assert found["verdict"] == verdict
     assert f"held-out seeds the winner {verdict} the settings" in found["sentence"]
 
@@ -425,7 +421,7 @@ def test_the_verdict_says_which_runs_it_is_without(tmp_path: Path) -> None:
     manifest = before[0].folder / "manifest.json"
     failed = json.loads(manifest.read_text()) | {"status": "failed", "error": "diverged"}
     manifest.write_text(json.dumps(sealed(failed)))
-    found = verdict_on(read_results(winner), read_results(before), "the winner")
+    found = verdict_on(read_results(winner), read_results(before))
     names = ", ".join(run.folder.name for run in winner[:4])
     assert found["sentence"].startswith("On 6 held-out seeds the winner ")
     assert "certified on 2 of 2 [34 %, 100 %], for good by step 3,000" in found["sentence"]

@@ -34,21 +34,13 @@ Task = TypeVar("Task")  # populations that run on a cluster
 
 @dataclass(frozen=True)
 class Launch:
-    """Populations to run, and what is called meanwhile.
+    """Populations to run, and what is called meanwhile."""
 
-    Args:
-        worker: runs a population.
-        groups: the populations.
-        stop: a file that is there once no more jobs are to begin.
-        ended: called with jobs that have ended, and their errors or a `LostError`; there may be fewer errors.
-        tick: called every now and then.
-    """
-
-    worker: Worker
+    worker: Worker  # runs a population
     groups: Sequence[Group]
-    stop: Path
-    ended: Callable[[Group, list[str] | LostError], None]
-    tick: Callable[[], None]
+    stop: Path  # a file that is there once no more jobs are to begin
+    ended: Callable[[Group, list[str] | LostError], None]  # with the errors of its first jobs
+    tick: Callable[[], None]  # called every now and then
 
 
 def launcher_settings(config: DictConfig) -> tuple[str, dict[str, Any]]:
@@ -73,13 +65,7 @@ def launcher_settings(config: DictConfig) -> tuple[str, dict[str, Any]]:
 
 
 def run_groups(launch: Launch, launcher: str, own: Mapping[str, Any]) -> None:
-    """Run populations.
-
-    Raises:
-        StopSweep: a job failed, and the others are not to begin.
-        SystemExit: a signal stopped them.
-        InputError: the cluster takes no jobs.
-    """
+    """Run populations. Raises `StopSweep`, `SystemExit`, or `InputError` where a cluster takes no jobs."""
     if launcher in _NEEDS:
         import_module(f"gridworld.sweep.launchers.{launcher}").run(launch, own)
         return
@@ -128,15 +114,7 @@ def collect(
     result: Callable[[Task], list[str]],
     seconds: float,
 ) -> None:
-    """Wait until tasks on a cluster have ended, asking every so many seconds. Raises `StopSweep`.
-
-    Args:
-        launch: what they run.
-        tasks: the jobs of each.
-        is_done: whether a task has ended.
-        result: the errors of its jobs; raises `LostError`.
-        seconds: between two looks.
-    """
+    """Wait until tasks on a cluster have ended, asking every so many seconds. Raises `StopSweep`."""
     left = dict(tasks)
     while left:
         launch.tick()
