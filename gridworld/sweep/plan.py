@@ -257,25 +257,29 @@ def plan(
     return list(planned.values())
 
 
+def runs_apart(launcher: str, config: TrainConfig) -> bool:
+    """Whether a job runs in another process on this machine, where there are several."""
+    return launcher == "joblib" or (launcher == "forks" and may_fork(config))
+
+
 def populations(
     jobs: Sequence[Job], settings: SweepConfig, launcher: str, own: Mapping[str, Any], hydra: DictConfig
 ) -> list[list[Job]]:
     """Divide jobs into populations."""
-    workers = worker_count(own["n_jobs"]) if launcher in ("forks", "joblib") else 1
-    memory = free_memory() / _SHARE_OF_MEMORY / workers
     shapes: dict[str, list[Job]] = {}
     for job in jobs:
         shapes.setdefault(job.hash if job.shape is None else f"shape {job.shape}", []).append(job)
     most = 1 if runs_in_turn(settings, hydra) else _most(settings)
     found = []
     for members in shapes.values():
-        in_this_process = launcher == "forks" and not may_fork(members[0].config)
-        share = len(members) if most and in_this_process else math.ceil(len(members) / workers)
+        workers = worker_count(own["n_jobs"]) if runs_apart(launcher, members[0].config) else 1
+        share = math.ceil(len(members) / workers)
         bounds = [most or LARGEST, (file_limit() - _OTHER_FILES) // RUNS_FILES]
         bounds.append(max(share, _FEWEST) if launcher == "forks" else share)
-        if most is None:
-            bounds.append(int(memory / (_RUNS_BYTES + max(job.memory for job in members))))
         bounds.append(own.get("jobs_per_task", len(members)))
+        if most is None:
+            memory = free_memory() / _SHARE_OF_MEMORY / workers
+            bounds.append(int(memory / (_RUNS_BYTES + max(job.memory for job in members))))
         count = math.ceil(len(members) / max(1, min(bounds)))
         if count > workers:
             count = min(len(members), math.ceil(count / workers) * workers)  # so that all end at once

@@ -25,7 +25,7 @@ from gridworld.process.signals import exiting, signal_name
 from gridworld.run.folder import ERROR_FILE
 from gridworld.storage.atomic_write import make_inside, write_text
 from gridworld.sweep import console
-from gridworld.sweep.folder import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, STOP, JobRow, SweepFolder
+from gridworld.sweep.folder import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, JobRow, SweepFolder
 from gridworld.sweep.job import StopSweep, Worker, mark_failed, run_status
 from gridworld.sweep.launchers import Group, Launch, launcher_settings, run_groups
 from gridworld.sweep.plan import Configurations, Job, expand, plan, populations, runs_in_turn
@@ -164,7 +164,7 @@ class _Sweep:
 
         folder = self._folder.path.absolute()
         found = [[self._begun(job, folder) for job in group] for group in groups]
-        self._run_groups(Launch(self._worker, found, folder / STOP, ended, self._tick))
+        self._run_groups(Launch(self._worker, found, ended, self._tick))
         return lost
 
     def _begun(self, job: Job, folder: Path) -> Job:

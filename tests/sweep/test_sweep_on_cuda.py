@@ -178,7 +178,7 @@ def test_a_run_that_went_on_says_with_whom_and_cannot_be_repeated(tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("population", "in_fork", "sizes"), [(8, False, [5, 5]), ("auto", False, [4, 3, 3]), (8, True, [4, 3, 3])]
+    ("population", "in_fork", "sizes"), [(8, False, [5, 5]), ("auto", False, [10]), (8, True, [4, 3, 3])]
 )
 def test_runs_that_no_fork_takes_are_not_divided_among_forks(
     population: int | str, in_fork: bool, sizes: list[int]

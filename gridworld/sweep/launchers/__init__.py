@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from pathlib import Path
 from typing import Any, TypeVar
 
 from omegaconf import DictConfig, OmegaConf
@@ -20,8 +19,9 @@ from omegaconf import DictConfig, OmegaConf
 from gridworld.config.train import check_bounds
 from gridworld.errors import InputError, install_command
 from gridworld.process.processes import LostError, can_fork, run_in_processes, worker_count
+from gridworld.sweep.folder import STOP
 from gridworld.sweep.job import StopSweep, Worker
-from gridworld.sweep.plan import Job, may_fork
+from gridworld.sweep.plan import Job, runs_apart
 from gridworld.training.setup import import_for
 
 # By the launcher: the package that it needs, and commands.
@@ -38,7 +38,6 @@ class Launch:
 
     worker: Worker  # runs a population
     groups: Sequence[Group]
-    stop: Path  # a file that is there once no more jobs are to begin
     ended: Callable[[Group, list[str] | LostError], None]  # with the errors of its first jobs
     tick: Callable[[], None]  # called every now and then
 
@@ -72,8 +71,7 @@ def run_groups(launch: Launch, launcher: str, own: Mapping[str, Any]) -> None:
     apart: list[partial[list[str]]] = []  # in other processes
     here: list[partial[list[str]]] = []  # in this one, when the others have ended
     for group in launch.groups:
-        is_apart = launcher == "joblib" or (launcher == "forks" and may_fork(group[0].config))
-        (apart if is_apart else here).append(partial(launch.worker, group))
+        (apart if runs_apart(launcher, group[0].config) else here).append(partial(launch.worker, group))
     if apart:
         if launcher == "forks":
             import_for(apart[0].args[0][0].config)  # once for all: forks share it
@@ -119,7 +117,7 @@ def collect(
     while left:
         launch.tick()
         time.sleep(seconds)
-        if launch.stop.exists():
+        if (launch.worker.sweep / STOP).exists():
             raise StopSweep("a job failed")
         for task in [task for task in left if is_done(task)]:
             jobs = left.pop(task)
