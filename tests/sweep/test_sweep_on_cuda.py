@@ -19,17 +19,14 @@ from helpers.pages import NO_PICTURES
 from helpers.resuming import differences, go_on, left_behind, stopped_after
 from helpers.stand_in_cuda import stand_in
 from helpers.support import ROOT, configure, script
-from omegaconf import OmegaConf
 
 from gridworld.agents import family
 from gridworld.commands import reproduce as command
-from gridworld.config.sweep import SweepConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.process.together import mixing
 from gridworld.restore.reproduce import population
 from gridworld.run.reader import read_run
-from gridworld.sweep.plan import Job, populations
 from gridworld.training.setup import check_settings, make_context
 
 SMALL = (
@@ -175,19 +172,6 @@ def test_a_run_that_went_on_says_with_whom_and_cannot_be_repeated(tmp_path: Path
         sentence = rf"it was resumed after step 512 {how}, which cannot be repeated"
         with pytest.raises(InputError, match=sentence):
             population(read_run(folder))
-
-
-@pytest.mark.parametrize(
-    ("population", "in_fork", "sizes"), [(8, False, [5, 5]), ("auto", False, [10]), (8, True, [4, 3, 3])]
-)
-def test_runs_that_no_fork_takes_are_not_divided_among_forks(
-    population: int | str, in_fork: bool, sizes: list[int]
-) -> None:
-    config = configure("agent=ppo", f"device={'cpu' if in_fork else 'cuda'}")
-    jobs = [Job((), (), str(n), None, config) for n in range(10)]
-    hydra = OmegaConf.create({"job": {"chdir": None}})
-    groups = populations(jobs, SweepConfig(population=population), "forks", {"n_jobs": 4}, hydra)
-    assert sorted(map(len, groups), reverse=True) == sizes
 
 
 # What cannot be tried out without the device

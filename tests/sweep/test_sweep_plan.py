@@ -15,9 +15,10 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from hypothesis import given
 from hypothesis import strategies as st
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from gridworld.config.compose import register_schemas, to_config
+from gridworld.config.sweep import SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import sentence
 from gridworld.errors import InputError
@@ -26,7 +27,7 @@ from gridworld.run.reader import read_run
 from gridworld.run.writer import RunWriter
 from gridworld.storage.safe_read import read_object
 from gridworld.sweep.folder import folder_name
-from gridworld.sweep.plan import Configurations, Job, expand, plan
+from gridworld.sweep.plan import Configurations, Job, expand, plan, populations
 from gridworld.training.setup import check_settings
 
 
@@ -135,6 +136,34 @@ def test_a_folder_is_named_by_what_makes_its_job_different() -> None:
     assert folder_name(job("+a.b={c: 1e-5}", "~d"), ()) == "a.b=-c-1e-5,d"
     assert folder_name(job("agent=ppo", "seed=3", swept=["seed=3"]), {"seed=3"}) == "agent=ppo,seed=3"
     assert folder_name(job("seed=3", swept=["seed=3"]), {"seed=3"}) == "seed=3,012345"
+
+
+@pytest.mark.parametrize(
+    ("population", "launcher", "device", "files", "sizes"),
+    [
+        (8, "forks", "cpu", 1000, [4, 3, 3]),
+        (8, "forks", "cuda", 1000, [5, 5]),  # which no fork takes
+        ("auto", "forks", "cuda", 1000, [10]),
+        (10, "basic", "cpu", 10, [1] * 10),  # so few may be open
+        (10, "basic", "cpu", 90, [5, 5]),
+        (10, "basic", "cpu", 114, [10]),
+    ],
+)
+def test_jobs_are_divided_into_populations(
+    population: int | str,
+    launcher: str,
+    device: str,
+    files: int,
+    sizes: list[int],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("gridworld.sweep.plan.file_limit", lambda: files)
+    config = configure("agent=ppo", f"device={device}")
+    jobs = [Job((), (), str(number), None, config) for number in range(10)]
+    hydra = OmegaConf.create({"job": {"chdir": None}})
+    groups = populations(jobs, SweepConfig(population=population), launcher, {"n_jobs": 4}, hydra)
+    assert sorted(map(len, groups), reverse=True) == sizes
+    assert [job for group in groups for job in group] == jobs
 
 
 words = st.text(st.characters(min_codepoint=32, max_codepoint=300), max_size=80)

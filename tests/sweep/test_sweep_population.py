@@ -13,18 +13,15 @@ from typing import Any
 
 import pytest
 from helpers.resuming import begin, begin_all, differences, go_on, left_behind
-from helpers.support import ROOT, configure, script, start
+from helpers.support import ROOT, script, start
 from helpers.sweeps import differing, logged, rows
-from omegaconf import OmegaConf
 from test_sweep import WORKERS, wait_for
 
-from gridworld.config.sweep import SweepConfig
 from gridworld.errors import InputError
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.folder import claimed
 from gridworld.storage.append_log import AppendLog
 from gridworld.sweep import plan as plan_module
-from gridworld.sweep.plan import Job
 from gridworld.training.learning_curve import LearningCurve
 
 SMALL = (
@@ -205,18 +202,6 @@ def test_a_run_has_as_many_files_open_as_a_population_reckons_with(
     with claimed(tmp_path / "run"):
         begin(tmp_path / "run", "agent=dqn", *SMALL)
     assert max(most) == plan_module.RUNS_FILES
-
-
-@pytest.mark.parametrize(("files", "largest"), [(10, 1), (90, 5), (114, 10), (sys.maxsize, 10)])
-def test_a_population_has_no_more_runs_than_files_can_be_open(
-    files: int, largest: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(plan_module, "file_limit", lambda: files)
-    jobs = [Job((), (), str(number), None, configure("agent=ppo")) for number in range(10)]
-    hydra = OmegaConf.create({"job": {"chdir": None}})
-    groups = plan_module.populations(jobs, SweepConfig(population=10), "basic", {}, hydra)
-    assert max(map(len, groups)) == largest
-    assert [job for group in groups for job in group] == jobs
 
 
 _WITH_FEW_FILES = """
