@@ -12,12 +12,10 @@ os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # before pygame is imported
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # a second thread waits busily for the next product
 
 import pytest
-from helpers import huge_pages
-from helpers.composing import compose_quickly
+from helpers.quickly import collapse_memory, compose_quickly
 from hypothesis import settings
 
 from gridworld.process import console
-from gridworld.process.memory_budget import collect_less_often
 
 # The package and the tests are compiled once, not in every process.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -100,8 +98,8 @@ def pytest_collection_finish() -> None:
         sys.modules["gridworld.agents.sb3.factory"].keep_compiler_out()
     compose_quickly()
     gc.freeze()
-    collect_less_often()
-    huge_pages.collapse()
+    gc.set_threshold(50_000)
+    collapse_memory()
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -1,26 +1,118 @@
-"""The probes: a row each, from one state up, and what must hold after training, by the solver's numbers."""
+"""The probes: a row each, from one state up, and what must hold after training, by the solver's numbers.
+
+A world is a list with, for every live state and each of its actions, the outcomes (probability, next state,
+reward, whether it ends the episode). An end that leads to a live state's number looks like that state to the
+agent, and does not count as a visit to it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from gridworld.agents import PolicySnapshot
-from gridworld.checking import worlds
-from gridworld.checking.worlds import BONUS
 from gridworld.world.chain import Chain
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
+from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 from gridworld.world.solver import backup, solved
 
 TOLERANCE = 0.1  # of a value, relative to the largest number in the world
 LEAST_BEST = 0.99  # share of late steps with a best action
 PROBABILITY = 0.06  # tolerance of an action's
 _VISITED = 0.05  # share of steps; an actor-critic knows the values of the states that it is in
-_LIMIT = 100
+_LIMIT = 20  # steps of an episode, unless the world says otherwise
+_LONGEST = 100  # steps that a policy is scored over
+# With this bonus the soft optimum of `DEAR_CONTEXTS` is right with probability 3/4. Its advantages then have
+# standard deviation 1, so that normalising them changes nothing.
+PAY = 4 / math.sqrt(3)
+BONUS = PAY / math.log(3)
+GOES_ON, ENDS = False, True
+
+Outcome = tuple[float, int, float, bool]
+
+
+def _world(
+    name: str,
+    rows: Sequence[Sequence[Sequence[Outcome]]],
+    start: Sequence[float] = (1.0,),
+    limit: int = _LIMIT,
+) -> Mdp:
+    """Compile the rows; a number without a row is an end."""
+    entries = [
+        ((state, action, index), outcome)
+        for state, row in enumerate(rows)
+        for action, outcomes in enumerate(row)
+        for index, outcome in enumerate(outcomes)
+    ]
+    size = 1 + max(len(rows) - 1, *(leads_to for _, (_, leads_to, _, _) in entries))
+    shape = size, len(rows[0]), 1 + max(index for (_, _, index), _ in entries)
+    probability, reward, ends = np.zeros(shape), np.zeros(shape), np.ones(shape, dtype=np.bool_)
+    next_state = np.broadcast_to(np.arange(size)[:, None, None], shape).copy()
+    probability[:, :, 0] = 1.0
+    for place, outcome in entries:
+        probability[place], next_state[place], reward[place], ends[place] = outcome
+    begins = np.pad(np.asarray(start), (0, size - len(start)))
+    tables = Outcomes(
+        next_state=next_state, probability=probability, reward=reward, terminated=ends, start=begins
+    )
+    return mdp_from_outcomes(name, tables, max_episode_steps=limit)
+
+
+def _sure(leads_to: int, reward: float, ends: bool) -> list[Outcome]:
+    return [(1.0, leads_to, reward, ends)]
+
+
+def _any(leads_to: int, reward: float, ends: bool) -> list[list[Outcome]]:
+    """Whichever of two actions."""
+    return [_sure(leads_to, reward, ends)] * 2
+
+
+def _two_contexts(name: str, pay: float) -> Mdp:
+    rows = [[_sure(2, pay * (state == action), ENDS) for action in range(2)] for state in range(2)]
+    return _world(name, rows, start=(0.5, 0.5))
+
+
+# Every episode is one step that pays 1.
+CONSTANT = _world("constant", [_any(1, 1, ENDS)])
+# Three steps, whatever the action; the last pays 1.
+CORRIDOR = _world("corridor", [_any(1, 0, GOES_ON), _any(2, 0, GOES_ON), _any(3, 1, ENDS)])
+# One step with three actions, which pay 0, 1 and 0.5.
+BANDIT = _world("bandit", [[_sure(1, pay, ENDS) for pay in (0.0, 1.0, 0.5)]])
+# One step from either of two states, in each of which the other action pays 1, or 4 / √3.
+TWO_CONTEXTS, DEAR_CONTEXTS = _two_contexts("two contexts", 1.0), _two_contexts("dear contexts", PAY)
+# The first action decides whether the fourth step pays 1; those between have no effect.
+_BETWEEN = [_any(state + 2, 0, GOES_ON) for state in (1, 2, 3, 4)]
+_FIRST = [_sure(1, 0, GOES_ON), _sure(2, 0, GOES_ON)]
+DELAY = _world("delay", [_FIRST, *_BETWEEN, _any(7, 1, ENDS), _any(7, 0, ENDS)])
+# Two steps, the second pays 1 and ends in what looks like the start.
+END_LIKE_THE_START = _world("end like the start", [_any(1, 0, GOES_ON), _any(0, 1, ENDS)])
+# One state that pays 1 a step; only a step limit of 5 ends an episode.
+ENDLESS = _world("endless", [_any(0, 1, GOES_ON)], limit=5)
+# One step: action 0 pays 0.1, action 1 pays 1 with probability 0.4.
+GAMBLE = _world("gamble", [[_sure(1, 0.1, ENDS), [(0.4, 1, 1.0, ENDS), (0.6, 1, 0.0, ENDS)]]])
+# Two states; action 1 goes to the other one, which pays 1 on the way from state 1 to state 0.
+ALTERNATION = _world(
+    "alternation",
+    [[_sure(0, 0, GOES_ON), _sure(1, 0, GOES_ON)], [_sure(1, 0, GOES_ON), _sure(0, 1, GOES_ON)]],
+    limit=10,
+)
+# Action 0 pays 0.2 and ends; action 1 costs 0.2 and leads to where action 1 pays 1.
+TRAP = _world(
+    "trap", [[_sure(2, 0.2, ENDS), _sure(1, -0.2, GOES_ON)], [_sure(2, 0, ENDS), _sure(2, 1, ENDS)]]
+)
+# Three cells; action 1 moves on with probability 0.8, else it stays; the last cell pays 1.
+SLIPPERY = _world(
+    "slippery",
+    [
+        [_sure(0, 0, GOES_ON), [(0.8, 1, 0.0, GOES_ON), (0.2, 0, 0.0, GOES_ON)]],
+        [_sure(0, 0, GOES_ON), [(0.8, 2, 1.0, ENDS), (0.2, 1, 0.0, GOES_ON)]],
+    ],
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +145,7 @@ def values(trained: Trained) -> str:
 def optimal(trained: Trained) -> str:
     """Its deterministic policy is optimal from the start, exactly."""
     mdp = trained.mdp
-    score = Evaluator(mdp, trained.gamma, mdp.max_episode_steps or _LIMIT).score(trained.greedy)
+    score = Evaluator(mdp, trained.gamma, mdp.max_episode_steps or _LONGEST).score(trained.greedy)
     if not score.certified:
         actions = trained.greedy.argmax(axis=1)[mdp.reachable & ~mdp.terminal].tolist()
         raise UnmetError(f"its best actions are {actions}, with regret {score.regret:.3g}")
@@ -85,7 +177,7 @@ def acts_at_random(trained: Trained) -> str:
 
 
 def soft_optimal(trained: Trained) -> str:
-    """Its policy is the best one for the reward of its one step and `worlds.BONUS` times its entropy."""
+    """Its policy is the best one for the reward of its one step and `BONUS` times its entropy."""
     gains = np.exp(solved(trained.mdp, trained.gamma).q / BONUS)
     aim = gains / gains.sum(axis=1, keepdims=True)
     return _near(trained.mdp, trained.last.sampled, aim, probability=True)
@@ -133,7 +225,7 @@ class Probe:
     """One question about an implementation."""
 
     name: str  # as the command line has it
-    world: Callable[[], Mdp]  # makes the world that it trains on
+    world: Mdp  # that it trains on
     holds: Callable[[Trained], str]  # after training; raises `UnmetError`, else says what was found
     meaning: str  # what a failure means
     gamma: float = 0.9  # that it trains with
@@ -143,55 +235,55 @@ class Probe:
     @property
     def training(self) -> tuple[str, float, str]:
         """Probes with the same one share a training run."""
-        return self.world.__name__, self.gamma, repr(self.arguments)
+        return self.world.name, self.gamma, repr(self.arguments)
 
 
 _NO_EXPLORATION_LEFT = {"exploration_final_eps": 0.0}
 
 # fmt: off
 PROBES = (
-    Probe("constant", worlds.constant, values,
+    Probe("constant", CONSTANT, values,
           "the value is not learnt at all: its loss, its optimiser or the reward that reaches it"),
-    Probe("discount", worlds.corridor, values,
+    Probe("discount", CORRIDOR, values,
           "gamma is ignored or applied at the wrong step, or a reward belongs to another step",
           gamma=0.5),
-    Probe("choice", worlds.bandit, optimal,
+    Probe("choice", BANDIT, optimal,
           "worse actions are preferred: the sign of the advantage, or rewards beside the wrong actions"),
-    Probe("context", worlds.two_contexts, optimal,
+    Probe("context", TWO_CONTEXTS, optimal,
           "the policy does not depend on the state: observations are lost, mixed up or of another step",
           arguments=_NO_EXPLORATION_LEFT),
-    Probe("behaviour", worlds.two_contexts, acts_as_learnt,
+    Probe("behaviour", TWO_CONTEXTS, acts_as_learnt,
           "it acts otherwise than it has learnt: exploration does not end, or ends late, or it sees another "
           "observation when it acts than when it learns",
           arguments=_NO_EXPLORATION_LEFT),
-    Probe("layers", worlds.two_contexts, all_layers_learn,
+    Probe("layers", TWO_CONTEXTS, all_layers_learn,
           "a layer never changes: it is not in the optimiser, cut off from the gradient or never copied",
           arguments=_NO_EXPLORATION_LEFT),
-    Probe("exploration", worlds.two_contexts, acts_at_random,
+    Probe("exploration", TWO_CONTEXTS, acts_at_random,
           "it explores less than its epsilon says: that is ignored, scaled or starts elsewhere",
           arguments={"exploration_initial_eps": 1.0, "exploration_final_eps": 1.0},
           needs="exploration_final_eps"),
-    Probe("entropy", worlds.dear_contexts, soft_optimal,
+    Probe("entropy", DEAR_CONTEXTS, soft_optimal,
           "the entropy bonus is not what its coefficient says: its sign or scale is wrong, it is missing, or "
           "it is not that of each state's policy",
           arguments={"ent_coef": BONUS}, needs="ent_coef"),
-    Probe("delay", worlds.delay, optimal_with_values,
+    Probe("delay", DELAY, optimal_with_values,
           "credit does not reach earlier steps: returns, traces or next observations are of the wrong step"),
-    Probe("termination", worlds.end_like_the_start, values,
+    Probe("termination", END_LIKE_THE_START, values,
           "values are taken from beyond the end of an episode: the terminal flag is ignored"),
-    Probe("truncation", worlds.endless, values,
+    Probe("truncation", ENDLESS, values,
           "a step limit is treated as an end: the value of the state where it was cut is missing",
           gamma=0.8),
-    Probe("stochastic", worlds.gamble, optimal_with_values,
+    Probe("stochastic", GAMBLE, optimal_with_values,
           "it does not learn the mean of a random reward, but its extreme, its median or its last draw"),
-    Probe("alternation", worlds.alternation, optimal_with_values,
+    Probe("alternation", ALTERNATION, optimal_with_values,
           "the value of the next state is wrong: another state's, or not that of its best action",
           gamma=0.8),
-    Probe("trap", worlds.trap, optimal_with_values,
+    Probe("trap", TRAP, optimal_with_values,
           "the next reward counts for more than the return: what follows is not added, or costs are lost"),
-    Probe("slip", worlds.slippery, optimal_with_values,
+    Probe("slip", SLIPPERY, optimal_with_values,
           "uncertain moves are not averaged over, or next states are not where the world went"),
-    Probe("target", worlds.endless, first_backup,
+    Probe("target", ENDLESS, first_backup,
           "targets are not computed with the target network: it never had an update, the values moved on",
           gamma=0.8, arguments={"target_update_interval": 10_000_000}, needs="target_update_interval"),
 )

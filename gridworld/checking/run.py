@@ -47,17 +47,11 @@ class Finding:
 
 @dataclass(frozen=True)
 class CheckResult:
-    """The findings of all probes on one implementation; its text is their table.
+    """The findings of all probes on one implementation; its text is their table."""
 
-    Attributes:
-        name: of the implementation.
-        findings: in the order of the probes.
-        seconds: of the whole check.
-    """
-
-    name: str
-    findings: tuple[Finding, ...]
-    seconds: float
+    name: str  # of the implementation
+    findings: tuple[Finding, ...]  # in the order of the probes
+    seconds: float  # of the whole check
 
     @property
     def failed(self) -> list[str]:
@@ -121,7 +115,7 @@ def check(
     groups = [list(group) for _, group in itertools.groupby(chosen, lambda probe: probe.training)]
     if (first := settings(config, chosen[0], given)) is not None:
         try:  # what it refuses is the user's mistake, not a finding
-            build(first[0], chosen[0].world(), first[1].num_envs, seed)
+            build(first[0], chosen[0].world, first[1].num_envs, seed)
         except InputError as error:
             raise InputError(str(error).replace("agent.arguments.", "--set ")) from None
     findings: list[Finding] = []
@@ -164,7 +158,7 @@ def _once(config: AgentConfig, given: Mapping[str, Any], seed: int, probes: list
         return [(None, f"takes no {first.needs}")] * len(probes)
     settled, kind = found
     try:
-        trained = train(settled, first.world(), first.gamma, kind.num_envs, kind.steps, seed)
+        trained = train(settled, first.world, first.gamma, kind.num_envs, kind.steps, seed)
     except Exception as error:  # it may be anybody's code
         return [(False, f"training failed: {in_short(error)}")] * len(probes)
     outcomes: Outcomes = []

@@ -18,7 +18,6 @@ from typing import Any
 from gridworld.bounds import Bounds, digits
 from gridworld.errors import EXIT_CODE, InputError, failure
 from gridworld.process.console import CONSOLE, prepare, printing, program, tell_error
-from gridworld.process.memory_budget import collect_less_often
 from gridworld.process.signals import at_work
 
 # By name, in the order of the manual: what it does.
@@ -103,7 +102,6 @@ def run(main: Main) -> None:
 
     So does output that could not be written, whatever exit code `main` ends with.
     """
-    collect_less_often()
     prepare()
     try:
         with at_work(), printing():

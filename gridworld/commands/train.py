@@ -36,15 +36,13 @@ from gridworld.process.console import (
     prepare,
     printable,
     printing,
-    result_is_in_files,
     tell_error,
 )
-from gridworld.process.memory_budget import collect_less_often, limited
+from gridworld.process.memory_budget import limited
 from gridworld.process.signals import at_work
 from gridworld.run.folder import MANIFEST, SWEEP_JSON, alone_in, check_inside, claimed, shown
 from gridworld.run.reader import check_free, check_is_run, is_started
 from gridworld.storage.atomic_write import check_no_links
-from gridworld.storage.safe_read import check_yaml
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 _RESUME, _STEPS = "resume", "total_timesteps"
@@ -57,11 +55,9 @@ class RefuseUsedFolders(Callback):
     """Checks the output folder before Hydra writes to it, and ends the program if it cannot be used."""
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        result_is_in_files()
         _exit_on_error(lambda: _claim_run_folder(config))
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        result_is_in_files()
         _exit_on_error(lambda: check_sweep_folder(config))
         _at_end.push(partial(_sum_up, Path(config.hydra.sweep.dir)))
 
@@ -92,7 +88,6 @@ def _claim_run_folder(config: DictConfig) -> None:
 def main() -> None:
     """Run the command line in `sys.argv`."""
     conf = conf_folder()
-    collect_less_often()
     prepare()
     if {"--help", "-h"} & set(sys.argv[1:]):
         run(lambda _: print(manual(conf)))
@@ -109,7 +104,7 @@ def main() -> None:
             hydra.main(version_base=VERSION_BASE, config_path=str(conf), config_name="train")(run_job)()
     except Exception as error:
         # Until a job starts, whatever goes wrong is the fault of the command line or a yaml file.
-        mistake = isinstance(error, CompactHydraException) or not _job_started.is_set()
+        mistake = isinstance(error, CompactHydraException | InputError) or not _job_started.is_set()
         if asked_for_traceback or not mistake:
             raise
         if isinstance(error, UnicodeDecodeError | RecursionError):
@@ -128,8 +123,6 @@ def _prepare_command_line(conf: Path) -> None:
         from gridworld.config.recipe_file import with_recipe
 
         sys.argv[1:] = with_recipe(sys.argv[1:])
-    for folder in own_conf_folders(sys.argv[1:]):
-        check_yaml(folder)
     sys.argv[1:] = completed(sys.argv[1:], conf)
 
 
@@ -219,7 +212,6 @@ def resume(arguments: Sequence[str]) -> None:
     `total_timesteps=N` makes it longer, `logging.progress=false` hides its progress. `trust=true` imports
     classes from anywhere, `anyway=true` accepts other versions or another processor.
     """
-    result_is_in_files()
     words = _resume_words(arguments)
     total_timesteps = _step_count(words[_STEPS]) if _STEPS in words else None
     progress, trust, anyway = ((words.get(name) or usual) == "true" for name, usual in _SWITCHES.items())

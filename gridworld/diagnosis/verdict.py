@@ -20,8 +20,7 @@ from gridworld.config.settings import check_foreign
 from gridworld.config.train import TrainConfig
 from gridworld.diagnosis.causes import CAUSES, PHRASES
 from gridworld.diagnosis.causes.objective import recommended_gamma
-from gridworld.diagnosis.evidence import Evidence, RegretSplit
-from gridworld.diagnosis.finding import Finding
+from gridworld.diagnosis.evidence import Evidence, Finding, RegretSplit
 from gridworld.envs.rendering import AGENT, INK, Frame, board_of
 from gridworld.errors import InputError
 from gridworld.process.console import command

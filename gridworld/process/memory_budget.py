@@ -7,7 +7,6 @@ number that was read calls `check_memory` first. The variable `GRIDWORLD_BUDGET`
 
 from __future__ import annotations
 
-import gc
 import math
 import os
 import re
@@ -19,7 +18,6 @@ from gridworld.errors import InputError
 
 VARIABLE = "GRIDWORLD_BUDGET"
 _MEGABYTES = {"MB": 1, "GB": 1000}
-_OBJECTS_BETWEEN_COLLECTIONS = 50_000  # 700 is Python's own
 
 _memory: ContextVar[float | None] = ContextVar("memory", default=None)  # bytes; None: no limit yet
 
@@ -76,8 +74,3 @@ def check_memory(what: object, size: float) -> None:
 def _shown(size: float) -> str:
     unit, factor = ("GB", 1e9) if size >= 1e9 else ("MB", 1e6)
     return f"{size / factor:,.3g} {unit}" if size < 1e15 else "more than a million GB"
-
-
-def collect_less_often() -> None:
-    """Set how often garbage is collected in this process: it is a sixth of the time of a short run."""
-    gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)

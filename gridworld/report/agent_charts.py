@@ -12,10 +12,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator
 
 from gridworld.report import chart
-from gridworld.report.analysis import BY_KEY, METRICS, Band, Comparison, Overall, Result, TaskAnalysis
+from gridworld.report.analysis import METRICS, Band, Overall, Result, TaskAnalysis
 from gridworld.report.chart import INK, MUTED, PAPER, Chart, Styles, house_style
 from gridworld.report.setting_charts import sweep_charts, sweeps
 from gridworld.report.statistics import INFINITE, Interval
@@ -143,10 +143,17 @@ def _draw_curves(
     axes.set(ylim=bounds, ylabel=label)
     axes.yaxis.set_major_formatter(form)
     first = -math.inf
-    if levels is None:
-        first = _set_steps(axes, list(bands.values()), log_steps)
-    else:
+    if levels is not None:
         axes.set(xlim=levels, xlabel="optimality: 0 is random, 1 is optimal")
+    else:
+        end = max(1.0, *(float(band.steps[-1]) for band in bands.values()))
+        first = min((float(step) for band in bands.values() for step in band.steps[1:2]), default=end)
+        if log_steps and 0 < first < end:  # it begins at the first after 0
+            chart.log_axis(axes, "x", first, end)
+            axes.set(xlabel="environment steps, logarithmic")
+        else:
+            axes.set(xlim=(0, end), xlabel="environment steps")
+            first = 0.0
     for later, band, look in zip(range(len(bands))[::-1], bands.values(), looks, strict=False):
         steps = np.maximum(band.steps, first)
         values, low, high = (np.clip(numbers, *bounds) for numbers in (band.point, band.low, band.high))
@@ -165,26 +172,10 @@ def _draw_curves(
     return Chart(name, title, description, figure)
 
 
-def _set_steps(axes: Axes, bands: Sequence[Band], log_steps: bool) -> float:
-    """Lay out the axis of the steps; returns its first. A logarithmic one begins at the first after 0."""
-    end = max(1.0, *(float(band.steps[-1]) for band in bands))
-    first = min((float(step) for band in bands for step in band.steps[1:2]), default=end)
-    if not log_steps or first <= 0 or first >= end:
-        axes.set(xlim=(0, end), xlabel="environment steps")
-        return 0.0
-    axes.set_xscale("log")
-    factors = (1, 2, 5) if end < 60 * first else (1, 3) if end < 600 * first else (1,)
-    axes.xaxis.set_major_locator(LogLocator(10, factors))
-    axes.xaxis.set_major_formatter(chart.compact)
-    axes.xaxis.set_minor_locator(NullLocator())
-    axes.set(xlim=(first, end), xlabel="environment steps, logarithmic")
-    return first
-
-
 @house_style()
 def _strip(analysis: TaskAnalysis, key: str, styles: Styles, more: str) -> Chart:
     """A row for each agent: the estimate with its interval, and below it a dot for every seed."""
-    metric = BY_KEY[key]
+    metric = METRICS[key]
     results = [result for result in analysis.results if len(result.samples[key])]
     samples = np.concatenate([result.samples[key] for result in results])
     names = chart.short_names([result.group.agent for result in results], _NAME)
@@ -255,26 +246,28 @@ def overall_charts(overall: Overall, styles: Styles) -> Iterator[Chart]:
         chart.percent,
         levels=(float(levels[0]), 1.0),
     )
-    for metric in METRICS:
-        pairs = [
-            each for each in overall.comparisons if each.metric == metric.key and each.agent < each.other
-        ]
-        if 0 < len(pairs) <= _MOST_PAIRS and any(each.probability.point != 0.5 for each in pairs):
-            yield _improvements(metric.title, pairs, styles)
+    for key in dict.fromkeys(key for key, _, _ in overall.comparisons):
+        pairs = {
+            (one, other): found
+            for (metric, one, other), found in overall.comparisons.items()
+            if metric == key and one < other
+        }
+        if len(pairs) <= _MOST_PAIRS and any(found.point != 0.5 for found in pairs.values()):
+            yield _improvements(METRICS[key].title, pairs, styles)
 
 
 @house_style()
-def _improvements(metric: str, pairs: Sequence[Comparison], styles: Styles) -> Chart:
-    agents = sorted({agent for each in pairs for agent in (each.agent, each.other)})
+def _improvements(metric: str, pairs: Mapping[tuple[str, str], Interval], styles: Styles) -> Chart:
+    agents = sorted({agent for pair in pairs for agent in pair})
     short = dict(zip(agents, chart.short_names(agents, _NAME), strict=True))
     between = " >\n" if 2 * max(map(len, short.values())) + 3 > _NAME else " > "
-    rows = [f"{short[each.agent]}{between}{short[each.other]}" for each in pairs]
+    rows = [f"{short[one]}{between}{short[other]}" for one, other in pairs]
     title = f"Improvement in {metric}"
     figure, axes, _ = chart.figure_of_rows(title, rows, 26.0)
     axes.set(xlim=(0.0, 1.0), xlabel="probability that the first is better")
     axes.axvline(0.5, color=MUTED, linewidth=1, linestyle=(0, (3, 3)), clip_on=False)
-    for row, pair in enumerate(pairs):
-        _draw_interval(axes, row, pair.probability, styles[pair.agent]["color"])
+    for row, ((one, _), found) in enumerate(pairs.items()):
+        _draw_interval(axes, row, found, styles[one]["color"])
     description = (
         "probability that a run of the first agent is better than one of the second, ties half: the mean "
         "over the tasks that both were run on, with 95 % intervals from the stratified bootstrap; at the "

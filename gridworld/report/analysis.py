@@ -20,12 +20,12 @@ from gridworld.report import statistics
 from gridworld.report.evidence import (
     DAMAGED,
     ONLINE,
+    REPORTED,
     SAMPLED_RETURN,
     Evidence,
     Unusable,
     find_runs,
     read,
-    reported,
 )
 from gridworld.report.grouping import Group, Study, arrange
 from gridworld.report.statistics import Interval, Share
@@ -34,8 +34,8 @@ from gridworld.run.reader import read_run, stored_world
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray
 
-GRID_POINTS = 101  # from step 0 to the end of the task's longest run
 MOST_SHOWN = 20  # sentences on standard error; the page has them all
+_GRID_POINTS = 101  # from step 0 to the end of the task's longest run
 _MOST_CELLS = 100_000  # beyond, solving the world again would take longer than the report
 _TOLERANCE = 1e-6  # relative
 _SLOWER = 10  # times, from which on the steps of a task's agents need a logarithmic axis
@@ -54,12 +54,11 @@ class Reference:
     problem: str | None = None  # why they are missing, or in doubt
 
 
-def reference(run: Evidence) -> Reference:
-    """Solve the run's world again, from its manifest. Nothing is raised: `problem` says what is wrong."""
+def _reference(run: Evidence) -> Reference:
+    """Solve the run's world again, from its manifest."""
     try:
         schema = schema_of(run.world)
-        known = {each.name for each in dataclasses.fields(schema)}
-        if unknown := sorted(run.world.keys() - known):
+        if unknown := sorted(run.world.keys() - {each.name for each in dataclasses.fields(schema)}):
             raise ValueError(f"env.{unknown[0]} is not known to this version")
         lines = run.layout.split("\n")
         if len(lines) * max(map(len, lines)) > _MOST_CELLS:
@@ -68,7 +67,7 @@ def reference(run: Evidence) -> Reference:
         check_bounds(env, "env.")
         mdp = stored_world(read_run(run.folder), env)
         evaluator = Evaluator(mdp, run.gamma, env.step_limit(mdp))
-        random = evaluator.score(np.full(evaluator.mdp.probability.shape[:2], 1 / evaluator.mdp.num_actions))
+        random = evaluator.score(np.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions))
     except (ValueError, TypeError, ArithmeticError, np.linalg.LinAlgError) as error:
         # Whatever is wrong with another version's world, the runs' own scores are as good as before.
         return Reference(run.optimal_value, problem=f"its world cannot be built again here ({error})")
@@ -88,10 +87,10 @@ class RunMetric:
 
     key: str
     title: str
-    of: Callable[[Evidence, Reference], float]  # from its task's scale, too; NaN where it has none
+    of: Callable[[Evidence, Reference], float]  # NaN where the run has none
     statistics: tuple[str, ...] = ("mean",)  # over seeds; the first one is drawn
     better: int = 1  # -1 where less is better
-    compared: bool = False  # between agents, as a probability of improvement
+    is_compared: bool = False  # between agents, as a probability of improvement
 
 
 def _optimality(run: Evidence, world: Reference) -> float:
@@ -119,28 +118,20 @@ def _last(column: str) -> Callable[[Evidence, Reference], float]:
     return lambda run, _: float(run.curve[column][-1]) if column in run.curve else math.nan
 
 
-METRICS = (
+# fmt: off
+_METRICS = (
     RunMetric("regret", "final regret", lambda run, _: run.regret, ("iqm", "median", "mean"), -1, True),
-    RunMetric(
-        "steps",
-        "steps to the first certificate",
-        lambda run, _: run.first_certified_step,
-        ("iqm", "median"),
-        better=-1,
-        compared=True,
-    ),
+    RunMetric("steps", "steps to the first certificate", lambda run, _: run.first_certified_step,
+              ("iqm", "median"), -1, True),
     RunMetric("optimality", "optimality", _optimality, ("iqm", "mean")),
-    *(RunMetric(metric.name, metric.label, _last(metric.name)) for metric in reported()),
+    *(RunMetric(metric.name, metric.label, _last(metric.name)) for metric in REPORTED),
     RunMetric("sampled_return", "sampled policy's return", _last(SAMPLED_RETURN)),
     RunMetric("online_return", "on-line return, all of training", lambda run, _: online_return(run)),
-    RunMetric(
-        "online_return_end",
-        "on-line return, last tenth",
-        lambda run, _: online_return(run, 0.1),
-        compared=True,
-    ),
+    RunMetric("online_return_end", "on-line return, last tenth", lambda run, _: online_return(run, 0.1),
+              is_compared=True),
 )
-BY_KEY = {metric.key: metric for metric in METRICS}
+# fmt: on
+METRICS = {metric.key: metric for metric in _METRICS}
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,13 +146,13 @@ class Band:
     whole_until: int  # environment steps that all runs reach; later, ended runs keep their last value
 
 
-def grid_for(runs: Sequence[Evidence], logarithmic: bool) -> FloatArray:
+def _grid(runs: Sequence[Evidence], logarithmic: bool) -> FloatArray:
     """The steps (points,) of all of a task's curves, spread evenly, and on a logarithmic axis where asked."""
     end = max(run.steps for run in runs)
-    points = np.linspace(0, end, GRID_POINTS)
+    points = np.linspace(0, end, _GRID_POINTS)
     first = min((run.curve["step"][1] for run in runs if run.steps > 0), default=0.0)
     if logarithmic and first > 0:
-        points = np.concatenate([[0.0], points[points >= first], np.geomspace(first, end, GRID_POINTS)])
+        points = np.concatenate([[0.0], points[points >= first], np.geomspace(first, end, _GRID_POINTS)])
     return np.unique(np.round(points))
 
 
@@ -173,7 +164,7 @@ def on_grid(run: Evidence, column: str, grid: FloatArray) -> FloatArray:
     return np.where(index >= 0, values[np.maximum(index, 0)], math.nan) if len(values) else grid * math.nan
 
 
-def band(runs: Sequence[Evidence], column: str, grid: FloatArray, seed: int) -> Band:
+def _band(runs: Sequence[Evidence], column: str, grid: FloatArray, seed: int) -> Band:
     """IQM and mean of a column over runs, with the IQM's 95 % bootstrap band.
 
     It goes from the first step at which every run has a value to the end of the last run.
@@ -185,11 +176,11 @@ def band(runs: Sequence[Evidence], column: str, grid: FloatArray, seed: int) -> 
     return Band(grid, point, values.mean(axis=-1), low, high, min(run.steps for run in runs))
 
 
-def certificates(runs: Sequence[Evidence], grid: FloatArray) -> Band:
+def _certificates(runs: Sequence[Evidence], grid: FloatArray) -> Band:
     """The share of runs that are certified at each step of the grid, with Wilson's 95 % interval."""
     counts = np.sum([on_grid(run, "certified", grid) for run in runs], axis=0)
     shares = [statistics.share(int(count), len(runs)) for count in counts]
-    low, high = np.array([s.low for s in shares]), np.array([s.high for s in shares])
+    low, high = np.array([(share.low, share.high) for share in shares]).T
     return Band(grid, counts / len(runs), counts / len(runs), low, high, min(run.steps for run in runs))
 
 
@@ -203,7 +194,7 @@ class Result:
     samples: Mapping[str, FloatArray]  # by metric, (runs that have it,)
     estimates: Mapping[tuple[str, str], Interval]  # by (metric, statistic)
     regret: Band
-    certificates: Band  # share of seeds certified; its mean, with Wilson's interval
+    certificates: Band
     online: Band | None  # None unless all runs have it
 
     @property
@@ -213,15 +204,8 @@ class Result:
         return float(min(ends, default=0))
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """The probability that a run of `agent` is better than one of `other`."""
-
-    agent: str
-    other: str
-    metric: str
-    tasks: int  # over how many
-    probability: Interval
+# By metric and two agents: the probability that a run of the first is better than one of the second.
+Comparisons = Mapping[tuple[str, str, str], Interval]
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +215,7 @@ class TaskAnalysis:
     task: str
     world: Reference
     results: tuple[Result, ...]
-    comparisons: tuple[Comparison, ...]
+    comparisons: Comparisons
     log_steps: bool = False  # whether curves are drawn against the logarithm of the steps
 
     @property
@@ -251,7 +235,7 @@ class Overall:
 
     tasks: int
     optimality: Mapping[str, tuple[int, Interval]]  # by agent: how many tasks, and the IQM over them
-    comparisons: tuple[Comparison, ...]
+    comparisons: Comparisons  # the mean over the tasks of both
     levels: FloatArray  # of optimality, (points,)
     profiles: Mapping[str, tuple[FloatArray, ...]]  # by agent: share of runs above each level, low and high
 
@@ -286,9 +270,14 @@ class Report:
     reasons: Reasons = field(default_factory=dict)  # of runs that are not certified
 
     @property
+    def runs(self) -> list[Evidence]:
+        """All that are counted."""
+        return [run for _, run in self.study.runs]
+
+    @property
     def damage(self) -> list[str]:
         """A sentence for each damaged file of the runs."""
-        counted = [sentence for group in self.study.groups for run in group.runs for sentence in run.damage]
+        counted = [sentence for run in self.runs for sentence in run.damage]
         return [*counted, *(each for run in self.unusable if run.state == DAMAGED for each in run.reasons)]
 
     def sentences(self) -> list[str]:
@@ -316,8 +305,8 @@ def gather(paths: Sequence[Path], seed: int = 0, log_steps: bool = False) -> Rep
         raise kind(f"nothing to report: {'; '.join(sentences[:MOST_SHOWN])}{more}")
     study = arrange(runs)
     tasks = tuple(_task(task, study.on(task), seed, log_steps) for task in study.tasks)
-    problems += [f"{task.task}: {task.world.problem}" for task in tasks if task.world.problem]
     tunings, unread = find_tunings(paths)
+    problems += [f"{task.task}: {task.world.problem}" for task in tasks if task.world.problem]
     problems += unread
     versions: dict[str, list[Path]] = defaultdict(list)
     for run in runs:
@@ -334,15 +323,15 @@ def gather(paths: Sequence[Path], seed: int = 0, log_steps: bool = False) -> Rep
 
 def _task(task: str, groups: list[Group], seed: int, log_steps: bool) -> TaskAnalysis:
     runs = [run for group in groups for run in group.runs]
-    world = reference(next((run for run in runs if not run.damage), runs[0]))
+    world = _reference(next((run for run in runs if not run.damage), runs[0]))
     ends = [max(run.steps for run in group.runs) for group in groups]
     learnt = [float(np.median([run.first_certified_step for run in group.runs])) for group in groups]
     for steps in (ends, learnt):  # whether one agent ran, or learnt, ten times as long as another
         known = [step for step in steps if 0 < step < math.inf]
         log_steps |= bool(known) and max(known) >= _SLOWER * min(known)
-    grid = grid_for(runs, log_steps)
+    grid = _grid(runs, log_steps)
     results = tuple(_result(group, world, grid, seed) for group in groups)
-    comparisons = compare([{r.group.agent: r.samples for r in results}], seed)
+    comparisons = _compare([{each.group.agent: each.samples for each in results}], seed)
     return TaskAnalysis(task, world, results, comparisons, log_steps)
 
 
@@ -350,7 +339,7 @@ def _result(group: Group, world: Reference, grid: FloatArray, seed: int) -> Resu
     runs, samples, estimates = group.runs, {}, {}
     end = float(max(run.steps for run in runs))
     grid = np.union1d(grid[grid <= end], [end])
-    for metric in METRICS:
+    for metric in METRICS.values():
         values = np.array([metric.of(run, world) for run in runs])
         samples[metric.key] = values = values[~np.isnan(values)]
         for name in metric.statistics if len(values) else ():
@@ -362,45 +351,40 @@ def _result(group: Group, world: Reference, grid: FloatArray, seed: int) -> Resu
         ever=statistics.share(sum(math.isfinite(run.first_certified_step) for run in runs), len(runs)),
         samples=samples,
         estimates=estimates,
-        regret=band(runs, "regret", grid, seed),
-        certificates=certificates(runs, grid),
-        online=band(runs, ONLINE, grid, seed) if has_online else None,
+        regret=_band(runs, "regret", grid, seed),
+        certificates=_certificates(runs, grid),
+        online=_band(runs, ONLINE, grid, seed) if has_online else None,
     )
 
 
-def compare(
-    tasks: Sequence[Mapping[str, Mapping[str, FloatArray]]], seed: int, least: int = 1
-) -> tuple[Comparison, ...]:
-    """Compare every agent with every other on the tasks that both were run on, `least` or more.
+def _compare(tasks: Sequence[Mapping[str, Mapping[str, FloatArray]]], seed: int) -> Comparisons:
+    """Compare every agent with every other on the tasks of both; of several tasks, on two at least.
 
     `tasks` has samples (runs,) by agent and metric for each task. Each pair is there from either side.
     """
     agents = sorted({agent for task in tasks for agent in task})
-    out = []
-    for metric in METRICS:
-        for one, other in itertools.combinations(agents, 2) if metric.compared else ():
-            pairs = [
-                (metric.better * task[one][metric.key], metric.better * task[other][metric.key])
-                for task in tasks
-                if one in task and other in task
-            ]
-            pairs = [pair for pair in pairs if len(pair[0]) and len(pair[1])]
-            if len(pairs) >= least:
-                seen = statistics.improvement(pairs, seed)
-                mirrored = Interval(1 - seen.point, 1 - seen.high, 1 - seen.low)
-                out.append(Comparison(one, other, metric.key, len(pairs), seen))
-                out.append(Comparison(other, one, metric.key, len(pairs), mirrored))
-    return tuple(out)
+    found: dict[tuple[str, str, str], Interval] = {}
+    compared = [metric for metric in METRICS.values() if metric.is_compared]
+    for metric, (one, other) in itertools.product(compared, itertools.combinations(agents, 2)):
+        pairs = [
+            (metric.better * task[one][metric.key], metric.better * task[other][metric.key])
+            for task in tasks
+            if one in task and other in task
+        ]
+        pairs = [(first, second) for first, second in pairs if len(first) and len(second)]
+        if len(pairs) >= min(2, len(tasks)):
+            found[metric.key, one, other] = seen = statistics.improvement(pairs, seed)
+            found[metric.key, other, one] = Interval(1 - seen.point, 1 - seen.high, 1 - seen.low)
+    return found
 
 
 def _overall(tasks: Sequence[TaskAnalysis], seed: int) -> Overall | None:
     """None where no agent was run on two tasks."""
     samples = [{result.group.agent: result.samples for result in task.results} for task in tasks]
-    scores: dict[str, list[FloatArray]] = {}
-    for task in samples:
-        for agent, metrics in task.items():
-            if len(metrics["optimality"]):
-                scores.setdefault(agent, []).append(metrics["optimality"])
+    scores: dict[str, list[FloatArray]] = defaultdict(list)
+    for agent, metrics in itertools.chain.from_iterable(task.items() for task in samples):
+        if len(metrics["optimality"]):
+            scores[agent].append(metrics["optimality"])
     strata = {agent: each for agent, each in sorted(scores.items()) if len(each) > 1}
     if not strata:
         return None
@@ -410,7 +394,7 @@ def _overall(tasks: Sequence[TaskAnalysis], seed: int) -> Overall | None:
     lowest = min(float(sample.min()) for each in strata.values() for sample in each)
     levels = np.linspace(min(0.0, max(-1.0, lowest)), 1.0, _LEVELS)
     profiles = {agent: statistics.profile(each, levels, seed) for agent, each in strata.items()}
-    return Overall(len(tasks), optimality, compare(samples, seed, least=2), levels, profiles)
+    return Overall(len(tasks), optimality, _compare(samples, seed), levels, profiles)
 
 
 def reasons(

@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patheffects import Normal
 from matplotlib.text import Text
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from gridworld.process.console import plain
 
@@ -178,6 +178,17 @@ def figure_of_rows(
     axes.set_yticklabels(names, size=LABEL, color=INK)
     axes.tick_params(axis="y", pad=10)
     return figure, axes, each
+
+
+def log_axis(axes: Axes, name: Literal["x", "y"], low: float, high: float) -> None:
+    """Make an axis logarithmic between two ends, with as many marks as there is room for."""
+    axes.set(**{f"{name}scale": "log", f"{name}lim": (low, high)})
+    axis = axes.xaxis if name == "x" else axes.yaxis
+    axis.set_major_locator(
+        LogLocator(10, (1, 2, 5) if high < 60 * low else (1, 3) if high < 600 * low else (1,))
+    )
+    axis.set_major_formatter(compact)
+    axis.set_minor_locator(NullLocator())
 
 
 def compact(number: float, _position: float = 0) -> str:

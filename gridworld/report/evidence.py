@@ -6,9 +6,7 @@ followed, so that a report covers what is in the folder, and the search ends.
 
 from __future__ import annotations
 
-import contextlib
 import csv
-import dataclasses
 import json
 import math
 import os
@@ -26,7 +24,7 @@ from gridworld.run.folder import CURVE, MANIFEST, SUMMARY, VISITS
 from gridworld.run.reader import RunReader, read_run
 from gridworld.storage.safe_read import LARGEST_CSV, as_table
 from gridworld.world.mdp import FloatArray
-from gridworld.world.metrics import METRICS, Metric
+from gridworld.world.metrics import METRICS
 
 MOST_ENTRIES = 2_000_000  # files and folders below a given one: some seconds
 DAMAGED = "damaged"
@@ -34,7 +32,11 @@ REQUIRED = ("step", "value", "regret", "certified", "goal_probability", "return"
 SAMPLED_RETURN = "sampled_return"
 ONLINE = "online_return"  # undiscounted, of training episodes (`training.learning_curve`); may be empty
 
-_FIRST = ("value", "return", "goal_probability")  # in the report's tables
+# The metrics of which a report has the last value, in the order of its tables.
+_ORDER = ("value", "return", "goal_probability")
+REPORTED = sorted(
+    (metric for metric in METRICS if metric.in_report), key=lambda each: (*_ORDER, each.name).index(each.name)
+)
 _MOST_COLUMNS = 100
 _LONGEST_NAME = 80  # characters
 _DIGITS = 9  # after the point: two ways to compute one regret differ later than that
@@ -60,10 +62,10 @@ class Evidence:
     started: str  # the date
     version: str  # of this package; "?" where the manifest does not say
     curve: Mapping[str, FloatArray]  # (evaluations,): the columns in `REQUIRED`, and what else the file has
-    pictures: Mapping[str, str | None]  # as `RunReader.pictures`
-    step_limit: Any = None  # of an episode, as the summary has it
-    privileges: Sequence[str] = ()  # as `config.settings.privileges` finds them in its settings
-    damage: tuple[str, ...] = ()  # a sentence for each of its other files that is not the one that it wrote
+    pictures: Mapping[str, str]  # as `RunReader.pictures`
+    step_limit: Any  # of an episode, as the summary has it
+    privileges: Sequence[str]  # as `config.settings.privileges` finds them in its settings
+    damage: tuple[str, ...]  # a sentence for each of its other files that is not the one that it wrote
 
     @property
     def steps(self) -> int:
@@ -111,10 +113,8 @@ def find_runs(paths: Sequence[Path]) -> tuple[list[Path], list[str]]:
         for folder in found:
             folders.setdefault(folder.resolve(), folder)
         if not found:
-            problems.append(
-                f"{path}: holds no run, there is no {MANIFEST} in it or below it (links to folders are not "
-                "followed)"
-            )
+            where = f"there is no {MANIFEST} in it or below it (links to folders are not followed)"
+            problems.append(f"{path}: holds no run, {where}")
     return list(folders.values()), problems
 
 
@@ -130,10 +130,8 @@ def _search(top: Path, problems: list[str]) -> Iterator[Path]:
             yield Path(name)
         entries += len(inner) + len(files)
         if entries > MOST_ENTRIES:
-            problems.append(
-                f"{top}: holds more than {MOST_ENTRIES:,} files and folders, the rest was not searched; name "
-                "the folders of the runs"
-            )
+            most = f"holds more than {MOST_ENTRIES:,} files and folders, the rest was not searched"
+            problems.append(f"{top}: {most}; name the folders of the runs")
             return
         inner.sort()
 
@@ -147,24 +145,29 @@ def read(folder: Path) -> Evidence | Unusable:
     sections = (run.manifest["config"].get(key) for key in ("agent", "env"))
     agent, env = (section if isinstance(section, dict) else {} for section in sections)
     names = (agent.get("name"), env.get("layout") or env.get("id") or env.get("source"))
-    named = (_printable(name) if isinstance(name, str) else None for name in names)
-    unusable = Unusable(folder, (), DAMAGED, *named)
+    named = [_printable(name) if isinstance(name, str) else None for name in names]
     if not run.is_finished:
-        status, cause = run.manifest["status"][:_LONGEST_NAME], run.manifest.get("error")
-        why = f": {' '.join(cause.split())[:300]}" if cause else ""
-        why = ": it is still running, or was killed" if status == "running" else why
-        told = f"{folder}: this run is {status!r}, not finished{why}"
-        with contextlib.suppress(InputError):
-            steps = f"{_read_curve(run)['step'][-1]:,.0f} steps"
-            told += f" (last evaluated after {steps}, says {CURVE}, which is not verified before the end)"
-        return dataclasses.replace(unusable, reasons=(told,), state=_printable(status))
+        return Unusable(folder, (_unfinished(run),), _printable(run.manifest["status"]), *named)
     damaged = run.damage()
     try:
         if not damaged.keys() & {CURVE, SUMMARY}:
             return _evidence(run, tuple(damaged.values()))
     except InputError as error:
         damaged = {"": str(error)} | damaged
-    return dataclasses.replace(unusable, reasons=tuple(damaged.values()))
+    return Unusable(folder, tuple(damaged.values()), DAMAGED, *named)
+
+
+def _unfinished(run: RunReader) -> str:
+    """How far a run came, and why it ended."""
+    status, cause = run.manifest["status"][:_LONGEST_NAME], run.manifest.get("error")
+    why = f": {' '.join(cause.split())[:300]}" if cause else ""
+    why = ": it is still running, or was killed" if status == "running" else why
+    try:
+        steps = f"{_read_curve(run)['step'][-1]:,.0f} steps"
+        why += f" (last evaluated after {steps}, says {CURVE}, which is not verified before the end)"
+    except InputError:
+        pass  # it has not been evaluated
+    return f"{run.folder}: this run is {status!r}, not finished{why}"
 
 
 def _evidence(run: RunReader, damaged: tuple[str, ...]) -> Evidence:
@@ -212,16 +215,9 @@ def _printable(text: str) -> str:
     return "".join(sign if sign.isprintable() else "?" for sign in text)[:_LONGEST_NAME]
 
 
-def reported() -> list[Metric]:
-    """The metrics of which a report has the last value, in the order of its tables."""
-    chosen = [metric for metric in METRICS if metric.in_report]
-    return sorted(chosen, key=lambda metric: (*_FIRST, metric.name).index(metric.name))
-
-
 def _read_curve(run: RunReader) -> dict[str, FloatArray]:
     """The columns that the statistics need: those in `REQUIRED`, and optional ones that the file has."""
-    used = dict.fromkeys((*REQUIRED, *(metric.name for metric in reported()), SAMPLED_RETURN, ONLINE))
-    curve = read_columns(run, tuple(used))
+    curve = read_columns(run, (*REQUIRED, *(metric.name for metric in REPORTED), SAMPLED_RETURN, ONLINE))
     curve["regret"] = np.maximum(0.0, curve["regret"])  # below zero is rounding
     return curve
 
@@ -247,8 +243,10 @@ def read_columns(run: RunReader, wanted: Sequence[str] | None = None) -> dict[st
     for line, row in enumerate(rows, 2):
         if len(row) != len(header):
             raise InputError(f"{path}: line {line} has {len(row)} of {len(header)} columns, it was cut off")
-    curve = {}
-    for name in (name for name in (header if wanted is None else wanted) if name in header):
+    curve: dict[str, FloatArray] = {}
+    for name in header if wanted is None else wanted:
+        if name not in header:
+            continue
         at = header.index(name)
         try:
             curve[name] = np.array([row[at] or "nan" for row in rows], dtype=np.float64)

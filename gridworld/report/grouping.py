@@ -10,8 +10,6 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from gridworld.config.fields import Effect
 from gridworld.config.settings import effect_of
 from gridworld.report.evidence import Evidence, Settings
@@ -53,6 +51,11 @@ class Study:
     notes: tuple[str, ...]  # what a reader should know, a sentence each
     warnings: tuple[str, ...]  # what somebody should look into
 
+    @property
+    def runs(self) -> list[tuple[Group, Evidence]]:
+        """All that are counted, each with its group."""
+        return [(group, run) for group in self.groups for run in group.runs]
+
     def on(self, task: str) -> list[Group]:
         """The groups of one task."""
         return [group for group in self.groups if group.task == task]
@@ -70,20 +73,18 @@ def arrange(runs: Iterable[Evidence]) -> Study:
     groups = []
     for task, members in zip(task_labels, tasks.values(), strict=True):
         configurations: dict[tuple[str, Key], list[Evidence]] = defaultdict(list)
-        of_agent: dict[str, dict[Key, Settings]] = defaultdict(dict)
         for run in members:
-            key = learning_key(run)
-            configurations[run.agent, key].append(run)
-            of_agent[run.agent][key] = dict(key)
-        notes += [
-            f"{agent} on {task} was run with {len(found)} different configurations, which are reported "
-            f"apart; they differ in {', '.join(differing(list(found.values())))}."
-            for agent, found in of_agent.items()
-            if len(found) > 1
-        ]
-        agent_labels = labels([(agent, dict(key)) for agent, key in configurations])
-        for agent, group in zip(agent_labels, configurations.values(), strict=True):
-            groups.append(Group(agent, task, _one_per_seed(group, notes, warnings)))
+            configurations[run.agent, learning_key(run)].append(run)
+        named = [(agent, dict(key)) for agent, key in configurations]
+        for agent in dict.fromkeys(agent for agent, _ in named):
+            found = [settings for name, settings in named if name == agent]
+            if len(found) > 1:
+                notes.append(
+                    f"{agent} on {task} was run with {len(found)} different configurations, which are "
+                    f"reported apart; they differ in {', '.join(differing(found))}."
+                )
+        for label, group in zip(labels(named), configurations.values(), strict=True):
+            groups.append(Group(label, task, _one_per_seed(group, notes, warnings)))
     groups.sort(key=lambda group: (group.task, group.agent))
     agents, on = sorted({group.agent for group in groups}), sorted({group.task for group in groups})
     return Study(tuple(groups), tuple(agents), tuple(on), tuple(notes), tuple(warnings))
@@ -178,9 +179,8 @@ def _one_per_seed(runs: list[Evidence], notes: list[str], warnings: list[str]) -
             continue
         warnings += run.damage
         text = f"{run.folder} has the settings and the seed of {first.folder}"
-        if first.curve.keys() == run.curve.keys() and all(
-            np.array_equal(first.curve[name], run.curve[name], equal_nan=True) for name in run.curve
-        ):
+        curves = [{name: column.tobytes() for name, column in each.curve.items()} for each in (first, run)]
+        if curves[0] == curves[1]:
             notes.append(f"{text}, and the same curve; it is counted once.")
         else:
             warnings.append(

@@ -15,14 +15,13 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullLocator
 
 from gridworld.report import chart
 from gridworld.report.analysis import Result
 from gridworld.report.chart import COLOURS, INK, MUTED, PAPER, SMALL, WIDE, Chart, clipped, house_style
 from gridworld.report.grouping import differing, learning_key
 from gridworld.report.statistics import Interval
-from gridworld.report.tables import number, steps_up_to
+from gridworld.report.tables import estimate
 from gridworld.report.tuning_study import TrialRow, TuningStudy
 from gridworld.world.mdp import FloatArray
 
@@ -84,16 +83,14 @@ _SHOWN = {  # title of a metric, and the statistic that the figures of a sweep s
 }
 
 
-def _of(result: Result, name: str) -> tuple[Interval, str]:
+def _of(result: Result, metric: str) -> tuple[Interval, str]:
     """What is shown of a result, and its text in a heatmap's cell."""
-    if name == "certified":
+    if metric == "certified":
         share = result.certified
         return Interval(share.count / share.total, share.low, share.high), f"{share.count}/{share.total}"
-    if name == "steps":
-        steps = result.estimates["steps", "median"]
-        return steps, steps_up_to(result.shortest_uncertified)(steps.point)
-    regret = result.estimates["regret", "iqm"]
-    return regret, number(regret.point)
+    found = estimate(result, metric, "median" if metric == "steps" else "iqm")
+    assert found is not None  # every run has them
+    return found.interval, found.form(found.interval.point)
 
 
 def sweep_charts(sweep: Sweep, task: str) -> Iterator[Chart]:
@@ -172,41 +169,34 @@ def tuning_charts(tuning: TuningStudy) -> Iterator[Chart]:
         yield _parallel(tuning, done)
 
 
-def _scale(trials: Sequence[TrialRow]) -> tuple[FloatArray, float, float, list[float]]:
-    """Scores for a logarithmic axis, its ends, and its marks: what is not positive lies at the lower end."""
+def _scores(trials: Sequence[TrialRow]) -> tuple[FloatArray, float, float]:
+    """Scores for a logarithmic axis, and its ends: what is not positive lies at the lower end."""
     scores = np.array([min(trial.score, _HIGHEST) for trial in trials])
     positive = scores[scores > 0] if (scores > 0).any() else np.ones(1)
     low = max(float(positive.min()), 1 / _HIGHEST) / 1.1
-    high = max(float(positive.max()) * 1.1, 2 * low)
-    factors = (1, 2, 5) if high < 1000 * low else (1,)
-    marks = [mark for mark in LogLocator(10, factors).tick_values(low, high) if low <= mark <= high]
-    return np.maximum(scores, low), low, high, marks
+    return np.maximum(scores, low), low, max(float(positive.max()) * 1.1, 2 * low)
 
 
 @house_style()
 def _history(tuning: TuningStudy) -> Chart:
     trials = sorted(tuning.scored, key=lambda trial: trial.number)
     numbers = np.array([trial.number for trial in trials], float)
-    scores, low, high, marks = _scale(trials)
+    scores, low, high = _scores(trials)
     done = np.array([trial.status == "done" for trial in trials])
     dots: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 6, "clip_on": False}
     looks = {
         "done": {"color": _DONE, "alpha": 0.75, **dots},
         "pruned, score at that time": {"color": MUTED, "alpha": 0.45, **dots},
+        "best so far": {"color": _WINNER, "linewidth": 2.2, "clip_on": False},
     }
-    best: dict[str, Any] = {"color": _WINNER, "linewidth": 2.2, "clip_on": False}
     legend = [(Line2D([], [], **look), name) for name, look in looks.items()]
-    legend += [(Line2D([], [], **best), "best so far")] if done.any() else []
     figure, axes = chart.new_figure("Score by trial", _HEIGHT, "y", legend)
-    end = max(1.0, numbers.max())
-    axes.set(yscale="log", ylim=(low, high), ylabel="score, logarithmic", xlim=(0, end), xlabel="trial")
-    axes.set_yticks(marks, [f"{mark:.3g}" for mark in marks])
-    axes.yaxis.set_minor_locator(NullLocator())
-    for chosen, look in zip((done, ~done), looks.values(), strict=True):
+    chart.log_axis(axes, "y", low, high)
+    axes.set(ylabel="score, logarithmic", xlim=(0, max(1.0, numbers.max())), xlabel="trial")
+    for chosen, look in zip((done, ~done), looks.values(), strict=False):
         axes.plot(numbers[chosen], scores[chosen], **look)
-    if done.any():
-        lowest = np.minimum.accumulate(scores[done])
-        axes.step([*numbers[done], end], [*lowest, lowest[-1]], where="post", **best)
+    lowest = np.minimum.accumulate(np.where(done, scores, np.inf))
+    axes.step(numbers, np.where(np.isfinite(lowest), lowest, np.nan), where="post", **looks["best so far"])
     return Chart(
         f"{tuning.name} history",
         f"Score by trial, {tuning.title.lower()}",
@@ -236,10 +226,9 @@ def _importances(tuning: TuningStudy) -> Chart:
 def _parallel(tuning: TuningStudy, done: Sequence[TrialRow]) -> Chart:
     ranked = sorted(done, key=lambda trial: trial.score)
     bold, keys = max(1, round(0.1 * len(ranked))), list(tuning.space)
-    scores, low, high, marks = _scale(ranked)
-    heights = _on_axis(np.array([*marks, *scores]), low, high, is_log=True)
-    columns = [(heights[len(marks) :], list(zip([f"{mark:.3g}" for mark in marks], heights, strict=False)))]
-    columns += [_axis(tuning.space[key], [trial.values[key] for trial in ranked]) for key in keys]
+    scores, low, high = _scores(ranked)
+    columns = [_axis({"type": "float", "low": low, "high": high, "log": True}, scores.tolist())]
+    columns += [_axis(tuning.space[key], [trial.row[key] for trial in ranked]) for key in keys]
     title = "What the best tenth of the finished trials chose, and the winner"
     figure, axes = chart.new_figure(title, 250, width=WIDE)
     axes.set(xlim=(0, max(1, len(keys))), ylim=(0, 1), xticks=[], yticks=[])
@@ -265,22 +254,18 @@ def _parallel(tuning: TuningStudy, done: Sequence[TrialRow]) -> Chart:
     )
 
 
-def _on_axis(numbers: FloatArray, low: float, high: float, is_log: bool) -> FloatArray:
-    """Where numbers lie between the ends of an axis, from 0 to 1."""
-    bend = np.log if is_log else np.asarray
-    return np.interp(bend(numbers), bend(np.array([low, high])), (0.0, 1.0))
-
-
-def _axis(dimension: Mapping[str, Any], texts: Sequence[str]) -> tuple[FloatArray, _Marks]:
+def _axis(dimension: Mapping[str, Any], values: Sequence[str | float]) -> tuple[FloatArray, _Marks]:
     """Where values lie on their axis, from 0 to 1, and its choices or ends."""
     if dimension["type"] == "categorical":
         choices = dimension["choices"]
         places = {choice: index / max(1, len(choices) - 1) for index, choice in enumerate(choices)}
         marks = [(clipped(choice, 12), height) for choice, height in places.items()]
-        return np.array([places.get(text, 0.0) for text in texts]), marks
+        return np.array([places.get(str(value), 0.0) for value in values]), marks
     low, high = dimension["low"], dimension["high"]
-    numbers = np.array([float(text or low) for text in texts])
-    return _on_axis(numbers, low, high, dimension["log"]), [(f"{low:g}", 0.0), (f"{high:g}", 1.0)]
+    numbers, ends = np.array([float(value or low) for value in values]), np.array([low, high])
+    bend = np.log if dimension["log"] else np.asarray
+    heights = np.interp(bend(numbers), bend(ends), (0.0, 1.0))
+    return heights, [(f"{low:.3g}", 0.0), (f"{high:.3g}", 1.0)]
 
 
 def _short(key: str) -> str:

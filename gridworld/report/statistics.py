@@ -3,8 +3,7 @@
 Interquartile mean (IQM): the mean without the lowest and the highest ⌊n/4⌋ values, as
 `scipy.stats.trim_mean(x, 0.25)`. Intervals: the 95 % percentile bootstrap, runs drawn anew within each task
 (the strata), as `scipy.stats.bootstrap` does; the same draws serve every point of a curve. Both come to
-SciPy's numbers, but by hand: a sweep ends with them, and `scipy.stats` takes as long to import as two runs to
-train.
+SciPy's numbers without `scipy.stats`, which takes as long to import as two runs to train.
 
 Infinity is a value like any other: a run that was never certified took infinitely many steps.
 
@@ -25,9 +24,9 @@ from gridworld.envs.rollout import wilson_interval
 from gridworld.world.mdp import FloatArray
 
 RESAMPLES = 2000
-TRIMMED = 0.25  # of the values, at either end
 INFINITE = 1e90  # numbers beyond stand for infinity
 
+_TRIMMED = 0.25  # of the values, at either end
 _BOUNDS = (0.025, 0.975)  # quantiles
 _FAR = 1e100  # stands in for infinity while sums and differences are taken; whatever it touches is infinite
 _LARGEST_BATCH = 4_000_000  # numbers that one batch of resamples may hold, 32 MB
@@ -57,28 +56,26 @@ class Share:
         return self.count == self.total
 
 
-# Of all samples (..., n) together: (*samples, axis=-1)
-Statistic = Callable[..., FloatArray]
+Statistic = Callable[..., FloatArray]  # of all samples (..., n) together, along the last axis
 
 
-def mean(*samples: FloatArray, axis: int = -1) -> FloatArray:
+def mean(*samples: FloatArray) -> FloatArray:
     """Mean of all samples together, each (..., n)."""
-    return np.asarray(np.mean(np.concatenate(samples, axis=axis), axis=axis))
+    return np.asarray(np.concatenate(samples, axis=-1).mean(axis=-1))
 
 
-def median(*samples: FloatArray, axis: int = -1) -> FloatArray:
+def median(*samples: FloatArray) -> FloatArray:
     """Median of all samples together, each (..., n)."""
-    return np.asarray(np.median(np.concatenate(samples, axis=axis), axis=axis))
+    return np.asarray(np.median(np.concatenate(samples, axis=-1), axis=-1))
 
 
-def iqm(*samples: FloatArray, axis: int = -1) -> FloatArray:
+def iqm(*samples: FloatArray) -> FloatArray:
     """Interquartile mean of all samples together, each (..., n)."""
-    values = np.concatenate(samples, axis=axis)
-    count = values.shape[axis]
-    cut = int(TRIMMED * count)
-    ordered = np.partition(values, (cut, count - cut - 1), axis=axis)
-    middle = np.moveaxis(np.moveaxis(ordered, axis, -1)[..., cut : count - cut], -1, axis)  # a view
-    return np.asarray(np.mean(middle, axis=axis))
+    values = np.concatenate(samples, axis=-1)
+    count = values.shape[-1]
+    cut = int(_TRIMMED * count)
+    ordered = np.partition(values, (cut, count - cut - 1), axis=-1)
+    return np.asarray(ordered[..., cut : count - cut].mean(axis=-1))
 
 
 def share(count: int, total: int) -> Share:
@@ -103,35 +100,30 @@ def bands(
 
     Returns point, low and high, (...) each; low and high are NaN where a stratum has one run. Points with the
     same values, such as those of a curve that has arrived, have the same draws, and so the same statistics,
-    which are taken once.
+    which are computed once.
     """
     samples = [np.clip(sample, -_FAR, _FAR) for sample in samples]
-    point, sizes = statistic(*samples, axis=-1), [sample.shape[-1] for sample in samples]
-    if min(sizes) < 2:
-        unknown = np.full(point.shape, math.nan)
-        return _extended(point), unknown, unknown
-    joined = np.concatenate(samples, axis=-1)
-    rows = joined.reshape(-1, joined.shape[-1])
-    _, first, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    samples = [sample.reshape(-1, sample.shape[-1])[first] for sample in samples]
-    chance, batch = np.random.default_rng(seed), max(1, _LARGEST_BATCH // joined.size)
-    parts = []
-    for begun in range(0, resamples, batch):
-        draws = [chance.integers(0, size, (min(batch, resamples - begun), size)) for size in sizes]
-        drawn = [sample[..., draw] for sample, draw in zip(samples, draws, strict=True)]
-        parts.append(statistic(*drawn, axis=-1))
-    bounds = np.quantile(np.concatenate(parts, axis=-1), _BOUNDS, axis=-1)[:, place.reshape(point.shape)]
-    return _extended(point), _extended(bounds[0]), _extended(bounds[1])
-
-
-def _extended(numbers: FloatArray) -> FloatArray:
-    """Numbers beyond `INFINITE` as infinities."""
-    numbers = np.asarray(numbers, dtype=np.float64)
-    return np.where(np.abs(numbers) > INFINITE, np.copysign(math.inf, numbers), numbers)
+    point, sizes = statistic(*samples), [sample.shape[-1] for sample in samples]
+    bounds = np.full((2, *point.shape), math.nan)
+    if min(sizes) > 1:
+        joined = np.concatenate(samples, axis=-1)
+        rows = joined.reshape(-1, joined.shape[-1])
+        _, first, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+        samples = [sample.reshape(-1, sample.shape[-1])[first] for sample in samples]
+        rng, batch = np.random.default_rng(seed), max(1, _LARGEST_BATCH // joined.size)
+        parts = []
+        for begin in range(0, resamples, batch):
+            draws = [rng.integers(0, size, (min(batch, resamples - begin), size)) for size in sizes]
+            parts.append(statistic(*(sample[..., draw] for sample, draw in zip(samples, draws, strict=True))))
+        bounds = np.quantile(np.concatenate(parts, axis=-1), _BOUNDS, axis=-1)
+        bounds = bounds[:, place.reshape(point.shape)]
+    found = np.stack([point, *bounds])
+    point, low, high = np.where(np.abs(found) > INFINITE, np.copysign(math.inf, found), found)
+    return point, low, high
 
 
 def interval(statistic: Statistic, samples: Sequence[FloatArray], seed: int) -> Interval:
-    """The same as `bands` for samples (n,)."""
+    """`bands` of samples (n,)."""
     return Interval(*(float(number) for number in bands(statistic, samples, seed)))
 
 
@@ -142,8 +134,8 @@ def profile(samples: Sequence[FloatArray], levels: FloatArray, seed: int) -> tup
     (points,) each (the score distribution of Agarwal et al. 2021, section 4.3).
     """
 
-    def mean_share(*above: FloatArray, axis: int = -1) -> FloatArray:
-        return np.asarray(np.mean([each.mean(axis=axis) for each in above], axis=0))
+    def mean_share(*above: FloatArray) -> FloatArray:
+        return np.asarray(np.mean([each.mean(axis=-1) for each in above], axis=0))
 
     return bands(mean_share, [(sample > levels[:, None]).astype(np.float64) for sample in samples], seed)
 
@@ -160,7 +152,7 @@ def improvement(pairs: Sequence[tuple[FloatArray, FloatArray]], seed: int) -> In
         for first, second in pairs
     ]
 
-    def mean_probability(*drawn: FloatArray, axis: int = -1) -> FloatArray:
+    def mean_probability(*drawn: FloatArray) -> FloatArray:
         """The mean share of pairs won among runs drawn by their places, (..., n) and (..., m) in turn."""
         shares = []
         for won, first, second in zip(wins, drawn[::2], drawn[1::2], strict=True):

@@ -12,16 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from gridworld.process.console import plain
-from gridworld.report.analysis import (
-    BY_KEY,
-    METRICS,
-    Comparison,
-    Overall,
-    Reasons,
-    Report,
-    Result,
-    TaskAnalysis,
-)
+from gridworld.report.analysis import METRICS, Comparisons, Overall, Reasons, Report, Result, TaskAnalysis
 from gridworld.report.evidence import Unusable
 from gridworld.report.grouping import Study, differing, learning_key
 from gridworld.report.statistics import Interval, Share
@@ -33,7 +24,7 @@ _MINUS = "\N{MINUS SIGN}"
 # Signs with which a name out of a run's folder could be HTML, a link, a row, or the end of a marked place.
 _MARKS = re.compile(r"""[\\|<>&`\[\]*!\n\r]|:(?=//)|(?<=www)\.""")
 
-_SCORES = tuple(metric.key for metric in METRICS if metric.key not in ("regret", "steps"))
+_SCORES = tuple(key for key in METRICS if key not in ("regret", "steps"))
 _HEADINGS = {
     ("regret", "iqm"): "regret, IQM",
     ("regret", "median"): "regret, median",
@@ -68,6 +59,10 @@ class Table:
         object.__setattr__(self, "columns", list(map(plain, self.columns)))
         object.__setattr__(self, "rows", rows)
 
+    def is_text(self, column: int) -> bool:
+        """Whether a column holds words, which are aligned to the left; numbers are aligned to the right."""
+        return bool(self.rows) and all(isinstance(row[column], str) for row in self.rows)
+
 
 def number(value: float) -> str:
     """Write a number with four digits, an infinite one as ∞, NaN as a dash."""
@@ -86,37 +81,21 @@ def steps_up_to(bound: float) -> Callable[[float], str]:
     return lambda value: f"> {bound:,.0f}" if math.isinf(value) else number(round(value))
 
 
-def main_text(cell: Cell) -> str:
-    """The cell without its interval."""
+def texts(cell: Cell) -> tuple[str, str]:
+    """A cell's text, and that of its interval, "" where it has none."""
     match cell:
-        case None:
-            return NOTHING
         case str():
-            return cell
-        case Share(count, total, _, _):
-            return f"{count} / {total}"
-        case Estimate(interval, form):
-            return form(interval.point)
+            return cell, ""
+        case Share(count, total, low, high):
+            return f"{count} / {total}", f"[{100 * low:.0f} %, {100 * high:.0f} %]"
+        case Estimate(Interval(point, low, high), form):
+            return form(point), "" if math.isnan(low) else f"[{form(low)}, {form(high)}]"
         case int():
-            return f"{cell:,}"
+            return f"{cell:,}", ""
         case float():
-            return number(cell)
-
-
-def interval_text(cell: Cell) -> str:
-    """The interval of a cell, or nothing."""
-    match cell:
-        case Share(_, _, low, high):
-            return f"[{100 * low:.0f} %, {100 * high:.0f} %]"
-        case Estimate(interval, form) if not math.isnan(interval.low):
-            return f"[{form(interval.low)}, {form(interval.high)}]"
+            return number(cell), ""
         case _:
-            return ""
-
-
-def is_text(table: Table, column: int) -> bool:
-    """Whether a column holds words, which are aligned to the left; numbers are aligned to the right."""
-    return bool(table.rows) and all(isinstance(row[column], str) for row in table.rows)
+            return NOTHING, ""
 
 
 def to_captioned_markdown(table: Table) -> str:
@@ -126,7 +105,7 @@ def to_captioned_markdown(table: Table) -> str:
 
 def to_markdown(table: Table) -> str:
     """A Markdown pipe table; names in it are shown as they are."""
-    sides = ("---" if is_text(table, column) else "---:" for column in range(len(table.columns)))
+    sides = ("---" if table.is_text(column) else "---:" for column in range(len(table.columns)))
     rows: list[Iterable[str]] = [map(_markdown, table.columns), sides]
     rows += [map(_markdown, row) for row in table.rows]
     return "".join(f"| {' | '.join(row)} |\n" for row in rows)
@@ -135,32 +114,32 @@ def to_markdown(table: Table) -> str:
 def _markdown(cell: Cell) -> str:
     if isinstance(cell, str):  # it may be anybody's
         return _MARKS.sub(lambda found: f"&#{ord(found[0])};", cell)
-    return f"{main_text(cell)} {interval_text(cell)}".strip()
+    return " ".join(texts(cell)).strip()
 
 
 def to_csv(table: Table) -> str:
     """A CSV of plain numbers; an interval takes three columns, a share four."""
-    suffixes = []  # of each column's headings
-    for index in range(len(table.columns)):
-        kinds = {type(row[index]) for row in table.rows}
-        parts = (" of", " low", " high") if Share in kinds else (" low", " high") if Estimate in kinds else ()
-        suffixes.append(("", *parts))
-    rows: list[list[object]] = [
-        [head + suffix for head, own in zip(table.columns, suffixes, strict=True) for suffix in own]
-    ]
-    for row in table.rows:
-        rows.append([])
-        for cell, own in zip(row, suffixes, strict=True):
-            match cell:
-                case Estimate(interval, _):
-                    rows[-1] += map(_digits, (interval.point, interval.low, interval.high))
-                case Share(count, total, low, high):
-                    rows[-1] += (count, total, _digits(low), _digits(high))
-                case None:
-                    rows[-1] += [""] * len(own)
-                case _:
-                    rows[-1].append(_digits(cell) if isinstance(cell, float) else cell)
-    return csv_text(rows)
+    rows = [list(map(_csv_parts, row)) for row in table.rows]
+    ends = [list(dict.fromkeys(end for row in rows for end in row[at])) for at in range(len(table.columns))]
+    ends = [each or [""] for each in ends]
+    heads = [head + end for head, own in zip(table.columns, ends, strict=True) for end in own]
+    cells = (
+        [parts.get(end, "") for parts, own in zip(row, ends, strict=True) for end in own] for row in rows
+    )
+    return csv_text([heads, *cells])
+
+
+def _csv_parts(cell: Cell) -> dict[str, object]:
+    """What a cell comes to, by the ends of its columns' headings."""
+    match cell:
+        case Estimate(Interval(point, low, high), _):
+            return {"": _digits(point), " low": _digits(low), " high": _digits(high)}
+        case Share(count, total, low, high):
+            return {"": count, " of": total, " low": _digits(low), " high": _digits(high)}
+        case None:
+            return {}
+        case _:
+            return {"": _digits(cell) if isinstance(cell, float) else cell}
 
 
 def _digits(value: float) -> str:
@@ -184,9 +163,7 @@ def all_tables(report: Report) -> Iterator[Table]:
     if report.overall is not None:
         yield overall_table(report.overall)
     for tuning in report.tunings:
-        yield winner_table(tuning)
-        yield finalists_table(tuning)
-        yield trials_table(tuning)
+        yield from tuning_tables(tuning)
 
 
 def results_table(tasks: Sequence[TaskAnalysis], reasons: Reasons) -> Table:
@@ -199,8 +176,7 @@ def results_table(tasks: Sequence[TaskAnalysis], reasons: Reasons) -> Table:
         estimates = [estimate(result, *which) for which in shown]
         rows.append([task.task, result.group.agent, result.certified, result.ever, *estimates])
         if reasons:  # the most common cause of those that are not certified
-            runs = result.group.runs
-            causes = Counter(reasons[run.folder].cause for run in runs if run.folder in reasons)
+            causes = Counter(reasons[run.folder].cause for run in result.group.runs if run.folder in reasons)
             most = [f"{cause} ({count} of {causes.total()})" for cause, count in causes.most_common(1)]
             rows[-1].append("".join(most))
     caption = "Certified seeds, exact regret and steps, with 95 % intervals"
@@ -234,7 +210,7 @@ def scores_table(task: TaskAnalysis) -> Table:
         [result.group.agent, *(estimate(result, key, "mean") for key in keys)] for result in task.results
     ]
     caption = f"Means over seeds on {task.task}, of the greedy policy where nothing else is said"
-    columns = ["agent", *(BY_KEY[key].title for key in keys)]
+    columns = ["agent", *(METRICS[key].title for key in keys)]
     return _table_of(task.results, f"{task.task} scores", caption, columns, rows)
 
 
@@ -245,21 +221,16 @@ def estimate(result: Result, key: str, statistic: str) -> Estimate | None:
     return None if found is None else Estimate(found, form)
 
 
-def improvement_tables(comparisons: Sequence[Comparison], name: str) -> list[Table]:
+def improvement_tables(comparisons: Comparisons, name: str) -> Iterator[Table]:
     """The probabilities that the row's agent is better than the column's on the task, by metric."""
-    tables = []
-    for metric in METRICS:
-        cells = {
-            (each.agent, each.other): Estimate(each.probability, lambda value: f"{value:.2f}")
-            for each in comparisons
-            if each.metric == metric.key
-        }
-        agents = sorted({agent for agent, _ in cells})
-        caption = f"Probability that a run of the row's agent beats one of the column's in {metric.title}"
-        rows = [[agent, *(cells.get((agent, other)) for other in agents)] for agent in agents]
-        if cells:
-            tables.append(Table(f"{name} improvement in {metric.title}", caption, ["agent", *agents], rows))
-    return tables
+    for key in dict.fromkeys(key for key, _, _ in comparisons):
+        title, agents = METRICS[key].title, sorted({one for other, one, _ in comparisons if other == key})
+        rows: list[list[Cell]] = []
+        for one in agents:
+            found = (comparisons.get((key, one, other)) for other in agents)
+            rows.append([one, *(None if each is None else Estimate(each, "{:.2f}".format) for each in found)])
+        caption = f"Probability that a run of the row's agent beats one of the column's in {title}"
+        yield Table(f"{name} improvement in {title}", caption, ["agent", *agents], rows)
 
 
 def overall_table(overall: Overall) -> Table:
@@ -281,7 +252,7 @@ def answer_table(study: Study, tasks: Sequence[TaskAnalysis]) -> Table:
 def runs_table(study: Study) -> Table:
     """A row for each run that is counted."""
     rows: list[list[Cell]] = []
-    for group, run in [(each, run) for each in study.groups for run in each.runs]:
+    for group, run in study.runs:
         first = int(run.first_certified_step) if math.isfinite(run.first_certified_step) else None
         certified = "yes" if run.certified else "no"
         rows.append([group.task, group.agent, run.seed, certified, run.regret, first])
@@ -294,11 +265,10 @@ def reasons_table(study: Study, reasons: Reasons) -> Table:
     """A row for each run whose reason is known."""
     rows: list[list[Cell]] = [
         [group.agent, group.task, run.seed, run.regret, reason.cause, reason.change]
-        for group in study.groups
-        for run in group.runs
+        for group, run in study.runs
         if (reason := reasons.get(run.folder)) is not None
     ]
-    missing = sum(not run.certified for group in study.groups for run in group.runs) - len(rows)
+    missing = sum(not run.certified for _, run in study.runs) - len(rows)
     rest = f"; {missing} more were not looked into, see --diagnose" if missing else ""
     columns = ["agent", "task", "seed", "regret", "largest cause", "to try"]
     return Table("not certified", f"Why runs are not certified{rest}", columns, rows)
@@ -318,34 +288,28 @@ def settings_table(study: Study) -> Table:
     return Table("settings", "Settings in which agents differ", columns, rows)
 
 
-def winner_table(tuning: TuningStudy) -> Table:
-    """What a search changed, and how much each key mattered."""
-    rows: list[list[Cell]] = [
+def tuning_tables(tuning: TuningStudy) -> tuple[Table, Table, Table]:
+    """What a search changed and how much each key mattered, the finalists, and every trial."""
+    changed: list[list[Cell]] = [
         [key, str(value), str(tuning.began_from.get(key, "")), tuning.importances.get(key)]
         for key, value in tuning.values.items()
     ]
-    caption = f"The winner, trial {tuning.winner}, beside what the search began from"
-    return Table(f"{tuning.name} winner", caption, ["key", "winner", "began from", "importance"], rows)
-
-
-def finalists_table(tuning: TuningStudy) -> Table:
-    """The trials that went on to more seeds."""
-    caption = "The finalists, by all of their seeds"
-    return Table(f"{tuning.name} finalists", caption, ["trial", "score", "certified"], tuning.finalists)
-
-
-def trials_table(tuning: TuningStudy) -> Table:
-    """Every trial."""
-    columns = ("certified", "steps", "regret", "seconds", "error")
+    others = ("certified", "steps", "regret", "seconds", "error")
     rows: list[list[Cell]] = [
         [
             str(trial.number),
             trial.status,
             trial.score if math.isfinite(trial.score) else None,
-            *(trial.told.get(column, "") for column in columns),
-            *(trial.values.get(key, "") for key in tuning.space),
+            *(trial.row.get(column, "") for column in (*others, *tuning.space)),
         ]
         for trial in tuning.trials
     ]
-    heads = ["trial", "status", "score", *columns, *tuning.space]
-    return Table(f"{tuning.name} trials", "All trials", heads, rows)
+    caption = f"The winner, trial {tuning.winner}, beside what the search began from"
+    finalists = "The finalists, by all of their seeds"
+    return (
+        Table(f"{tuning.name} winner", caption, ["key", "winner", "began from", "importance"], changed),
+        Table(f"{tuning.name} finalists", finalists, ["trial", "score", "certified"], tuning.finalists),
+        Table(
+            f"{tuning.name} trials", "All trials", ["trial", "status", "score", *others, *tuning.space], rows
+        ),
+    )

@@ -18,7 +18,6 @@ from gridworld.storage.safe_read import LARGEST_CSV, as_table, read_bytes, read_
 
 STUDY_JSON, TRIALS_CSV = "study.json", "trials.csv"
 TRIALS_SUM = "trials_sha256"  # in the former, of the latter
-_SCORED = ("done", "pruned")
 _OF_A_TRIAL = 6000  # bytes of memory that one comes to in the tables and figures of a page
 
 
@@ -29,8 +28,7 @@ class TrialRow:
     number: int
     status: str
     score: float  # NaN where it has none
-    told: Mapping[str, str]  # the other columns
-    values: Mapping[str, str]  # what was chosen, by key
+    row: Mapping[str, str]  # all columns, what was chosen by its key
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,16 +54,11 @@ class TuningStudy:
         return f"Tuning {self.agent} on {self.env}"
 
     @property
-    def counts(self) -> str:
-        """How its trials ended."""
-        statuses = [trial.status for trial in self.trials]
-        counted = [f"{statuses.count(status)} {status}" for status in sorted(set(statuses))]
-        return f"{len(statuses)} trials: {', '.join(counted)}"
-
-    @property
     def scored(self) -> list[TrialRow]:
         """Those that have a score."""
-        return [t for t in self.trials if t.status in _SCORED and math.isfinite(t.score)]
+        return [
+            each for each in self.trials if each.status in ("done", "pruned") and math.isfinite(each.score)
+        ]
 
 
 def find_tunings(paths: Sequence[Path]) -> tuple[list[TuningStudy], list[str]]:
@@ -96,22 +89,19 @@ def _read(folder: Path) -> TuningStudy:
     check_memory(trials, _OF_A_TRIAL * table.count("\n"))
     try:
         head, *rows = csv_rows(table)
-        winner = content["winner"]
+        name, agent, env = (_text(content[key])[:80] for key in ("study", "agent", "env"))
         space = {str(key): _dimension(dimension) for key, dimension in content["space"].items()}
         return TuningStudy(
             folder=folder,
-            name=_text(content["study"])[:80],
-            agent=_text(content["agent"])[:80],
-            env=_text(content["env"])[:80],
+            name=name,
+            agent=agent,
+            env=env,
             sentence=_text(content["confirmation"]["sentence"]),
-            winner=int(winner["trial"]),
-            values=dict(winner["values"]),
+            winner=int(content["winner"]["trial"]),
+            values=dict(content["winner"]["values"]),
             began_from=dict(content["began_from"] or {}),
             space=space,
-            finalists=[
-                [str(int(each["trial"])), float(each["score"]), _certified(each)]
-                for each in content["finalists"]
-            ],
+            finalists=[_finalist(each) for each in content["finalists"]],
             importances={str(key): float(share) for key, share in content["importances"].items()},
             trials=[_trial(dict(zip(head, row, strict=True)), space) for row in rows],
         )
@@ -119,15 +109,16 @@ def _read(folder: Path) -> TuningStudy:
         raise InputError(f"{file}: is not a finished study, or was changed ({error!r})") from None
 
 
-def _certified(finalist: Mapping[str, Any]) -> str:
-    failed = int(finalist.get("failed", 0))
-    return f"{finalist['certified']} / {finalist['seeds']}" + (f", {failed} failed" if failed else "")
-
-
 def _text(value: Any) -> str:
     if not isinstance(value, str):
         raise TypeError(f"{str(value)[:40]} is not a text")
     return plain(value)
+
+
+def _finalist(content: Mapping[str, Any]) -> tuple[str, float, str]:
+    failed = int(content.get("failed", 0))
+    certified = f"{content['certified']} / {content['seeds']}" + (f", {failed} failed" if failed else "")
+    return str(int(content["trial"])), float(content["score"]), certified
 
 
 def _dimension(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -143,5 +134,4 @@ def _trial(row: Mapping[str, str], space: Mapping[str, Mapping[str, Any]]) -> Tr
     for key, dimension in space.items():
         if row[key] and dimension["type"] != "categorical" and not float(row[key]) >= dimension["low"]:
             raise ValueError(f"{key}={row[key]}")
-    values = {key: row[key] for key in space}
-    return TrialRow(int(row["trial"]), row["status"], float(row["score"] or "nan"), row, values)
+    return TrialRow(int(row["trial"]), row["status"], float(row["score"] or "nan"), row)

@@ -1,23 +1,31 @@
-"""A report's folder: the page, its figures and tables as files, event files. Written whole or not at all.
+"""A report's folder: one HTML page without scripts or network, figures and tables as files, event files.
 
-The event files have the curves over seeds, since TensorBoard cannot average runs.
+The folder is written whole or not at all. The event files have the curves over seeds, since TensorBoard
+cannot average runs.
 """
 
 from __future__ import annotations
 
+import base64
 import dataclasses
+import functools
+import io
 import logging
 import math
 import os
 import re
-from collections.abc import Iterable, Sequence
+import struct
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from PIL import Image
 
+from gridworld.config.train import PICTURES
 from gridworld.errors import InputError, reason
-from gridworld.process.console import tell
-from gridworld.report import tables
+from gridworld.process.console import plain, tell
+from gridworld.report import statistics, tables
 from gridworld.report.analysis import (
     MOST_SHOWN,
     Band,
@@ -31,23 +39,30 @@ from gridworld.report.tables import to_captioned_markdown, to_csv, to_markdown
 from gridworld.run.folder import EVENTS as EVENT_FILE
 from gridworld.run.folder import MANIFEST, check_writable
 from gridworld.storage.atomic_write import replacing_folder, write_text
+from gridworld.storage.safe_read import read_bytes, sha256
 from gridworld.training.tensorboard import EventWriter
+
+if TYPE_CHECKING:  # a sweep does not wait for matplotlib and Jinja
+    import jinja2
+
+    from gridworld.report.chart import Chart, Styles
 
 PAGE = "report.html"
 FIGURES, TABLES, EVENTS = "figures", "tables", "tensorboard"
 OVER_SEEDS = "_over_seeds"  # in a sweep's folder or a study's; TensorBoard shows it before the runs
-_MOST_READ_UNASKED = 500  # runs of a sweep: a second
-_OURS = {PAGE, FIGURES, TABLES, EVENTS}
-_LONGEST_NAME = 120
-
 FORMATS = ("png", "pdf", "svg")  # of the figures
-
 BANDS = {  # tags of a value, its lower and its upper end
     name: (f"{name}/{'mean' if name == 'seeds certified' else 'iqm'}", f"{name}/low", f"{name}/high")
     for name in ("regret", "value", "on-line return", "seeds certified")
 }
-
 MARKERS = "<!-- results -->", "<!-- /results -->"
+
+_ALL_TASKS = ""  # no task's name
+_MOST_READ_UNASKED = 500  # runs of a sweep: a second
+_OURS = {PAGE, FIGURES, TABLES, EVENTS}
+_LONGEST_NAME = 120
+_LARGEST = {".png": 4 * 2**20, ".gif": 256 * 2**10}  # bytes
+_MOST_PIXELS = 4_000_000
 
 
 def check_out(folder: Path) -> None:
@@ -72,27 +87,129 @@ def write_report(report: Report, folder: Path, formats: Sequence[str] = FORMATS)
     check_out(folder)
     # It keeps what matplotlib says about its fonts and folders, also on import, off standard error.
     logging.getLogger("matplotlib").addHandler(logging.NullHandler())
-    try:
-        from gridworld.report.page import charts, render
-    except (ValueError, OSError) as error:  # it reads the user's settings when it is imported
-        raise InputError(
-            f"matplotlib: its settings cannot be read ({error}); mend or remove matplotlibrc"
-        ) from None
-    of_all = charts(report)
+    of_all, all_tables = charts(report), list(tables.all_tables(report))
+    drawn = [chart for of_one in of_all.values() for chart in of_one]
     with replacing_folder(folder) as new:
         write_text(new / PAGE, render(report, of_all))
         (new / FIGURES).mkdir()
-        drawn = [chart for of_one in of_all.values() for chart in of_one]
         for name, chart in zip(_file_names(chart.name for chart in drawn), drawn, strict=True):
             for kind in formats:
                 (new / FIGURES / f"{name}.{kind}").write_bytes(chart.saved_as(kind))
         (new / TABLES).mkdir()
-        all_tables = list(tables.all_tables(report))
         for name, table in zip(_file_names(table.name for table in all_tables), all_tables, strict=True):
             write_text(new / TABLES / f"{name}.csv", to_csv(table))
             write_text(new / TABLES / f"{name}.md", to_captioned_markdown(table))
         _write_events(report, new / EVENTS)
     return folder / PAGE
+
+
+def _file_names(names: Iterable[str], blank: str = "_") -> list[str]:
+    """Names that are safe for files and different from each other, even where capitals do not count."""
+    out: dict[str, str] = {}  # by their small letters
+    for name in names:
+        safe = re.sub(r"[^\w.,=()+ -]+", "-", name).strip(" .-")[:_LONGEST_NAME] or "unnamed"
+        safe = unique = safe.replace(" ", blank)
+        count = 1
+        while unique.lower() in out:
+            count += 1
+            unique = f"{safe}{blank}{count}"
+        out[unique.lower()] = unique
+    return list(out.values())
+
+
+# ---- the page ------------------------------------------------------------------------------------------
+
+
+def charts(report: Report) -> dict[str, list[Chart]]:
+    """The figures by task, those of tuning studies by title, and over tasks, in the agents' colours."""
+    from gridworld.report.agent_charts import overall_charts, task_charts
+    from gridworld.report.setting_charts import tuning_charts
+
+    look = _look(report)
+    drawn = {task.task: list(task_charts(task, look)) for task in report.tasks}
+    drawn |= {tuning.title: list(tuning_charts(tuning)) for tuning in report.tunings}
+    return drawn | {_ALL_TASKS: list(overall_charts(report.overall, look)) if report.overall else []}
+
+
+def _look(report: Report) -> Styles:
+    """A style for each agent; where they are more than the colours, the best ones come first."""
+    from gridworld.report.chart import COLOURS, styles
+
+    agents = list(report.study.agents)
+    if len(agents) > len(COLOURS):
+        best = [result.group.agent for task in report.tasks for result in task.ranked[: len(COLOURS)]]
+        agents = list(dict.fromkeys([*sorted(set(best)), *agents]))
+    return styles(agents)
+
+
+@functools.cache
+def template() -> jinja2.Template:
+    """The page's, compiled once."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("gridworld.report", "."),
+        autoescape=True,  # a run's folder is data: names in it may hold anything
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("page.html.j2")
+
+
+def render(report: Report, drawn: dict[str, list[Chart]]) -> str:
+    """The page's HTML with the figures of `charts`."""
+    folders = [run.folder.absolute() for run in report.runs]
+    of_one_study = (
+        tuning.title
+        for tuning in report.tunings
+        if all(folder.is_relative_to(tuning.folder.absolute()) for folder in folders)
+    )
+    return template().render(
+        report=report,
+        study=report.study,
+        headline=next(of_one_study, ""),
+        drawn=drawn,
+        overall_figures=drawn[_ALL_TASKS],
+        resamples=statistics.RESAMPLES,
+        colours={agent: look["color"] for agent, look in _look(report).items()},
+        tables=tables,
+        is_finite=math.isfinite,
+        pictures=_pictures,
+        plain=plain,
+        base64=lambda content: base64.b64encode(content).decode(),
+    )
+
+
+def _pictures(task: TaskAnalysis) -> list[tuple[str, list[dict[str, Any]]]]:
+    """The agents that have pictures, the best first, each with those that are embedded."""
+    found = [(result.group.agent, list(_embedded(result))) for result in task.ranked]
+    return [(agent, pictures) for agent, pictures in found if pictures]
+
+
+def _embedded(result: Result) -> Iterator[dict[str, Any]]:
+    """The pictures of the run with the median regret that are there, unchanged and not too large."""
+    ranked = sorted(result.group.runs, key=lambda run: (run.regret, run.seed))
+    run = ranked[(len(ranked) - 1) // 2]
+    for picture in PICTURES:
+        path = run.folder / picture.file
+        if picture.caption is None or picture.file not in run.pictures:
+            continue
+        kind = path.suffix[1:]
+        try:
+            content = read_bytes(path, _LARGEST[path.suffix])
+            with Image.open(io.BytesIO(content), formats=[kind.upper()]) as image:
+                width, height = image.size
+                if width * height > _MOST_PIXELS or run.pictures[picture.file] != sha256(content):
+                    continue
+                image.load()
+        # What Pillow raises for a damaged one; ValueError is ours, too.
+        except (OSError, ValueError, SyntaxError, EOFError, struct.error, Image.DecompressionBombError):
+            continue
+        yield {"run": run, "of": picture, "kind": kind, "content": content, "width": width, "height": height}
+
+
+# ---- TensorBoard ---------------------------------------------------------------------------------------
 
 
 def write_over_seeds(runs: Path, folder: Path) -> Path | None:
@@ -110,7 +227,7 @@ def write_over_seeds(runs: Path, folder: Path) -> Path | None:
             tell(sentence)
         if len(report.damage) > MOST_SHOWN:
             tell(f"{runs}: {len(report.damage) - MOST_SHOWN} more files are damaged; the report has all")
-        if all(len(result.group.runs) < 2 for task in report.tasks for result in task.results):
+        if all(len(group.runs) < 2 for group in report.study.groups):
             return None
         with replacing_folder(folder / OVER_SEEDS) as new:
             _write_events(report, new)
@@ -143,15 +260,13 @@ def _curves(result: Result, task: TaskAnalysis) -> dict[str, Band]:
     """The curves by name."""
     regret, best = result.regret, task.world.optimal_value
     # The value is the optimum's minus the regret: its upper end belongs to the regret's lower one.
-    value = dataclasses.replace(
-        regret,
-        point=best - regret.point,
-        mean=best - regret.mean,
-        low=best - regret.high,
-        high=best - regret.low,
-    )
+    mean, point, low, high = (best - each for each in (regret.mean, regret.point, regret.high, regret.low))
+    value = dataclasses.replace(regret, point=point, mean=mean, low=low, high=high)
     curves = {"regret": regret, "value": value, "seeds certified": result.certificates}
     return curves if result.online is None else curves | {"on-line return": result.online}
+
+
+# ---- a README ------------------------------------------------------------------------------------------
 
 
 def check_markers(path: Path) -> None:
@@ -178,17 +293,3 @@ def _around_markers(path: Path) -> tuple[str, str]:
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
         raise InputError(f"--readme {path}: must have one line {begin} and, after it, one line {end}")
     return text.split(begin)[0], text.split(end)[1]
-
-
-def _file_names(names: Iterable[str], blank: str = "_") -> list[str]:
-    """Names that are safe for files and different from each other, even where capitals do not count."""
-    out: list[str] = []
-    for name in names:
-        plain = re.sub(r"[^\w.,=()+ -]+", "-", name).strip(" .-")[:_LONGEST_NAME] or "unnamed"
-        plain = plain.replace(" ", blank)
-        count, unique = 1, plain
-        while unique.lower() in {other.lower() for other in out}:
-            count += 1
-            unique = f"{plain}{blank}{count}"
-        out.append(unique)
-    return out

@@ -15,7 +15,7 @@ from gridworld.errors import InputError
 from gridworld.process.memory_budget import BudgetError
 from gridworld.process.together import clock
 from gridworld.run.folder import CHECKPOINTS
-from gridworld.storage.atomic_write import check_ours, remove_path, sync_folder, write_bytes
+from gridworld.storage.atomic_write import remove_path, sync_folder, write_bytes
 from gridworld.storage.safe_read import check_no_link, read_bytes
 from gridworld.storage.serialization import State, StateError, decode, encode
 
@@ -57,7 +57,6 @@ class Checkpoints:
             OSError: it could not be written; the ones before are still there.
         """
         check_no_link(self.folder)
-        check_ours(self.folder)
         is_new = not self.folder.exists()
         self.folder.mkdir(exist_ok=True)
         write_bytes(self._path(steps), encode(state, compress=small), durable)

@@ -12,8 +12,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
-from gridworld.errors import InputError
-from gridworld.storage.atomic_write import check_ours
+from gridworld.errors import FolderLostError
 from gridworld.storage.safe_read import open_ordinary
 
 _PIECE = 1 << 20  # bytes read at once
@@ -21,6 +20,9 @@ _PIECE = 1 << 20  # bytes read at once
 
 class AppendLog:
     """An append-only file that is open for writing. Nothing is buffered: readers see each record at once.
+
+    The file also is the witness that the folder is still this process's: if somebody deleted it, and began
+    anew at the same path, whatever writes here raises `FolderLostError`.
 
     Args:
         path: of a new file, or with `mark` of an existing one.
@@ -32,7 +34,6 @@ class AppendLog:
 
     def __init__(self, path: Path, mark: dict[str, Any] | None = None) -> None:
         self.path = path
-        check_ours(path)
         self._file: BinaryIO
         if mark is None:
             if path.is_symlink() or path.is_fifo():
@@ -46,6 +47,7 @@ class AppendLog:
 
     def append(self, record: bytes) -> None:
         """Append a record; if that fails (the disk is full), the file ends with the record before."""
+        self.check()
         rest = memoryview(record)
         try:
             while rest:
@@ -61,7 +63,7 @@ class AppendLog:
         self._file.seek(self.length)
 
     def content(self) -> bytes:
-        """All records, also where somebody has deleted the file meanwhile."""
+        """All records."""
         return os.pread(self._file.fileno(), self.length, 0)
 
     def mark(self) -> dict[str, Any]:
@@ -70,22 +72,22 @@ class AppendLog:
 
     def sync(self) -> None:
         """Make the file survive a power cut."""
-        self._check_there()
+        self.check()
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Close the file."""
         if not self._file.closed:
             try:
-                self._check_there()
+                self.check()
             finally:
                 self._file.close()
 
-    def _check_there(self) -> None:
-        check_ours(self.path)
+    def check(self) -> None:
+        """Refuse to continue where the file at this path is not this one any more."""
         opened = os.fstat(self._file.fileno())
         if not os.path.lexists(self.path) or not os.path.samestat(os.lstat(self.path), opened):
-            raise InputError(f"{self.path}: was deleted or replaced during the run")
+            raise FolderLostError(f"{self.path}: was deleted or replaced during the run, which ends here")
 
 
 def holds(folder: Path, mark: Any, pattern: str) -> bool:

@@ -150,19 +150,6 @@ def _seal(content: Mapping[str, Any]) -> str:
     return sha256(json.dumps(unsealed, sort_keys=True).encode())
 
 
-def check_yaml(folder: Path) -> None:
-    """Refuse a configuration's folder with a yaml file that is no regular file, or is far too large.
-
-    Hydra would read a pipe or a device, which need not end, and follows links.
-    """
-    for depth in ("", "*/", "*/*/"):  # as deep as its groups are
-        for file in filter(Path.exists, sorted(folder.glob(f"{depth}*.yaml"))):
-            if not file.is_file():
-                raise InputError(f"{file}: is no ordinary file; give a yaml file, or take it away")
-            if file.stat().st_size > LARGEST_JSON:
-                raise InputError(f"{file}: is larger than {_size(LARGEST_JSON)}, which is no configuration")
-
-
 def check_no_link(path: Path) -> None:
     """Refuse a path that is a symbolic link, which writing would follow."""
     if path.is_symlink():

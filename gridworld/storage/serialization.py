@@ -52,7 +52,7 @@ def encode(state: State, compress: bool = False) -> memoryview:
     with zipfile.ZipFile(content, "w") as archive:
         archive.writestr(zipfile.ZipInfo(_TREE), tree)
         for name, array in arrays.items():
-            member = _npy(array)
+            member = npy_bytes(array)
             how = zipfile.ZIP_DEFLATED if compress and _gets_smaller(member) else zipfile.ZIP_STORED
             archive.writestr(zipfile.ZipInfo(f"{name}.npy"), member, how, compresslevel=1)
     return content.getbuffer()
@@ -107,7 +107,8 @@ def fill(target: NDArray[Any], value: Any, where: str) -> None:
     target[...] = value
 
 
-def _npy(array: NDArray[Any]) -> bytes:
+def npy_bytes(array: NDArray[Any]) -> bytes:
+    """An array in numpy's own format; `numpy.load` reads it without unpickling anything."""
     content = io.BytesIO()
     np.lib.format.write_array(content, np.asarray(array, order="C"), allow_pickle=False)
     return content.getvalue()

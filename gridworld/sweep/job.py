@@ -22,8 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from gridworld.agents import family
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.errors import FolderLostError, InputError, MachineError, reason
-from gridworld.process.console import called_from
-from gridworld.process.memory_budget import collect_less_often
+from gridworld.process.console import called_from, prepare
 from gridworld.process.signals import Interrupted, exiting, handling, send_sigterm
 from gridworld.process.together import mixing
 from gridworld.restore.resume import unfinished_of
@@ -75,7 +74,7 @@ def run_in_sweep(
         raise JobError(one_line(reason(error))) from None
     except Exception as error:
         why = one_line(reason(error))
-        with contextlib.suppress(OSError, FolderLostError):
+        with contextlib.suppress(OSError):
             mark_failed(folder, why, "" if isinstance(error, InputError) else traceback.format_exc())
         if stop_at_failure:
             raise StopSweep(why) from None
@@ -113,7 +112,7 @@ class Worker:
 
     def __call__(self, jobs: Sequence[Job]) -> list[str]:
         """Run the jobs of a population; returns the error of each, or ""."""
-        collect_less_often()
+        prepare()
         os.environ.update(self.master.hydra.job.env_set)
         configure_log(self.master.hydra.job_logging, self.master.hydra.verbose)
         config = jobs[0].config  # all have one device

@@ -18,12 +18,12 @@ from omegaconf import DictConfig, open_dict, read_write
 
 from gridworld.config.sweep import SweepConfig
 from gridworld.config.words import prepared
-from gridworld.errors import EXIT_CODE, FolderLostError, InputError, reason
+from gridworld.errors import InputError, reason
 from gridworld.process.console import ProgressLine, tell, tell_error, time_left
 from gridworld.process.processes import LostError
 from gridworld.process.signals import exiting, signal_name
 from gridworld.run.folder import ERROR_FILE
-from gridworld.storage.atomic_write import make_inside, write_text
+from gridworld.storage.atomic_write import inside, write_text
 from gridworld.sweep import console
 from gridworld.sweep.folder import DONE, FAILED, INTERRUPTED, PENDING, RUNNING, JobRow, SweepFolder
 from gridworld.sweep.job import StopSweep, Worker, mark_failed, run_status
@@ -73,9 +73,6 @@ def run_sweep(words: list[str], context: HydraContext, master: DictConfig, setti
         where = console.shell_path(folder.path)
         tell_error(f"{where}: {reason(error)}; put that right, then go on with: {again}")
         code = 1
-    except FolderLostError as error:
-        tell_error(str(error))
-        code = EXIT_CODE
     if code:
         raise SystemExit(code)
 
@@ -114,8 +111,10 @@ class _Sweep:
     def run(self, divide: Callable[[Sequence[Job]], list[list[Job]]], retry_failed: bool) -> int:
         """Run the jobs to do, and print how they ended; returns the exit code."""
         for name, mistake in self._reasons.items():
-            if not run_status(self._folder.path / name):
-                write_text(make_inside(self._folder.path, name) / ERROR_FILE, f"{mistake}\n")
+            folder = inside(self._folder.path, name)
+            if not run_status(folder):
+                folder.mkdir(exist_ok=True)
+                write_text(folder / ERROR_FILE, f"{mistake}\n")
         self._look()
         statuses = {PENDING, INTERRUPTED} | ({FAILED} if retry_failed else set())
         to_do = [job for job in self._jobs if not job.mistake and self._row(job).status in statuses]
@@ -191,7 +190,7 @@ class _Sweep:
         if began < self._due:
             return
         ended = {job: row for job, row in self._rows.items() if row.status in (DONE, FAILED)}
-        with contextlib.suppress(OSError, FolderLostError):
+        with contextlib.suppress(OSError):
             rows = self._folder.rows(self._reasons, ended)
             if rows != self._rows:
                 self._folder.write(rows)

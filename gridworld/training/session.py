@@ -31,8 +31,8 @@ from gridworld.run.provenance import environment, identity
 from gridworld.run.summary import MOST_NAMED, Summary
 from gridworld.run.writer import NEEDED, RunWriter, write_evaluations
 from gridworld.storage.append_log import AppendLog
-from gridworld.storage.atomic_write import sync, write_array, write_bytes, write_json
-from gridworld.storage.serialization import State, fitting
+from gridworld.storage.atomic_write import sync, write_bytes, write_json
+from gridworld.storage.serialization import State, fitting, npy_bytes
 from gridworld.training.learning_curve import (
     CHARTS,
     CurveScalars,
@@ -90,7 +90,7 @@ class Parts:
 
 PARTS = tuple(field.name for field in dataclasses.fields(Parts))
 LOGS = {"curve": CURVE, "events": EVENTS}  # that a checkpoint has marks of, and the pattern of their names
-FORMAT = 5  # of a checkpoint; a number more where a part's state has other keys or another meaning
+FORMAT = 6  # of a checkpoint; a number more where a part's state has other keys or another meaning
 CONTENT = {  # the type of each key of a checkpoint
     "format": int,
     "identity": str,
@@ -223,7 +223,6 @@ class Session:
         if not (asked or is_last or self._pace.is_due(steps)) or steps == self.checkpoints.newest:
             self._stop.obey()
             return
-        self._stop.take_time()
         started = clock()
         try:
             self._save(steps, is_last)
@@ -259,7 +258,7 @@ class Session:
         write_bytes(run.model_file, parts.agent.agent.model_file())
         write_bytes(run.best_model_file, parts.curve.best.content)
         self._write_evaluations()
-        write_array(run.visits_file, self._visits)
+        write_bytes(run.visits_file, npy_bytes(self._visits))
         summary = summarise(self._config, parts.curve, last, seconds)
         write_json(run.summary_file, _as_json(summary))
         if self._events is not None:
@@ -279,6 +278,7 @@ class Session:
             sync([], self.checkpoints.folder)
 
     def _write_evaluations(self) -> None:
+        self._curve_log.check()
         if self._parts.curve.newest is not None:
             write_evaluations(self._run.evaluations_file, read_curve(self._curve_log, NEEDED))
 

@@ -16,7 +16,7 @@ from gridworld.agents import Agent, family
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import make_observation
-from gridworld.errors import InputError, MachineError, reason
+from gridworld.errors import FolderLostError, InputError, MachineError, reason
 from gridworld.process.console import recorded_command_line, tell
 from gridworld.process.signals import Interrupted
 from gridworld.run.folder import MANIFEST, RunFolder, shown
@@ -115,7 +115,7 @@ def carry_out(
             log.add(f"begins: {shlex.join(recorded_command_line())}")
         summary = yield from session.run(run)
     except BaseException as error:
-        if run is not None:
+        if run is not None and not isinstance(error, FolderLostError):
             with contextlib.suppress(OSError):  # nothing can be written perhaps
                 _note_end(run, log, error, session.progress())
         if isinstance(error, StateError):

@@ -44,10 +44,9 @@ from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, alone_in, check_wri
 from gridworld.run.provenance import versions
 from gridworld.storage.atomic_write import (
     check_no_links,
+    inside,
     is_locked,
     make_folder,
-    make_inside,
-    noted,
     tidy,
     write_json,
     write_text,
@@ -212,10 +211,8 @@ def check_study_folder(folder: Path) -> None:
 def at_work_in(folder: Path, is_shared: bool = False) -> Iterator[None]:
     """Make the folder and hold it, unless others share the study; one that stays empty is removed."""
     make_folder(folder)
-    if is_shared:
-        (folder / LOCK).touch()
     try:
-        with noted(folder / LOCK) if is_shared else alone_in(folder):
+        with contextlib.nullcontext() if is_shared else alone_in(folder):
             if not is_shared:
                 tidy(folder)
             yield
@@ -291,7 +288,8 @@ def write_recipe(
     lines = ["# @package _global_", f"# {about}", "defaults:"]
     lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
     lines += ["  - _self_", "", OmegaConf.to_yaml(OmegaConf.create(values)) if values else ""]
-    path = make_inside(folder, _EXPERIMENT) / _WINNER
+    path = inside(folder, _EXPERIMENT) / _WINNER
+    path.parent.mkdir(exist_ok=True)
     write_text(path, "\n".join(lines), durable=True)
     for words in ([f"experiment={path.stem}"], overrides(path, trust=True)):
         assert composed(words, (folder,)) == _relevant(config), f"{path} does not say what the winner is"

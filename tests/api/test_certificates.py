@@ -675,7 +675,7 @@ class Clock(PPO):
 
 
 def test_a_predict_that_draws_or_keeps_time_is_refused() -> None:
-    for kind, told in ((Sampling, "draws random numbers"), (Clock, "gives a state to give back")):
+    for kind, told in ((Sampling, "draws random numbers"), (Clock, "keeps a state from step to step")):
         model = held(BEST)
         model.__class__ = kind
         with pytest.raises(InputError, match=told):

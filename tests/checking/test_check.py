@@ -14,7 +14,7 @@ from stable_baselines3 import A2C, DQN, PPO
 import gridworld
 from gridworld.agents import PolicySnapshot
 from gridworld.checking import probes as expect
-from gridworld.checking import run, worlds
+from gridworld.checking import run
 from gridworld.checking.probes import PROBES, Trained
 from gridworld.checking.training import arguments, settings, subject, train
 from gridworld.commands import check as command
@@ -70,7 +70,7 @@ def test_states_that_look_alike_are_alike_in_both_loops(kind: type) -> None:
     found = settings(subject(kind), BY_NAME["constant"], {})
     assert found is not None
     stock, tabulated = (
-        train(dataclasses.replace(found[0], engine=engine), worlds.end_like_the_start(), 0.9, 8, 640, 0).last
+        train(dataclasses.replace(found[0], engine=engine), expect.END_LIKE_THE_START, 0.9, 8, 640, 0).last
         for engine in ("stock", "tabulated")
     )
     assert tabulated.values == pytest.approx(stock.values, abs=1e-4)
@@ -111,7 +111,7 @@ def test_two_of_three_seeds_decide(
 
 def trained(q: np.ndarray) -> Trained:
     """A learner of Q on the alternation, which acts as it has learnt."""
-    mdp = worlds.alternation()
+    mdp = expect.ALTERNATION
     greedy = q.argmax(axis=1)
     last = PolicySnapshot(greedy, one_hot_policy(greedy, 2), q.max(axis=1), q)
     visits = np.ones((2, 2), np.int64)
@@ -119,7 +119,7 @@ def trained(q: np.ndarray) -> Trained:
 
 
 def test_expectations_have_a_tolerance_and_tell_what_is_farthest() -> None:
-    exact = solved(worlds.alternation(), 0.8).q
+    exact = solved(expect.ALTERNATION, 0.8).q
     assert expect.optimal_with_values(trained(exact)) == "optimal, Q(0, 0) 1.778, exact 1.778"
     near, far = exact.copy(), exact.copy()
     near[1, 0] += 0.27
@@ -186,17 +186,17 @@ def test_their_values_are_those_that_the_page_tells() -> None:
         """Q* of the live states."""
         return solved(mdp, gamma).q[~mdp.terminal]
 
-    assert q(worlds.constant(), 0.9) == pytest.approx(1.0)
-    assert q(worlds.corridor(), 0.5)[:, 0] == pytest.approx([0.25, 0.5, 1])
-    assert q(worlds.bandit(), 0.9)[0] == pytest.approx([0, 1, 0.5])
-    assert q(worlds.two_contexts(), 0.9) == pytest.approx(np.eye(2))
-    assert q(worlds.delay(), 0.9)[0] == pytest.approx([0.9**3, 0])
-    assert q(worlds.end_like_the_start(), 0.9)[:, 0] == pytest.approx([0.9, 1])
-    assert q(worlds.endless(), 0.8) == pytest.approx(5)
-    assert q(worlds.gamble(), 0.9)[0] == pytest.approx([0.1, 0.4])
-    assert q(worlds.alternation(), 0.8)[:, 1] == pytest.approx([0.8 / 0.36, 1 / 0.36])
-    assert q(worlds.trap(), 0.9)[0] == pytest.approx([0.2, 0.7])
-    assert q(worlds.slippery(), 0.9)[1, 1] == pytest.approx(0.8 / 0.82)
-    assert worlds.end_like_the_start().number.tolist() == [0, 1, 0]  # its end looks like a live state
-    assert (worlds.endless().max_episode_steps, worlds.endless().terminal.any()) == (5, False)
+    assert q(expect.CONSTANT, 0.9) == pytest.approx(1.0)
+    assert q(expect.CORRIDOR, 0.5)[:, 0] == pytest.approx([0.25, 0.5, 1])
+    assert q(expect.BANDIT, 0.9)[0] == pytest.approx([0, 1, 0.5])
+    assert q(expect.TWO_CONTEXTS, 0.9) == pytest.approx(np.eye(2))
+    assert q(expect.DELAY, 0.9)[0] == pytest.approx([0.9**3, 0])
+    assert q(expect.END_LIKE_THE_START, 0.9)[:, 0] == pytest.approx([0.9, 1])
+    assert q(expect.ENDLESS, 0.8) == pytest.approx(5)
+    assert q(expect.GAMBLE, 0.9)[0] == pytest.approx([0.1, 0.4])
+    assert q(expect.ALTERNATION, 0.8)[:, 1] == pytest.approx([0.8 / 0.36, 1 / 0.36])
+    assert q(expect.TRAP, 0.9)[0] == pytest.approx([0.2, 0.7])
+    assert q(expect.SLIPPERY, 0.9)[1, 1] == pytest.approx(0.8 / 0.82)
+    assert expect.END_LIKE_THE_START.number.tolist() == [0, 1, 0]  # its end looks like a live state
+    assert (expect.ENDLESS.max_episode_steps, expect.ENDLESS.terminal.any()) == (5, False)
     assert len({probe.name for probe in PROBES}) == len(PROBES)

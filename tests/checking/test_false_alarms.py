@@ -77,7 +77,7 @@ def shares(name: str, seeds: range) -> dict[str, np.ndarray]:
         config = dataclasses.replace(chosen[0], engine="tabulated")
         for seed in seeds:
             trained = train(
-                config, probes[0].world(), probes[0].gamma, chosen[1].num_envs, chosen[1].steps, seed
+                config, probes[0].world, probes[0].gamma, chosen[1].num_envs, chosen[1].steps, seed
             )
             for probe in probes:
                 found.setdefault(probe.name, []).append(share(probe, trained))

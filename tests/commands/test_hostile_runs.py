@@ -11,9 +11,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from helpers.forks import run_watched
+from helpers import forks
 from helpers.hostile import CATALOGUE, FINE, SECRET, Hostile
-from helpers.support import SHORT, train_in
+from helpers.support import ROOT, SHORT, train_in
 from PIL import Image
 
 WORDS = {
@@ -79,6 +79,8 @@ def test_nothing_of_a_hostile_run_gets_out(case: Hostile, good: Path, tmp_path: 
     base = tmp_path / "base"
     outside = base / "outside"
     outside.mkdir(parents=True)
+    (outside / "kept").write_text("kept")
+    (base / "evil.py").write_text(f"open({str(base / 'canary')!r}, 'w')\nclass Agent: pass\n")
     (base / "secret.txt").write_text(f"S{SECRET}G\n")
     (base / "secret.json").write_text(f'{{"status": "{SECRET}", "timesteps": "{SECRET}"}}')
     Image.new("RGB", (16, 16), "red").save(base / "secret.png")
@@ -92,8 +94,10 @@ def test_nothing_of_a_hostile_run_gets_out(case: Hostile, good: Path, tmp_path: 
 
     looked_at = -1
     for command, words in WORDS.items():
-        secret = base / "secret"
-        ended = run_watched(SCRIPTS[command], *words, cwd=place, secret=secret, environment=AWAY, timeout=60)
+        variables = {**AWAY, "PYTHONPATH": f"{ROOT}{os.pathsep}{base}"}
+        ended = forks.run(
+            SCRIPTS[command], *words, cwd=place, secret=base / "secret", environment=variables, timeout=60
+        )
         where = f"{command}: {ended.output[-2000:]}"
         assert ended.deeds == [], where
         assert not (base / "canary").exists(), where

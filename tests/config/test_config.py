@@ -19,17 +19,19 @@ from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.training.tensorboard import hparams
 from gridworld.world.layout import shipped_layouts
+from gridworld.world.mdp import Mdp
 
 GROUPS = sorted(folder.name for folder in CONF.iterdir() if folder.is_dir() and folder.name != "tune")
 CHOICES = [(group, file.stem) for group in GROUPS for file in sorted((CONF / group).glob("*.yaml"))]
 AGENTS = {choice for group, choice in CHOICES if group == "agent"}
 COMPLETED = {  # choices that leave something to say
     "gymnasium": ["env.id=FrozenLake-v1"],
-    "enumerated": ["env.id=MiniGrid-Empty-5x5-v0"],
+    "enumerated": ["env.id=MiniGrid-Empty-5x5-v0", "env.kwargs={max_steps: 10}"],
     "arrays": ["env.path=two_rooms.npz"],
     "built": ["env.builder=gridworld.world.sources.classics.river_swim"],
-    "own": ["env=enumerated", "env.id=MiniGrid-Empty-5x5-v0"],
+    "own": ["env=enumerated", "env.id=MiniGrid-Empty-5x5-v0", "env.kwargs={max_steps: 10}"],
 }
+COMPILED: dict[str, Mdp] = {}  # worlds by their settings
 FROM_ELSEWHERE = {"self", "env", "seed", "device", "tensorboard_log", "verbose", "_init_setup_model"}
 
 
@@ -51,7 +53,8 @@ def test_every_choice_composes_and_could_train(
     config = configure(f"{group}={choice}", *pair.split(), *COMPLETED.get(choice, []))
     check(config)
     family(config.agent).check(config)
-    mdp = config.env.compile()
+    world = repr(config.env)
+    mdp = COMPILED[world] = COMPILED.get(world) or config.env.compile()
     assert make_observation(mdp, config.observation.kind).num_states == mdp.num_states
     for part in dataclasses.fields(TrainConfig):
         assert not isinstance(getattr(config, part.name), dict)

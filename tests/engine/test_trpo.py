@@ -18,8 +18,8 @@ from gridworld.engine.trpo import conjugate_gradients
 @pytest.mark.parametrize(
     ("kind", "arguments"),
     [
-        *[("one_hot", {}), ("one_hot", RELU), ("one_hot", ELU), ("one_hot", LINEAR)],
-        *[("coordinates", {}), ("coordinates", TWO_SIZES), ("image", {})],
+        *[("one_hot", RELU), ("one_hot", ELU), ("one_hot", LINEAR)],
+        *[("coordinates", TWO_SIZES), ("image", {})],
     ],
     ids=str,
 )
@@ -82,30 +82,6 @@ def test_conjugate_gradients_solve_each_system_as_alone() -> None:
         assert torch.equal(solve(slice(row, row + 1))[0], solved[row])
 
 
-@pytest.mark.parametrize("size", [1, 3])
-def test_a_population_goes_on_from_the_middle(size: int) -> None:
-    runs = [(*SMALL["trpo"], f"seed={seed}", "env.slip=0.1") for seed in range(size)]
-    expected = [alone(words) for words in runs]
-    kept: list[Any] = [None] * size
-    learnings = [Learned(words).learning() for words in runs]
-    for place, learning in enumerate(learnings):
-
-        def keep(steps: int, place: int = place) -> None:
-            if steps == 64:
-                kept[place] = learnings[place].agent.get_state()
-
-        learning.on_safe_point = keep
-    assert learn_together(learnings) == [None] * size
-    rest = [Learned(words) for words in runs]
-    learnings = [run.learning() for run in rest]
-    for learning, state in zip(learnings, kept, strict=True):
-        assert 0 < state["num_timesteps"] < learning.total_timesteps
-        learning.state = state
-    assert learn_together(learnings) == [None] * size
-    for run, whole in zip(rest, expected, strict=True):
-        assert set(differences(run.found(), whole)) <= {".logged"}  # in which the first half is missing
-
-
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_a_trust_region_that_there_is_not_ends_its_own_run() -> None:
     runs = [(*SMALL["trpo"], f"seed={seed}") for seed in range(3)]
@@ -113,5 +89,5 @@ def test_a_trust_region_that_there_is_not_ends_its_own_run() -> None:
     learnings = [each.learning() for each in learned]
     learned[1].agent.run.model.target_kl = -1.0  # which no settings can be
     errors = learn_together(learnings)
-    assert "the network's weights are no finite number" in str(errors[1])
+    assert "a weight is not finite" in str(errors[1])
     assert [differences(learned[place].found(), alone(runs[place])) for place in (0, 2)] == [[], []]

@@ -10,10 +10,9 @@ from sb3_contrib import QRDQN, TRPO
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.logger import KVWriter, Logger
 
-from gridworld.agents.sb3.agent import extractors_kind
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.engine import a2c, dqn, on_policy, population
+from gridworld.engine import dqn, on_policy, population
 from gridworld.engine.population import Run
 from gridworld.engine.sb3_format import algorithm_of, make_run, put_weights
 from gridworld.envs.observations import make_observation
@@ -50,7 +49,7 @@ def twins(algorithm: type, kind: str, **arguments: Any) -> tuple[Run, Any]:
         model._setup_learn(10_000)
         models.append(model)
     models[1].policy.load_state_dict(models[0].policy.state_dict())
-    run = make_run(models[0], observation, envs, 0, extractors_kind(models[0]))
+    run = make_run(models[0], observation, envs, 0)
     run.begin(10_000)
     found = algorithm_of(algorithm)
     assert found is not None
@@ -110,31 +109,28 @@ RMSPROP = {"optimizer_class": torch.optim.RMSprop, "optimizer_kwargs": {"eps": 1
 RELU = {"policy_kwargs": {"activation_fn": torch.nn.ReLU, **RMSPROP}}
 ELU = {"policy_kwargs": {"activation_fn": torch.nn.ELU}}
 FEW_PRODUCTS = {"cg_max_steps": 2, "cg_damping": 1.0, "n_critic_updates": 1}
+COEFFICIENTS = {"ent_coef": 0.3, "vf_coef": 0.1, "max_grad_norm": 0.01}
+NETWORKS: list[tuple[str, dict[str, Any]]] = [
+    *[(kind, {}) for kind in KINDS],
+    *[("none", LINEAR), ("coordinates", TWO_SIZES), ("coordinates", SEPARATE), ("image", SEPARATE)],
+    *[("coordinates", FOURIER), ("coordinates", APART), ("image", CELLS), ("image", PIXELS)],
+    *[("one_hot", RELU), ("one_hot", ELU)],
+]
 ON_POLICY: list[tuple[type, str, dict[str, Any]]] = [
-    *[(PPO, kind, {}) for kind in KINDS],
-    (PPO, "one_hot", {"clip_range": 0.02, "ent_coef": 0.3, "vf_coef": 0.1}),
+    *[(PPO, kind, arguments) for kind, arguments in NETWORKS],
+    (PPO, "one_hot", {"clip_range": 0.02, "normalize_advantage": False, **COEFFICIENTS}),
     (PPO, "one_hot", {"clip_range_vf": 0.05}),
-    (PPO, "one_hot", {"normalize_advantage": False}),
-    (PPO, "one_hot", {"max_grad_norm": 0.01}),
     (PPO, "one_hot", {"target_kl": 1e-3, "n_epochs": 3}),
     (PPO, "one_hot", {"n_epochs": 3, "batch_size": 100}),
     (PPO, "one_hot", {"n_epochs": 3, "batch_size": 10_000}),
-    *[(PPO, "none", LINEAR), (PPO, "coordinates", TWO_SIZES), (PPO, "coordinates", SEPARATE)],
-    *[(PPO, "image", SEPARATE), (PPO, "coordinates", FOURIER), (PPO, "image", CELLS)],
-    *[(PPO, "image", PIXELS), (PPO, "coordinates", APART), (PPO, "one_hot", RELU), (PPO, "one_hot", ELU)],
-    *[(A2C, kind, {}) for kind in KINDS],
-    (A2C, "one_hot", {"ent_coef": 0.3, "vf_coef": 0.1, "normalize_advantage": True}),
-    (A2C, "one_hot", {"use_rms_prop": False, "max_grad_norm": 0.01}),
-    *[(A2C, "none", LINEAR), (A2C, "coordinates", TWO_SIZES), (A2C, "image", SEPARATE)],
-    *[(A2C, "coordinates", FOURIER), (A2C, "image", PIXELS)],
-    *[(TRPO, kind, {}) for kind in KINDS if kind != "image"],
-    *[(TRPO, "image", FEW_PRODUCTS), (TRPO, "image", {**SEPARATE, **FEW_PRODUCTS})],
+    *[(A2C, "one_hot", {}), (A2C, "coordinates", TWO_SIZES), (A2C, "image", PIXELS)],
+    (A2C, "one_hot", {"normalize_advantage": True, "use_rms_prop": False, **COEFFICIENTS}),
+    *[(TRPO, "one_hot", {}), (TRPO, "none", LINEAR), (TRPO, "coordinates", TWO_SIZES)],
+    *[(TRPO, "one_hot", RELU), (TRPO, "one_hot", ELU), (TRPO, "image", {**PIXELS, **FEW_PRODUCTS})],
     (TRPO, "one_hot", {"normalize_advantage": False, "cg_max_steps": 3, "cg_damping": 1.0}),
     (TRPO, "one_hot", {"sub_sampling_factor": 3, "batch_size": 100, "n_critic_updates": 2}),
     (TRPO, "one_hot", {"target_kl": 0.5, "line_search_shrinking_factor": 0.5, "cg_damping": 1.0}),
     (TRPO, "one_hot", {"line_search_max_iter": 0}),
-    *[(TRPO, "none", LINEAR), (TRPO, "coordinates", TWO_SIZES), (TRPO, "coordinates", FOURIER)],
-    *[(TRPO, "one_hot", RELU), (TRPO, "one_hot", ELU), (TRPO, "image", {**PIXELS, **FEW_PRODUCTS})],
 ]
 
 
@@ -144,7 +140,7 @@ ON_POLICY: list[tuple[type, str, dict[str, Any]]] = [
 def test_updates_from_rollouts(
     algorithm: Any, kind: str, arguments: dict[str, Any], few_states: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (population, on_policy, a2c):
+    for module in (population, on_policy):
         monkeypatch.setattr(module, "FEW_STATES", few_states)
     n_steps = STEPS
     if algorithm is PPO:
@@ -190,10 +186,8 @@ OFF_POLICY: list[tuple[type, str, dict[str, Any]]] = [
     *[(DQN, "one_hot", LINEAR), (DQN, "coordinates", FOURIER), (DQN, "image", CELLS), (DQN, "image", PIXELS)],
     (DQN, "none", {"policy_kwargs": {"net_arch": [8], "activation_fn": torch.nn.Tanh}}),
     (DQN, "one_hot", {"policy_kwargs": {"activation_fn": torch.nn.PReLU}}),
-    *[(QRDQN, kind, {}) for kind in KINDS],
-    (QRDQN, "one_hot", {"max_grad_norm": 1e-3, "gamma": 0.5}),
-    (QRDQN, "coordinates", FOURIER),
-    (QRDQN, "one_hot", {"policy_kwargs": {"net_arch": [], "n_quantiles": 7}}),
+    *[(QRDQN, "one_hot", {"max_grad_norm": 1e-3, "gamma": 0.5}), (QRDQN, "coordinates", FOURIER)],
+    (QRDQN, "image", {"policy_kwargs": {"net_arch": [], "n_quantiles": 7}}),
     (QRDQN, "none", {"policy_kwargs": {"n_quantiles": 1, **SGD}}),
 ]
 

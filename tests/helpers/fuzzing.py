@@ -26,7 +26,7 @@ from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.report.evidence import read
 from gridworld.report.setting_charts import tuning_charts
-from gridworld.report.tables import finalists_table, to_captioned_markdown, to_csv, trials_table, winner_table
+from gridworld.report.tables import to_captioned_markdown, to_csv, tuning_tables
 from gridworld.report.tuning_study import TRIALS_SUM, find_tunings
 from gridworld.restore.saved_run import SavedRun
 from gridworld.storage.safe_read import sealed
@@ -201,7 +201,7 @@ def fuzz_study(random: random.Random, folder: Path) -> None:
     is_claimed(study, "mine")
     found, problems = find_tunings([study])
     for each in found:
-        for table in (winner_table(each), finalists_table(each), trials_table(each)):
+        for table in tuning_tables(each):
             to_csv(table), to_captioned_markdown(table)
         for chart in tuning_charts(each):
             places = "".join(re.findall(r'\b(?:d|x|y|transform)="[^"]*"', chart.saved_as("svg").decode()))

@@ -29,7 +29,7 @@ from gridworld.config.train import PICTURES
 from gridworld.errors import InputError
 from gridworld.report import tuning_study as tuning
 from gridworld.report.analysis import gather
-from gridworld.report.page import charts, render
+from gridworld.report.writer import charts, render
 from gridworld.restore.reproduce import check_whole
 from gridworld.restore.resume import open_unfinished
 from gridworld.restore.saved_run import SavedRun, read_visits

@@ -22,11 +22,10 @@ NAME: ContextVar[str] = ContextVar("name", default="outside")
 
 @pytest.fixture(autouse=True)
 def handlers_are_put_back() -> Iterator[None]:
-    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGALRM)
+    before = signal.getsignal(signal.SIGTERM)
     yield
     assert StopRequest._listening == []
-    assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGALRM)) == before
-    assert signal.getitimer(signal.ITIMER_REAL)[0] == 0
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 class Walker:
@@ -198,28 +197,3 @@ def test_a_second_signal_ends_all_at_once() -> None:
     with pytest.raises(Interrupted):
         run_together([partial(interruptible, log, name, {2: 2} if name == "b" else {}) for name in "abc"])
     assert sorted(log) == [f"{name} stopped" for name in "abc"]
-
-
-def test_who_comes_to_no_safe_point_is_stopped_after_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(signals, "_SECONDS_TO_SAFE_POINT", 0.01)
-    log: list[str] = []
-
-    def slow() -> None:
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(5)
-
-    def sleeps(name: str) -> Training[None]:
-        request = StopRequest()
-        try:
-            with request.listening():
-                request.patient = True
-                yield Learning(Walker(name, {1: slow}), 1, lambda step: 1)  # type: ignore[arg-type]
-        except Interrupted:
-            log.append(f"{name} stopped")
-            raise
-
-    started = time.monotonic()
-    with pytest.raises(Interrupted):
-        run_together([partial(sleeps, "a"), partial(sleeps, "b")])
-    assert time.monotonic() - started < 4
-    assert log == ["a stopped", "b stopped"]

@@ -3,7 +3,6 @@
 import csv
 import json
 import sys
-import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -219,21 +218,6 @@ def test_a_signal_while_the_runs_files_are_opened_interrupts_it(
         with pytest.raises(type(stop)):
             train_in(tmp_path, *SHORT["q_learning"])
     assert json.loads((tmp_path / "manifest.json").read_text())["status"] == "interrupted"
-
-
-@pytest.mark.parametrize(("date", "is_refused"), [("1979-12-31", True), ("1980-01-01", False)])
-def test_a_clock_from_before_zip_files_is_told_before_training(
-    date: str, is_refused: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    then = time.strptime(date, "%Y-%m-%d")
-    monkeypatch.setattr(time, "localtime", lambda seconds=None: then)
-    if is_refused:
-        with pytest.raises(InputError, match=r"the clock says 1979-12-31, .* set the clock"):
-            train_in(tmp_path / "a2c", *SHORT["a2c"])
-        assert not list((tmp_path / "a2c").iterdir())
-    else:
-        train_in(tmp_path / "a2c", *SHORT["a2c"])
-    train_in(tmp_path / "sarsa", *SHORT["sarsa"])  # whose file has no dates
 
 
 @pytest.mark.slow

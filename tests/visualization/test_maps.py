@@ -238,15 +238,15 @@ def test_a_run_leaves_out_what_cannot_be_drawn_and_says_so(
     assert (tmp_path / "visits.png").exists()
 
 
-def test_a_run_on_a_long_corridor_ends_well(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    (tmp_path / "long.txt").write_text("S" + "." * 65_600 + "G")
+def test_a_run_on_a_wide_map_ends_well(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "wide.txt").write_text("S.G" + "#" * 65_600)
     settings = ["observation=coordinates", "total_timesteps=320", "env.max_episode_steps=5"]
-    overrides = [f"env.layout={tmp_path / 'long.txt'}", *settings, "agent.learning_starts=200"]
+    overrides = [f"env.layout={tmp_path / 'wide.txt'}", *settings, "agent.learning_starts=200"]
     with caplog.at_level(logging.WARNING):
         train_in(tmp_path / "run", *SHORT["dqn"], *overrides)
     for name in ("policy.png", "q_error.png", "visits.png", "learning.gif", "the episode"):
         assert caplog.text.count(f"{name} is left out") == 1
-        assert "65604 x 3 pixels is too large to draw" in caplog.text
+        assert "65605 x 3 pixels is too large to draw" in caplog.text
     assert (tmp_path / "run" / "visits.npy").exists()
 
 

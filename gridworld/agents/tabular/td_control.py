@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import PolicySnapshot, TrainingContext
+from gridworld.agents import PolicySnapshot, TrainingContext, misfit
 from gridworld.bounds import Bounds
 from gridworld.config.fields import MOST_KEPT, Effect, Schedule, Word, affects, bounds, parse_schedule, rate
 from gridworld.config.train import AgentConfig
@@ -256,10 +256,8 @@ def update(
 
         Q(s, a) ← Q(s, a) + Σ_j w_j [y_j - Q(s, a)],    w_j = α_j Π_(l > j) (1 - α_l)
 
-    with Q on the right as it was before: a sum over the batch. So α is a step per transition, whatever the
-    number of environments. Plain addition of the errors would overshoot as soon as k α > 2, and their mean
-    make k transitions count as one. Targets may be a batch old: J. N. Tsitsiklis, Asynchronous stochastic
-    approximation and Q-learning, 1994, allows for outdated values.
+    with Q on the right as it was before. Plain addition of the errors would overshoot as soon as k α > 2.
+    Targets may be a batch old: J. N. Tsitsiklis, Asynchronous stochastic approximation and Q-learning, 1994.
 
     `q` and `visits`, which counts updates, are (S * A,); `pairs`, s * A + a, and `targets` y are (n,).
     """
@@ -317,23 +315,11 @@ def read_model(path: Path, algorithm: str, like: Mapping[str, NDArray[Any]]) -> 
     """Read an algorithm's model file; its arrays must have the names, types and shapes of `like`."""
     most = _SPARE_BYTES + sum(array.nbytes for array in like.values())
     found = read_arrays(path, most, algorithm)
-    if found.keys() != {"algorithm", *like}:
-        raise InputError(
-            f"{path}: not a model of {algorithm}: must hold {sorted(['algorithm', *like])}, "
-            f"holds {sorted(found)[:8]}"
-        )
-    written_by = str(found.pop("algorithm"))
+    written_by = str(found.pop("algorithm", "something else"))
     if written_by != algorithm:
         raise InputError(f"{path}: not a model of {algorithm} but of {written_by[:50]}")
-    for name, expected in like.items():
-        array = found[name]
-        if (array.dtype, array.shape) != (expected.dtype, expected.shape):
-            raise InputError(
-                f"{path}: {name} is {array.dtype} {array.shape}; "
-                f"{algorithm} in this world has {expected.dtype} {expected.shape}"
-            )
-        if not np.isfinite(array).all():
-            raise InputError(f"{path}: {name} holds numbers that are not finite")
+    if (reason := misfit(found, like)) is not None:
+        raise InputError(f"{path}: not a model of {algorithm} for this world ({reason})")
     return found
 
 

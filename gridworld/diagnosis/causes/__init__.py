@@ -6,32 +6,20 @@ what remains.
 
 from __future__ import annotations
 
-from gridworld.diagnosis.causes.exploration import collapsed, ended_early, not_tried
-from gridworld.diagnosis.causes.implementation import faulty_class
-from gridworld.diagnosis.causes.learning import (
-    diverged,
-    hardly_moved,
-    lost_again,
-    not_there_yet,
-    overshot,
-    scaled,
-    unsettled,
-)
-from gridworld.diagnosis.causes.network import cannot_represent, forgets, spoilt, spoilt_policy
-from gridworld.diagnosis.causes.objective import (
-    faint_gamma,
-    hopeless_gamma,
-    other_optimum,
-    too_much_entropy,
-    too_much_epsilon,
-)
-from gridworld.diagnosis.finding import Cause
+from gridworld.diagnosis.causes import exploration, implementation, learning, network, objective
+from gridworld.diagnosis.evidence import Cause
 
+# fmt: off
 CAUSES: tuple[Cause, ...] = (
-    *(faulty_class, hopeless_gamma, other_optimum, too_much_epsilon, too_much_entropy),
-    *(scaled, forgets, lost_again, diverged, cannot_represent, hardly_moved, overshot),
-    *(spoilt_policy, not_tried, collapsed, faint_gamma, spoilt, not_there_yet, ended_early, unsettled),
+    implementation.faulty_class,
+    objective.hopeless_gamma, objective.other_optimum, objective.too_much_epsilon, objective.too_much_entropy,
+    learning.scaled, network.forgets, learning.lost_again, learning.diverged, network.cannot_represent,
+    learning.hardly_moved, learning.overshot, network.spoilt_policy,
+    exploration.not_tried, exploration.collapsed,
+    objective.faint_gamma, network.spoilt,
+    learning.not_there_yet, exploration.ended_early, learning.unsettled,
 )
+# fmt: on
 
 PHRASES = {  # by name
     "implementation": "the class is wrong",

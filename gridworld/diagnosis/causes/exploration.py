@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gridworld.config.fields import LINEAR
-from gridworld.diagnosis.evidence import Evidence
-from gridworld.diagnosis.finding import Finding, best_of_what_was_tried, longer
+from gridworld.diagnosis.evidence import Evidence, Finding, best_of_what_was_tried, longer
 from gridworld.world.chain import Chain
 from gridworld.world.mdp import BoolArray
 

@@ -13,8 +13,7 @@ from dataclasses import replace
 from gridworld.agents import family
 from gridworld.agents.sb3.settings import SB3ClassConfig
 from gridworld.config.train import AgentConfig
-from gridworld.diagnosis.evidence import Evidence
-from gridworld.diagnosis.finding import Finding
+from gridworld.diagnosis.evidence import Evidence, Finding
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.training.setup import make_context

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from gridworld.config.fields import LINEAR
-from gridworld.diagnosis.evidence import Evidence, entropy
-from gridworld.diagnosis.finding import (
+from gridworld.diagnosis.evidence import (
+    Evidence,
     Finding,
-    behind,
     costliest,
+    entropy,
     entropy_optimum,
     falling,
     faster,
@@ -77,7 +77,7 @@ def hardly_moved(run: Evidence) -> Finding | None:
     moves = run.updates * rate >= _MOVES
     if run.is_tabular or has_own_step or moves or _too_short(run, run.split.wrong):
         return None
-    why = f"{run.updates:,.0f} updates at a learning rate of {rate:g} cannot move a weight far{behind(run)}"
+    why = f"{run.updates:,.0f} updates at a learning rate of {rate:g} cannot move a weight far"
     late = run.setting("learning_starts") > run.config.total_timesteps / 2
     starts = (run.change("learning_starts", 100),) if late else ()
     return Finding("slow", run.split.wrong, why, (*starts, *faster(run)))
@@ -124,11 +124,11 @@ def not_there_yet(run: Evidence) -> Finding | None:
     if interval and run.updates >= _FEW_UPDATES and refreshed < _REFRESHES * path:
         why = (
             f"its target network was refreshed {refreshed:.0f} times, and a value needs {path:.0f} to come "
-            f"from the goal to the start{behind(run)}"
+            f"from the goal to the start"
         )
         often = max(1.0, round(run.config.total_timesteps / (8 * path)))
         return Finding("target", states, why, (run.change("target_update_interval", often), longer(run, 4)))
-    why = f"it was still learning: {run.updates:,.0f} updates were too few{behind(run)}"
+    why = f"it was still learning: {run.updates:,.0f} updates were too few"
     return Finding("slow", states, why, faster(run))
 
 
@@ -164,7 +164,7 @@ def _slow_table(run: Evidence, states: BoolArray) -> Finding | None:
     if rate < run.usual_rate:  # with as many updates, enough of it
         enough = (1 - _FORGOTTEN ** (1 / max(tried, 1))) / rate
         changes.append(run.multiplied("learning_rate", max(10, enough), most=run.usual_rate))
-    return Finding("slow", states, f"{why}{behind(run)}", (*changes, longer(run, 4)))
+    return Finding("slow", states, why, (*changes, longer(run, 4)))
 
 
 def unsettled(run: Evidence) -> Finding:

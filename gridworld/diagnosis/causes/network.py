@@ -1,14 +1,13 @@
 """Causes in a network, told by the oracle ablation: the same network, fitted to the exact answer.
 
-Of all states at once, with new weights or its own, and of the costliest one alone.
+Of all states at once, with new weights or its own; and of the costliest one alone, for what it forgets.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from gridworld.diagnosis.evidence import Evidence
-from gridworld.diagnosis.finding import Finding, costliest, slower
+from gridworld.diagnosis.evidence import Evidence, Finding, costliest, slower
 from gridworld.world.chain import one_hot_policy
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import IntArray
@@ -20,13 +19,7 @@ _OFTEN = 10  # times as many visits
 def cannot_represent(run: Evidence) -> Finding | None:
     """The same network with new weights cannot be fitted, or has a layer too narrow for the exact answer."""
     if _fits(run, fresh=True) is False:
-        worst = costliest(run, run.split.wrong)
-        told_apart, _ = _alone(run, worst)
-        alone = "its own can learn {} alone" if told_apart else "its own cannot even tell {} from the others"
-        how = (
-            "with new weights and fitted to the exact one, it still errs; "
-            f"{alone.format(run.mdp.state_name(worst))}"
-        )
+        how = "with new weights and fitted to the exact one, it still errs"
     elif units := _bottleneck(run):
         how = f"it has a layer of {units}, and the best table of rank {units} still errs"
     else:
@@ -47,14 +40,16 @@ def forgets(run: Evidence) -> Finding | None:
     states = run.split.wrong & (kept < _FEW) & (met >= _OFTEN * np.maximum(kept, 1.0))
     if not states.any():
         return None
+    from gridworld.agents.sb3.oracle_fit import one_state_fit  # imports torch
+
     worst = costliest(run, states)
-    _, spoilt = _alone(run, worst)
-    if not len(spoilt):
+    found = one_state_fit(run.agent, run.own, np.flatnonzero(run.mdp.acting), worst)
+    if found is None or not len(found.spoilt):
         return None
     where = run.mdp.state_name(worst)
     why = (
         f"it forgets: {where} was met {met[worst]:,} times, of which {kept[worst]:.1g} are in its replay "
-        f"buffer, and to learn that state alone makes {len(spoilt)} others wrong"
+        f"buffer, and to learn that state alone makes {len(found.spoilt)} others wrong"
     )
     return Finding("forgetting", states, why, (run.change("buffer_size", total),))
 
@@ -106,11 +101,3 @@ def _fits(run: Evidence, fresh: bool) -> bool | None:
         return judge.score(one_hot_policy(greedy, run.mdp.num_actions)).certified
 
     return oracle_fit(run.agent, run.own, np.flatnonzero(run.mdp.acting), is_optimal, fresh)
-
-
-def _alone(run: Evidence, state: int) -> tuple[bool, IntArray]:
-    """Whether a network can learn one state and keep the others, and which it loses if nothing holds them."""
-    from gridworld.agents.sb3.oracle_fit import one_state_fit  # imports torch
-
-    found = one_state_fit(run.agent, run.own, np.flatnonzero(run.mdp.acting), state)
-    return (True, np.empty(0, np.int64)) if found is None else found

@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from gridworld.diagnosis.evidence import Evidence, entropy
-from gridworld.diagnosis.finding import Finding, costliest, entropy_optimum, optimum_of_epsilon
+from gridworld.diagnosis.evidence import (
+    Evidence,
+    Finding,
+    costliest,
+    entropy,
+    entropy_optimum,
+    optimum_of_epsilon,
+)
 from gridworld.world.evaluation import fitting_discounts
 from gridworld.world.mdp import BoolArray, FloatArray
 from gridworld.world.solver import pick, solved

@@ -20,7 +20,7 @@ import submitit
 from gridworld.errors import InputError
 from gridworld.process.console import printable
 from gridworld.process.processes import LostError
-from gridworld.storage.atomic_write import make_inside, remove_inside
+from gridworld.storage.atomic_write import inside, remove_path
 from gridworld.sweep.launchers import Group, Launch, collect
 
 _FOLDER = ".slurm"  # in the sweep's: what submitit writes
@@ -35,7 +35,8 @@ SlurmTask = submitit.Job[list[str]]
 def run(launch: Launch, settings: Mapping[str, Any]) -> None:
     """Run populations; see `run_groups`."""
     chunks = _chunks(launch.groups, settings["jobs_per_task"])
-    folder = make_inside(launch.worker.sweep, _FOLDER)
+    folder = inside(launch.worker.sweep, _FOLDER)
+    folder.mkdir(exist_ok=True)
     tasks = _submit(folder, settings, launch, chunks)
     of_task = [[job for group in chunk for job in group] for chunk in chunks]
     try:
@@ -45,7 +46,7 @@ def run(launch: Launch, settings: Mapping[str, Any]) -> None:
         raise
     if all(task.paths.result_pickle.exists() for task in tasks):
         with contextlib.suppress(OSError):
-            remove_inside(folder.parent, folder.name)  # of a lost task the logs are kept
+            remove_path(folder)  # of a lost task the logs are kept
 
 
 class _IsDone:
