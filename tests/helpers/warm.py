@@ -83,7 +83,7 @@ def _prepare() -> None:
     console._SECONDS_BETWEEN_LINES = 600.0
     tune_search._SECONDS_BETWEEN_TABLES = 0.3
     if launcher := sys.modules.get("gridworld.sweep.launchers.slurm"):  # it runs here: files are not late
-        vars(launcher).update(_POLL_SECONDS=0.2, _SECONDS_BETWEEN_QUESTIONS=1.0, _FILES_ARRIVE_WITHIN=1.0)
+        vars(launcher).update(_SECONDS_BETWEEN_QUESTIONS=1.0, _FILES_ARRIVE_WITHIN=1.0)
     compose_quickly()
     compose(_CONF, [])
     for file in _CONF.rglob("*.yaml"):

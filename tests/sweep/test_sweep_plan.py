@@ -217,25 +217,10 @@ def test_each_job_is_what_hydra_composes(
     assert configs == [to_config(compose("train", job)) for job in jobs]
 
 
-@pytest.mark.parametrize(
-    ("word", "told"),
-    [("agent.gama=0.5", "did you mean gamma"), ("total_timesteps=often", "total_timesteps=often: Value")],
-)
-def test_a_mistake_is_told_as_hydra_tells_it(loader: ConfigLoader, word: str, told: str) -> None:
+def test_a_mistake_is_told_as_hydra_tells_it(loader: ConfigLoader) -> None:
     with pytest.raises(HydraException) as mistake:
-        Configurations(loader, master_of(loader))(["agent=dqn", word])
-    assert told in sentence(mistake.value)
-
-
-def test_what_all_jobs_have_in_common_is_not_some_jobs_own(loader: ConfigLoader, tmp_path: Path) -> None:
-    (tmp_path / "experiment").mkdir()
-    text = "# @package _global_\nhydra: {sweep: {dir: mine}}\n"
-    (tmp_path / "experiment" / "dir.yaml").write_text(text)
-    master = master_of(loader, f"hydra.searchpath=[file://{tmp_path}]")
-    with pytest.raises(InputError, match=r"^hydra\.sweep: is set in a file that only some of the jobs"):
-        Configurations(loader, master)(["experiment=dir"])
-    with pytest.raises(InputError, match=r"^hydra\.sweep\.subdir=\$\{seed\}: a sweep names the folders"):
-        Configurations(loader, master_of(loader, "hydra.sweep.subdir=${seed}"))
+        Configurations(loader, master_of(loader))(["agent=dqn", "agent.gama=0.5"])
+    assert "did you mean gamma" in sentence(mistake.value)
 
 
 GRID = """\
@@ -283,6 +268,7 @@ def test_a_yaml_says_what_is_swept_and_that_it_is_a_sweep(conf: Path, tmp_path: 
         ("experiment=grid env=maze", "[agent.learning_rate,env]: env has no list of values; give it one"),
         ("experiment=other,maze_dqn", "hydra.sweeper: is set in a file that only some of the jobs choose"),
         ("experiment=no_text", "hydra.sweeper.params.seed: must be text as on the command line, such as 0,1"),
+        ("hydra.sweep.subdir=x seed=0", "hydra.sweep.subdir=x: a sweep names the folders of its jobs itself"),
     ],
 )
 def test_a_yaml_that_cannot_be_swept_is_refused(words: str, told: str, conf: Path, tmp_path: Path) -> None:

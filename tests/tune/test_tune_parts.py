@@ -50,10 +50,9 @@ from gridworld.tune.objective import (
     score,
     with_values,
 )
-from gridworld.tune.search import in_reach, open_study, search
-from gridworld.tune.study import SEARCH_JSON, is_claimed
+from gridworld.tune.search import open_study, search
 from gridworld.tune.study_spec import ConfFolders, SearchSpace, StudySpec, compose_study
-from gridworld.tune.workers import SearchError, Workers
+from gridworld.tune.workers import Workers
 
 SPACES = sorted(
     file.stem
@@ -343,16 +342,6 @@ def test_workers_share_all_runs(count: int, runs: int, can_join: bool) -> None:
     assert len(shares) <= max(count, math.ceil(runs / (32 if can_join else 1)))
 
 
-def test_a_database_that_goes_away_is_one_sentence(tmp_path: Path) -> None:
-    _, study = asked(tmp_path)
-    (tmp_path / "study.db").unlink()
-    url = f"sqlite:///{tmp_path / 'study.db'}"
-    with pytest.raises(SearchError, match=r"study\.db: the study cannot be"), in_reach(url):
-        study.set_user_attr("x", 1)
-    with pytest.raises(ZeroDivisionError), in_reach(url):
-        _ = 1 / 0
-
-
 def results(*steps: float) -> HeldOutResults:
     return HeldOutResults(np.array(steps, dtype=np.float64), TOTAL)
 
@@ -472,14 +461,3 @@ def test_a_study_whose_database_was_altered_is_refused_in_a_sentence(
     with pytest.raises(InputError, match=r"^tune\.(storage|study)=.*") as caught:
         open_study(f"sqlite:///{tmp_path / 'study.db'}", "mine", ABOUT, TWO, must_exist=True)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"\xff", b'{"study": 3}'])
-def test_a_folder_that_does_not_say_whose_it_is_is_refused(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / SEARCH_JSON).write_bytes(content)
-    with pytest.raises(InputError):
-        is_claimed(tmp_path, "mine")
-    (tmp_path / SEARCH_JSON).unlink()
-    os.mkfifo(tmp_path / SEARCH_JSON)
-    with pytest.raises(InputError, match=r"search\.json: is no ordinary file"):
-        is_claimed(tmp_path, "mine")

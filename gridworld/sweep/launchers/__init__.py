@@ -110,13 +110,12 @@ def collect(
     tasks: Mapping[Task, Group],
     is_done: Callable[[Task], bool],
     result: Callable[[Task], list[str]],
-    seconds: float,
 ) -> None:
-    """Wait until tasks on a cluster have ended, asking every so many seconds. Raises `StopSweep`."""
+    """Wait until tasks on a cluster have ended. Raises `StopSweep`."""
     left = dict(tasks)
     while left:
         launch.tick()
-        time.sleep(seconds)
+        time.sleep(_SECONDS_BETWEEN_TICKS)
         if (launch.worker.sweep / STOP).exists():
             raise StopSweep("a job failed")
         for task in [task for task in left if is_done(task)]:

@@ -18,7 +18,6 @@ from gridworld.sweep.job import StopSweep, Worker
 from gridworld.sweep.launchers import Launch, collect
 from gridworld.sweep.plan import Job
 
-_POLL_SECONDS = 1.0
 _ENDED_WITHIN = 1.0  # seconds
 
 
@@ -29,7 +28,7 @@ def run(launch: Launch, settings: Mapping[str, Any]) -> None:
     function, worker = remote(_run), ray.put(launch.worker)
     tasks = {function.remote(worker, list(jobs)): jobs for jobs in launch.groups}
     try:
-        collect(launch, tasks, _is_done, _result, _POLL_SECONDS)
+        collect(launch, tasks, _is_done, _result)
     except StopSweep:
         # Tasks that wait see the file and end by themselves. Ray's own process is aborted where a task is
         # cancelled in the moment in which it ends.

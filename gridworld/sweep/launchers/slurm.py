@@ -24,7 +24,6 @@ from gridworld.storage.atomic_write import inside, remove_path
 from gridworld.sweep.launchers import Group, Launch, collect
 
 _FOLDER = ".slurm"  # in the sweep's: what submitit writes
-_POLL_SECONDS = 1.0
 _SECONDS_BETWEEN_QUESTIONS = 5.0  # to Slurm, which answers others too
 _FILES_ARRIVE_WITHIN = 15.0  # seconds, over a network
 _SLURMS_NAMES = {"array_parallelism", "partition", "account", "qos", "constraint", "setup", "signal_delay_s"}
@@ -40,7 +39,7 @@ def run(launch: Launch, settings: Mapping[str, Any]) -> None:
     tasks = _submit(folder, settings, launch, chunks)
     of_task = [[job for group in chunk for job in group] for chunk in chunks]
     try:
-        collect(launch, dict(zip(tasks, of_task, strict=True)), _IsDone(), _result, _POLL_SECONDS)
+        collect(launch, dict(zip(tasks, of_task, strict=True)), _IsDone(), _result)
     except BaseException:
         _cancel(tasks[0].job_id.partition("_")[0])
         raise
