@@ -91,13 +91,13 @@ def run_status(folder: Path) -> str:
 
 
 def mark_failed(folder: Path, why: str, trace: str = "") -> None:
-    """Note why the job failed: in its manifest, and with the traceback or without a manifest in a file."""
+    """Note why the job failed, unless its run did: in the manifest, or where there is none in a file."""
     run = None
     with contextlib.suppress(InputError):  # a damaged manifest is left as it is
         run = find_run(folder)
         if run is not None and run.manifest["status"] in _UNFINISHED:
             record_failure(run, why)
-    if trace or run is None:
+    if run is None:
         write_text(folder / ERROR_FILE, f"{why}\n{trace}")
 
 
