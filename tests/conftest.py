@@ -53,11 +53,11 @@ LONG = (
     *("restore/test_reproduce.py", "checking/test_check.py", "training/test_training.py"),
     *("training/test_certified.py", "restore/test_resume.py", "restore/test_resume_commands.py"),
     *("storage/test_other_systems.py", "docs/test_examples.py", "commands/test_console.py"),
-    *("agents/sb3/test_resume_own_classes.py", "export/test_export.py", "agents/tabular/test_tabular.py"),
+    *("agents/sb3/test_custom_code.py", "export/test_export.py", "agents/tabular/test_tabular.py"),
     *("world/test_evaluation.py", "process/test_forks.py", "tune/test_tune_together.py"),
     *("api/test_scores.py", "api/test_runs.py", "run/test_power_cuts.py", "visualization/test_maps.py"),
     *("commands/test_fuzz.py", "run/test_lost_folders.py", "agents/sb3/test_any_class.py"),
-    *("agents/sb3/test_callbacks.py", "config/test_config.py"),
+    "config/test_config.py",
 )
 
 

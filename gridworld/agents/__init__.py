@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from gridworld.world.mdp import FloatArray, IntArray
 
 WriteScalars = Callable[[Mapping[str, float], int], None]  # ({tag: value}, environment steps)
+Hook = Callable[[int], int]  # see `Agent.learn`
+SafePoint = Callable[[int], None] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +69,7 @@ class Agent(Protocol):
         """What it has learnt, as its library has it: a model of SB3, or a table Q (S, A)."""
 
     def learn(
-        self,
-        total_timesteps: int,
-        on_step: Callable[[int], int],
-        on_safe_point: Callable[[int], None] | None = None,
-        state: State | None = None,
+        self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
     ) -> None:
         """Learn for so many environment steps.
 
@@ -110,8 +108,8 @@ class Learning:
 
     agent: Agent
     total_timesteps: int
-    on_step: Callable[[int], int]
-    on_safe_point: Callable[[int], None] | None = None
+    on_step: Hook
+    on_safe_point: SafePoint = None
     state: State | None = None
 
 

@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot
-from gridworld.api.settings import Override, compose_words, words
+from gridworld.api.settings import Override, words
+from gridworld.config.compose import compose as compose_words
 from gridworld.config.train import TrainConfig
 from gridworld.diagnosis import verdict
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.errors import InputError, failure
-from gridworld.process.memory_budget import limited, unlimited
+from gridworld.process.memory_budget import limited
 from gridworld.process.signals import Interrupted
 from gridworld.report.evidence import read_columns
 from gridworld.restore.resume import unfinished_of
@@ -122,7 +123,7 @@ def train(
         overrides: words as on the command line, `"agent=dqn"`, or dictionaries, `{"agent.gamma": 0.9}`.
         folder: where the run's files go, an ordinary run for all commands. It must be new, or hold this
             run unfinished. None: nothing stays on disk, and no pictures are drawn.
-        progress: whether to show a progress bar; None: as `logging.progress` says, which is to show it.
+        progress: whether to show progress; None: as `logging.progress` says, which is to show it.
         settings: settings whose name has no dot, `seed=3`, `total_timesteps=20_000`.
 
     Returns:
@@ -242,7 +243,7 @@ def _finished(place: Path, config: TrainConfig, given: list[str], folder: Path |
         unfinished_of(place, config).resume(on_built=agents.append)
     else:
         train_in(config, place, given, on_built=agents.append)
-    with unlimited():
+    with limited(is_own=True):
         result = RunResult(SavedRun(place, trust=True), folder, agents.pop)
         _ = result.policy, result.evaluator  # before the model is trained further, or the folder is gone
     return result

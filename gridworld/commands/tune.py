@@ -55,9 +55,8 @@ examples:
 
 def main(arguments: Sequence[str]) -> None:
     """Search, confirm the winner, and print the verdict."""
-    conf = conf_folder()
     refuse_dashes(arguments)
-    parser = _parser(conf)
+    parser = _parser(conf_folder())
     options = parser.parse_intermixed_args(arguments)
     if options.cfg not in (None, *_KINDS):
         if "=" not in options.cfg:
@@ -72,10 +71,10 @@ def main(arguments: Sequence[str]) -> None:
         raise InputError(f"{program('tune')}: optuna is not installed; {install_command('tune')}")
     if options.config_dir is not None and not options.config_dir.is_dir():
         raise InputError(f"--config-dir {options.config_dir}: no such folder")
+    own = (options.config_dir,) if options.config_dir is not None else ()
     from gridworld.tune.study_spec import ConfFolders, compose_study
 
-    folders = ConfFolders(conf, (options.config_dir,) if options.config_dir else ())
-    spec = compose_study(folders, options.overrides)
+    spec = compose_study(ConfFolders(conf_folder(), own), options.overrides)
     if options.cfg:
         _show(spec, options.cfg, options.package)
         return

@@ -240,17 +240,17 @@ def faster(run: Evidence) -> tuple[str, ...]:
     return *adam, *((run.multiplied("learning_rate", by),) if by > 2 else ()), longer(run, 4)
 
 
-def longer(run: Evidence, times: int) -> str:
+def longer(run: Evidence, times: int, keep_rate: bool = False) -> str:
     """The words for a run at least so many times as long: for enough updates, and to meet the goal often.
 
-    At a learning rate far below the usual one no length helps, so that changes too.
+    At a learning rate far below the usual one no length helps, so that changes too, unless `keep_rate`.
     """
     total = run.config.total_timesteps
     updates = 1.0 if run.is_tabular else _ENOUGH[run.is_actor_critic] / max(run.updates, 1.0)
     goals = _MEETINGS * run.steps_to_goal / total if np.isfinite(run.steps_to_goal) else 1.0
     word = f"total_timesteps={total * max(times, math.ceil(min(max(updates, goals), _MOST)))}"
     by = run.usual_rate / max(run.setting("learning_rate", 1.0), 1e-300)
-    return f"{word} {run.multiplied('learning_rate', by)}" if by > _FAR else word
+    return f"{word} {run.multiplied('learning_rate', by)}" if by > _FAR and not keep_rate else word
 
 
 def best_of_what_was_tried(evaluator: Evaluator, tried: BoolArray) -> FloatArray:

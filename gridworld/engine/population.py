@@ -28,7 +28,6 @@ from gridworld.storage.serialization import (
     fitting,
     generator_state,
     set_generator_state,
-    set_plain_state,
 )
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
@@ -52,6 +51,7 @@ class Run:
     target: Inputs | None = None  # what its target network sees of each state, where it has one
     target_parameters: Sequence[nn.Parameter] = ()  # of that, in the same order
     counts_transitions: bool = False  # whether its replay counts transitions
+    shape: Hashable = None  # what runs of one population have in common of their settings
     population: Population = field(init=False, repr=False)
     row: int = field(init=False, default=0)
     total_timesteps: int = field(init=False, default=0)
@@ -137,7 +137,7 @@ class Run:
         if state["num_timesteps"] < 0 or state["num_updates"] < 0 or state["num_episodes"] < 0:
             raise StateError("counters must be at least 0")
         self.torch_generator.set_state(torch.from_numpy(state["torch_generator"]))
-        set_plain_state(self.numpy_generator, state["numpy_generator"])
+        self.numpy_generator.set_state(state["numpy_generator"])
         set_generator_state(model.action_space.np_random, state["action_generator"])
         self.envs.set_state(state["environments"])
         model.num_timesteps, model._n_updates = int(state["num_timesteps"]), int(state["num_updates"])
@@ -187,7 +187,6 @@ class Population:
         num_timesteps: environment steps of each run.
     """
 
-    same: ClassVar[tuple[str, ...]]  # SB3's settings that runs of one population have in common
     pushes: ClassVar[bool] = False  # whether it needs `Networks.push` of the networks that act
 
     def __init__(self, runs: Sequence[Run], states: Sequence[State | None]) -> None:
@@ -214,13 +213,10 @@ class Population:
         fits = mdp.num_states <= FEW_STATES and DenseNetworks.fit(run.nets, run.parameters)
         if not fits or not (model.device.type == "cpu" or mixed()):
             return id(run)
-        settings = [repr(getattr(model, name)) for name in cls.same]
-        optimizer = {**model.policy.optimizer.param_groups[0], "lr": None, "params": None}
         return (
-            *(cls, mdp.digest(), envs.num_envs, envs.step_limit, envs.stratified),
-            *(repr(model.policy), str(model.device), type(model.policy.optimizer), repr(optimizer)),
-            *(run.reward_scale, run.inputs.digest()),
-            *(model.num_timesteps, run.total_timesteps, *settings),
+            *(cls, run.shape, mdp.digest(), envs.num_envs, envs.step_limit, envs.stratified),
+            *(repr(model.policy), str(model.device), run.reward_scale, run.inputs.digest()),
+            *(model.num_timesteps, run.total_timesteps),
         )
 
     @classmethod

@@ -42,11 +42,6 @@ class TRPO(OnPolicy):
     """P runs of TRPO."""
 
     pushes: ClassVar[bool] = True
-    same: ClassVar[tuple[str, ...]] = (
-        *OnPolicy.same,
-        *("batch_size", "n_critic_updates", "sub_sampling_factor", "line_search_max_iter"),
-        *("cg_max_steps", "cg_damping"),
-    )
 
     @classmethod
     def networks_of(cls, runs: Sequence[Run]) -> list[Networks]:

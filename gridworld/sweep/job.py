@@ -11,7 +11,6 @@ import sys
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -119,7 +118,7 @@ class Worker:
         asked = self.master.hydra.sweeper.population != AUTO and len(jobs) > 1
         depend = asked and not family(config.agent).on_processor(config.device)
         with mixing({job.folder.name: job.hash for job in jobs} if depend else {}):
-            results = run_together([partial(self._run, job) for job in jobs])
+            results = run_together([self._run(job) for job in jobs])
         return [one_line(reason(result)) if isinstance(result, Exception) else "" for result in results]
 
     def on_node(self, groups: Sequence[Sequence[Job]]) -> list[str]:

@@ -14,7 +14,6 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +125,7 @@ class HeldOutRuns:
     runs: tuple[HeldOutRun, ...]
 
     def __call__(self, ask: Ask) -> None:
-        for result in run_together([partial(_run, run) for run in self.runs]):
+        for result in run_together([_run(run) for run in self.runs]):
             if isinstance(result, Exception):
                 raise result
 

@@ -138,7 +138,7 @@ class Trials:
 
     def __call__(self, ask: Ask) -> list[Outcome]:
         trials = [_Trial(self.objective, name, *trial, ask) for name, trial in self.trials.items()]
-        runs = [partial(trial.training, place) for trial in trials for place in range(len(trial.seeds))]
+        runs = [trial.training(place) for trial in trials for place in range(len(trial.seeds))]
         with handling(
             dict.fromkeys((signal.SIGINT, signal.SIGTERM), signal.SIG_DFL)
         ):  # nothing is to be saved

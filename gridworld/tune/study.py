@@ -29,7 +29,7 @@ import optuna
 from omegaconf import OmegaConf
 from optuna.trial import FrozenTrial, TrialState
 
-from gridworld.config.compose import search_path, without_hydra
+from gridworld.config.compose import search_path, to_config
 from gridworld.config.fields import Effect
 from gridworld.config.recipe_file import IN_A_STUDY, TRUST, overrides
 from gridworld.config.settings import ON_RESULT, with_effects
@@ -281,7 +281,7 @@ def write_recipe(
 
     def composed(words: list[str], more: tuple[Path, ...] = ()) -> dict[str, Any]:
         own = dataclasses.replace(folders, own=(*folders.own, *more))
-        return _relevant(without_hydra(compose_in(own, "train", words)))
+        return _relevant(to_config(compose_in(own, "train", words)))
 
     bare = composed([f"{group}={choice}" for group, choice in choices.items()])
     values = _difference(bare, _relevant(config))

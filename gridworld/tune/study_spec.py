@@ -41,7 +41,7 @@ from optuna.distributions import (
 )
 from yaml import YAMLError
 
-from gridworld.config.compose import compose_whole, register_schemas, search_path, slug, without_hydra
+from gridworld.config.compose import compose_whole, register_schemas, search_path, slug, to_config
 from gridworld.config.fields import Effect
 from gridworld.config.recipe_file import CHOSEN, with_recipe
 from gridworld.config.settings import effect_of
@@ -121,7 +121,7 @@ def compose_study(folders: ConfFolders, words: Sequence[str]) -> StudySpec:
         choices = {group: str(whole.hydra.runtime.choices[group]) for group in CHOSEN}
         if choices["preset"] == AUTO:  # nothing was chosen, and nothing is to be for the winner
             choices["preset"] = "none"
-        base = without_hydra(whole)
+        base = to_config(whole)
         if base.recipe is None:  # the pair has none
             choices["tuned"] = "none"
         if not any(override.key_or_group == "tune" for override in of_search):

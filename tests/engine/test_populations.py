@@ -284,3 +284,14 @@ def test_where_products_add_up_otherwise_runs_train_one_by_one(
     assert set(meetings) == {1}
     told = capsys.readouterr().err
     assert len(re.findall(r"^population: .* train one by one$", told, re.MULTILINE)) == 1
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_a_trust_region_that_there_is_not_ends_its_own_run() -> None:
+    runs = [(*SMALL["trpo"], f"seed={seed}") for seed in range(3)]
+    learned = [Learned(words) for words in runs]
+    learnings = [each.learning() for each in learned]
+    learned[1].agent.run.model.target_kl = -1.0  # which no settings can be
+    errors = learn_together(learnings)
+    assert "a weight is not finite" in str(errors[1])
+    assert [differences(learned[place].found(), alone(runs[place])) for place in (0, 2)] == [[], []]

@@ -8,11 +8,12 @@ import pytest
 import torch
 from sb3_contrib import QRDQN, TRPO
 from stable_baselines3 import A2C, DQN, PPO
-from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.logger import Logger
 
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.engine import dqn, on_policy, population
+from gridworld.engine.networks import aligned
 from gridworld.engine.population import Run
 from gridworld.engine.sb3_format import algorithm_of, make_run, put_weights
 from gridworld.envs.observations import make_observation
@@ -20,19 +21,6 @@ from gridworld.envs.statistics_env import StatisticsVectorEnv
 
 NUM_ENVS, STEPS = 16, 32
 KINDS = ["one_hot", "coordinates", "none", "image"]
-
-
-class Keep(KVWriter):
-    """Keeps what was logged."""
-
-    def __init__(self) -> None:
-        self.values: dict[str, Any] = {}
-
-    def write(self, key_values: dict[str, Any], key_excluded: Any, step: int = 0) -> None:
-        self.values.update(key_values)
-
-    def close(self) -> None:
-        pass
 
 
 def twins(algorithm: type, kind: str, **arguments: Any) -> tuple[Run, Any]:
@@ -45,7 +33,7 @@ def twins(algorithm: type, kind: str, **arguments: Any) -> tuple[Run, Any]:
         model = algorithm(
             policy, GridWorldVecEnv(envs, observation), seed=0, device="cpu", **copy.deepcopy(arguments)
         )
-        model.set_logger(Logger(None, [Keep()]))
+        model.set_logger(Logger(None, []))
         model._setup_learn(10_000)
         models.append(model)
     models[1].policy.load_state_dict(models[0].policy.state_dict())
@@ -79,14 +67,8 @@ def assert_same(run: Run, theirs: Any) -> None:
     put_weights(run)
     for mine, peer in zip(run.model.policy.parameters(), theirs.policy.parameters(), strict=True):
         assert torch.allclose(mine, peer, rtol=1e-5, atol=1e-6)
-    for model in (run.model, theirs):
-        model.logger.dump()
     logged, expected = (
-        {
-            key: value
-            for key, value in model.logger.output_formats[0].values.items()
-            if key.startswith("train/")
-        }
+        {key: value for key, value in model.logger.name_to_value.items() if key.startswith("train/")}
         for model in (run.model, theirs)
     )
     of_the_rollout = {"train/explained_variance", "train/n_updates", "train/learning_rate"}
@@ -174,7 +156,7 @@ def test_updates_from_rollouts(
     assert run.error is None
     assert_same(run, theirs)
     if algorithm is TRPO:
-        is_improved = run.model.logger.output_formats[0].values["train/is_line_search_success"]
+        is_improved = run.model.logger.name_to_value["train/is_line_search_success"]
         assert is_improved == ("line_search_max_iter" not in arguments)
         kept = run.model.policy.optimizer.state_dict()["state"].keys()  # those of the values alone
         assert kept == theirs.policy.optimizer.state_dict()["state"].keys()
@@ -273,3 +255,35 @@ def test_rollouts_and_advantages_are_sb3s(algorithm: Any) -> None:
     buffer.compute_returns_and_advantage(last, ends[-1])
     for name, table in (("advantages", advantages), ("returns", returns)):
         assert np.allclose(getattr(buffer, name).T.ravel(), table[0], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("states", [None, np.array([3, 7, 8])], ids=["all states", "some states"])
+@pytest.mark.parametrize(
+    ("kind", "arguments"),
+    [
+        *[("one_hot", RELU), ("one_hot", ELU), ("one_hot", LINEAR)],
+        *[("coordinates", TWO_SIZES), ("image", {})],
+    ],
+    ids=str,
+)
+def test_products_with_the_jacobian_agree_from_both_sides(
+    kind: str, arguments: dict[str, Any], states: Any
+) -> None:
+    """uᵀ(J v) = (uᵀJ) v, and J v is what small changes v of the weights do."""
+    run, _ = twins(TRPO, kind, batch_size=64, n_steps=4, **arguments)
+    for networks in run.population.all_networks:
+        (outputs,) = (each.copy() for each in networks.run(states))
+        change = torch.randn(networks.weights.shape, generator=torch.Generator().manual_seed(1))
+        slopes = np.random.default_rng(1).normal(size=outputs.shape).astype(np.float32)
+        (moved,) = networks.push(aligned(change))
+        networks.backward(slopes)
+        scale = float(np.abs(slopes * moved).sum())
+        assert float((networks.gradients * change).sum()) == pytest.approx(
+            (slopes * moved).sum(), abs=1e-5 * scale
+        )
+        weights, length = networks.weights.clone(), 1e-5  # little: ReLU has kinks
+        networks.weights.copy_(weights + length * change)
+        (ahead,) = (each.copy() for each in networks.run(states))
+        networks.weights.copy_(weights - length * change)
+        (behind,) = networks.run(states)
+        assert np.allclose((ahead - behind) / (2 * length), moved, atol=0.02 * np.abs(moved).max())

@@ -1,6 +1,8 @@
 """The pages of the documentation: their blocks of code, run or read in one folder."""
 
+import contextlib
 import importlib
+import io
 import re
 import shlex
 import subprocess
@@ -102,9 +104,18 @@ class Reader:
         self._ran: set[str] = set()
 
     def read(self, page: Path) -> None:
-        """Run a page's commands and Python, write its files, and read what else looks like a command."""
+        """Run a page's commands and Python, write its files, and read what else looks like a command.
+
+        A block of text after one of Python is what that prints.
+        """
         names: dict[str, object] = {}
+        printed = ""
         for block in blocks(page):
+            if block.language == "text" and printed:
+                assert block.text.split() == printed.split(), page
+                printed = ""
+                continue
+            printed = ""
             if block.file:
                 (self.folder / block.file).parent.mkdir(parents=True, exist_ok=True)
                 (self.folder / block.file).write_text(block.text)
@@ -112,7 +123,9 @@ class Reader:
                 for line in block.lines:
                     self._run_once(line)
             elif block.language == "python":
-                exec(compile(block.text, page.name, "exec"), names)
+                with contextlib.redirect_stdout(io.StringIO()) as output:
+                    exec(compile(block.text, page.name, "exec"), names)
+                printed = output.getvalue()
             elif block.language == "yaml":
                 yaml.safe_load(block.text)
             else:

@@ -85,7 +85,7 @@ def _prepare() -> None:
     if launcher := sys.modules.get("gridworld.sweep.launchers.slurm"):  # it runs here: files are not late
         vars(launcher).update(_SECONDS_BETWEEN_QUESTIONS=1.0, _FILES_ARRIVE_WITHIN=1.0)
     compose_quickly()
-    compose(_CONF, [])
+    compose([])
     for file in _CONF.rglob("*.yaml"):
         with file.open(encoding="utf-8") as opened:
             OmegaConf.load(opened)  # which `compose_quickly` keeps

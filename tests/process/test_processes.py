@@ -37,7 +37,7 @@ def is_killed() -> None:
 def test_each_task_has_its_result_and_all_processes_end(forks: bool, tmp_path: Path) -> None:
     assert run([partial(write, tmp_path, number) for number in range(7)], 2, forks) == list(range(7))
     processes = {path.read_text() for path in tmp_path.iterdir()}
-    assert len(processes) == 7
+    assert len(processes) <= 2
     assert str(os.getpid()) not in processes
     for process in processes:
         with pytest.raises(ProcessLookupError):

@@ -20,7 +20,7 @@ from test_sweep import WORKERS, wait_for
 from gridworld.errors import InputError
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.folder import claimed
-from gridworld.storage.append_log import AppendLog
+from gridworld.storage.atomic_write import AppendLog
 from gridworld.sweep import plan as plan_module
 from gridworld.training.learning_curve import LearningCurve
 

@@ -270,7 +270,7 @@ def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path
 
 
 def test_a_search_of_one_worker_is_the_same_however_it_is_killed(tmp_path: Path) -> None:
-    words = [*QUICK, "env=river_swim", "total_timesteps=20000", "tune.trials=4"]
+    words = [*QUICK, "env=river_swim", "total_timesteps=12000", "tune.trials=3"]
 
     def outcome(folder: Path) -> tuple[list[dict[str, str]], object]:
         found = rows(folder)

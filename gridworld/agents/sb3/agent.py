@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import traceback
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from torch import nn
 
-from gridworld.agents import Learning, PolicySnapshot, TrainingContext, WriteScalars, misfit
+from gridworld.agents import Hook, Learning, PolicySnapshot, SafePoint, TrainingContext, WriteScalars, misfit
 from gridworld.agents.sb3.callbacks import RunCallback, check_finite, class_without_state
 from gridworld.agents.sb3.factory import algorithm_and_arguments, failed, make_callbacks, make_model, unfit
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
@@ -129,11 +129,7 @@ class SB3Agent:
         return self._model
 
     def learn(
-        self,
-        total_timesteps: int,
-        on_step: Callable[[int], int],
-        on_safe_point: Callable[[int], None] | None = None,
-        state: State | None = None,
+        self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
     ) -> None:
         """See `gridworld.agents.Agent.learn`."""
         interval, falling = self.config.log_interval, self.config.falling()
@@ -225,6 +221,7 @@ class EngineAgent(SB3Agent):
             falling=config.falling(),
             log_interval=config.log_interval,
             counts_transitions=config.counts_transitions,
+            shape=config.shape,
         )
         self._algorithm([self.run], [None])
 
@@ -239,11 +236,7 @@ class EngineAgent(SB3Agent):
         return type(self._model).load(file, env=envs, device=self._model.device)
 
     def learn(
-        self,
-        total_timesteps: int,
-        on_step: Callable[[int], int],
-        on_safe_point: Callable[[int], None] | None = None,
-        state: State | None = None,
+        self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
     ) -> None:
         """See `gridworld.agents.Agent.learn`."""
         (error,) = self.learn_together([Learning(self, total_timesteps, on_step, on_safe_point, state)])

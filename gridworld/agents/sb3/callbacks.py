@@ -16,20 +16,23 @@ buffer or callback says everything. With a custom class that does not define the
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from stable_baselines3.common import callbacks as sb3_callbacks
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import FloatSchedule
-from torch import Tensor
 
+from gridworld.agents import Hook, SafePoint
+from gridworld.agents.sb3.model_file import load_tensors
 from gridworld.agents.sb3.settings import SCHEDULES
 from gridworld.config.fields import Decay
 from gridworld.engine.population import diverged, log_state, set_log_state
@@ -66,8 +69,8 @@ class RunCallback(CallbackList):
 
     def __init__(
         self,
-        on_step: Callable[[int], int],
-        on_safe_point: Callable[[int], None] | None,
+        on_step: Hook,
+        on_safe_point: SafePoint,
         state: State | None,
         log_interval: int,
         others: Sequence[BaseCallback],
@@ -219,7 +222,7 @@ def get_state(model: Any, callbacks: Sequence[BaseCallback]) -> State:
     """The state of a model that waits between a rollout and the next, and of its callbacks."""
     return {
         **{name: getattr(model, name) for name in _NUMBERS if hasattr(model, name)},
-        "parameters": _plain(model.get_parameters()),
+        "parameters": {name: _saved(each) for name, each in model.get_parameters().items()},
         "replay": _replay(model),
         "environments": model.env.envs.get_state(),
         "last_episode_starts": model._last_episode_starts,
@@ -237,15 +240,7 @@ def set_state(model: Any, callbacks: Sequence[BaseCallback], state: State) -> No
     for name in _NUMBERS:
         if hasattr(model, name):
             setattr(model, name, type(getattr(model, name))(state[name]))
-    expected, parameters = _plain(model.get_parameters()), _tensors(state["parameters"])
-    if parameters.keys() != expected.keys():
-        raise StateError(f"the model's parameters must be {', '.join(expected)}")
-    for name, found in parameters.items():
-        if "param_groups" in found:  # of an optimiser: its numbers of each weight, which are counted
-            found["state"] = {int(number): values for number, values in found["state"].items()}
-            continue
-        for key, array in expected[name].items():
-            fill(array, state["parameters"][name].get(key), f"{name}.{key}")
+    parameters = {name: load_tensors(each.tobytes()) for name, each in state["parameters"].items()}
     model.set_parameters(parameters, exact_match=True, device=model.device)
     if _replay(model):
         buffer, pos = model.replay_buffer, int(state["replay"]["pos"])
@@ -272,6 +267,12 @@ def set_state(model: Any, callbacks: Sequence[BaseCallback], state: State) -> No
         torch.cuda.set_rng_state_all([torch.from_numpy(each) for each in state["torch_generators"]["cuda"]])
 
 
+def _saved(tensors: dict[str, Any]) -> NDArray[np.uint8]:
+    content = io.BytesIO()
+    torch.save(tensors, content)
+    return np.frombuffer(content.getvalue(), dtype=np.uint8)
+
+
 def _torch_state() -> State:
     state: State = {"cpu": torch.get_rng_state().numpy().copy()}
     if torch.cuda.is_available() and torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
@@ -292,21 +293,3 @@ def _replay(model: Any) -> State:
 
 def _counts(callback: BaseCallback) -> tuple[str, ...]:
     return ("n_calls", "num_timesteps", *_OF_CALLBACKS.get(type(callback), ()))
-
-
-def _plain(node: Any) -> Any:
-    """Tensors as arrays, keys as text."""
-    if isinstance(node, dict):
-        return {str(key): _plain(value) for key, value in node.items()}
-    if isinstance(node, list | tuple):
-        return [_plain(value) for value in node]
-    return node.detach().cpu().numpy().copy() if isinstance(node, Tensor) else node
-
-
-def _tensors(node: Any) -> Any:
-    """Mirrors `_plain`, but for the keys."""
-    if isinstance(node, dict):
-        return {key: _tensors(value) for key, value in node.items()}
-    if isinstance(node, list):
-        return [_tensors(value) for value in node]
-    return torch.from_numpy(node.copy()) if isinstance(node, np.ndarray) else node

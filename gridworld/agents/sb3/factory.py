@@ -50,9 +50,9 @@ def unfit(config: SB3Config, why: str) -> InputError:
 
 def failed(config: SB3Config, what: str, error: Exception) -> InputError:
     """The error to raise where the class fails, with the settings that only it can judge."""
-    given = dict(config.given) if isinstance(config, SB3ClassConfig) else {}
-    given.pop("policy_kwargs", None)
-    given |= {f"policy_kwargs.{name}": value for name, value in config.policy_kwargs_given.items()}
+    given = {f"policy_kwargs.{name}": value for name, value in config.policy_kwargs_given.items()}
+    if isinstance(config, SB3ClassConfig):
+        given |= {name: value for name, value in config.arguments.items() if name != "policy_kwargs"}
     suspects = ", ".join(f"{config.where}.{name}={value}" for name, value in given.items())
     return unfit(config, f"{what}: {in_short(error)}" + (f"; look at {suspects}" if suspects else ""))
 

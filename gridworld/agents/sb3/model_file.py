@@ -48,7 +48,7 @@ def read_model(path: Path, most: int, kind: str = "a model") -> tuple[Parameters
         members = _members(content)
         rate = _RATE.search(members.get("data", b""))
         modules = [name for name in members if name.endswith(".pth") and name != _VARIABLES]
-        parameters = {name.removesuffix(".pth"): _tensors(members[name]) for name in modules}
+        parameters = {name.removesuffix(".pth"): _flat(load_tensors(members[name])) for name in modules}
         return parameters, None if rate is None else float(rate.group(1))
     except Exception as error:  # zipfile and torch, each in their way
         raise InputError(f"{path}: not {kind} that can be read ({in_short(error)})") from None
@@ -74,14 +74,19 @@ def _members(content: bytes) -> dict[str, bytes]:
         return {info.filename: archive.read(info) for info in infos}
 
 
-def _tensors(content: bytes) -> dict[str, Tensor]:
+def load_tensors(content: bytes) -> dict[str, Any]:
+    """Read a dictionary of tensors as torch saves it; ValueError, or whatever torch raises: it is none."""
     pickles = [member for name, member in _members(content).items() if name.endswith(".pkl")]
     if len(pickles) != 1 or len(pickles[0]) > _LARGEST_PICKLE:
         raise ValueError("it holds no tensors as torch writes them")
     for code, argument, _ in pickletools.genops(pickles[0]):  # which does not run it
         if code.name in _NAMING and not (code.name == "GLOBAL" and _NAMED.fullmatch(str(argument))):
             raise ValueError(f"its pickle asks for {str(argument)[:80]}, which is not read from a model")
-    found = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    found: dict[str, Any] = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    return found
+
+
+def _flat(found: dict[str, Any]) -> dict[str, Tensor]:
     if "param_groups" in found:  # an optimiser's numbers of each weight, which are counted
         numbers = found["state"].items()
         found = {f"{place}.{name}": value for place, own in numbers for name, value in own.items()}

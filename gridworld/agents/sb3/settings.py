@@ -34,10 +34,9 @@ FALLING = ("ent_coef", "gae_lambda", "learning_rate")  # see `agents.sb3.callbac
 REPLAY_COUNTS = "gridworld.agents.sb3.replay_counts.ReplayCounts"  # a replay buffer that counts transitions
 # Arguments of SB3's classes that are a number to compute with: runs of one population may differ in them.
 _NUMBERS = {
-    *("learning_rate", "gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm", "clip_range", "tau"),
-    *("clip_range_vf", "target_kl", "exploration_fraction", "exploration_initial_eps", "name", "buffer_size"),
-    *("exploration_final_eps", "learning_starts", "target_update_interval", "reward_scale", "log_interval"),
-    "stats_window_size",
+    *("learning_rate", "gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm", "clip_range", "name"),
+    *("clip_range_vf", "target_kl", "exploration_fraction", "exploration_initial_eps", "log_interval"),
+    *("exploration_final_eps", "reward_scale", "stats_window_size", "line_search_shrinking_factor"),
 }
 # Fields that are ours, not arguments of the algorithm's class.
 _OWN_FIELDS = {"name", "family", "algorithm", "engine", "log_interval", "reward_scale", "policy"}

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import PolicySnapshot, TrainingContext, misfit
+from gridworld.agents import Hook, PolicySnapshot, SafePoint, TrainingContext, misfit
 from gridworld.bounds import Bounds
 from gridworld.config.fields import MOST_KEPT, Effect, Schedule, Word, affects, bounds, parse_schedule, rate
 from gridworld.config.train import AgentConfig
@@ -119,11 +119,7 @@ class TabularControl(ABC):
         return self._act(states)
 
     def learn(
-        self,
-        total_timesteps: int,
-        on_step: Callable[[int], int],
-        on_safe_point: Callable[[int], None] | None = None,
-        state: State | None = None,
+        self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
     ) -> None:
         """See `gridworld.agents.Agent.learn`."""
         envs, config = self._context.envs, self.config
@@ -190,32 +186,23 @@ class TabularControl(ABC):
             "random": generator_state(self._random),
             "q": self.q.copy(),
             "visits": self.visits.copy(),
-            "exploration_rate": self.exploration_rate,
-            "steps": self._steps,
             "actions": self._actions.copy(),
-            "log": {
-                "finished": self._episodes,
-                "last": [list(episode) for episode in self._last],
-                "next": self._next_log,
-                "error": self._error,
-                "updates": self._updates,
-            },
+            "exploration_rate": self.exploration_rate,
+            "error": self._error,
+            "counts": [self._steps, self._episodes, self._next_log, self._updates],
+            "last": [list(episode) for episode in self._last],
         }
 
     def _set_state(self, state: State) -> None:
         """Mirrors `get_state`, once learning has begun."""
         self._context.envs.set_state(state["envs"])
         set_generator_state(self._random, state["random"])
-        fill(self.q, state["q"], "q")
-        fill(self.visits, state["visits"], "visits")
-        self.exploration_rate = float(state["exploration_rate"])
-        self._steps = int(state["steps"])
-        fill(self._actions, state["actions"], "actions")
-        log = state["log"]
-        self._episodes, self._next_log = int(log["finished"]), int(log["next"])
-        self._error, self._updates = float(log["error"]), int(log["updates"])
+        for name, array in (("q", self.q), ("visits", self.visits), ("actions", self._actions)):
+            fill(array, state[name], name)
+        self.exploration_rate, self._error = float(state["exploration_rate"]), float(state["error"])
+        self._steps, self._episodes, self._next_log, self._updates = map(int, state["counts"])
         self._last.clear()
-        self._last.extend((float(total), int(length)) for total, length in log["last"])
+        self._last.extend((float(total), int(length)) for total, length in state["last"])
 
     def _act(self, states: IntArray) -> IntArray:
         return draw_actions(self.q, self.exploration_rate, states, self._random.random(len(states)))

@@ -1,4 +1,4 @@
-"""Which settings the engine learns with, and SB3's own model that it leaves."""
+"""Which settings the engine learns with, SB3's own model that it leaves, and settings that fall."""
 
 import contextlib
 from pathlib import Path
@@ -12,19 +12,21 @@ from helpers.support import SHORT, configure
 from sb3_contrib import QRDQN, TRPO
 from stable_baselines3 import A2C, DQN, PPO
 
+import gridworld
 from gridworld.agents import Agent, TrainingContext, family
 from gridworld.agents.sb3 import check
 from gridworld.agents.sb3.agent import ACTIVATIONS, EngineAgent, SB3Agent
+from gridworld.agents.sb3.callbacks import FallingSetting
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.training.setup import make_context
 
 
-def built(*words: str, **changes: Any) -> Agent:
+def built(*words: str, log: Any = None) -> Agent:
     config = configure(*words)
     mdp = config.env.compile()
     observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
-    context: TrainingContext = make_context(config, mdp, observation)
+    context: TrainingContext = make_context(config, mdp, observation, log)
     return family(config.agent).build(config.agent, context)
 
 
@@ -75,20 +77,16 @@ def test_what_it_does_not_know_learns_in_sb3s_loop_and_a_line_says_why(
 
 
 @pytest.mark.parametrize(
-    "settings",
+    "words",
     [
-        [],
-        ["agent.policy_kwargs.activation_fn=torch.nn.modules.activation.GELU"],
-        ["agent.policy_kwargs.optimizer_class=torch.optim.adamw.AdamW", "agent.policy_kwargs.net_arch=[]"],
-        ["agent.policy=stable_baselines3.POLICY"],
+        ["agent=ppo"],
+        ["agent=dqn", "agent.policy_kwargs.activation_fn=torch.nn.modules.activation.GELU"],
+        ["agent=ppo", "agent.policy_kwargs.optimizer_class=torch.optim.adamw.AdamW"],
+        ["agent=dqn", "agent.policy=stable_baselines3.dqn.policies.DQNPolicy"],
     ],
 )
-@pytest.mark.parametrize(
-    ("agent", "policy"), [("dqn", "dqn.policies.DQNPolicy"), ("ppo", "common.policies.ActorCriticPolicy")]
-)
-def test_what_it_knows(agent: str, policy: str, settings: list[str]) -> None:
-    words = [each.replace("POLICY", policy) for each in settings]
-    assert type(built(f"agent={agent}", *words)) is EngineAgent
+def test_what_it_knows(words: list[str]) -> None:
+    assert type(built(*words)) is EngineAgent
 
 
 @pytest.mark.parametrize("agent", ["a2c", "qrdqn", "trpo"])
@@ -119,3 +117,33 @@ def test_an_activation_that_is_covered_is_a_function_of_each_number(kind: type[t
     assert torch.allclose(torch.stack([module(row) for row in x]), expected, atol=1e-6)
     assert torch.equal(torch.get_rng_state(), chance)
     assert not list(module.buffers())
+
+
+@pytest.mark.parametrize(("name", "last"), [("ent_coef", 0), ("gae_lambda", 0.4 * (1 - 256 / 300))])
+def test_it_falls_to_nothing_in_plain_sb3(name: str, last: float) -> None:
+    envs, arguments = gridworld.make_vec_env("classic", n_envs=4), {name: 0.4}
+    model: Any = A2C("MlpPolicy", envs, n_steps=16, **arguments)
+    model.learn(300, callback=FallingSetting(name, 0.4))  # the last rollout ends beyond the end
+    assert getattr(model, name) == pytest.approx(last)
+    assert model.rollout_buffer.gae_lambda == model.gae_lambda
+
+
+@pytest.mark.parametrize("engine", ["tabulated", "stock"])
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("ent_coef", "lin_0.5", [0.4, 0.3, 0.2, 0.1, 0]),
+        ("ent_coef", "quad_0.5", [0.32, 0.18, 0.08, 0.02, 0]),
+        ("gae_lambda", "lin_0.5", [0.5, 0.4, 0.3, 0.2, 0.1]),
+        ("learning_rate", "lin_0.5", [0.4, 0.3, 0.2, 0.1]),
+        ("learning_rate", "sqrt_0.5", [0.5 * left**0.5 for left in (0.8, 0.6, 0.4, 0.2)]),
+    ],
+)
+def test_a_run_has_it_by_its_setting(engine: str, name: str, value: str, expected: list[float]) -> None:
+    words = ("total_timesteps=320", "n_envs=4", "agent.n_steps=16", "agent.batch_size=16")
+    logged: list[Any] = []
+    words = (*words, f"agent.engine={engine}", f"agent.{name}={value}")
+    agent = built("agent=ppo", *words, log=lambda values, _: logged.append(dict(values)))
+    agent.learn(320, lambda steps: steps + 1)
+    found = [values[f"train/{name}"] for values in logged if f"train/{name}" in values]
+    assert found == pytest.approx(expected)

@@ -37,19 +37,6 @@ def test_with_the_grids_own_orders_cells_are_orthonormal(rows: int, cols: int) -
     assert (default(nowhere).norm(dim=1) > 0).tolist() == [False, True]
 
 
-def test_they_are_products_of_cosines_of_length_one() -> None:
-    x = torch.rand(9, 2)
-    basis = FourierFeatures(PLANE, [3, 2])
-    found, orders = basis(x), list(product(range(4), range(3)))
-    assert basis.features_dim == found.shape[1] == len(orders)
-    assert torch.allclose(found.norm(dim=1), torch.ones(9))
-    weights = [0.5 ** (((a in (0, 3)) + (b in (0, 2))) / 2) for a, b in orders]
-    naive = [[np.cos(np.pi * a * float(p)) * np.cos(np.pi * b * float(q)) for a, b in orders] for p, q in x]
-    expected = np.array(naive) * weights
-    expected /= np.linalg.norm(expected, axis=1, keepdims=True)
-    assert np.allclose(found, expected, atol=1e-5)
-
-
 @pytest.mark.parametrize("cell_size", [8, 16])
 @pytest.mark.parametrize("layout", ["classic", "cliff", "four_rooms"])
 def test_images_of_different_cells_are_far_apart(layout: str, cell_size: int) -> None:

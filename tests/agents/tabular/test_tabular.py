@@ -173,23 +173,13 @@ def test_beliefs_are_the_table_and_the_policy_it_acts_with(schema: type[TabularC
     np.testing.assert_allclose(snapshot.values, (followed * snapshot.q).sum(axis=1), atol=1e-15)
 
 
-@pytest.mark.parametrize(
-    ("slip", "gamma", "power", "num_envs", "steps", "bound"),
-    [(0.0, 0.99, 0.6, 64, 200_000, 1e-3), (0.1, 0.9, 0.8, 1024, 2_000_000, 6e-2)],
-    ids=["default", "slippery"],
-)
-def test_q_learning_with_a_decaying_step_size_converges_to_q_star(
-    slip: float, gamma: float, power: float, num_envs: int, steps: int, bound: float
-) -> None:
-    config = QLearningConfig(
-        gamma=gamma, learning_rate=1.0, learning_rate_power=power, exploration_final_eps=1.0
-    )
-    context = seat_of(num_envs, seed=0, slip=slip)
-    agent = trained(config, steps, context)
+def test_q_learning_with_a_decaying_step_size_converges_to_q_star() -> None:
+    config = QLearningConfig(gamma=0.9, learning_rate=1, learning_rate_power=0.8, exploration_final_eps=1)
+    context = seat_of(512, slip=0.1)
+    agent = trained(config, 1_000_000, context)
     mdp = context.envs.mdp
-    error = np.abs(agent.q - value_iteration(mdp, gamma).q)[~mdp.terminal]
     assert agent.visits[~mdp.terminal].min() > 0  # all of them are reachable
-    assert error.max() < bound
+    assert np.abs(agent.q - value_iteration(mdp, 0.9).q)[~mdp.terminal].max() < 0.1
 
 
 def test_the_curves_are_means_over_the_last_episodes() -> None:
