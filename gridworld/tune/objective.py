@@ -139,9 +139,8 @@ class Trials:
     def __call__(self, ask: Ask) -> list[Outcome]:
         trials = [_Trial(self.objective, name, *trial, ask) for name, trial in self.trials.items()]
         runs = [trial.training(place) for trial in trials for place in range(len(trial.seeds))]
-        with handling(
-            dict.fromkeys((signal.SIGINT, signal.SIGTERM), signal.SIG_DFL)
-        ):  # nothing is to be saved
+        at_once = dict.fromkeys((signal.SIGINT, signal.SIGTERM), signal.SIG_DFL)
+        with handling(at_once):  # there is nothing to save
             run_together(runs)
         return [trial.outcome or Outcome() for trial in trials]
 

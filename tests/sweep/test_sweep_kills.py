@@ -18,7 +18,7 @@ from helpers.sweeps import rows
 from gridworld.commands import jobs as jobs_command
 from gridworld.storage.atomic_write import is_locked
 
-KILLS = int(os.environ.get("GRIDWORLD_KILLS", "8"))
+KILLS = int(os.environ.get("GRIDWORLD_KILLS", "4"))
 EVERY = 256  # steps: checkpoints
 SHORT = (
     *("n_envs=16", "total_timesteps=1536", "evaluation.every=512", "agent.batch_size=64"),
@@ -34,8 +34,8 @@ OF_EACH = (
 )
 CASES = {  # the jobs, their number, and the launchers in turn
     "of each": (OF_EACH, 12, ("basic", "joblib", "forks")),
-    "ppo": (("agent=ppo", "seed=range(10)", *SAVED), 10, ("forks",)),
-    "dqn": (("agent=dqn", "seed=range(4)", *SAVED), 4, ("forks",)),
+    "ppo": (("agent=ppo", "seed=range(6)", *SAVED), 6, ("forks",)),
+    "dqn": (("agent=dqn", "seed=range(3)", *SAVED), 3, ("forks",)),
 }
 
 
