@@ -16,7 +16,7 @@ from gridworld.report.writer import write_over_seeds
 from gridworld.run.folder import RESULTS, WORLD
 from gridworld.run.reader import read_run
 from gridworld.sweep.console import results_lines
-from gridworld.sweep.job_table import DONE, JobRow
+from gridworld.sweep.folder import DONE, JobRow
 
 AGENTS = {"sarsa": SHORT["sarsa"], "dqn": SHORT["dqn"]}
 SEEDS = range(3)
