@@ -21,12 +21,12 @@ from gridworld.config.train import TrainConfig
 from gridworld.diagnosis.causes import CAUSES, PHRASES
 from gridworld.diagnosis.causes.objective import recommended_gamma
 from gridworld.diagnosis.evidence import Evidence, Finding, RegretSplit
-from gridworld.envs.rendering import AGENT, INK, Frame, board_of
+from gridworld.envs.rendering import Frame, board_of
 from gridworld.errors import InputError
 from gridworld.process.console import command
 from gridworld.restore.saved_run import SavedRun
 from gridworld.visualization.canvas import Canvas, directions, greedy_paths
-from gridworld.visualization.sheet import ORANGES, PAPER, UNREACHABLE, Swatch, is_dark, linear, short
+from gridworld.visualization.sheet import ORANGES, PAPER, UNREACHABLE, linear, short
 from gridworld.visualization.state_table import StateTable, table_states
 from gridworld.world.evaluation import score_of_optimum
 from gridworld.world.mdp import IntArray, Mdp
@@ -221,15 +221,14 @@ def draw_diagnosis(found: Diagnosis, cell_size: int | None = None) -> Frame:
     ways = directions(mdp)[np.arange(mdp.num_states), found.greedy].tolist()
     paths = greedy_paths(mdp, found.greedy)
     canvas.draw_paths(paths, ways, 0.4)
-    costly = np.flatnonzero((cost > 0) & canvas.board.floor).tolist()
-    texts = {state: short(float(cost[state]), scale.high) for state in costly}
-    size = canvas.number_size(0.8, texts.values())
-    dark = is_dark(colours)
-    for state, text in texts.items() if size is not None else ():
-        ink = PAPER if dark[state] else INK
-        canvas.number(text, canvas.point(state, 0.5, 0.83), size or 0, ink, colours[state])
+    costly = (cost > 0) & canvas.board.floor
+    canvas.write_numbers(
+        *(cost[:, None], costly[:, None], colours[:, None], scale.high),
+        canvas.number_size(cost[costly], scale.high, 0.8),
+        lambda state, _: canvas.point(state, 0.5, 0.83),
+        plates=range(mdp.num_states),
+    )
     canvas.caption(caption)
-    path = Swatch("greedy path from the start" if canvas.cell >= 24 else "greedy path", AGENT, PAPER)
-    swatches = [*([path] if paths else []), *([UNREACHABLE] if canvas.hidden else [])]
+    swatches = [*([canvas.path_swatch] if paths else []), *([UNREACHABLE] if canvas.hidden else [])]
     canvas.legend(scale, "regret 0", short(scale.high), swatches)
     return canvas.frame()

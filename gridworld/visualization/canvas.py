@@ -22,8 +22,6 @@ from gridworld.visualization.sheet import (
     Scale,
     Sheet,
     Swatch,
-    is_dark,
-    short,
 )
 from gridworld.world.grid import GridMdp
 from gridworld.world.layout import MOVES
@@ -72,6 +70,11 @@ class Canvas(Sheet):
     def hidden(self) -> bool:
         """Whether there are cells whose states cannot be reached."""
         return bool((self.board.kind == Kind.UNREACHABLE).any())
+
+    @property
+    def path_swatch(self) -> Swatch:
+        """What the legend says of `draw_paths`."""
+        return Swatch("greedy path from the start" if self.cell >= 24 else "greedy path", AGENT, PAPER)
 
     @property
     def has_grid(self) -> bool:
@@ -126,14 +129,13 @@ class Canvas(Sheet):
             self.paint(colours)
         self.draw_world()
         known &= playable[:, None]
-        texts = {number: short(number, scale.high) for number in set(numbers[known].tolist())}
-        size = self.number_size(0.36 if by_move else 0.8, texts.values())
-        dark = is_dark(colours)
-        for state, part in np.argwhere(known).tolist() if size is not None else []:
+        size = self.number_size(numbers[known], scale.high, 0.36 if by_move else 0.8)
+
+        def middle(state: int, part: int) -> Point:
             down, right = MOVES[part] if by_move else (0, 0)
-            middle = self.point(state, 0.5 + 0.29 * right, 0.5 + 0.33 * down)
-            ink = PAPER if dark[state, part] else INK
-            self.number(texts[float(numbers[state, part])], middle, size or 0, ink)
+            return self.point(state, 0.5 + 0.29 * right, 0.5 + 0.33 * down)
+
+        self.write_numbers(numbers, known, colours, scale.high, size, middle)
         self.caption(caption)
         unknown = [] if known[playable].all() else [Swatch(missing)]
         self.legend(scale, low, high, [*unknown, *([UNREACHABLE] if self.hidden else [])])

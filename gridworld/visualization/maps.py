@@ -174,14 +174,13 @@ def draw_policy_map(
     canvas.paint(colours[:, None])
     canvas.draw_world()
     with_numbers = scale is None and len(canvas.board.panels) <= 1  # of several panels the cells are small
-    texts = {value: short(value, own.high) for value in set(values[known].tolist()) if with_numbers}
-    size = canvas.number_size(0.8, texts.values())
+    size = canvas.number_size(values[known], own.high, 0.8) if with_numbers else 0
     inks = np.where(known[:, None], np.where(is_dark(colours)[:, None], PAPER, INK), UNKNOWN_INK).tolist()
-    middle = 0.5 if size is None else 0.4  # of the arrows, above the numbers
+    middle = 0.4 if size else 0.5  # of the arrows, above the numbers
     paths = greedy_paths(mdp, greedy)
     ways = directions(mdp)[np.arange(mdp.num_states), greedy].tolist()
     canvas.draw_paths(paths, ways, middle)
-    length = canvas.cell if size is None else 0.85 * canvas.cell
+    length = 0.85 * canvas.cell if size else canvas.cell
     letter = min(round(0.32 * length), 20)
     draw = drawing.import_pygame().draw
     for state in np.flatnonzero(playable).tolist() if canvas.cell >= _SMALLEST_ARROW_CELL else []:
@@ -192,18 +191,17 @@ def draw_policy_map(
         draw.circle(canvas.world, inks[state], point, round(0.2 * length))
         if letter >= SMALLEST_TEXT:
             name = mdp.action_names[greedy[state]]
-            canvas.number(name[:1].upper(), point, letter, colours[state].tolist())
-    on_path = set().union(*paths)
-    for state in np.flatnonzero(known).tolist() if size is not None else []:
-        plate = colours[state] if state in on_path else None
-        below = canvas.point(state, 0.5, 0.83)
-        canvas.number(texts[float(values[state])], below, size or 0, inks[state], plate)
+            canvas.write(name[:1].upper(), point, letter, colours[state].tolist())
+    canvas.write_numbers(
+        *(values[:, None], known[:, None], colours[:, None], own.high, size),
+        lambda state, _: canvas.point(state, 0.5, 0.83),
+        plates=set().union(*paths),
+    )
     wrong = playable & ~optimal[np.arange(mdp.num_states), greedy]
     canvas.mark(np.flatnonzero(wrong & ~known), _UNKNOWN_DISAGREES)
     canvas.mark(np.flatnonzero(wrong & known), DISAGREES)
     canvas.caption(caption)
-    path = Swatch("greedy path from the start" if canvas.cell >= 24 else "greedy path", AGENT, PAPER)
-    swatches = [path] if paths else []
+    swatches = [canvas.path_swatch] if paths else []
     swatches.append(Swatch("not optimal in this cell", frame=DISAGREES, thick=2))
     swatches += [] if known[playable].all() and not canvas.hidden else [NEVER_VISITED]
     canvas.legend(ends, f"value {short(ends.low, ends.high)}", short(ends.high), swatches)

@@ -12,8 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.envs import rendering as drawing
-from gridworld.envs.rendering import INK, SMALLEST_TEXT, UNKNOWN, Colour, Frame, text_size, text_width, write
-from gridworld.visualization.sheet import PAPER, Scale, Sheet, Swatch, is_dark, short
+from gridworld.envs.rendering import (
+    INK,
+    SMALLEST_TEXT,
+    UNKNOWN,
+    Colour,
+    Frame,
+    Point,
+    text_size,
+    text_width,
+    write,
+)
+from gridworld.visualization.sheet import PAPER, Scale, Sheet, Swatch, short
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 _MOST_ROWS = 24
@@ -82,13 +92,13 @@ class StateTable(Sheet):
         for row, column in np.ndindex(*values.shape):
             self.world.fill(colours[row, column].tolist(), self.box(row, column))
             drawing.import_pygame().draw.rect(self.world, INK, self.box(row, column), 1)
-        texts = {value: short(value, scale.high) for value in set(values[there].tolist())}
-        size = min((text_size(text, _TEXT, 0.8 * self._column) or 0 for text in texts.values()), default=0)
-        dark = is_dark(colours)
-        for row, column in np.argwhere(there).tolist() if written and size else []:
-            middle = self.box(row, column)[0] + self._column / 2, self._middle(row)
-            ink = PAPER if dark[row, column] else INK
-            self.number(texts[float(values[row, column])], middle, size, ink)
+        texts = [short(value, scale.high) for value in set(values[there].tolist())]
+        size = min((text_size(text, _TEXT, 0.8 * self._column) or 0 for text in texts), default=0)
+
+        def middle(row: int, column: int) -> Point:
+            return self.box(row, column)[0] + self._column / 2, self._middle(row)
+
+        self.write_numbers(values, there & written, colours, scale.high, size, middle)
 
     def mark(self, row: int, column: int, colour: Colour) -> None:
         """A frame inside a cell, edged in white."""
