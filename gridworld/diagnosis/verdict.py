@@ -128,11 +128,7 @@ def diagnose(run: Evidence) -> Diagnosis:
 
 
 def _offers(run: Evidence, findings: tuple[Finding, ...]) -> tuple[tuple[str, ...], ...]:
-    """The run's own words with a change each: those of the first cause, then one of each other.
-
-    No change helps as long as even the optimum under the agent's own discount is not certified, so each has
-    another discount with it then.
-    """
+    """The run's own words with a change each: those of the first cause, then one of each other."""
     first, others = findings[0].changes, [word for each in findings[1:] for word in each.changes[:1]]
     changes = list(dict.fromkeys((*first, *others)))[:_MOST_CHANGES]
     key, fits = run.config.agent.key("gamma"), score_of_optimum(run.evaluator, run.own.gamma).certified

@@ -82,10 +82,7 @@ class Canvas(Sheet):
         return self.cell >= _NO_GRID
 
     def paint(self, colours: ColourArray, parts: NDArray[np.intp] | None = None) -> None:
-        """Fill the cells with the colours (S, P, 3) of their P parts.
-
-        `parts` (cell, cell) says which part each pixel of a cell belongs to; None: all to the first.
-        """
+        """Fill the cells with colours (S, P, 3); `parts` (cell, cell) says which part a pixel belongs to."""
         board, cell = self.board, self.cell
         cells, is_fixed = colours[board.state], board.kind != Kind.FLOOR
         fixed = _WITH_GRID if self.has_grid else _WITHOUT_GRID
@@ -165,10 +162,7 @@ class Canvas(Sheet):
             rect(self.world, colour, (left + 1, top + 1, cell - 1, cell - 1), thick)
 
     def draw_paths(self, paths: list[list[int]], ways: list[list[int]], middle: float) -> None:
-        """A ring around each start, and lines through the states where one is next to the last.
-
-        `ways` are each state's arrow, down and right; lines are `middle` of a cell below its upper edge.
-        """
+        """A ring around each start, and lines through neighbours, `middle` of a cell below its edge."""
         place = self.board.place
         for path in paths:
             placed, lines = [state for state in path if place[state][0] >= 0], []
@@ -245,11 +239,7 @@ def moving_actions(mdp: Mdp) -> tuple[int, ...] | None:
 
 
 def greedy_paths(mdp: Mdp, greedy: IntArray) -> list[list[int]]:
-    """Follow the greedy policy (S,) from each start, each time to the most probable next state.
-
-    A path ends with the episode, or with the first state that comes twice. There are none from more than four
-    start states.
-    """
+    """Follow the greedy policy (S,) from each start, of four at most, until a state comes twice."""
     starts = mdp.start_states.tolist()
     likely = mdp.probability[np.arange(mdp.num_states), greedy].argmax(axis=1)
     following = mdp.next_state[np.arange(mdp.num_states), greedy, likely].tolist()

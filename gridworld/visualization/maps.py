@@ -106,10 +106,7 @@ def learning(subject: Subject) -> Draw:
 
 
 def q_error(subject: Subject) -> Draw:
-    """The map of |Q - Q*|, or |V - V*| without Q.
-
-    Q* is the optimum under the discount that the agent learns with, which may differ from the evaluation's.
-    """
+    """The map of |Q - Q*|, or |V - V*| without Q; the optimum is that under the agent's own discount."""
     mdp, snapshot, gamma = subject.evaluator.mdp, subject.snapshot, agents_gamma(subject)
     best = subject.evaluator.solution
     error = value_error(snapshot, best if gamma == best.gamma else solved(mdp, gamma))
@@ -247,10 +244,7 @@ def value_error(snapshot: PolicySnapshot, best: Solution) -> FloatArray:
 
 
 def draw_error_map(mdp: Mdp, error: FloatArray, caption: str = "", cell_size: int | None = None) -> Frame:
-    """Draw errors (S, A) as four triangles in each cell, or (S, 1) as its colour.
-
-    Where the cells are too small, or the actions are not the four moves, a cell shows the largest error.
-    """
+    """Draw errors (S, A) as four triangles in each cell; a cell too small for them shows the largest."""
     canvas = Canvas(mdp, cell_size)
     moves = moving_actions(mdp) if error.shape[1] > 1 and canvas.has_grid else None
     error = error.max(axis=1, keepdims=True) if moves is None else error[:, moves]

@@ -148,10 +148,7 @@ class Sheet:
         middle: Callable[[int, int], Point],
         plates: Container[int] = (),
     ) -> None:
-        """Write the chosen ones of numbers (S, P), around `middle` of a state and part, on colours (S, P, 3).
-
-        Those of the states in `plates` get a plate of their colour, as something lies below them.
-        """
+        """Write the chosen ones of numbers (S, P) on colours (S, P, 3), those of `plates` over a path."""
         dark = is_dark(colours)
         for state, part in np.argwhere(chosen).tolist() if size else []:
             ink = PAPER if dark[state, part] else INK

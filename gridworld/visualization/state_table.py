@@ -34,10 +34,7 @@ _NARROWEST, _WIDEST = 8, 80  # pixels, of a column
 
 
 def table_states(mdp: Mdp, visits: NDArray[np.int64] | None = None) -> IntArray:
-    """The states (rows,) of a table, in its order, chosen by how often training took each action (S, A).
-
-    States that are terminal or cannot be reached are not among them.
-    """
+    """The live states (rows,) of a table, in its order; of many those with most `visits` (S, A)."""
     states = np.flatnonzero(mdp.reachable & ~mdp.terminal)
     states = states[np.argsort(mdp.steps_away[states], kind="stable")]
     counts = np.zeros(len(states)) if visits is None else visits[states].sum(axis=1)
@@ -79,10 +76,7 @@ class StateTable(Sheet):
     def paint(
         self, table: FloatArray, scale: Scale, known: BoolArray | None = None, written: bool = True
     ) -> None:
-        """Fill the cells with numbers (S, columns) as colours, and as text if `written`.
-
-        NaN is left white; the rows of states that are not `known` (S,) are grey. None: all are.
-        """
+        """Fill the cells with numbers (S, columns); NaN is white, rows that are not `known` (S,) grey."""
         values = table[self._states]
         rows = np.ones(len(values), dtype=np.bool_) if known is None else known[self._states]
         there = np.isfinite(values) & rows[:, None]
