@@ -16,6 +16,7 @@ import tokenize
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache
+from types import UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from gridworld.commands import COMMANDS
@@ -178,7 +179,7 @@ def _yaml_comments() -> dict[str, str]:
 
 def _type(hint: Any) -> str:
     """`int or null`, of `Optional[int]`."""
-    kinds = get_args(hint) if get_origin(hint) is Union else (hint,)
+    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     names = ("null" if kind is type(None) else str(getattr(kind, "__name__", kind)) for kind in kinds)
     return " or ".join(names)
 

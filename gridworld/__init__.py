@@ -15,8 +15,8 @@ TYPE_CHECKING = False  # what type checkers take for True; `typing` itself would
 if TYPE_CHECKING:
     from gridworld.agents.sb3.exact_eval import ExactEvalCallback as ExactEvalCallback
     from gridworld.agents.sb3.vec_env import make_vec_env as make_vec_env
-    from gridworld.api.diagnosis import diagnose as diagnose
     from gridworld.api.runs import RunResult as RunResult
+    from gridworld.api.runs import diagnose as diagnose
     from gridworld.api.runs import open_run as open_run
     from gridworld.api.runs import train as train
     from gridworld.api.settings import compose as compose
@@ -48,8 +48,7 @@ __version__ = "0.1.0"
 _NAMES = {  # the public names of each module
     "agents.sb3.exact_eval": "ExactEvalCallback",
     "agents.sb3.vec_env": "make_vec_env",
-    "api.diagnosis": "diagnose",
-    "api.runs": "RunResult open_run train",
+    "api.runs": "RunResult diagnose open_run train",
     "api.settings": "compose",
     "api.worlds": "compile_env evaluate make_vec",
     "checking.run": "CheckResult check",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 from gridworld.errors import InputError
 
@@ -60,13 +59,6 @@ def digits(text: str) -> str:
     Raises:
         ValueError: it is not a number.
     """
-    whole = as_whole(float(text))
-    return text if text.lstrip("+-").isdecimal() or isinstance(whole, float) else str(whole)
-
-
-def as_whole(value: Any) -> Any:
-    """A float that is a whole number as an int, in lists too; anything else as it is."""
-    if isinstance(value, list):
-        return [as_whole(each) for each in value]
-    is_whole = isinstance(value, float) and value.is_integer() and abs(value) <= _LARGEST_EXACT
-    return int(value) if is_whole else value
+    number = float(text)
+    is_whole = number.is_integer() and abs(number) <= _LARGEST_EXACT
+    return str(int(number)) if is_whole and not text.lstrip("+-").isdecimal() else text

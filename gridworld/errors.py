@@ -22,7 +22,7 @@ class MachineError(InputError):
 
 
 class FolderLostError(InputError):
-    """The folder that this process was at work in is gone, or is another process's by now."""
+    """The folder that this run was at work in is gone, or is another process's by now."""
 
 
 def reason(error: BaseException) -> str:

@@ -4,7 +4,6 @@ from gridworld.process.signals import listen
 
 if __name__ == "__main__":
     listen()  # before what takes time to import
-    from gridworld.commands import run
-    from gridworld.commands.benchmark import main
+    from gridworld.commands import call
 
-    run(main)
+    call("benchmark")

@@ -4,6 +4,6 @@ from gridworld.process.signals import listen
 
 if __name__ == "__main__":
     listen()  # before what takes time to import
-    from gridworld.commands.train import main
+    from gridworld.commands import call
 
-    main()
+    call("train")

@@ -12,12 +12,10 @@ os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # before pygame is imported
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # a second thread waits busily for the next product
 
 import pytest
-from helpers import huge_pages
-from helpers.composing import compose_quickly
+from helpers.quickly import collapse_memory, compose_quickly
 from hypothesis import settings
 
 from gridworld.process import console
-from gridworld.process.memory_budget import collect_less_often
 
 # The package and the tests are compiled once, not in every process.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -55,11 +53,11 @@ LONG = (
     *("restore/test_reproduce.py", "checking/test_check.py", "training/test_training.py"),
     *("training/test_certified.py", "restore/test_resume.py", "restore/test_resume_commands.py"),
     *("storage/test_other_systems.py", "docs/test_examples.py", "commands/test_console.py"),
-    *("agents/sb3/test_resume_own_classes.py", "export/test_export.py", "agents/tabular/test_tabular.py"),
+    *("agents/sb3/test_custom_code.py", "export/test_export.py", "agents/tabular/test_tabular.py"),
     *("world/test_evaluation.py", "process/test_forks.py", "tune/test_tune_together.py"),
     *("api/test_scores.py", "api/test_runs.py", "run/test_power_cuts.py", "visualization/test_maps.py"),
     *("commands/test_fuzz.py", "run/test_lost_folders.py", "agents/sb3/test_any_class.py"),
-    *("agents/sb3/test_callbacks.py", "config/test_config.py"),
+    "config/test_config.py",
 )
 
 
@@ -100,8 +98,8 @@ def pytest_collection_finish() -> None:
         sys.modules["gridworld.agents.sb3.factory"].keep_compiler_out()
     compose_quickly()
     gc.freeze()
-    collect_less_often()
-    huge_pages.collapse()
+    gc.set_threshold(50_000)
+    collapse_memory()
 
 
 @pytest.hookimpl(optionalhook=True)

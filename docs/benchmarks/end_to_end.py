@@ -97,7 +97,6 @@ def _certified(agent: str, seeds: range) -> Callable[[], float]:
     def measure() -> float:
         from gridworld.agents import family
         from gridworld.config.compose import compose
-        from gridworld.config.words import conf_folder
         from gridworld.envs.observations import make_observation
         from gridworld.training.learning_curve import LearningCurve
         from gridworld.training.setup import make_context
@@ -105,7 +104,7 @@ def _certified(agent: str, seeds: range) -> Callable[[], float]:
 
         seconds = []
         for seed in seeds:
-            config = compose(conf_folder(), [f"agent={agent}", f"seed={seed}"])
+            config = compose([f"agent={agent}", f"seed={seed}"])
             mdp = config.env.compile()
             evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
             made = family(config.agent).build(

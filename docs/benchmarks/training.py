@@ -107,11 +107,10 @@ def learner(words: Sequence[str], steps: int, mdp: Mdp | None = None) -> Callabl
 def steps_per_second(commands: Sequence[Sequence[str]], mdp: Mdp | None = None) -> float:
     """Environment steps a second of agents that learn together, without evaluations."""
     from gridworld.config.compose import compose
-    from gridworld.config.words import conf_folder
 
     learnings, made = [], [0] * len(commands)
     for number, words in enumerate(commands):
-        config = compose(conf_folder(), list(words))
+        config = compose(words)
         world = mdp or config.env.compile()
         context = make_context(config, world, make_observation(world, config.observation.kind))
         agent = family(config.agent).build(config.agent, context)

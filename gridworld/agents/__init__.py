@@ -1,8 +1,7 @@
-"""Agents: what learns. An algorithm family is one package here; nothing outside knows how it works.
+"""Agents: what learns. A family of algorithms is a package here, with the functions of `Family`.
 
-A family is the package `gridworld.agents.<family>` with the functions of `Family`. It is found by the
-`family` of an agent's settings. Importing a family, and asking it for its schemas or to check settings, must
-not import torch.
+It is found by the `family` of an agent's settings. Importing it, and asking it for its schemas or to check
+settings, must not import torch.
 """
 
 from __future__ import annotations
@@ -27,6 +26,8 @@ if TYPE_CHECKING:
     from gridworld.world.mdp import FloatArray, IntArray
 
 WriteScalars = Callable[[Mapping[str, float], int], None]  # ({tag: value}, environment steps)
+Hook = Callable[[int], int]  # see `Agent.learn`
+SafePoint = Callable[[int], None] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +41,7 @@ class PolicySnapshot:
 
     def greedy_policy(self) -> FloatArray:
         """The greedy policy's action probabilities, (S, A)."""
-        # here, since settings are read without numpy
-        from gridworld.world.chain import one_hot_policy
+        from gridworld.world.chain import one_hot_policy  # settings are read without numpy
 
         return one_hot_policy(self.greedy, self.sampled.shape[1])
 
@@ -69,18 +69,14 @@ class Agent(Protocol):
         """What it has learnt, as its library has it: a model of SB3, or a table Q (S, A)."""
 
     def learn(
-        self,
-        total_timesteps: int,
-        on_step: Callable[[int], int],
-        on_safe_point: Callable[[int], None] | None = None,
-        state: State | None = None,
+        self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
     ) -> None:
         """Learn for so many environment steps.
 
         Args:
             total_timesteps: environment steps, from the very start; a whole last batch counts.
             on_step: called with the steps so far after a batch of steps; it returns the steps by which it is
-                to be called again at the latest, and 0 where learning is to end. It may be called sooner.
+                to be called again at the latest, and 0 where learning is to end.
             on_safe_point: called with the steps so far where nothing is half done, so that `get_state` is
                 complete, and once more at the end if that is such a point.
             state: of `get_state`, to continue from; None: from the start.
@@ -112,8 +108,8 @@ class Learning:
 
     agent: Agent
     total_timesteps: int
-    on_step: Callable[[int], int]
-    on_safe_point: Callable[[int], None] | None = None
+    on_step: Hook
+    on_safe_point: SafePoint = None
     state: State | None = None
 
 
@@ -139,6 +135,21 @@ def learn_together(learnings: Sequence[Learning]) -> list[BaseException | None]:
         for place, end in zip(places, ends, strict=True):
             errors[place] = end
     return errors
+
+
+def misfit(found: Mapping[str, NDArray[Any]], expected: Mapping[str, NDArray[Any]]) -> str | None:
+    """The first name, type, shape or number of a model's arrays that does not fit; None: all do."""
+    import numpy as np
+
+    for name in sorted(found.keys() ^ expected.keys()):
+        return f"{name[:80]} is {'missing' if name in expected else 'not part of it'}"
+    for name, like in expected.items():
+        is_now, must_be = (f"{each.dtype} {each.shape}" for each in (found[name], like))
+        if is_now != must_be:
+            return f"{name} is {is_now}, it must be {must_be}"
+        if not np.isfinite(found[name]).all():
+            return f"{name} holds numbers that are not finite"
+    return None
 
 
 class Family(Protocol):

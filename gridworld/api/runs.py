@@ -1,4 +1,4 @@
-"""Training from Python, and a finished run opened again: both come as a `RunResult`."""
+"""Training from Python, a finished run opened again, and why it is not optimal."""
 
 from __future__ import annotations
 
@@ -18,10 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.agents import Agent, PolicySnapshot
-from gridworld.api.settings import Override, compose_words, words
+from gridworld.api.settings import Override, words
+from gridworld.config.compose import compose as compose_words
 from gridworld.config.train import TrainConfig
+from gridworld.diagnosis import verdict
+from gridworld.diagnosis.evidence import Evidence
 from gridworld.errors import InputError, failure
-from gridworld.process.memory_budget import limited, unlimited
+from gridworld.process.memory_budget import limited
 from gridworld.process.signals import Interrupted
 from gridworld.report.evidence import read_columns
 from gridworld.restore.resume import unfinished_of
@@ -120,7 +123,7 @@ def train(
         overrides: words as on the command line, `"agent=dqn"`, or dictionaries, `{"agent.gamma": 0.9}`.
         folder: where the run's files go, an ordinary run for all commands. It must be new, or hold this
             run unfinished. None: nothing stays on disk, and no pictures are drawn.
-        progress: whether to show a progress bar; None: as `logging.progress` says, which is to show it.
+        progress: whether to show progress; None: as `logging.progress` says, which is to show it.
         settings: settings whose name has no dot, `seed=3`, `total_timesteps=20_000`.
 
     Returns:
@@ -140,7 +143,7 @@ def train(
     config = compose_words(given)
     if progress is not None:
         config.logging.progress = progress
-    with _ONE_AT_A_TIME, torch_threads_kept(), _as_python_interrupts(folder is not None):
+    with _ONE_AT_A_TIME, _torch_threads_kept(), _as_python_interrupts(folder is not None):
         if folder is None:
             return _train_without_files(config, given)
         path = Path(folder).expanduser()
@@ -176,6 +179,51 @@ def open_run(folder: str | PathLike[str], trust: bool = False) -> RunResult:
         return RunResult(saved, path, saved.agent)
 
 
+def diagnose(
+    run: RunResult | str | PathLike[str], try_offers: bool = False, trust: bool = False
+) -> verdict.Diagnosis:
+    """Say why a run is not optimal: its regret by state, the causes, and what to try.
+
+    Args:
+        run: what `train` or `open_run` returned, or the folder of a finished run.
+        try_offers: train what there is to try, until one is certified: `tried` has the results. The new runs
+            are in the folder `RUN-tried`; of a run without a folder they do not stay.
+        trust: import the classes that the run's settings name, wherever they are from.
+
+    Returns:
+        The diagnosis; without causes for a run that is certified optimal.
+
+    Raises:
+        InputError: the folder holds no finished run, or one of its files was changed; it would take more
+            memory than the budget, `GRIDWORLD_BUDGET`, usually 1 GB; or its settings name classes from
+            elsewhere, and are not trusted.
+
+    Example:
+        >>> import gridworld
+        >>> run = gridworld.train("agent=q_learning", "agent.learning_rate=0.001", progress=False)
+        >>> found = gridworld.diagnose(run)
+        >>> found.cause, bool(abs(found.split.cost.sum() - found.split.score.regret) < 1e-9)
+        ('slow', True)
+    """
+    with _torch_threads_kept(), limited():
+        if isinstance(run, RunResult):
+            folder, saved = run.folder, run.saved
+            evidence = Evidence(
+                run.config, run.overrides, run.curve, run.visits, run.evaluator, run.agent, run.policy
+            )
+        else:
+            folder = Path(run).expanduser()
+            saved = SavedRun(folder, trust)
+            evidence = Evidence.of(saved)
+        found = verdict.diagnose(evidence)
+        if not try_offers:
+            return found
+        verdict.check_trusted(saved, found, trust)
+        with tempfile.TemporaryDirectory(prefix="gridworld-") as elsewhere:
+            place = Path(elsewhere) if folder is None else verdict.trials_folder(folder)
+            return dataclasses.replace(found, tried=tuple(verdict.try_offers(saved, found, place, trust)))
+
+
 def _train_without_files(config: TrainConfig, given: list[str]) -> RunResult:
     plain = without_pictures(config)
     quiet = dataclasses.replace(
@@ -195,7 +243,7 @@ def _finished(place: Path, config: TrainConfig, given: list[str], folder: Path |
         unfinished_of(place, config).resume(on_built=agents.append)
     else:
         train_in(config, place, given, on_built=agents.append)
-    with unlimited():
+    with limited(is_own=True):
         result = RunResult(SavedRun(place, trust=True), folder, agents.pop)
         _ = result.policy, result.evaluator  # before the model is trained further, or the folder is gone
     return result
@@ -213,7 +261,7 @@ def _as_python_interrupts(is_kept: bool) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def torch_threads_kept() -> Iterator[None]:
+def _torch_threads_kept() -> Iterator[None]:
     """Give the caller's torch its number of threads back, which a run sets for the whole process."""
     torch: Any = sys.modules.get("torch")
     before = None if torch is None else torch.get_num_threads()

@@ -11,14 +11,11 @@ from typing import Any
 import numpy as np
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
-from gridworld.config import compose as composition
+from gridworld.config.compose import compose as compose_words
 from gridworld.config.recipe_file import literal, with_recipe
 from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
-from gridworld.config.words import conf_folder, sentence
 from gridworld.errors import InputError
 
 Override = str | Mapping[str, Any]
@@ -70,14 +67,6 @@ def words(*overrides: Override, **settings: Any) -> list[str]:
             if parsed.is_sweep_override():
                 raise InputError(f"{parsed.input_line}: has several values; call train once for each")
     return found
-
-
-def compose_words(words: list[str]) -> TrainConfig:
-    """Compose the settings that these words of a command line choose."""
-    try:
-        return composition.compose(conf_folder(), words)
-    except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError) as error:
-        raise InputError(sentence(error)) from None
 
 
 def _checked(word: str) -> str:

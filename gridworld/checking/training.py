@@ -126,7 +126,7 @@ def subject(algorithm: Any) -> AgentConfig:
             f"check {name}: must be the import path of a class, e.g. my_package.MyPPO, or a shipped agent, "
             f"which are {', '.join(known)}"
         )
-    return compose(conf_folder(), [f"agent={name}"]).agent
+    return compose([f"agent={name}"]).agent
 
 
 def arguments(words: Sequence[str]) -> dict[str, Any]:

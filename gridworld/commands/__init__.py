@@ -1,7 +1,6 @@
 """A module per command, behind the console command `gridworld` and the files in `scripts/`.
 
-A module has `main(arguments)`, which `run` calls with the command line's words. That of `train` has no
-arguments, and reads `sys.argv` as Hydra does.
+A module has `main(words)`, which gets the words of the command line.
 """
 
 from __future__ import annotations
@@ -18,8 +17,7 @@ from typing import Any
 from gridworld.bounds import Bounds, digits
 from gridworld.errors import EXIT_CODE, InputError, failure
 from gridworld.process.console import CONSOLE, prepare, printing, program, tell_error
-from gridworld.process.memory_budget import collect_less_often
-from gridworld.process.signals import at_work
+from gridworld.process.signals import Interrupted, at_work
 
 # By name, in the order of the manual: what it does.
 COMMANDS = {
@@ -51,11 +49,7 @@ Examples:
   {console} train agent=dqn
   {console} evaluate runs/...
   {console} train -m agent=dqn,ppo "seed=range(20)" hydra.sweep.dir=runs/mine
-  {console} report runs/mine
-"""
-
-Main = Callable[[Sequence[str]], None]
-
+  {console} report runs/mine"""
 _BEST = "the model with the lowest exact regret on the way, not the last one"
 _TRUST = "import the classes that the run names, wherever they are from, and let its environment draw"
 _POLICY = "the best action, or the distribution it explores with"
@@ -98,22 +92,26 @@ def whole(low: float = -math.inf, high: float = math.inf) -> Callable[[str], int
     return number
 
 
-def run(main: Main) -> None:
+def call(command: str) -> None:
+    """Run a command with the words in `sys.argv`."""
+    run(import_module(f"gridworld.commands.{command}").main)
+
+
+def run(main: Callable[[Sequence[str]], None]) -> None:
     """Call a command's `main`; a user's mistake ends the program with one sentence and no traceback.
 
     So does output that could not be written, whatever exit code `main` ends with.
     """
-    collect_less_often()
     prepare()
     try:
         with at_work(), printing():
             main(sys.argv[1:])
-    except InputError as error:
-        tell_error(str(error))
+    except (InputError, OSError) as error:
+        tell_error(str(error) if isinstance(error, InputError) else failure(error))
         sys.exit(EXIT_CODE)
-    except OSError as error:
-        tell_error(failure(error))
-        sys.exit(EXIT_CODE)
+    except Interrupted as interruption:
+        print(str(interruption), file=sys.stderr)
+        sys.exit(interruption.exit_code)
     except KeyboardInterrupt:
         sys.exit(130)
 
@@ -125,11 +123,7 @@ def console() -> None:
         run(_without_command)
         return
     sys.argv = [f"{CONSOLE} {name}", *words]  # what the command and its messages go by
-    module = import_module(f"gridworld.commands.{name}")
-    if name == "train":  # Hydra has its own ways to end
-        module.main()
-    else:
-        run(module.main)
+    call(name)
 
 
 def _without_command(words: Sequence[str]) -> None:
@@ -137,14 +131,15 @@ def _without_command(words: Sequence[str]) -> None:
     word = words[0] if words else "--help"
     if word in ("--help", "-h", "help"):
         commands = "\n".join(f"  {name:<11}{about}" for name, about in COMMANDS.items())
-        print(_MANUAL.format(console=CONSOLE, commands=commands).rstrip())
-    elif word == "--version":
+        print(_MANUAL.format(console=CONSOLE, commands=commands))
+        return
+    if word == "--version":
         from gridworld import __version__
 
         print(f"{CONSOLE} {__version__}")
-    else:
-        close = difflib.get_close_matches(word.removesuffix(".py"), COMMANDS, n=1)
-        advice = f"did you mean {CONSOLE} {close[0]}?" if close else f"it is one of {', '.join(COMMANDS)}"
-        if not close and "=" in word:
-            advice = f"settings stand after a command: {CONSOLE} train {word}"
-        raise InputError(f"{CONSOLE}: there is no command {word}; {advice}")
+        return
+    close = difflib.get_close_matches(word.removesuffix(".py"), COMMANDS, n=1)
+    advice = f"did you mean {CONSOLE} {close[0]}?" if close else f"it is one of {', '.join(COMMANDS)}"
+    if not close and "=" in word:
+        advice = f"settings stand after a command: {CONSOLE} train {word}"
+    raise InputError(f"{CONSOLE}: there is no command {word}; {advice}")

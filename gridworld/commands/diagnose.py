@@ -19,7 +19,6 @@ from gridworld.diagnosis.verdict import (
 from gridworld.errors import InputError
 from gridworld.process.console import aligned, printable, tell, telling_if_slow
 from gridworld.process.memory_budget import limited
-from gridworld.process.signals import Interrupted
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.folder import shown
 from gridworld.storage.safe_read import check_no_link
@@ -53,12 +52,7 @@ def main(arguments: Sequence[str]) -> None:
             tell(f"{path}: not drawn ({error})")
     if options.try_offers and found.findings:
         check_trusted(saved, found, options.trust)
-        try:
-            certified = _is_any_certified(saved, found, options)
-        except Interrupted as interruption:
-            print(str(interruption), file=sys.stderr)
-            sys.exit(interruption.exit_code)
-        if not certified:
+        if not _is_any_certified(saved, found, options):
             sys.exit(_NONE)
 
 

@@ -73,15 +73,13 @@ def _table(evaluator: Evaluator, policy: FloatArray, score: Score, sampled: Samp
         "return": sampled.episode_return,
         "length": sampled.length,
     }
-    discounted = evaluator.discounted_return(policy)
-    best_discounted = evaluator.discounted_return(evaluator.optimal_policy())
-    estimate = f" {sampled.discounted_return}"
+    discounted = [f"{evaluator.discounted_return(each):.4g}" for each in (policy, evaluator.optimal_policy())]
     rows = [
         ["", "exact", f" {sampled.episodes:,} episodes [95 %]", "optimum"],
         ["without a step limit:", "", "", ""],
         ["value", f"{score.value:.4g}", "", f"{evaluator.optimal_value:.4g}"],
         [f"within {evaluator.max_episode_steps:,} steps:", "", "", ""],
-        ["discounted return", f"{discounted:.4g}", estimate, f"{best_discounted:.4g}"],
+        ["discounted return", discounted[0], f" {sampled.discounted_return}", discounted[1]],
     ]
     for metric in METRICS:
         if metric.within_limit:

@@ -8,12 +8,8 @@ from __future__ import annotations
 import textwrap
 from pathlib import Path
 
+from gridworld.config.words import conf_folder, pairs
 from gridworld.process.console import as_called
-
-FAILS = "known_failure:"  # a setting of recipes that do not solve their task
-RECIPES = "tuned"  # the group of recipes
-SETTINGS = "settings"  # in the group of presets, which are chosen by their own names
-SPACES = "tune"  # the group of search spaces, which is tune.py's
 
 _TEXT = """\
 Train an agent on a GridWorld whose optimum is known exactly.
@@ -68,13 +64,14 @@ Hydra's own options: python scripts/train.py --hydra-help
 """
 
 
-def manual(conf: Path) -> str:
-    """The help text, with the choices in the folder `conf`."""
-    lines = []
-    groups = {file.parent for file in conf.glob("**/*.yaml")}
-    for group in sorted(groups - {conf, conf / SPACES, conf / "preset" / SETTINGS}):
+def manual() -> str:
+    """The help text, with the choices in the folder of the yaml files."""
+    conf, lines = conf_folder(), []
+    # Spaces are tune.py's, and settings are chosen by the names of the presets.
+    hidden = {conf, conf / "tune", conf / "preset" / "settings"}
+    for group in sorted({file.parent for file in conf.glob("**/*.yaml")} - hidden):
         lines.append(f"  {group.relative_to(conf).as_posix()}=...")
-        lines += _recipes(conf, group) if group.name == RECIPES else choices(group)
+        lines += _recipes(group) if group.name == "tuned" else choices(group)
     return as_called(_TEXT.format(choices="\n".join(lines)))
 
 
@@ -88,17 +85,16 @@ def choices(group: Path) -> list[str]:
     return lines
 
 
-def _recipes(conf: Path, group: Path) -> list[str]:
-    """A line or two per world, since recipes are named WORLD_AGENT; then those that are known to fail."""
+def _recipes(group: Path) -> list[str]:
+    """A line or two per world, then those that are known to fail."""
     files = sorted(group.glob("*.yaml"))
-    worlds = sorted((file.stem for file in (conf / "env").glob("*.yaml")), key=len, reverse=True)
     agents: dict[str, list[str]] = {}
     for file in files:
-        world = next((world for world in worlds if file.stem.startswith(f"{world}_")), "")
-        agents.setdefault(world, []).append(file.stem.removeprefix(f"{world}_"))
+        world, agent = pairs().get(file.stem, ("", file.stem))
+        agents.setdefault(world, []).append(agent)
     lines = []
     for world, names in agents.items():
         text = f"    {world + '_...' if world else '':<20} {', '.join(names)}"
         lines += textwrap.wrap(text, 100, subsequent_indent=" " * 25, drop_whitespace=True)
-    failing = [file.stem for file in files if FAILS in file.read_text("utf-8")]
+    failing = [file.stem for file in files if "known_failure:" in file.read_text("utf-8")]
     return [*lines, f"    Known to fail: {', '.join(failing)}"] if failing else lines

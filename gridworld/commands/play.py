@@ -1,7 +1,6 @@
 """Play a world with the arrow keys, alone or beside a trained agent, and see how far you are from optimal.
 
-`Game` is a state machine driven by key presses and ticks; `draw` is a function of it. The agent takes a step
-whenever the person does, and continues alone when the person's episode is over.
+The agent takes a step whenever the person does, and continues alone when the person's episode is over.
 """
 
 from __future__ import annotations
@@ -9,7 +8,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from collections.abc import Sequence
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -45,22 +43,14 @@ _WORLD: dict[str, tuple[Any, str]] = {  # a setting of the world: its type, and 
 }
 
 
-class Key(Enum):
-    """The meaning of a key; the values of the first four are the actions' numbers."""
-
-    UP = 0
-    RIGHT = 1
-    DOWN = 2
-    LEFT = 3
-    RESTART = 4
-    QUIT = 5
-
-
 class Player:
-    """An episode in progress, of at most `limit` steps, and its return so far."""
+    """An episode in progress and its return so far; an agent's has a policy, (S, A), and a step limit."""
 
-    def __init__(self, evaluator: Evaluator, name: str, limit: int | None = None) -> None:
-        self.evaluator, self.name, self._limit = evaluator, name, limit
+    def __init__(
+        self, evaluator: Evaluator, name: str, policy: FloatArray | None = None, limit: int | None = None
+    ) -> None:
+        self.evaluator, self.name = evaluator, name
+        self._policy, self._limit = policy, limit
         self._env = GridWorldEnv(mdp=evaluator.mdp)
         self.state = self.steps = 0
         self.value = self.optimum = 0.0  # discounted return so far, and the best expected from the start
@@ -69,8 +59,15 @@ class Player:
     def restart(self, seed: int) -> None:
         """Start an episode; players with the same seed start in the same cell."""
         self.state, _ = self._env.reset(seed=seed)
+        self._chance = independent_generator(seed)  # the world uses the seed's own generator
         self.steps, self.value, self.over = 0, 0.0, False
         self.optimum = float(self.evaluator.solution.v[self.state])
+
+    def act(self) -> None:
+        """Take an action of the policy, if there is one."""
+        if self._policy is not None:
+            row = self._policy[self.state]
+            self.step(int(self._chance.choice(len(row), p=row)))
 
     def step(self, action: int) -> None:
         """Take an action, unless the episode is over."""
@@ -103,61 +100,35 @@ class Player:
 
 
 class Game:
-    """A person's board and perhaps an agent's.
+    """A person's board and perhaps an agent's; a restart adds 1 to the seed of the start and the slips."""
 
-    Args:
-        evaluator: of the world.
-        seed: of the start and the slips; a restart adds 1.
-        policy: the agent's, (S, A); None: there is no agent.
-        agent: the agent's name.
-        limit: the most steps of an agent's episode.
-    """
-
-    def __init__(
-        self,
-        evaluator: Evaluator,
-        seed: int = 0,
-        policy: FloatArray | None = None,
-        agent: str = "agent",
-        limit: int | None = None,
-    ) -> None:
-        self.quit = False
+    def __init__(self, evaluator: Evaluator, seed: int = 0, agent: Player | None = None) -> None:
         self.person = Player(evaluator, "you")
-        self.agent = None if policy is None else Player(evaluator, agent, limit)
-        self.players = [self.person] if self.agent is None else [self.person, self.agent]
-        self._policy, self._seed = policy, seed
-        self._restart()
+        self.players = [self.person] if agent is None else [self.person, agent]
+        self._seed = seed - 1
+        self.restart()
 
     @property
     def over(self) -> bool:
         """Whether all episodes are over."""
         return all(player.over for player in self.players)
 
-    def press(self, key: Key) -> None:
-        """Handle a key that the person pressed."""
-        if key is Key.QUIT:
-            self.quit = True
-        elif key is Key.RESTART:
-            self._seed += 1
-            self._restart()
-        elif not self.person.over:
-            self.person.step(key.value)
-            self._agent_steps()
+    def restart(self) -> None:
+        """Start the next episodes, from the same cell."""
+        self._seed += 1
+        for player in self.players:
+            player.restart(self._seed)
+
+    def move(self, action: int) -> None:
+        """Take the person's action, and the agent's."""
+        if not self.person.over:
+            self.person.step(action)
+            self.players[-1].act()
 
     def tick(self) -> None:
         """Let the agent take a step if the person's episode is over."""
         if self.person.over:
-            self._agent_steps()
-
-    def _agent_steps(self) -> None:
-        if self.agent is not None and self._policy is not None:
-            row = self._policy[self.agent.state]
-            self.agent.step(int(self._chance.choice(len(row), p=row)))
-
-    def _restart(self) -> None:
-        self._chance = independent_generator(self._seed)  # the world uses the seed's own generator
-        for player in self.players:
-            player.restart(self._seed)
+            self.players[-1].act()
 
 
 def draw(game: Game, cell_size: int) -> Frame:
@@ -192,13 +163,12 @@ def main(arguments: Sequence[str]) -> None:
 def play(game: Game, cell_size: int) -> None:
     """Show a game and pass it the keys until the person quits; print the verdict on every episode."""
     pygame = drawing.import_pygame()
-    keys = {getattr(pygame, f"K_{key.name}"): key for key in (Key.UP, Key.RIGHT, Key.DOWN, Key.LEFT)}
-    keys |= {pygame.K_r: Key.RESTART, pygame.K_q: Key.QUIT, pygame.K_ESCAPE: Key.QUIT}
+    actions = {pygame.K_UP: 0, pygame.K_RIGHT: 1, pygame.K_DOWN: 2, pygame.K_LEFT: 3}
     pygame.display.init()
     window: Any = None
-    clock, frames, is_told = pygame.time.Clock(), 0, False
+    clock, frames, is_told, goes_on = pygame.time.Clock(), 0, False, True
     try:
-        while not game.quit:
+        while goes_on:
             frame = draw(game, cell_size)
             size = (frame.shape[1], frame.shape[0])
             if window is None:
@@ -208,10 +178,13 @@ def play(game: Game, cell_size: int) -> None:
             pygame.display.flip()
             clock.tick(_FPS)
             for event in pygame.event.get():
-                if event.type == pygame.QUIT:
-                    game.press(Key.QUIT)
-                elif event.type == pygame.KEYDOWN and event.key in keys:
-                    game.press(keys[event.key])
+                key = event.key if event.type == pygame.KEYDOWN else None
+                if event.type == pygame.QUIT or key in (pygame.K_q, pygame.K_ESCAPE):
+                    goes_on = False
+                elif key == pygame.K_r:
+                    game.restart()
+                elif key in actions:
+                    game.move(actions[key])
             frames += 1
             if frames % _TICKS == 0:
                 game.tick()
@@ -253,4 +226,5 @@ def _game(options: argparse.Namespace) -> Game:
     mdp = dataclasses.replace(config.env, **given).compile_on(world.layout)
     gamma = config.evaluation.gamma if options.gamma is None else options.gamma
     evaluator, policy = Evaluator(mdp, gamma, config.env.step_limit(mdp)), saved.snapshot().greedy_policy()
-    return Game(evaluator, options.seed, policy, config.agent.name, evaluator.max_episode_steps)
+    agent = Player(evaluator, config.agent.name, policy, evaluator.max_episode_steps)
+    return Game(evaluator, options.seed, agent)

@@ -18,7 +18,6 @@ from gridworld.process.console import printable, telling_if_slow
 from gridworld.process.memory_budget import limited
 from gridworld.restore.saved_run import SavedRun, choose_policy, read_visits
 from gridworld.run.folder import check_inside, check_writable
-from gridworld.storage.atomic_write import make_inside
 from gridworld.storage.safe_read import check_no_link
 from gridworld.visualization import files
 from gridworld.visualization.episode import film
@@ -77,10 +76,7 @@ def _record(options: argparse.Namespace) -> None:
     episodes = [play(mdp, policy, limit, options.seed + index) for index in range(options.episodes)]
     animation = film(saved.config.env, mdp, episodes, options.trust)(options.cell_size)
     files.check_size(animation, formats)
-    if options.out is None:
-        make_inside(options.run, folder.name)
-    else:
-        folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     for kind in formats:
         path = folder / ("frames" if kind == "png" else f"{kind}.png" if kind in MAPS else f"episode.{kind}")
         if kind == "png":

@@ -13,14 +13,13 @@ import argparse
 import importlib
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from gridworld.commands import parser_of
 from gridworld.errors import InputError
 from gridworld.process.console import printable, telling_if_slow
 from gridworld.process.memory_budget import limited
-from gridworld.process.signals import Interrupted
 from gridworld.restore.reproduce import check_whole, compare, lengths, population, repeat
 from gridworld.restore.saved_run import settings_of
 from gridworld.run.folder import MANIFEST, check_inside
@@ -54,46 +53,32 @@ def main(arguments: Sequence[str]) -> None:
     if members:
         names = ", ".join(run.folder.name for run in members)
         print(f"  its numbers depend on all runs of its population, which train again: {names}", flush=True)
-
-    def same_in(folder: Path) -> bool | None:
+    with tempfile.TemporaryDirectory(prefix="gridworld-") as temporary:
+        folder = options.keep or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
         again = config if options.keep is not None else without_pictures(config)
         try:
             repeat(then, folder, again, mdp, options.trust, members)
         except InputError as error:
             if not (folder / MANIFEST).exists():  # these settings cannot be run here at all
                 raise
-            print(f"  it did not come to its end this time: {printable(str(error))}")
-            return False
+            print(f"  it did not come to its end this time: {printable(str(error))}\ndifferent")
+            sys.exit(DIFFERENT)
         with telling_if_slow("comparing"):
             findings = list(compare(then, read_run(folder), again, mdp))
-        for finding in findings:
-            verdict = {True: "identical", False: "DIFFERENT", None: "UNKNOWN"}[finding.same]
-            print(f"  {finding.part:<20}{verdict:<9}  {printable(finding.detail)}")
-        verdicts = {finding.same for finding in findings}
-        return next((verdict for verdict in (False, None) if verdict in verdicts), True)
-
-    same = _in_folder(options.keep, same_in)
-    if same is None:
+    for finding in findings:
+        verdict = {True: "identical", False: "DIFFERENT", None: "UNKNOWN"}[finding.same]
+        print(f"  {finding.part:<20}{verdict:<9}  {printable(finding.detail)}")
+    verdicts = {finding.same for finding in findings}
+    if False in verdicts:
+        print("different")
+        sys.exit(DIFFERENT)
+    if None in verdicts:
         raise InputError(
             f"{options.run}: all that could be compared is identical, but not all of the run is there; put "
             "its files back to compare them too"
         )
-    print("identical" if same else "different")
-    if not same:
-        sys.exit(DIFFERENT)
-
-
-def _in_folder(keep: Path | None, same_in: Callable[[Path], bool | None]) -> bool | None:
-    """Compare in the folder that is kept, or in a temporary one."""
-    try:
-        if keep is not None:
-            keep.mkdir(parents=True, exist_ok=True)
-            return same_in(keep)
-        with tempfile.TemporaryDirectory(prefix="gridworld-") as folder:
-            return same_in(Path(folder))
-    except Interrupted as interruption:
-        print(str(interruption), file=sys.stderr)
-        sys.exit(interruption.exit_code)
+    print("identical")
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -27,10 +27,8 @@ from gridworld.process.console import (
     command_line,
     printable,
     program,
-    result_is_in_files,
     tell_error,
 )
-from gridworld.storage.safe_read import check_yaml
 
 if TYPE_CHECKING:
     from gridworld.tune.study_spec import StudySpec
@@ -57,9 +55,8 @@ examples:
 
 def main(arguments: Sequence[str]) -> None:
     """Search, confirm the winner, and print the verdict."""
-    conf = conf_folder()
     refuse_dashes(arguments)
-    parser = _parser(conf)
+    parser = _parser(conf_folder())
     options = parser.parse_intermixed_args(arguments)
     if options.cfg not in (None, *_KINDS):
         if "=" not in options.cfg:
@@ -72,18 +69,15 @@ def main(arguments: Sequence[str]) -> None:
         )
     if importlib.util.find_spec("optuna") is None:
         raise InputError(f"{program('tune')}: optuna is not installed; {install_command('tune')}")
-    if options.config_dir is not None:
-        if not options.config_dir.is_dir():
-            raise InputError(f"--config-dir {options.config_dir}: no such folder")
-        check_yaml(options.config_dir)
+    if options.config_dir is not None and not options.config_dir.is_dir():
+        raise InputError(f"--config-dir {options.config_dir}: no such folder")
+    own = (options.config_dir,) if options.config_dir is not None else ()
     from gridworld.tune.study_spec import ConfFolders, compose_study
 
-    folders = ConfFolders(conf, (options.config_dir,) if options.config_dir else ())
-    spec = compose_study(folders, options.overrides)
+    spec = compose_study(ConfFolders(conf_folder(), own), options.overrides)
     if options.cfg:
         _show(spec, options.cfg, options.package)
         return
-    result_is_in_files()
     from gridworld.process.signals import Interrupted
     from gridworld.tune.study import tune
     from gridworld.tune.workers import SearchError

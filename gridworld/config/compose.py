@@ -15,15 +15,18 @@ from typing import Any, cast
 import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from gridworld.config.presets import may_need_preset, with_preset
 from gridworld.config.settings import agent_schemas
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SearchConfig, SweepConfig
 from gridworld.config.train import TrainConfig
-from gridworld.config.words import is_override, meant, own_conf_folders, prepared
+from gridworld.config.words import conf_folder, is_override, meant, own_conf_folders, prepared, sentence
 from gridworld.config.worlds import SOURCES, EnvConfig
 from gridworld.errors import InputError
 
@@ -37,26 +40,21 @@ _NO_SINGLE_RUN = {  # with these of Hydra's options, a command line is not that 
 _PLAIN = re.compile(r"[\w./:-]+")  # what Hydra takes without quotes
 
 
-def compose(conf: Path, overrides: list[str]) -> TrainConfig:
-    """Compose the configuration that a command line would give to a run.
+def compose(words: Sequence[str]) -> TrainConfig:
+    """Compose the configuration that a command line of these words would give to a run.
 
     It may be called in any thread, and in a program that uses Hydra itself.
-
-    Args:
-        conf: the folder of the yaml files.
-        overrides: the command line's words.
     """
-    with _leaving_hydra_as_it_was():
-        _store_schemas()
-        return without_hydra(compose_whole(conf, "train", overrides)[0])
+    try:
+        with _leaving_hydra_as_it_was():
+            _store_schemas()
+            return to_config(compose_whole(conf_folder(), "train", words)[0])
+    except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError) as error:
+        raise InputError(sentence(error)) from None
 
 
 def compose_whole(conf: Path, name: str, overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:
-    """Compose `name` with Hydra's own part, and with the preset that a run's world needs.
-
-    Returns:
-        The composition; the words that chose the preset.
-    """
+    """Compose `name` with Hydra's own part, and the preset that the world needs; return its words, too."""
     words = prepared(overrides)
 
     def again(more: list[str]) -> DictConfig:
@@ -69,7 +67,7 @@ def compose_whole(conf: Path, name: str, overrides: Sequence[str]) -> tuple[Dict
         return with_preset(found, words, again)
 
 
-def completed(words: Sequence[str], conf: Path) -> list[str]:
+def completed(words: Sequence[str]) -> list[str]:
     """A command line as Hydra takes it, with the words that choose the preset that a single run needs."""
     own = list(own_conf_folders(words))
     found = prepared(words, own)
@@ -77,12 +75,12 @@ def completed(words: Sequence[str], conf: Path) -> list[str]:
     values = [found[number] for number in places]
     if {word.partition("=")[0] for word in found} & _NO_SINGLE_RUN or not (own or may_need_preset(values)):
         return found
-    folders = [search_path([conf])] if own else []
+    folders = [search_path([conf_folder()])] if own else []
+    chosen: list[str] = []
     with contextlib.suppress(Exception):  # Hydra composes again, and says what is wrong
-        chosen = compose_whole([*own, conf][0], "train", [*folders, *values])[1]
-        end = places[-1] + 1 if places else len(found)
-        return [*found[:end], *chosen, *found[end:]]  # options may follow
-    return found
+        chosen = compose_whole([*own, conf_folder()][0], "train", [*folders, *values])[1]
+    end = places[-1] + 1 if places else len(found)  # options may follow
+    return [*found[:end], *chosen, *found[end:]]
 
 
 def search_path(folders: Sequence[Path]) -> str:
@@ -108,34 +106,28 @@ def _leaving_hydra_as_it_was() -> Iterator[None]:
             version.version_base = base
 
 
-def without_hydra(whole: DictConfig) -> TrainConfig:
-    """Convert a composition that has Hydra's own part too, which is deleted from it. See `to_config`."""
-    return to_config(drop_hydra(whole))
-
-
 def drop_hydra(whole: DictConfig) -> DictConfig:
-    """Delete Hydra's own part from a composition."""
+    """Delete Hydra's own part from a composition, if it is there."""
     with read_write(whole), open_dict(whole):
-        del whole["hydra"]
+        whole.pop("hydra", None)
     return whole
 
 
 def to_config(settings: DictConfig) -> TrainConfig:
-    """Convert Hydra's settings to the dataclasses that everything below takes."""
-    _refuse_added_keys(settings)
+    """Convert what Hydra composed to dataclasses; its own part is deleted."""
+    _refuse_added_keys(drop_hydra(settings))
     return cast(TrainConfig, OmegaConf.to_object(settings))
 
 
 def _refuse_added_keys(settings: DictConfig, prefix: str = "") -> None:
     """Refuse keys that `+key=value` added, which gets past the schema while Hydra composes."""
     schema = OmegaConf.get_type(settings)
-    known = {field.name for field in dataclasses.fields(schema)} if dataclasses.is_dataclass(schema) else None
+    known = [field.name for field in dataclasses.fields(schema)] if dataclasses.is_dataclass(schema) else None
     for key in map(str, settings):
         if known is not None and key not in known:
             raise InputError(f"{prefix}{key}: there is no such key{meant(key, sorted(known))}")
-        if OmegaConf.is_missing(settings, key) or OmegaConf.is_interpolation(settings, key):
-            continue
-        if isinstance(child := settings[key], DictConfig):
+        is_value = not (OmegaConf.is_missing(settings, key) or OmegaConf.is_interpolation(settings, key))
+        if is_value and isinstance(child := settings[key], DictConfig):
             _refuse_added_keys(child, f"{prefix}{key}.")
 
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 import functools
 import math
 import re
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum, auto
-from typing import Annotated, Any, Union
+from typing import Annotated, Any
 
 from gridworld.bounds import Bounds
 from gridworld.errors import InputError
@@ -45,16 +45,21 @@ class Effect(Enum):
     NOTHING = auto()  # once the run has come to its end
 
 
+def setting(default: Any, *declared: dict[str, Any]) -> Any:
+    """A field of a schema, with metadata as below; `default` may be a class, which makes it."""
+    metadata = {key: value for part in declared for key, value in part.items()}
+    if isinstance(default, type):
+        return field(default_factory=default, metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
 def affects(effect: Effect, **entries: Effect) -> dict[str, Any]:
     """Metadata: the setting's effect, and that of single entries where it is a mapping."""
     return {EFFECTS: {"": effect, **{f".{name}": other for name, other in entries.items()}}}
 
 
 def privilege(name: str, value: Any = None) -> dict[str, Any]:
-    """Metadata: with `value` (None: any that is not empty or 0), the run has what a learner would not have.
-
-    Results show it by its name.
-    """
+    """Metadata: with `value` (None: any that is not empty or 0), the run has a privilege of this name."""
     return {PRIVILEGE: (name, value)}
 
 
@@ -103,21 +108,16 @@ EnvId = Annotated[str, Text.ENV]
 Callback = Annotated[Any, Text.CODE]
 Arguments = Annotated[dict[str, Any], Text.ARGUMENTS]
 Kwargs = Annotated[dict[str, Any], Text.KWARGS]
-Schedule = Union[int, float, Word]  # noqa: UP007  # OmegaConf reads it at run time
+Schedule = int | float | Word
 WholeNumbers = Annotated[Any, Text.WORD, "a whole number, or lists and dicts of them"]
 
 
 @dataclass(frozen=True)
 class Decay:
-    """A rate over training.
+    """A rate over training."""
 
-    Attributes:
-        initial: at the start, finite and not negative.
-        power: of the share of training that is left, with which it falls to 0; with 0 it stays.
-    """
-
-    initial: float
-    power: float
+    initial: float  # at the start, finite and not negative
+    power: float  # of the share of training that is left, with which it falls to 0; with 0 it stays
 
     def at(self, progress: float) -> float:
         """The rate after this share of training, from 0 to 1."""
@@ -130,12 +130,9 @@ def falls(value: object) -> bool:
 
 
 def parse_schedule(key: str, value: Schedule, linear_only: bool = False) -> Decay:
-    """Read a rate that may fall over training.
+    """Read a rate: a number, or one of `lin_NUMBER`, `sqrt_NUMBER` and `quad_NUMBER`, which fall.
 
-    Args:
-        key: the setting's dotted name, for the message.
-        value: a number, or one of `lin_NUMBER`, `sqrt_NUMBER` and `quad_NUMBER`.
-        linear_only: whether the last two are refused.
+    `key` is for the message; with `linear_only` the last two are refused.
     """
     form, digits = "", value
     if isinstance(value, str):

@@ -1,16 +1,12 @@
 """`preset=auto`: settings for worlds that the agents' own numbers are not made for, chosen by one rule.
 
 The agents' yaml files are made for the default world. `conf/preset/settings` has plain numbers of some agents
-for stochastic and for larger worlds. Where `preset` is `auto`, which is the default, it becomes
+for stochastic and for larger worlds. `preset=auto`, the default, becomes `stochastic` where an action may
+have several outcomes, or else `large` where there are more states than in the default world. It stays `auto`
 
-1. `none` where the command line or an experiment gives `total_timesteps` or `n_envs`, which a preset's
-   numbers rest on, or chooses a recipe by `tuned=`; and where Stable-Baselines3's own loop trains, for which
-   the numbers are too large;
-2. `none` with a recipe in the world that it was made for; where the command line makes that world a
-   stochastic one, the recipe is left out;
-3. `stochastic` where an action may have several outcomes;
-4. `large` where there are more states than in the default world, and no recipe;
-5. `none`.
+- where the command line or an experiment gives `total_timesteps` or `n_envs`, which the numbers rest on, or
+  chooses a recipe; and where Stable-Baselines3's own loop trains, for which the numbers are too large;
+- with a recipe in its own world, or in one that is only larger; in a stochastic one the recipe is left out.
 
 The choice becomes a word of the run's command line, as if it had been typed.
 """
@@ -61,12 +57,11 @@ def with_preset(
 
     Args:
         config: what the command line composes to, as dataclasses or as Hydra has it.
-        words: the command line.
-        compose: composes it with further words.
+        words: the command line, which `compose` composes with further words.
         world: makes the configured world, or returns an existing one.
 
     Returns:
-        The settings; the words that were added, none where no preset is needed.
+        The settings; the words that were added, if any.
     """
     if config.preset != AUTO or any(map(_CHOSEN_BY_HAND.match, words)):
         return config, []
@@ -87,10 +82,10 @@ def with_preset(
 
 
 def fitting_preset(config: TrainConfig | DictConfig, world: Callable[[], Mdp | None]) -> str | None:
-    """The name of the preset that is made for a world.
+    """The preset that the agent has for a world; None for none.
 
-    None: `world` returns none, as it is not known before the run; the agent's own settings are made for it,
-    or the agent has no such preset; or the settings make no world, which the check before training says.
+    That is so as well where `world` returns none, or the settings make none, which the check before training
+    says.
     """
     callbacks = config.callbacks
     plain = OmegaConf.to_container(callbacks) if OmegaConf.is_config(callbacks) else callbacks
@@ -100,9 +95,8 @@ def fitting_preset(config: TrainConfig | DictConfig, world: Callable[[], Mdp | N
         mdp = world()
     except (InputError, TypeError, ValueError, OSError):
         return None
-    if mdp is None:
-        return None
-    name = STOCHASTIC if mdp.is_stochastic else LARGE if mdp.num_states > _DEFAULT_STATES else ""
+    is_large = mdp is not None and mdp.num_states > _DEFAULT_STATES
+    name = STOCHASTIC if mdp is not None and mdp.is_stochastic else LARGE if is_large else ""
     return name if _numbers(config.agent.name, name) else None
 
 

@@ -2,7 +2,7 @@
 
 What `tune.py` leaves in a study is a yaml that Hydra could compose. From Hydra, a yaml may ask for callbacks,
 for log files, for environment variables. Here it is data: names of an agent, a world and an observation, and
-settings that the schema has, of the types that it has. What comes out are plain overrides, quoted.
+settings that the schema has. What comes out are plain overrides, quoted.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ import dataclasses
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 import yaml
 from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import OmegaConf
 
-from gridworld.bounds import LARGEST_INTEGER, as_whole
+from gridworld.bounds import LARGEST_INTEGER
 from gridworld.config.fields import MISSING
-from gridworld.config.settings import alternatives, check_foreign, fits, foreign, shown
+from gridworld.config.settings import check_foreign, foreign, settings_of_a_run
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import is_override
 from gridworld.errors import InputError
@@ -80,7 +80,7 @@ def overrides(path: Path, trust: bool = False) -> list[str]:
     if not isinstance(content, dict):
         raise InputError(f"{path}: holds no settings")
     choices = list(_choices(content.pop("defaults", []), path))
-    values = list(_values([TrainConfig], content, path, ""))
+    values = list(_values(content, path))
     if not trust:
         check_foreign(content, str(path), f"{TRUST}=true")
     return [*choices, *values]
@@ -89,35 +89,29 @@ def overrides(path: Path, trust: bool = False) -> list[str]:
 def _read(path: Path) -> Any:
     text = as_text(read_bytes(path, _LARGEST), path)
     try:
-        _check_syntax(text, path)
+        _check_plain(text, path)
         return OmegaConf.to_container(OmegaConf.create(text)) if text.strip() else None
     except InputError:
         raise
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark is not None else ""
-        raise InputError(f"{path}: {where}is not valid YAML: {error.problem}") from None
     except (yaml.YAMLError, ValueError) as error:
-        raise InputError(f"{path}: is not valid YAML ({' '.join(str(error).split())[:200]})") from None
+        mark = getattr(error, "problem_mark", None)
+        where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark is not None else ""
+        what = " ".join(str(getattr(error, "problem", error)).split())[:200]
+        raise InputError(f"{path}: {where}is not valid YAML: {what}") from None
 
 
-def _check_syntax(text: str, path: Path) -> None:
-    """Nothing in a yaml that means more than it says. Raises `InputError`."""
-    depth = documents = 0
+def _check_plain(text: str, path: Path) -> None:
+    """Refuse what is larger, once it is read, than it is written."""
+    depth = 0
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         at = f"{path}: line {event.start_mark.line + 1}"
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
             raise InputError(f"{at}: has an anchor or an alias; write the value out")
-        if getattr(event, "tag", None) is not None:
-            raise InputError(f"{at}: has the tag {event.tag[:80]!r}; a recipe has plain values only")
         if isinstance(event, yaml.ScalarEvent) and "${" in event.value:
             raise InputError(f"{at}: has the interpolation {event.value[:80]!r}; write the value out")
-        documents += isinstance(event, yaml.DocumentStartEvent)
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > _DEEPEST:
             raise InputError(f"{at}: is nested too deeply, more than {_DEEPEST} levels")
-    if documents > 1:
-        raise InputError(f"{path}: has {documents} documents; a recipe is one")
 
 
 def _choices(defaults: Any, path: Path) -> Iterator[str]:
@@ -135,25 +129,19 @@ def _choices(defaults: Any, path: Path) -> Iterator[str]:
         yield f"{groups[0]}={choice}"
 
 
-def _values(schemas: Sequence[type], content: dict[Any, Any], path: Path, section: str) -> Iterator[str]:
-    """An override for every setting; `schemas` are those that the section may have."""
-    known = [get_type_hints(schema) for schema in schemas]
+def _values(content: dict[Any, Any], path: Path, section: str = "") -> Iterator[str]:
+    """An override for every setting; Hydra checks its type."""
     for key, value in content.items():
         name = f"{section}{str(key)[:80]}"
-        hints = [hints[key] for hints in known if key in hints]
-        if not hints:
-            raise InputError(f"{path}: has an unknown key {name!r}; a recipe has the settings of a run only")
-        kinds = [kind for kind in hints if isinstance(kind, type) and dataclasses.is_dataclass(kind)]
-        kinds = [schema for kind in kinds for schema in alternatives(kind)]
-        if kinds and isinstance(value, dict):
-            yield from _values(kinds, value, path, f"{name}.")
-        elif any(fits(value, hint) or fits(as_whole(value), hint) for hint in hints if hint not in kinds):
+        if name in settings_of_a_run():
             # What is in no schema has no entry yet that could be changed.
             yield f"{'++' if isinstance(value, dict) else ''}{name}={literal(value, f'{path}: {name}')}"
+        elif not any(known.startswith(f"{name}.") for known in settings_of_a_run()):
+            raise InputError(f"{path}: has an unknown key {name!r}; a recipe has the settings of a run only")
+        elif isinstance(value, dict):
+            yield from _values(value, path, f"{name}.")
         else:
-            types = (h.__name__ if isinstance(h, type) else str(h).replace("typing.", "") for h in hints)
-            wanted = "settings" if kinds else " or ".join(sorted(set(types)))
-            raise InputError(f"{path}: {name}={shown(value)}: must be {wanted}")
+            raise InputError(f"{path}: {name}={str(value)[:80]}: must be settings")
 
 
 def harmless_words(words: Sequence[str], config: TrainConfig) -> Iterator[str]:

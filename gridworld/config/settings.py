@@ -1,4 +1,4 @@
-"""Settings by what the schemas declare: their names, their effects, and those of a stranger.
+"""Settings by what the schemas declare: their names, types and effects, and which are a stranger's to set.
 
 What a stranger may have written is plain values, checked against the schema. Nothing is resolved,
 instantiated or imported. An interpolation is a text like any other.
@@ -13,6 +13,7 @@ import os
 import pkgutil
 import re
 import types
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -43,25 +44,17 @@ NEWER = frozenset(
 ON_RESULT = frozenset(Effect) - {Effect.FILES, Effect.NOTHING}
 _LARGEST_KWARG = 1000  # of an environment: sizes, and what it pays
 
+Hints = tuple[Any, ...]  # types of a setting: several where the schemas of agents or worlds differ
+
 
 @functools.cache
 def agent_schemas() -> dict[str, type[AgentConfig]]:
-    """The schemas of all agents by their names in Hydra's group `agent/schema`.
-
-    The only place where this room reaches a room above it, by a package's name, not by an import statement.
-    """
-    agents = importlib.import_module("gridworld.agents")
+    """The schemas of all agents, from a room above this one, by their names in the group `agent/schema`."""
     found: dict[str, type[AgentConfig]] = {}
+    agents = importlib.import_module("gridworld.agents")
     for family in pkgutil.iter_modules(agents.__path__):
         found |= importlib.import_module(f"{agents.__name__}.{family.name}").schemas()
     return found
-
-
-def alternatives(schema: type) -> tuple[type, ...]:
-    """The schemas that may take the place of a field annotated with `schema`, itself first."""
-    if schema is AgentConfig:
-        return (schema, *agent_schemas().values())
-    return (schema, *SOURCES.values()) if schema is EnvConfig else (schema,)
 
 
 def flat(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -73,24 +66,65 @@ def flat(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield f"{prefix}{key}", value
 
 
+def _walk(schema: type, section: str = "") -> Iterator[tuple[str, Any, dict[str, Any]]]:
+    """(dotted name, type, metadata) of every field of a schema, its sections and their alternatives."""
+    hints = get_type_hints(schema, include_extras=True)
+    for name, metadata in declared(schema).items():
+        hint = hints[name]
+        yield section + name, hint, metadata
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+            others: dict[type, Mapping[str, Any]] = {AgentConfig: agent_schemas(), EnvConfig: SOURCES}
+            for each in (hint, *others.get(hint, {}).values()):
+                yield from _walk(each, f"{section}{name}.")
+
+
+def _types(schema: type, section: str = "") -> dict[str, Hints]:
+    found: dict[str, dict[Any, None]] = defaultdict(dict)
+    for name, hint, _ in _walk(schema, section):
+        if not dataclasses.is_dataclass(hint):
+            found[name][hint] = None
+    return {name: tuple(hints) for name, hints in found.items()}
+
+
+@functools.cache
+def settings_of_a_run() -> dict[str, Hints]:
+    """The types of every setting of a run, of all agents and sources of worlds, by dotted names."""
+    return _types(TrainConfig)
+
+
+@functools.cache
+def all_settings() -> dict[str, Hints]:
+    """The same, with those of a sweep, its launchers and a search."""
+    found = settings_of_a_run() | _types(TuneConfig, "tune.") | _types(SweepConfig, "hydra.sweeper.")
+    for schema in LAUNCHER_SCHEMAS.values():
+        found |= _types(schema, "hydra.launcher.")
+    return found
+
+
+def takes_whole_numbers(name: str) -> bool:
+    """Whether a setting of a run, a sweep or a search, or what contains it, consists of whole numbers."""
+    return name in _whole_numbers() or ("." in name and takes_whole_numbers(name.rpartition(".")[0]))
+
+
+@functools.cache
+def _whole_numbers() -> frozenset[str]:
+    return frozenset(name for name, hints in all_settings().items() if all(map(_is_whole, hints)))
+
+
+def _is_whole(hint: Any) -> bool:
+    if get_origin(hint) in (Union, types.UnionType):
+        return int in get_args(hint) and float not in get_args(hint)
+    return hint in (int, WholeNumbers)
+
+
 @functools.cache
 def _effects() -> dict[str, Effect]:
     """Every effect that is declared, by the dotted name of its field, entry or section."""
     return {
         name + entry: effect
-        for name, metadata in _declarations(TrainConfig)
+        for name, _, metadata in _walk(TrainConfig)
         for entry, effect in metadata.get(EFFECTS, {}).items()
     }
-
-
-def _declarations(schema: type, section: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
-    """(dotted name, metadata) of every field of the schema, its sections and their alternatives included."""
-    for name, metadata in declared(schema).items():
-        yield section + name, metadata
-    for name, kind in get_type_hints(schema).items():
-        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-            for each in alternatives(kind):
-                yield from _declarations(each, f"{section}{name}.")
 
 
 @functools.cache
@@ -112,13 +146,8 @@ def with_effects(
 ) -> dict[str, Any]:
     """Select the settings that have one of these effects, and are not among `NEWER` and empty.
 
-    Args:
-        effects: e.g. `ON_RESULT`.
-        settings: a run's, as plain values; they may come from a manifest, and be anything.
-        section: where they are in a run's settings, with a dot at its end.
-
-    Returns:
-        The selected settings, nested as they are; a section without any is left out.
+    They are plain values of a run, or of a `section` ("agent."); of a manifest, they may be anything. A
+    section of which nothing is selected is left out.
     """
     found = {}
     for key, value in settings.items():
@@ -132,75 +161,24 @@ def with_effects(
 
 
 def privileges(settings: Mapping[str, Any]) -> list[str]:
-    """Find what a simulator allowed a run, and a learner in the world would not have.
-
-    Args:
-        settings: a run's, as plain values; they may come from a manifest, and be anything.
-
-    Returns:
-        The names of the privileges.
-    """
-    found = []
+    """The names of what a simulator allowed a run with these plain values, and a learner would not have."""
+    given, found = dict(flat(settings)), []
     for name, (called, value) in _privileges().items():
-        given: Any = settings
-        for key in name.split("."):
-            given = given.get(key) if isinstance(given, Mapping) else None
-        if given == value if value is not None else given:
+        if given.get(name) == value if value is not None else given.get(name):
             found.append(called)
     return list(dict.fromkeys(found))
 
 
 @functools.cache
 def _privileges() -> dict[str, tuple[str, Any]]:
-    found = _declarations(TrainConfig)
-    return {name: metadata[PRIVILEGE] for name, metadata in found if PRIVILEGE in metadata}
-
-
-@functools.cache
-def settings_of_a_run() -> dict[str, tuple[Any, ...]]:
-    """The type hints of every setting of a run, of all agents and sources of worlds, by dotted names."""
-    found: dict[str, tuple[Any, ...]] = {}
-    for name, hint in _settings(TrainConfig, ""):
-        found[name] = tuple(dict.fromkeys([*found.get(name, ()), hint]))
-    return found
-
-
-def takes_whole_numbers(name: str) -> bool:
-    """Whether a setting of a run, a sweep or a search, or what contains it, consists of whole numbers."""
-    return name in _whole_numbers() or ("." in name and takes_whole_numbers(name.rpartition(".")[0]))
-
-
-@functools.cache
-def _whole_numbers() -> frozenset[str]:
-    found = settings_of_a_run() | {name: (hint,) for name, hint in _settings(TuneConfig, "tune.")}
-    for schema in (SweepConfig, *LAUNCHER_SCHEMAS.values()):
-        section = "hydra.sweeper." if schema is SweepConfig else "hydra.launcher."
-        found |= {name: (hint,) for name, hint in _settings(schema, section)}
-    return frozenset(name for name, hints in found.items() if all(map(_is_whole, hints)))
-
-
-def _settings(schema: type, section: str) -> Iterator[tuple[str, Any]]:
-    for name, hint in get_type_hints(schema, include_extras=True).items():
-        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-            for each in alternatives(hint):
-                yield from _settings(each, f"{section}{name}.")
-        else:
-            yield f"{section}{name}", hint
-
-
-def _is_whole(hint: Any) -> bool:
-    if get_origin(hint) in (Union, types.UnionType):
-        return int in get_args(hint) and float not in get_args(hint)
-    return hint in (int, WholeNumbers)
+    found = _walk(TrainConfig)
+    return {name: metadata[PRIVILEGE] for name, _, metadata in found if PRIVILEGE in metadata}
 
 
 def check_foreign(settings: Mapping[str, Any], where: str, allow: str) -> None:
-    """Refuse settings by which a stranger would run code, or have a file read, on the reader's machine.
+    """Refuse plain values by which a stranger would run code, or have a file read, on the reader's machine.
 
-    Args:
-        settings: of a run, or a part of them, as plain values.
-        where: they were read, for the message.
-        allow: the word that would allow it, for the message.
+    `where` they were read, and the word that would `allow` them, are for the message.
     """
     for name, value, harm in foreign(settings):
         setting = printable(f"{name[:200]}={str(value)[:80]}")
@@ -210,7 +188,7 @@ def check_foreign(settings: Mapping[str, Any], where: str, allow: str) -> None:
 def foreign(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any, str]]:
     """Find what does harm if a stranger wrote it, however deep: (dotted name, value, what it does)."""
     for name, value in _leaves(settings, ""):
-        for kind in sorted(_kinds(name), key=lambda kind: kind.name):
+        for kind in sorted(_texts_at(name), key=lambda kind: kind.name):
             pattern, harm = kind.value
             if isinstance(value, str):
                 if re.fullmatch(pattern, value) is None or (kind is Text.FILE and not _is_inside(value)):
@@ -244,16 +222,15 @@ def _leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
         yield name, value
 
 
-def _kinds(name: str) -> frozenset[Text]:
-    """What the schemas declare a text to be, at this setting or around it; what none knows may be code."""
-    while name and name not in _declared_texts():
+def _texts_at(name: str) -> frozenset[Text]:
+    """What a text is at this setting, or around it: code where no schema knows; nothing for a number."""
+    while name and name not in _texts():
         name = name.rpartition(".")[0]
-    return _declared_texts().get(name) or frozenset([Text.CODE])
+    return _texts().get(name, frozenset([Text.CODE]))
 
 
 @functools.cache
-def _declared_texts() -> dict[str, frozenset[Text]]:
-    """What a text in each setting of a run is; several where the schemas of agents or worlds differ."""
+def _texts() -> dict[str, frozenset[Text]]:
     found = settings_of_a_run().items()
     return {name: frozenset(text for hint in hints for text in texts_in(hint)) for name, hints in found}
 
@@ -275,7 +252,7 @@ def read_config(content: Any, where: str) -> TrainConfig:
     if not own and "arguments" in agent:  # of any class, whose schema names no algorithm
         own = [schema for schema in schemas if schema.algorithm == MISSING]
     if not own:
-        raise InputError(f"{where}: config.agent.algorithm={shown(algorithm)} is not known here")
+        raise InputError(f"{where}: config.agent.algorithm={_shown(algorithm)} is not known here")
     stand_in = {AgentConfig: own[0], EnvConfig: schema_of(content.get("env"))}
     config = _read(TrainConfig, content, f"{where}: config", stand_in)
     assert isinstance(config, TrainConfig)
@@ -285,7 +262,7 @@ def read_config(content: Any, where: str) -> TrainConfig:
 def _read(schema: type, content: Any, where: str, stand_in: dict[type, type], section: str = "") -> object:
     hints = get_type_hints(schema)
     if not isinstance(content, dict):
-        raise InputError(f"{where}: must be settings, is {shown(content)}")
+        raise InputError(f"{where}: must be settings, is {_shown(content)}")
     # A run from before there was a setting is read with its default, where the result does not depend on it.
     optional = {
         name
@@ -300,26 +277,25 @@ def _read(schema: type, content: Any, where: str, stand_in: dict[type, type], se
         kind, value = stand_in.get(hints[name], hints[name]), content[name]
         if isinstance(kind, type) and dataclasses.is_dataclass(kind):
             values[name] = _read(kind, value, f"{where}.{name}", stand_in, f"{section}{name}.")
-        elif fits(value, kind):
+        elif _fits(value, kind):
             values[name] = value
         else:
-            raise InputError(f"{where}.{name}={shown(value)}: must be {getattr(kind, '__name__', kind)}")
+            raise InputError(f"{where}.{name}={_shown(value)}: must be {getattr(kind, '__name__', kind)}")
     return schema(**values)
 
 
-def fits(value: Any, hint: Any) -> bool:
-    """Whether a plain value is of the type `hint` that a field of a schema is annotated with."""
+def _fits(value: Any, hint: Any) -> bool:
     if hint is Any:
         return True
     origin = get_origin(hint)
     if origin in (Union, types.UnionType):
-        return any(fits(value, choice) for choice in get_args(hint))
+        return any(_fits(value, choice) for choice in get_args(hint))
     kind = origin or hint
     if isinstance(value, bool):
         return kind is bool
     return isinstance(value, (int, float) if kind is float else kind)
 
 
-def shown(value: Any) -> str:
+def _shown(value: Any) -> str:
     """A value for a message; of a list or a mapping, which may be large, its type alone."""
     return f"a {type(value).__name__}" if isinstance(value, list | dict) else repr(value)[:80]

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Optional, Union
+from typing import Any
 
-from gridworld.config.fields import MISSING, bounds
-
-# OmegaConf reads these annotations at run time and knows no `X | None`.
+from gridworld.config.fields import MISSING, bounds, setting
 
 _MOST_RUNS = 10_000  # of one kind: seeds, finalists
 _MOST_LOOKS = 100_000  # at a seed's training
@@ -24,7 +22,7 @@ class SweepConfig:
     max_jobs: int = 10_000  # more are taken for a slip
     params: dict[str, Any] = field(default_factory=dict)  # settings and their values, as on a command line
     paired: list[Any] = field(default_factory=list)  # swept settings that vary together, or lists of such
-    population: Optional[Union[int, str]] = "auto"  # noqa: UP007, UP045  # runs that train as one; 1: each alone
+    population: int | str | None = "auto"  # runs that train as one; 1: each alone
 
 
 @dataclass
@@ -53,11 +51,11 @@ class SlurmConfig:
     timeout_min: int = 60
     signal_delay_s: int = 60
     cpus_per_task: int = 1  # cores
-    mem_gb: Optional[float] = None  # noqa: UP045
-    partition: Optional[str] = None  # noqa: UP045  # of Slurm's, and so below; null: the default
-    account: Optional[str] = None  # noqa: UP045  # that pays
-    qos: Optional[str] = None  # noqa: UP045  # quality of service
-    constraint: Optional[str] = None  # noqa: UP045  # features that a node must have
+    mem_gb: float | None = None
+    partition: str | None = None  # of Slurm's, and so below; null: the default
+    account: str | None = None  # that pays
+    qos: str | None = None  # quality of service
+    constraint: str | None = None  # features that a node must have
     setup: list[str] = field(default_factory=list)
     more: dict[str, Any] = field(default_factory=dict)
 
@@ -71,12 +69,7 @@ class RayConfig:
     remote: dict[str, Any] = field(default_factory=dict)
 
 
-LAUNCHER_SCHEMAS: dict[str, type] = {
-    "forks": ForksConfig,
-    "joblib": JoblibConfig,
-    "slurm": SlurmConfig,
-    "ray": RayConfig,
-}
+LAUNCHER_SCHEMAS = {"forks": ForksConfig, "joblib": JoblibConfig, "slurm": SlurmConfig, "ray": RayConfig}
 
 
 @dataclass
@@ -84,40 +77,37 @@ class DimensionConfig:
     """What a search may choose for one key: a range, or a list."""
 
     type: str = MISSING  # float, int, categorical
-    low: Optional[float] = None  # noqa: UP045  # of a range, included
-    high: Optional[float] = None  # noqa: UP045  # the same
+    low: float | None = None  # of a range, included
+    high: float | None = None  # the same
     log: bool = False  # even on a logarithmic scale
-    step: Optional[float] = None  # noqa: UP045  # between the values of a range
-    choices: Optional[list[Any]] = None  # noqa: UP045  # of a categorical one
+    step: float | None = None  # between the values of a range
+    choices: list[Any] | None = None  # of a categorical one
 
 
 @dataclass
 class TuneConfig:
     """How `scripts/tune.py` searches; `tune` on the command line."""
 
-    trials: int = field(default=100, metadata=bounds(1))  # the search ends after so many
-    seeds: int = field(default=3, metadata=bounds(1, _MOST_RUNS))  # a trial's: seed, seed + 1, ...
+    trials: int = setting(100, bounds(1))  # the search ends after so many
+    seeds: int = setting(3, bounds(1, _MOST_RUNS))  # a trial's: seed, seed + 1, ...
     # trials that go on to more seeds, beside what the search began from
-    finalists: int = field(default=5, metadata=bounds(1, _MOST_RUNS))
-    final_seeds: int = field(default=10, metadata=bounds(0, _MOST_RUNS))  # the next ones, for the finalists
+    finalists: int = setting(5, bounds(1, _MOST_RUNS))
+    final_seeds: int = setting(10, bounds(0, _MOST_RUNS))  # the next ones, for the finalists
     # the next ones, for the winner and for what the search began from
-    confirm_seeds: int = field(default=20, metadata=bounds(2, _MOST_RUNS))
-    study: Optional[str] = None  # noqa: UP045  # its name; null: of agent and world
-    folder: Optional[str] = None  # noqa: UP045  # null: runs/STUDY
-    storage: Optional[str] = None  # noqa: UP045  # any URL that Optuna takes; null: study.db in the folder
-    workers: int = field(default=-1, metadata=bounds(-1))  # processes; -1 for one on each core
-    # trials of a worker at once; null: 8 of all, 1 of one
-    together: Optional[int] = field(default=None, metadata=bounds(1))  # noqa: UP045
-    # seconds; no trial begins after that
-    timeout: Optional[float] = field(default=None, metadata=bounds(0, above=True))  # noqa: UP045
+    confirm_seeds: int = setting(20, bounds(2, _MOST_RUNS))
+    study: str | None = None  # its name; null: of agent and world
+    folder: str | None = None  # null: runs/STUDY
+    storage: str | None = None  # any URL that Optuna takes; null: study.db in the folder
+    workers: int = setting(-1, bounds(-1))  # processes; -1 for one on each core
+    together: int | None = setting(None, bounds(1))  # trials of a worker at once; null: 8 of all, 1 of one
+    timeout: float | None = setting(None, bounds(0, above=True))  # seconds; no trial begins after that
     sampler: str = "tpe"  # or random
-    sampler_seed: int = field(default=0, metadata=bounds(0))  # of the search itself
+    sampler_seed: int = setting(0, bounds(0))  # of the search itself
     pruner: str = "median"  # or hyperband, none
     # of a seed, at least, so that who is certified sooner shows
-    evaluations: int = field(default=50, metadata=bounds(1, _MOST_LOOKS))
-    reports: int = field(default=10, metadata=bounds(1, _MOST_LOOKS))  # looks of the pruner at a seed's curve
-    # a trial's seed ends at this many certificates in a row
-    stop_after: Optional[int] = field(default=3, metadata=bounds(1))  # noqa: UP045
+    evaluations: int = setting(50, bounds(1, _MOST_LOOKS))
+    reports: int = setting(10, bounds(1, _MOST_LOOKS))  # looks of the pruner at a seed's curve
+    stop_after: int | None = setting(3, bounds(1))  # a trial's seed ends at this many certificates in a row
     space: dict[str, DimensionConfig] = field(default_factory=dict)  # conf/tune/*.yaml
 
 

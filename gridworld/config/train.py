@@ -3,13 +3,17 @@
 Plain dataclasses. Hydra merges the yaml files and the command line into them and refuses a misspelt key or
 a wrong type by name; `check` refuses numbers outside of the bounds that their fields declare
 (`gridworld.config.fields`). Nothing heavy is imported here.
+
+Pictures are declared at the field of their setting. The run's folder, TensorBoard, `record.py` and the
+report's page read the table `PICTURES`. To add one, add a field to `RecordingConfig` and a function to
+`gridworld.visualization` (see `gridworld.visualization.picture`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Optional, Union
+from typing import Any
 
 from gridworld.bounds import LARGEST_INTEGER, discount
 from gridworld.config.fields import (
@@ -25,24 +29,23 @@ from gridworld.config.fields import (
     declared,
     parse_schedule,
     privilege,
+    setting,
 )
 from gridworld.config.worlds import SOURCES, EnvConfig, MapConfig
 from gridworld.errors import InputError
 
-# OmegaConf reads the annotations at run time and knows no `X | None`.
-
 MOST_ENVS = 2**17  # eight times the largest batch that any measurement here is faster with
 MOST_BONUS = 10**6  # of exploration; any reward beside it would be lost in the numbers of a network
 MOST_THREADS = 1024
-_PICTURE = "picture"  # in a field's metadata
 AUTO = "auto"  # checkpoints as often as they cost next to nothing
+_PICTURE = "picture"  # in a field's metadata
 
 
 @dataclass
 class AgentConfig:
-    """The settings of any agent."""
+    """The settings of any agent; an agent's own schema is in its family's package in `gridworld.agents`."""
 
-    name: Word = field(default=MISSING, metadata=affects(Effect.LABELS))  # in tables and folders
+    name: Word = setting(MISSING, affects(Effect.LABELS))  # in tables and folders
     family: Word = MISSING  # the package in `gridworld.agents`
     algorithm: ClassPath = MISSING  # the class, by its import path where it is none of ours
 
@@ -70,9 +73,9 @@ class ObservationConfig:
     """What the agent sees of a state."""
 
     kind: Word = "one_hot"  # or coordinates, image, own, none (the state's number)
-    cell_size: int = field(default=8, metadata=bounds(1))  # pixels, for images
+    cell_size: int = setting(8, bounds(1))  # pixels, for images
     # features extractor of an `MlpPolicy` whose settings name none; null: Stable-Baselines3's own
-    features: Optional[ClassPath] = None  # noqa: UP045
+    features: ClassPath | None = None
 
     def policy_kwargs(self) -> dict[str, Any]:
         """What this adds to an `MlpPolicy`'s settings: its features extractor, with an image's cell size."""
@@ -86,11 +89,10 @@ class ObservationConfig:
 class EvaluationConfig:
     """The exact evaluation."""
 
-    every: int = field(default=1000, metadata=bounds(1))  # environment steps
+    every: int = setting(1000, bounds(1))  # environment steps
     # discount of value and regret, whatever discount the agent learns with
-    gamma: float = field(default=0.99, metadata=affects(Effect.TASK))
-    # end training at this many certificates in a row
-    stop_after: Optional[int] = field(default=None, metadata=bounds(1))  # noqa: UP045
+    gamma: float = setting(0.99, affects(Effect.TASK))
+    stop_after: int | None = setting(None, bounds(1))  # end training at this many certificates in a row
 
 
 @dataclass
@@ -99,8 +101,8 @@ class LoggingConfig:
 
     tensorboard: bool = True  # write an event file
     # evaluations between two pictures of the policy; 0 for none
-    policy_map_every: int = field(default=5, metadata=bounds(0))
-    progress: bool = field(default=True, metadata=affects(Effect.NOTHING))
+    policy_map_every: int = setting(5, bounds(0))
+    progress: bool = setting(True, affects(Effect.NOTHING))
 
 
 @dataclass(frozen=True)
@@ -134,40 +136,28 @@ class Picture:
         return self.file.endswith((".png", ".gif"))
 
 
-def picture(
-    file: str, drawer: str, caption: str | None = None, while_training: bool = False
-) -> dict[str, Any]:
-    """A field's metadata; the arguments are those of `Picture`."""
-    return {_PICTURE: Picture(file, drawer, caption, while_training)}
-
-
 @dataclass
 class RecordingConfig:
     """Pictures in the run's folder; TensorBoard gets them too."""
 
     # values and greedy actions
-    policy_map: bool = field(
-        default=True, metadata=picture("policy.png", "maps.policy", "policy", while_training=True)
+    policy_map: bool = setting(
+        True, {_PICTURE: Picture("policy.png", "maps.policy", "policy", while_training=True)}
     )
     # how far the values are from the true ones
-    q_error: bool = field(
-        default=True, metadata=picture("q_error.png", "maps.q_error", "error of its values")
-    )
+    q_error: bool = setting(True, {_PICTURE: Picture("q_error.png", "maps.q_error", "error of its values")})
     # where training has been
-    visits: bool = field(
-        default=True, metadata=picture("visits.png", "maps.visits", "visits while it learnt")
-    )
+    visits: bool = setting(True, {_PICTURE: Picture("visits.png", "maps.visits", "visits while it learnt")})
     # the policy over training
-    learning: bool = field(
-        default=True, metadata=picture("learning.gif", "maps.learning", "policy while it learnt")
+    learning: bool = setting(
+        True, {_PICTURE: Picture("learning.gif", "maps.learning", "policy while it learnt")}
     )
     # the final greedy policy's episode; MP4 needs the extra `video`
-    frames: bool = field(default=True, metadata=picture("frames", "episode.episode"))
-    gif: bool = field(default=True, metadata=picture("episode.gif", "episode.episode"))
-    mp4: bool = field(default=False, metadata=picture("episode.mp4", "episode.episode"))
-    # pixels of the episode's; null: 100, less on large maps
-    cell_size: Optional[int] = field(default=None, metadata=bounds(2))  # noqa: UP045
-    fps: int = field(default=4, metadata=bounds(1, 100))  # frames a second
+    frames: bool = setting(True, {_PICTURE: Picture("frames", "episode.episode")})
+    gif: bool = setting(True, {_PICTURE: Picture("episode.gif", "episode.episode")})
+    mp4: bool = setting(False, {_PICTURE: Picture("episode.mp4", "episode.episode")})
+    cell_size: int | None = setting(None, bounds(2))  # pixels of the episode's; null: 100, less on large maps
+    fps: int = setting(4, bounds(1, 100))  # frames a second
 
 
 PICTURES: tuple[Picture, ...] = tuple(
@@ -181,7 +171,7 @@ PICTURES: tuple[Picture, ...] = tuple(
 class CheckpointConfig:
     """What it takes to go on after an interruption."""
 
-    every: Optional[Union[int, Word]] = "auto"  # noqa: UP007, UP045  # steps; auto: as it costs little; null: none
+    every: int | Word | None = "auto"  # steps; auto: as it costs little; null: none
 
 
 @dataclass
@@ -189,36 +179,31 @@ class TrainConfig:
     """One training run."""
 
     # the tuned settings of the agent in the world, a file in conf/tuned, that went into this; null: none
-    recipe: Optional[Word] = field(default=None, metadata=affects(Effect.NOTHING))  # noqa: UP045
+    recipe: Word | None = setting(None, affects(Effect.NOTHING))
     # of conf/preset, whose numbers went into this; auto: none was needed (`config.presets`)
-    preset: Word = field(default="none", metadata=affects(Effect.NOTHING))
+    preset: Word = setting("none", affects(Effect.NOTHING))
     # what came of these settings when they were tried, where they do not solve the task
-    known_failure: Optional[Word] = field(default=None, metadata=affects(Effect.NOTHING))  # noqa: UP045
-    # of all random numbers
-    seed: int = field(default=0, metadata=affects(Effect.SEED) | bounds(0, 2**32 - 1))
-    # environment steps
-    total_timesteps: int = field(default=20_000, metadata=affects(Effect.LENGTH) | bounds(1))
-    n_envs: int = field(default=64, metadata=bounds(1, MOST_ENVS))  # environments that step together
+    known_failure: Word | None = setting(None, affects(Effect.NOTHING))
+    seed: int = setting(0, affects(Effect.SEED), bounds(0, 2**32 - 1))  # of all random numbers
+    total_timesteps: int = setting(20_000, affects(Effect.LENGTH), bounds(1))  # environment steps
+    n_envs: int = setting(64, bounds(1, MOST_ENVS))  # environments that step together
     # b of b / sqrt(N), added to a reward of training for an action that was taken there N times; 0 for none
-    exploration_bonus: float = field(default=0.0, metadata=bounds(0, MOST_BONUS))
+    exploration_bonus: float = setting(0.0, bounds(0, MOST_BONUS))
     # share of training episodes that begin in a state drawn uniformly
-    exploring_starts: float = field(default=0.0, metadata=privilege("starts anywhere") | bounds(0, 1))
+    exploring_starts: float = setting(0.0, privilege("starts anywhere"), bounds(0, 1))
     # whether environments in one state share out an action's outcomes evenly, see `gridworld.envs.vector_env`
-    stratified_draws: bool = field(default=False, metadata=privilege("stratified draws"))
-    device: Word = field(default="cpu", metadata=affects(Effect.MACHINE))
-    threads: int = field(default=1, metadata=affects(Effect.MACHINE) | bounds(1, MOST_THREADS))  # of torch
+    stratified_draws: bool = setting(False, privilege("stratified draws"))
+    device: Word = setting("cpu", affects(Effect.MACHINE))
+    threads: int = setting(1, affects(Effect.MACHINE), bounds(1, MOST_THREADS))  # of torch
     # of SB3: each a mapping of `_target_`, the import path of a class, and its arguments
     callbacks: list[Callback] = field(default_factory=list)
-    agent: AgentConfig = field(default_factory=AgentConfig)  # the chosen agent's own schema in its place
-    # of the chosen source (`gridworld.config.worlds`)
-    env: EnvConfig = field(default_factory=MapConfig, metadata=affects(Effect.TASK))
-    observation: ObservationConfig = field(default_factory=ObservationConfig)
-    evaluation: EvaluationConfig = field(
-        default_factory=EvaluationConfig, metadata=affects(Effect.EVALUATION)
-    )
-    logging: LoggingConfig = field(default_factory=LoggingConfig, metadata=affects(Effect.FILES))
-    recording: RecordingConfig = field(default_factory=RecordingConfig, metadata=affects(Effect.FILES))
-    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig, metadata=affects(Effect.NOTHING))
+    agent: AgentConfig = setting(AgentConfig)  # the chosen agent's own schema in its place
+    env: EnvConfig = setting(MapConfig, affects(Effect.TASK))  # of the chosen source (`config.worlds`)
+    observation: ObservationConfig = setting(ObservationConfig)
+    evaluation: EvaluationConfig = setting(EvaluationConfig, affects(Effect.EVALUATION))
+    logging: LoggingConfig = setting(LoggingConfig, affects(Effect.FILES))
+    recording: RecordingConfig = setting(RecordingConfig, affects(Effect.FILES))
+    checkpoint: CheckpointConfig = setting(CheckpointConfig, affects(Effect.NOTHING))
 
 
 def check(config: TrainConfig) -> None:

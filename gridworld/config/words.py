@@ -6,22 +6,46 @@ schema would refuse as well. `sentence` keeps the fact, and adds what would have
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import functools
+import itertools
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import pairwise
 from pathlib import Path
 
 from gridworld.bounds import digits
 from gridworld.config.fields import MISSING
-from gridworld.config.settings import settings_of_a_run, takes_whole_numbers
-from gridworld.config.sweep import SweepConfig, TuneConfig
+from gridworld.config.settings import all_settings, settings_of_a_run, takes_whole_numbers
 from gridworld.errors import InputError, failure
 
 OF_THE_COMMAND = ("experiment", "recipe", "resume", "trust", "anyway")  # words that look like settings
 _FLOAT = re.compile(r"(?<![\w.$'\"])[-+]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][-+]?\d+)?(?![\w.'\"])")
+_SENTENCES = (  # a pattern of a message of Hydra's: what is said instead
+    (
+        r"Config group override must be a string|^argument of type '\w+' is not iterable$",
+        "a choice is a name, and null is none: write preset=none, tuned=none, or ~experiment",
+    ),
+    (
+        r"Interpolation key '([^']*)' not found",
+        "{}: is missing, and other settings refer to it; give it a value",
+    ),
+    (
+        r"Error resolving interpolation '\$\{env\}_\$\{agent\}'",
+        "agent and env: every run needs both; give agent=... and env=..., not ~agent or ~env",
+    ),
+    (
+        r"Multiple values for (\S+)\. To override a value use 'override \S+: (.*)'",
+        "+{0}={1}: {0} has a place for its choice already, which a plus would add; write {0}={1}",
+    ),
+)
+_HINTS = (  # a pattern of what is said: what would have been right
+    ("Ambiguous value", "; to run one job for each of the values, add -m"),
+    ("Could not append to config", "; leave out the plus"),
+    (
+        r"'\d+\.0' of type 'float' could not be converted to Integer",
+        "; in a yaml, write a whole number without point and exponent",
+    ),
+)
 _LISTED = 24  # choices of a group that are listed at most; of more, those with a similar name
 _PACKAGE = Path(__file__).parents[1]
 _WITH_VALUE = (  # Hydra's options that the next word belongs to
@@ -38,7 +62,7 @@ def conf_folder() -> Path:
 
 def own_conf_folders(words: Sequence[str]) -> Iterator[Path]:
     """The folders that `--config-dir` names in a command line."""
-    for word, following in pairwise([*words, ""]):
+    for word, following in itertools.pairwise([*words, ""]):
         option, _, value = word.partition("=")
         if option in ("--config-dir", "-cd"):
             yield Path(value or following)
@@ -52,9 +76,7 @@ def is_override(words: Sequence[str], index: int) -> bool:
 def prepared(words: Sequence[str], own: Sequence[Path] = ()) -> list[str]:
     """A command line as Hydra takes it: 1e5 as 100000, experiment=ENV_AGENT as the choice of the two.
 
-    Args:
-        words: the command line, lists of values for a sweep included.
-        own: the folders of `--config-dir`, which may have recipes too.
+    There may be recipes in the folders of `--config-dir` too, which are `own`.
     """
     found: list[str] = []
     chosen = {word.lstrip("+").partition("=")[0] for word in words if "=" in word}
@@ -86,18 +108,15 @@ def pairs() -> dict[str, tuple[str, str]]:
     """Every shipped world with every shipped agent, by the names that experiments for them have."""
     conf = conf_folder()
     envs = [file for file in sorted((conf / "env").glob("*.yaml")) if MISSING not in file.read_text("utf-8")]
-    found = {
-        f"{env.stem}_{agent.stem}": (env.stem, agent.stem)
-        for env in envs
-        for agent in sorted((conf / "agent").glob("*.yaml"))
-    }
+    both = itertools.product(envs, sorted((conf / "agent").glob("*.yaml")))
+    found = {f"{env.stem}_{agent.stem}": (env.stem, agent.stem) for env, agent in both}
     return {name: pair for name, pair in found.items() if not (conf / "experiment" / f"{name}.yaml").exists()}
 
 
 def refuse_dashes(words: Sequence[str]) -> None:
     """Refuse settings that are written as the options of other programs are: `--seed 3`."""
     known = {*OF_THE_COMMAND, *settings_of_a_run()}
-    for word, following in pairwise([*words, ""]):
+    for word, following in itertools.pairwise([*words, ""]):
         option, equals, value = word.partition("=")
         name = option[2:].replace("-", "_")
         if option.startswith("--") and (name in known or any(each.startswith(f"{name}.") for each in known)):
@@ -118,26 +137,13 @@ def sentence(error: BaseException) -> str:
         problem = getattr(error, "problem", None)
         return f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}: is not valid YAML: {problem}"
     if missing := re.search(r"[Mm]issing mandatory value: (\S+)", message):
-        key = missing.group(1)
-        key = key if "." in key else getattr(error, "full_key", None) or key
+        key = missing[1] if "." in missing[1] else getattr(error, "full_key", None) or missing[1]
         return f"{key}: has no value; give {key}=..., or have the yaml that is chosen for it do so"
-    is_list = isinstance(error, TypeError) and re.fullmatch(
-        r"argument of type '\w+' is not iterable", message
-    )
-    if "Config group override must be a string" in message or is_list:
-        return "a choice is a name, and null is none: write preset=none, tuned=none, or ~experiment"
-    if lacking := re.search(r"Interpolation key '([^']*)' not found", message):
-        return f"{lacking.group(1)}: is missing, and other settings refer to it; give it a value"
-    if "Error resolving interpolation '${env}_${agent}'" in message:
-        return "agent and env: every run needs both; give agent=... and env=..., not ~agent or ~env"
+    for pattern, words in _SENTENCES:
+        if found := re.search(pattern, message):
+            return words.format(*found.groups())
     if "Could not find" in message and "Available options in" in message:
         return _unknown_choice(message)
-    if added := re.search(
-        r"Multiple values for (\S+)\. To override a value use 'override \S+: (.*)'", message
-    ):
-        group, choice = added.groups()
-        fact = f"+{group}={choice}: {group} has a place for its choice already, which a plus would add"
-        return f"{fact}; write {group}={choice}"
     lines = message.splitlines() or [type(error).__name__]
     facts = lines[: 2 if lines[0].endswith(":") or lines[0].startswith("Error parsing") else 1]
     facts[0] = facts[0].removeprefix("Error merging override ").removeprefix("Error parsing override ")
@@ -148,28 +154,23 @@ def sentence(error: BaseException) -> str:
     return ": ".join(fact.strip().rstrip(".:") for fact in facts) + _suggestion(" ".join(facts), message)
 
 
-def unreadable_file(error: Exception, folders: Iterable[Path]) -> str | None:
-    """A sentence on the first yaml file for which reading raises an error like this one; None: there is none.
+def unreadable_file(error: Exception, folders: Iterable[Path]) -> str:
+    """A sentence on the first yaml file that raises an error like this one, for which Hydra names no file.
 
-    Args:
-        error: a `UnicodeDecodeError` or a `RecursionError`, for which Hydra does not name the file.
-        folders: of the yaml files.
+    It is a `UnicodeDecodeError` or a `RecursionError`.
     """
     from omegaconf import OmegaConf  # here, since --help takes no longer than it must
-    from yaml import YAMLError
 
     for file in sorted(file for folder in folders for file in folder.rglob("*.yaml")):
         try:
             OmegaConf.load(file)
-        except UnicodeDecodeError as found:
-            if isinstance(error, UnicodeDecodeError):
+        except type(error) as found:
+            if isinstance(found, UnicodeDecodeError):
                 return f"{file}: byte {found.start + 1} is no UTF-8"
-        except RecursionError:
-            if isinstance(error, RecursionError):
-                return f"{file}: is nested too deeply, or contains itself"
-        except (OSError, YAMLError):
-            continue  # these name their file themselves
-    return None
+            return f"{file}: is nested too deeply, or contains itself"
+        except Exception:
+            continue  # which would name its file itself
+    return sentence(error)
 
 
 def _unknown_choice(message: str) -> str:
@@ -190,27 +191,22 @@ def _unknown_choice(message: str) -> str:
 
 
 def _suggestion(facts: str, message: str) -> str:
-    if "Ambiguous value" in facts:
-        return "; to run one job for each of the values, add -m"
+    for pattern, hint in _HINTS:
+        if re.search(pattern, facts):
+            return hint
     if added := re.search(r"Could not override '([^']*)'.*Key '([^']*)' is not in struct", facts, re.DOTALL):
         place, name = added.groups()
         entry = place if place.endswith(f".{name}") else f"{place}.{name}"
         return f"; a new entry of a dictionary needs a plus: +{entry}=..."
-    if "Could not append to config" in facts:
-        return "; leave out the plus"
-    if re.search(r"'\d+\.0' of type 'float' could not be converted to Integer", facts):
-        return "; in a yaml, write a whole number without point and exponent"
     if unknown := re.search(r"Key '([^']*)' not in '\w+'", facts):
-        place = re.search(r"full_key: (\S+)", message + str(facts)) or re.search(r"override '([^']*)'", facts)
-        return _alike(place.group(1) if place else unknown.group(1), unknown.group(1))
+        place = re.search(r"full_key: (\S+)", message + facts) or re.search(r"override '([^']*)'", facts)
+        return _alike((place or unknown)[1], unknown[1])
     return ""
 
 
 def _alike(name: str, key: str) -> str:
     """The settings in the section of `name` that look like `key`, or else those in other sections."""
-    sections = {"hydra.sweeper": SweepConfig, "tune": TuneConfig}
-    others = [f"{of}.{each.name}" for of, schema in sections.items() for each in dataclasses.fields(schema)]
-    known = {*settings_of_a_run(), *others, *OF_THE_COMMAND} - {name}
+    known = {*all_settings(), *OF_THE_COMMAND} - {name}
     section = name.rpartition(".")[0]
     own = [each[len(section) + bool(section) :] for each in known if each.startswith(section)]
     if near := meant(key, sorted({each.partition(".")[0] for each in own} - {key})):

@@ -10,10 +10,10 @@ import functools
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Optional
+from typing import TYPE_CHECKING, Any
 
 from gridworld.bounds import MOST_STEPS, STEP_LIMIT
-from gridworld.config.fields import MISSING, CodePath, EnvId, FilePath, Kwargs, Word, bounds
+from gridworld.config.fields import MISSING, CodePath, EnvId, FilePath, Kwargs, Word, bounds, setting
 from gridworld.errors import InputError
 
 if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
@@ -21,15 +21,13 @@ if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
     from gridworld.world.layout import Layout
     from gridworld.world.mdp import Mdp
 
-# OmegaConf reads the annotations at run time and knows no `X | None`.
-
 
 @dataclass
 class EnvConfig:
     """A world of any source."""
 
     # the step limit; null: the world's own, or 100
-    max_episode_steps: Optional[int] = field(default=None, metadata=bounds(1, MOST_STEPS))  # noqa: UP045
+    max_episode_steps: int | None = setting(None, bounds(1, MOST_STEPS))
 
     @property
     def name(self) -> str:
@@ -62,13 +60,13 @@ class MapConfig(EnvConfig):
     """A map and its rewards; the arguments of `GridWorldEnv`."""
 
     layout: FilePath = "classic"  # the name of a shipped map, or a file
-    num_rows: Optional[int] = None  # noqa: UP045  # of the layout `classic`; null: 5
-    num_cols: Optional[int] = None  # noqa: UP045  # the same; null: 6
+    num_rows: int | None = None  # of the layout `classic`; null: 5
+    num_cols: int | None = None  # the same; null: 6
     slip: float = 0.0  # probability of moving at a right angle instead
     step_reward: float = 0.0  # paid for every step, beside the reward of the cell entered
     goal_reward: float = 1.0  # paid for entering a goal, which ends the episode
     trap_reward: float = -1.0  # for entering a trap, which ends it too, or a cliff, which does not
-    max_episode_steps: Optional[int] = 100  # noqa: UP045  # the step limit: then the episode is cut
+    max_episode_steps: int | None = 100  # the step limit: then the episode is cut
 
     @property
     def name(self) -> str:
@@ -196,7 +194,7 @@ class DeepSeaConfig(ClassicConfig):
 
     source: Word = "deep_sea"
     size: int = 10  # rows and columns
-    seed: Optional[int] = None  # noqa: UP045  # of what the actions mean in each cell; null: left and right
+    seed: int | None = None  # of what the actions mean in each cell; null: left and right
 
 
 @dataclass
@@ -206,7 +204,7 @@ class CombinationLockConfig(ClassicConfig):
     source: Word = "combination_lock"
     length: int = 10  # actions that open it
     num_actions: int = 2  # of each state
-    seed: Optional[int] = None  # noqa: UP045  # of the combination; null: the last action everywhere
+    seed: int | None = None  # of the combination; null: the last action everywhere
 
 
 @dataclass

@@ -152,21 +152,13 @@ def try_offers(saved: SavedRun, found: Diagnosis, folder: Path, trust: bool = Fa
     anywhere. Raises `InputError` where they are not trusted, `Interrupted` where training was asked to stop.
     """
     # here, since it takes a second
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
-
     from gridworld.config.compose import compose
-    from gridworld.config.words import conf_folder, sentence
     from gridworld.run.folder import claimed
     from gridworld.training.train import train
 
     for words, line in zip(found.offers, found.commands, strict=True):
         place = next(each for n in range(1, 10**6) if not (each := folder / str(n)).exists()).absolute()
-        try:
-            composed = compose(conf_folder(), list(words))
-        except (HydraException, OmegaConfBaseException) as error:
-            raise InputError(sentence(error)) from None
-        config = dataclasses.replace(composed, env=saved.config.env)
+        config = dataclasses.replace(compose(words), env=saved.config.env)
         check_trusted(saved, found, trust, config)
         try:
             with claimed(place):

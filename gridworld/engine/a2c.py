@@ -10,16 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from gridworld.engine.networks import Array
-from gridworld.engine.on_policy import (
-    Coefficients,
-    OnPolicy,
-    log_softmax,
-    losses_of,
-    normalized,
-    slopes_of,
-    sum_up,
-)
-from gridworld.engine.population import FEW_STATES
+from gridworld.engine.on_policy import Coefficients, OnPolicy, log_softmax, losses_of, slopes_of
 from gridworld.world.mdp import IntArray
 
 
@@ -28,13 +19,7 @@ class A2C(OnPolicy):
 
     def update(self, old: tuple[Array, Array], pairs: IntArray, advantages: Array, returns: Array) -> None:
         """See `OnPolicy.update`."""
-        if self.normalize_advantage:
-            advantages = normalized(advantages)
-        states, shape = None, (self.num_states, self.num_actions)
-        if self.num_states > max(FEW_STATES, pairs.shape[1]):
-            states, distinct = self.distinct(pairs[0])
-            pairs, shape = distinct[None], (len(states), self.num_actions)
-        sums = sum_up(pairs, advantages, returns, shape)
+        ((states, sums),) = self.summed_up(pairs[:, None], advantages[:, None], returns[:, None])
         logits, values = self.networks.run(states)
         new = log_softmax(logits), values[..., 0]
         nothing = np.zeros((len(self.runs), 1, 1))

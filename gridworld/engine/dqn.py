@@ -12,7 +12,6 @@ Greedy actions and targets are look-ups in tables, which are made anew when a ne
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -30,11 +29,6 @@ _DRAWN_AT_ONCE = 2**13  # transitions of a run
 
 class DQN(Population):
     """P runs of DQN."""
-
-    same: ClassVar[tuple[str, ...]] = (
-        *("batch_size", "buffer_size", "learning_starts", "train_freq", "gradient_steps"),
-        *("target_update_interval", "tau"),
-    )
 
     def __init__(self, runs: Sequence[Run], states: Sequence[State | None]) -> None:
         self._outputs: Array | None = None  # of the networks as they are, of all states
@@ -55,7 +49,7 @@ class DQN(Population):
     def kind(cls, run: Run) -> Hashable:
         """See `Population.kind`; runs that count episodes make steps of their own."""
         by_episode = run.model.train_freq.unit is TrainFrequencyUnit.EPISODE
-        return id(run) if by_episode else (super().kind(run), run.counts_transitions)
+        return id(run) if by_episode else super().kind(run)
 
     def iterate(self) -> None:
         """See `Population.iterate`: some steps into the replay, and an update by it."""

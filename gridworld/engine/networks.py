@@ -16,14 +16,15 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch import Tensor, nn
 
 from gridworld.envs.observations import ObservationTable
 from gridworld.world.mdp import IntArray
 
 Array = NDArray[Any]
-# Of features extractors: `flat` changes nothing, `fixed` learns nothing, `patches` learns from squares of
-# pixels (`agents.sb3.features.PixelCNN`), and `any` may do whatever.
+# Of features extractors, `kind` of those in `agents.sb3.features`: `flat` changes nothing, `fixed` learns
+# nothing, `patches` learns from squares of pixels, and `any` may do whatever.
 Kind = Literal["flat", "fixed", "patches", "any"]
 _LARGEST_TABLE = 2**26  # numbers of 4 bytes
 ALIGNMENT = 16  # float32 numbers in 64 bytes
@@ -217,35 +218,21 @@ class ModuleNetworks:
             torch.as_tensor(slope, dtype=output.dtype, device=output.device).view_as(output)
             for slope, output in zip(slopes, self._outputs, strict=True)
         ]
-        _pull(self._outputs, given, self._parameters, accumulate_grad=True)
+        torch.autograd.backward(self._outputs, given, retain_graph=True, inputs=self._parameters)
 
     def push(self, changes: Tensor) -> tuple[Array, ...]:
         """See `DenseNetworks.push`: a pass back through the pass back, which is linear in the slopes."""
         self._pulled = self._pulled or [self._pull(output) for output in self._outputs]
         given = cut(changes[0], [each.shape for each in self._parameters])
-        moved = [_pull(pulled, given, [slopes])[0] for slopes, pulled in self._pulled]
+        moved = [
+            torch.autograd.grad(pulled, slopes, given, retain_graph=True)[0]
+            for slopes, pulled in self._pulled
+        ]
         return tuple(each.cpu().numpy()[None] for each in moved)
 
     def _pull(self, output: Tensor) -> tuple[Tensor, Sequence[Tensor]]:
         slopes = torch.zeros_like(output, requires_grad=True)
-        return slopes, _pull([output], [slopes], self._parameters, create_graph=True)
-
-
-def _pull(
-    outputs: Sequence[Tensor],
-    slopes: Sequence[Tensor],
-    inputs: Sequence[Tensor],
-    create_graph: bool = False,
-    accumulate_grad: bool = False,
-) -> Sequence[Tensor]:
-    """What torch.autograd's own functions call once they have imported sympy; the graph is kept."""
-    engine: Any = torch.autograd.Variable._execution_engine
-    found: Sequence[Tensor] = engine.run_backward(
-        *(tuple(outputs), tuple(slopes), True, create_graph, tuple(inputs)),
-        allow_unreachable=accumulate_grad,
-        accumulate_grad=accumulate_grad,
-    )
-    return found
+        return slopes, torch.autograd.grad(output, self._parameters, slopes, create_graph=True)
 
 
 Networks = DenseNetworks | ModuleNetworks
@@ -264,7 +251,6 @@ class Inputs:
         nets: the layers of each of its outputs.
         extractors: the modules that make features of observations, one, or one for each output.
         extract: makes features of observations (U, *shape): a tensor, or one for each output.
-        kind: of the extractors, see `Kind`.
     """
 
     def __init__(
@@ -274,10 +260,11 @@ class Inputs:
         nets: Sequence[Sequence[nn.Module]],
         extractors: Sequence[Any],
         extract: Callable[[Tensor], Any],
-        kind: Kind,
     ) -> None:
         self._policy, self._observation, self._nets = policy, observation, nets
         self._extractors, self._extract = extractors, extract
+        kinds = {_kind(each) for each in extractors}
+        kind = kinds.pop() if len(kinds) == 1 else "any"
         begin_linear = all(len(net) > 0 and isinstance(net[0], nn.Linear) for net in nets)
         self.is_look_up = kind == "flat" and begin_linear and _is_one_hot(observation)
         self._is_fixed = kind in ("flat", "fixed")
@@ -337,6 +324,11 @@ class Inputs:
     def _tensor(self, states: IntArray) -> Tensor:
         tensor, _ = self._policy.obs_to_tensor(self._observation.rows(states))
         return cast(Tensor, tensor)
+
+
+def _kind(extractor: Any) -> Kind:
+    kind: Kind = "flat" if type(extractor) is FlattenExtractor else getattr(extractor, "kind", "any")
+    return kind
 
 
 def _is_one_hot(observation: ObservationTable) -> bool:

@@ -26,7 +26,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -40,8 +39,6 @@ from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 class OnPolicy(Population):
     """Actor-critics that alternate between a rollout of `n_steps` steps and an update on it."""
-
-    same: ClassVar[tuple[str, ...]] = ("n_steps", "normalize_advantage")
 
     def __init__(self, runs: Sequence[Run], states: Sequence[State | None]) -> None:
         self._outputs: tuple[Array, Array] | None = None  # of the networks as they are

@@ -28,7 +28,6 @@ from gridworld.storage.serialization import (
     fitting,
     generator_state,
     set_generator_state,
-    set_plain_state,
 )
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
@@ -44,14 +43,15 @@ class Run:
     inputs: Inputs  # what the network sees of each state
     nets: Sequence[Sequence[nn.Module]]  # the layers of each output
     envs: StatisticsVectorEnv  # for their generator and their statistics
-    reward_scale: float  # that rewards are multiplied by
-    falling: Mapping[str, Decay]  # settings that fall over training in ways that SB3 has not
     torch_generator: torch.Generator  # in place of torch's own
     numpy_generator: np.random.RandomState  # in place of numpy's own
+    reward_scale: float = 1.0  # that rewards are multiplied by
+    falling: Mapping[str, Decay] = field(default_factory=dict)  # settings that fall as SB3 lets none fall
     log_interval: int = 1  # as SB3's `learn` takes it
     target: Inputs | None = None  # what its target network sees of each state, where it has one
     target_parameters: Sequence[nn.Parameter] = ()  # of that, in the same order
     counts_transitions: bool = False  # whether its replay counts transitions
+    shape: Hashable = None  # what runs of one population have in common of their settings
     population: Population = field(init=False, repr=False)
     row: int = field(init=False, default=0)
     total_timesteps: int = field(init=False, default=0)
@@ -117,15 +117,9 @@ class Run:
         self.error = error
         self.population.end(self)
 
-    def diverge(self, what: str) -> None:
-        """End the run, since `what` is no finite number."""
-        updates, steps = self.model._n_updates, self.model.num_timesteps
-        where = f"training diverged at update {updates:,}, after {steps:,} steps"
-        self.fail(InputError(f"{where}: {what}; try a smaller learning rate"))
-
     def get_state(self) -> State:
         """Its generators, environments and counters, for `Population.get_state`."""
-        model, excluded = self.model, self.model.logger.name_to_excluded
+        model = self.model
         return {
             "torch_generator": self.torch_generator.get_state().numpy().copy(),
             "numpy_generator": self.numpy_generator.get_state(legacy=False),
@@ -134,12 +128,7 @@ class Run:
             "num_timesteps": int(model.num_timesteps),
             "num_updates": int(model._n_updates),
             "num_episodes": int(model._episode_num),
-            "recent_episodes": [[each["r"], each["l"]] for each in model.ep_info_buffer],
-            "seconds": (time.time_ns() - model.start_time) / 1e9,
-            "logged": [
-                [name, float(value), "tensorboard" in (excluded[name] or ())]
-                for name, value in model.logger.name_to_value.items()
-            ],
+            **log_state(model),
         }
 
     def set_state(self, state: State) -> None:
@@ -148,18 +137,44 @@ class Run:
         if state["num_timesteps"] < 0 or state["num_updates"] < 0 or state["num_episodes"] < 0:
             raise StateError("counters must be at least 0")
         self.torch_generator.set_state(torch.from_numpy(state["torch_generator"]))
-        set_plain_state(self.numpy_generator, state["numpy_generator"])
+        self.numpy_generator.set_state(state["numpy_generator"])
         set_generator_state(model.action_space.np_random, state["action_generator"])
         self.envs.set_state(state["environments"])
         model.num_timesteps, model._n_updates = int(state["num_timesteps"]), int(state["num_updates"])
         model._episode_num = int(state["num_episodes"])
-        model.ep_info_buffer.clear()
-        model.ep_info_buffer.extend(
-            {"r": float(each), "l": int(length), "t": 0.0} for each, length in state["recent_episodes"]
-        )
-        model.start_time = time.time_ns() - int(state["seconds"] * 1e9)
-        for name, value, is_excluded in state["logged"]:
-            self.record(name, float(value), not is_excluded)
+        set_log_state(model, state)
+
+
+def log_state(model: Any) -> State:
+    """The last episodes of SB3's model, what it has logged since it last wrote, and the seconds so far."""
+    logger = model.logger
+    return {
+        "recent_episodes": [[each["r"], each["l"]] for each in model.ep_info_buffer],
+        "logged": [
+            [name, float(value), logger.name_to_count[name], "tensorboard" in (excluded or ())]
+            for name, value in logger.name_to_value.items()
+            for excluded in [logger.name_to_excluded[name]]
+        ],
+        "seconds": (time.time_ns() - model.start_time) / 1e9,
+    }
+
+
+def set_log_state(model: Any, state: State) -> None:
+    """Mirrors `log_state`."""
+    model.ep_info_buffer.clear()
+    model.ep_info_buffer.extend(
+        {"r": float(each), "l": int(length), "t": 0.0} for each, length in state["recent_episodes"]
+    )
+    for name, value, count, is_excluded in state["logged"]:
+        model.logger.record(name, float(value), exclude="tensorboard" if is_excluded else None)
+        model.logger.name_to_count[name] = int(count)
+    model.start_time = time.time_ns() - int(state["seconds"] * 1e9)
+
+
+def diverged(model: Any, what: str) -> InputError:
+    """The error to raise where `what` of SB3's model is not finite any more."""
+    where = f"at update {model._n_updates:,}, after {model.num_timesteps:,} steps"
+    return InputError(f"training diverged {where}: {what} is not finite; try a smaller learning rate")
 
 
 class Population:
@@ -172,7 +187,6 @@ class Population:
         num_timesteps: environment steps of each run.
     """
 
-    same: ClassVar[tuple[str, ...]]  # SB3's settings that runs of one population have in common
     pushes: ClassVar[bool] = False  # whether it needs `Networks.push` of the networks that act
 
     def __init__(self, runs: Sequence[Run], states: Sequence[State | None]) -> None:
@@ -199,13 +213,10 @@ class Population:
         fits = mdp.num_states <= FEW_STATES and DenseNetworks.fit(run.nets, run.parameters)
         if not fits or not (model.device.type == "cpu" or mixed()):
             return id(run)
-        settings = [repr(getattr(model, name)) for name in cls.same]
-        optimizer = {**model.policy.optimizer.param_groups[0], "lr": None, "params": None}
         return (
-            *(cls, mdp.digest(), envs.num_envs, envs.step_limit, envs.stratified),
-            *(repr(model.policy), str(model.device), type(model.policy.optimizer), repr(optimizer)),
-            *(run.reward_scale, run.inputs.digest()),
-            *(model.num_timesteps, run.total_timesteps, *settings),
+            *(cls, run.shape, mdp.digest(), envs.num_envs, envs.step_limit, envs.stratified),
+            *(repr(model.policy), str(model.device), run.reward_scale, run.inputs.digest()),
+            *(model.num_timesteps, run.total_timesteps),
         )
 
     @classmethod
@@ -280,20 +291,18 @@ class Population:
 
     def safe_point(self) -> Self | None:
         """Let all runs be saved, as nothing is half done; returns the population of those that go on."""
-        sums = [each.weights.sum(dim=1).cpu().numpy() for each in self.all_networks]
-        finite: BoolArray = np.isfinite(np.stack(sums)).all(axis=0)
+        finite = [torch.isfinite(each.weights).all(dim=1).cpu().numpy() for each in self.all_networks]
         for run in self.going():
-            rows = [each.weights[run.row] for each in self.all_networks]
-            if finite[run.row] or all(bool(torch.isfinite(row).all()) for row in rows):
+            if all(of_runs[run.row] for of_runs in finite):
                 run.safe_point(self.num_timesteps)
             else:
-                run.diverge("the network's weights are no finite number")
+                run.fail(diverged(run.model, "a weight"))
         return self.remaining()
 
     def check(self, finite: BoolArray, what: str) -> None:
         """End the runs (P,) that had a number that is not finite."""
         for run in self.going(~finite):
-            run.diverge(f"{what} is no finite number")
+            run.fail(diverged(run.model, what))
 
     def get_state(self, run: Run) -> State:
         """All that a run's next steps depend on."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Sequence
-from typing import ClassVar
 
 import numpy as np
 
@@ -24,8 +23,6 @@ from gridworld.world.mdp import BoolArray, IntArray
 
 class PPO(OnPolicy):
     """P runs of PPO."""
-
-    same: ClassVar[tuple[str, ...]] = (*OnPolicy.same, "batch_size", "n_epochs")
 
     def __init__(self, runs: Sequence[Run], states: Sequence[State | None]) -> None:
         super().__init__(runs, states)

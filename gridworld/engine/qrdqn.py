@@ -13,8 +13,6 @@ as sb3-contrib has it.
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 import torch
 
@@ -26,8 +24,6 @@ from gridworld.world.mdp import FloatArray, IntArray
 
 class QRDQN(DQN):
     """P runs of QR-DQN."""
-
-    same: ClassVar[tuple[str, ...]] = (*DQN.same, "n_quantiles")
 
     def _shaped(self, outputs: Array) -> Array:
         """The quantiles, (P, U, N, A)."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 import importlib
 import io
 import pkgutil
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from torch import nn
 
 import gridworld.engine
-from gridworld.config.fields import Decay
-from gridworld.engine.networks import Inputs, Kind, copy_row, cut
+from gridworld.engine.networks import Inputs, copy_row, cut
 from gridworld.engine.population import Population, Run
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.statistics_env import StatisticsVectorEnv
@@ -42,20 +40,11 @@ def make_run(
     observation: ObservationTable,
     envs: StatisticsVectorEnv,
     seed: int,
-    kind: Kind,
-    reward_scale: float = 1.0,
-    falling: Mapping[str, Decay] = MappingProxyType({}),
-    log_interval: int = 1,
+    **options: Any,
 ) -> Run:
     """A run of a model that SB3 has just made, so that its generators are where `learn` would find them.
 
-    Args:
-        model: SB3's.
-        observation: what it sees of a state.
-        envs: what it learns in.
-        seed: of the run.
-        kind: of its features extractors.
-        reward_scale: see `Run`, as for the others.
+    `observation` is what it sees of a state, `options` are other fields of `Run`.
     """
     torch_generator, numpy_generator = torch.Generator(), np.random.RandomState()
     torch_generator.set_state(torch.get_rng_state())
@@ -63,22 +52,18 @@ def make_run(
     envs.np_random = independent_generator(seed)
     envs.reset()
     policy: Any = model.policy
-    nets, inputs = _inputs(policy, observation, kind)
-    run = Run(
-        model,
-        policy.optimizer.param_groups[0]["params"],
-        *(inputs, nets, envs, reward_scale, falling),
-        *(torch_generator, numpy_generator, log_interval),
-    )
+    nets, inputs = _inputs(policy, observation)
+    parameters = policy.optimizer.param_groups[0]["params"]
+    run = Run(model, parameters, inputs, nets, envs, torch_generator, numpy_generator, **options)
     for name in ("q_net_target", "quantile_net_target"):
         if hasattr(policy, name):
-            _, run.target = _inputs(policy, observation, kind, getattr(policy, name))
+            _, run.target = _inputs(policy, observation, getattr(policy, name))
             run.target_parameters = list(getattr(policy, name).parameters())
     return run
 
 
 def _inputs(
-    policy: Any, observation: ObservationTable, kind: Kind, network: Any = None
+    policy: Any, observation: ObservationTable, network: Any = None
 ) -> tuple[Sequence[Sequence[nn.Module]], Inputs]:
     """The layers of each output, and what feeds them; `network`: None for the policy's own."""
     if isinstance(policy, ActorCriticPolicy):
@@ -88,12 +73,12 @@ def _inputs(
         if not policy.share_features_extractor:
             names = ["pi_features_extractor", "vf_features_extractor"]
         extractors = [getattr(policy, name) for name in names]
-        return nets, Inputs(policy, observation, nets, extractors, policy.extract_features, kind)
+        return nets, Inputs(policy, observation, nets, extractors, policy.extract_features)
     network = network or (policy.q_net if hasattr(policy, "q_net") else policy.quantile_net)
     nets = [[*(network.q_net if hasattr(network, "q_net") else network.quantile_net)]]
     extractor = network.features_extractor
     return nets, Inputs(
-        policy, observation, nets, [extractor], lambda rows: network.extract_features(rows, extractor), kind
+        policy, observation, nets, [extractor], lambda rows: network.extract_features(rows, extractor)
     )
 
 

@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from gridworld.engine.networks import Array, Networks, aligned
 from gridworld.engine.on_policy import OnPolicy, Sums, log_softmax
 from gridworld.engine.optimizer import Optimizer
-from gridworld.engine.population import Run, make_networks
+from gridworld.engine.population import Run, diverged, make_networks
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray
 
 _OF_VALUES = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")  # parameters of these alone
@@ -42,11 +42,6 @@ class TRPO(OnPolicy):
     """P runs of TRPO."""
 
     pushes: ClassVar[bool] = True
-    same: ClassVar[tuple[str, ...]] = (
-        *OnPolicy.same,
-        *("batch_size", "n_critic_updates", "sub_sampling_factor", "line_search_max_iter"),
-        *("cg_max_steps", "cg_damping"),
-    )
 
     @classmethod
     def networks_of(cls, runs: Sequence[Run]) -> list[Networks]:
@@ -144,7 +139,7 @@ class TRPO(OnPolicy):
             step(scale)
             log_prob = log_softmax(self.networks.run(states)[0])
             for run in self.going(searching & ~np.isfinite(log_prob).all(axis=(1, 2))):
-                run.diverge("the network's weights are no finite number")
+                run.fail(diverged(run.model, "a weight"))
             searching &= self.active
             now, far = _surrogate(log_prob, old, gains), _divergence(log_prob, start, sums.states)
             improved = searching & (far < target) & (now > surrogate)

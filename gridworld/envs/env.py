@@ -104,10 +104,11 @@ class GridWorldEnv(gym.Env[int, int]):
         self.observation_space = spaces.Discrete(self.mdp.num_states)
         self.action_space = spaces.Discrete(NUM_ACTIONS)
 
-        self._window: Window | None = None
         self._state: int = int(self.mdp.start_states[0])
 
-        # The tutorial's public attributes.
+        # The tutorial's public attributes; pygame's surface and clock are None until there is a window.
+        self.window: Any = None
+        self.clock: Any = None
         drawn = self.mdp.layout
         self.num_rows, self.num_cols = drawn.num_rows, drawn.num_cols
         self.state2grid: dict[int, Cell] = dict(enumerate(drawn.cells()))
@@ -126,16 +127,6 @@ class GridWorldEnv(gym.Env[int, int]):
         """The world, which stays what it is from when the environment is made."""
         return self._mdp
 
-    @property
-    def window(self) -> Any:
-        """pygame's surface of the window, None until human mode has opened one."""
-        return None if self._window is None else self._window.surface
-
-    @property
-    def clock(self) -> Any:
-        """pygame's clock that keeps the frame rate, None until human mode has opened a window."""
-        return None if self._window is None else self._window.clock
-
     def _move(self, action: int, row: int, col: int) -> Cell:
         return self.state2grid[int(self.mdp.neighbour[self.grid2state[row, col], action])]
 
@@ -146,10 +137,7 @@ class GridWorldEnv(gym.Env[int, int]):
 
     @state.setter
     def state(self, value: int) -> None:
-        try:
-            state = -1 if isinstance(value, bool) else operator.index(value)
-        except TypeError:
-            state = -1
+        state = _whole_number(value)
         if not 0 <= state < self.mdp.num_states or self.mdp.wall[state]:
             last = self.mdp.num_states - 1
             raise InputError(f"state={value!r}: must be the number of a cell that is no wall, 0 to {last}")
@@ -174,10 +162,7 @@ class GridWorldEnv(gym.Env[int, int]):
 
         Returns the state, the reward, whether the episode terminated, False for truncated, and an empty info.
         """
-        try:
-            move = -1 if isinstance(action, bool | np.bool_) else operator.index(action)
-        except TypeError:
-            move = -1
+        move = _whole_number(action)
         if not 0 <= move < NUM_ACTIONS:
             raise InputError(f"action={action!r}: must be 0 (up), 1 (right), 2 (down) or 3 (left)")
         state, mdp = self._state, self.mdp
@@ -189,8 +174,8 @@ class GridWorldEnv(gym.Env[int, int]):
         self._state = int(mdp.next_state[state, move, outcome])
         if self.render_mode == "human":
             self._show()
-        reward = float(mdp.reward[state, move, outcome])
-        return self._state, reward, bool(mdp.terminal[self._state]), False, {}
+        reward, terminated = float(mdp.reward[state, move, outcome]), bool(mdp.terminal[self._state])
+        return self._state, reward, terminated, False, {}
 
     def render(self) -> Frame | str | None:
         """A fresh frame (`rgb_array`), the map as text (`ansi`), or None after showing it (`human`)."""
@@ -208,19 +193,37 @@ class GridWorldEnv(gym.Env[int, int]):
         return None
 
     def _show(self) -> None:
-        if self._window is None:
-            self._window = Window(drawing.frame_size(self.mdp, self.cell_size), "GridWorld")
-        try:
-            self._window.show(self.mdp, self._state, self.cell_size, self.metadata["render_fps"], self.delay)
-        except SystemExit:
-            self._window = None
-            raise
+        """Draw and show one frame; keep `render_fps`, then wait. SystemExit if the user closed the window."""
+        pygame = drawing.import_pygame()
+        if self.window is None or not pygame.display.get_init():  # another environment may have closed it
+            self._open_window()
+        drawing.draw_world(self.window, self.mdp, self._state, self.cell_size)
+        for event in pygame.event.get():
+            if event.type == pygame.QUIT:
+                self.close()
+                raise SystemExit
+        pygame.display.flip()
+        self.clock.tick(self.metadata["render_fps"])
+        time.sleep(self.delay)
+
+    def _open_window(self) -> None:
+        pygame = drawing.import_pygame()
+        if self.window is None and not drawing.has_display():
+            # A log line and no exception: SDL then draws off screen, where every call still works.
+            _log.warning(
+                "human mode found no display, so its window cannot be seen; "
+                "set DISPLAY, or use render_mode='rgb_array'"
+            )
+        size = drawing.frame_size(self.mdp, self.cell_size)
+        pygame.display.init()  # not pygame.init(), which would look for a sound card too
+        self.window, self.clock = pygame.display.set_mode(size), pygame.time.Clock()
+        pygame.display.set_caption("GridWorld")
 
     def close(self) -> None:
-        """Close the window, if there is one. May be called again."""
-        if self._window is not None:
-            self._window.close()
-            self._window = None
+        """Close the window and shut pygame down, if there is one. May be called again."""
+        if self.window is not None:
+            drawing.import_pygame().quit()
+            self.window = self.clock = None
 
     def get_coords(self, row: int, col: int, loc: str = "center") -> Point | list[Point]:
         """Pixels for drawing into a cell: one (x, y) for `center`, else a list of them.
@@ -252,44 +255,12 @@ class GridWorldEnv(gym.Env[int, int]):
             raise InputError(f"coords_list: {len(coords_list)} points make no shape; give 1, 3 or more")
 
 
-class Window:
-    """The window of human mode, of a size in pixels. `surface` and `clock` are pygame's."""
-
-    def __init__(self, size: tuple[int, int], title: str) -> None:
-        pygame = drawing.import_pygame()
-        if not drawing.has_display():
-            # A log line and no exception: SDL then draws off screen, where every call still works.
-            _log.warning(
-                "human mode found no display, so its window cannot be seen; "
-                "set DISPLAY, or use render_mode='rgb_array'"
-            )
-        self._size, self._title = size, title
-        self.clock = pygame.time.Clock()
-        self._open()
-
-    def _open(self) -> None:
-        display = drawing.import_pygame().display
-        display.init()  # not pygame.init(), which would look for a sound card too
-        self.surface = display.set_mode(self._size)
-        display.set_caption(self._title)
-
-    def show(self, mdp: Mdp, state: int, cell_size: int, fps: int, delay: float) -> None:
-        """Draw and show one frame; keep `fps`, then wait. SystemExit if the user closed the window."""
-        pygame = drawing.import_pygame()
-        if not pygame.display.get_init():  # pygame has one display a process, and another window closed it
-            self._open()
-        drawing.draw_world(self.surface, mdp, state, cell_size)
-        for event in pygame.event.get():
-            if event.type == pygame.QUIT:
-                self.close()
-                raise SystemExit
-        pygame.display.flip()
-        self.clock.tick(fps)
-        time.sleep(delay)
-
-    def close(self) -> None:
-        """Close the window and shut pygame down."""
-        drawing.import_pygame().quit()
+def _whole_number(value: Any) -> int:
+    """The number itself; -1 for anything else, booleans included."""
+    try:
+        return -1 if isinstance(value, bool | np.bool_) else operator.index(value)
+    except TypeError:
+        return -1
 
 
 def play_random_episode() -> None:

@@ -79,9 +79,8 @@ class Task:
     max_episode_steps: int = STEP_LIMIT
     is_transformed: bool = False  # by wrappers, so that a Discrete observation may be another number
     seen: Callable[[], ObservationTable] | None = None  # as it is now; None: a world alone was given
-    masks: Callable[[], NDArray[np.bool_] | None] = lambda: (
-        None
-    )  # allowed actions (S, A), if anything is said
+    # allowed actions (S, A), if anything is said
+    masks: Callable[[], NDArray[np.bool_] | None] = lambda: None
 
 
 def task_of(env: Any, max_episode_steps: int | None = None) -> Task:
@@ -282,17 +281,15 @@ def tabulated(space: gym.Space[Any], rows: Any, num_states: int) -> ObservationT
 
 def observation_like(mdp: Mdp, space: gym.Space[Any]) -> ObservationTable:
     """The observation of a world that has this space."""
-    needs = {"coordinates": mdp.places, "own": mdp.own_observation}
+    width = (space.shape or (0,))[-1] if space.dtype == np.uint8 and len(space.shape or ()) == 3 else None
     for kind in KINDS:
-        cell_size = 1
-        if kind == "image":
-            if not isinstance(mdp, GridMdp) or space.dtype != np.uint8 or len(space.shape or ()) != 3:
-                continue
-            border, width = frame_size(mdp, 1)[0], (space.shape or (1,))[-1]
-            cell_size = max(1, (width - border) // (frame_size(mdp, 2)[0] - border) + 1)
-        elif kind in needs and needs[kind] is None:
+        if kind == "image" and width is None:
             continue
-        table = make_observation(mdp, kind, cell_size)
+        try:
+            cell_size = 1 if width is None else max(1, width // frame_size(mdp, 1)[0])
+            table = make_observation(mdp, kind, cell_size)
+        except InputError:  # the world has nothing of this kind
+            continue
         if table.space == space:
             return table
     raise InputError(

@@ -137,10 +137,7 @@ KINDS: dict[str, Callable[[Mdp, int], Rows]] = {  # takes the world and `cell_si
 
 
 def make_observation(mdp: Mdp, kind: str, cell_size: int = IMAGE_CELL_SIZE) -> ObservationTable:
-    """Make the observations of all states of a world, of a kind of `KINDS`; `cell_size` is of images, pixels.
-
-    Raises InputError if there is no such kind, the world has nothing of it, or images do not fit into memory.
-    """
+    """The observations of a kind of `KINDS` of all states of a world; `cell_size` is of images, in pixels."""
     if kind not in KINDS:
         *others, last = KINDS
         raise InputError(f"observation kind {kind!r}: must be {', '.join(others)} or {last}")

@@ -11,11 +11,6 @@ from gridworld.bounds import STEP_LIMIT
 
 ENV_ID = "GridWorld-v0"
 
-TYPE_CHECKING = False  # what type checkers take for True; `typing` itself would double the import's cost
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from types import ModuleType
-
 
 def register_envs() -> None:
     """Make `GridWorld-v0` known to Gymnasium, for `make` and `make_vec`; a second call changes nothing."""
@@ -30,25 +25,18 @@ def register_envs() -> None:
         )
 
 
-def register_when_gymnasium_is_imported() -> None:
-    """Register now if Gymnasium is there already, else as soon as it is imported."""
-    if _gymnasium_is_ready():
-        register_envs()
-    elif not any(isinstance(finder, _GymnasiumWatch) for finder in sys.meta_path):
-        sys.meta_path.insert(0, _GymnasiumWatch())
-
-
 class _GymnasiumWatch:
     """Finds no module. Python asks it at each import, until Gymnasium's registry is there."""
 
-    def find_spec(
-        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
-    ) -> None:
-        if _gymnasium_is_ready():
+    def find_spec(self, *module: object) -> None:
+        # The registry's module imports nothing after it has defined this name.
+        if hasattr(sys.modules.get("gymnasium.envs.registration"), "register"):
             sys.meta_path = [finder for finder in sys.meta_path if finder is not self]
             register_envs()
 
 
-def _gymnasium_is_ready() -> bool:
-    """Whether the registry's module has run so far; it imports nothing after this name."""
-    return hasattr(sys.modules.get("gymnasium.envs.registration"), "register")
+def register_when_gymnasium_is_imported() -> None:
+    """Register now if Gymnasium is there already, else as soon as it is imported."""
+    watch = _GymnasiumWatch()
+    sys.meta_path.insert(0, watch)
+    watch.find_spec()

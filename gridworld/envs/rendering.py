@@ -112,15 +112,15 @@ _boards: WeakKeyDictionary[Mdp, Board] = WeakKeyDictionary()
 def board_of(mdp: Mdp) -> Board:
     """The board of a world, made once. Of two states in one place the first that can be reached is shown."""
     if mdp not in _boards:
-        if mdp.places is None:
-            tables = np.full((mdp.num_states, 2), -1), np.full(_CARD, -1), np.full(_CARD, Kind.BLANK)
-            _boards[mdp] = Board(*_CARD, (), *map(frozen, tables))
-        else:
-            _boards[mdp] = _board(mdp, mdp.places)
+        _boards[mdp] = _board(mdp)
     return _boards[mdp]
 
 
-def _board(mdp: Mdp, places: IntArray) -> Board:
+def _board(mdp: Mdp) -> Board:
+    places = mdp.places
+    if places is None:
+        tables = np.full((mdp.num_states, 2), -1), np.full(_CARD, -1), np.full(_CARD, Kind.BLANK)
+        return Board(*_CARD, (), *map(frozen, tables))
     panels = _mosaic(mdp, places)
     rows = max(panel.top + panel.rows for panel in panels)
     cols = max(panel.left + panel.cols for panel in panels)
@@ -257,17 +257,9 @@ def draw_grid(surface: Any, board: Board, cell_size: int) -> None:
     for panel in board.panels:
         rows, cols = slice(panel.top, panel.top + panel.rows), slice(panel.left, panel.left + panel.cols)
         left, top = (panel.left + 1) * cell_size, (panel.top + 1) * cell_size
-        shown = board.state[rows, cols] >= 0
-        if shown.all():
-            width, height = panel.cols * cell_size, panel.rows * cell_size
-            for x in range(0, width + 1, cell_size):
-                surface.fill(GRID_LINE, (left + x, top, 1, height + 1))
-            for y in range(0, height + 1, cell_size):
-                surface.fill(GRID_LINE, (left, top + y, width + 1, 1))
-        else:
-            for row, col in np.argwhere(shown).tolist():
-                box = left + col * cell_size, top + row * cell_size, cell_size + 1, cell_size + 1
-                draw.rect(surface, GRID_LINE, box, 1)
+        for row, col in np.argwhere(board.state[rows, cols] >= 0).tolist():
+            box = left + col * cell_size, top + row * cell_size, cell_size + 1, cell_size + 1
+            draw.rect(surface, GRID_LINE, box, 1)
         size = text_size(panel.name, min(round(0.6 * cell_size), 16), panel.cols * cell_size)
         if panel.name and size is not None:
             write(surface, panel.name, left, round((panel.top + 0.5) * cell_size), size)

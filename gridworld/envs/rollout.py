@@ -42,7 +42,6 @@ def wilson_interval(count: int, total: int) -> tuple[float, float]:
 
 
 def _estimate_share(hits: BoolArray) -> Estimate:
-    """The share of samples (n,) that are hits, with Wilson's interval."""
     count, total = int(hits.sum()), len(hits)
     return Estimate(count / total, *wilson_interval(count, total))
 

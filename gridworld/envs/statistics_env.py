@@ -59,29 +59,26 @@ class StatisticsVectorEnv(GridWorldVectorEnv):
         """See `GridWorldVectorEnv.advance`."""
         pairs = self._state * self.mdp.num_actions
         step = super().advance(actions)
+        _, rewards, *_, ended = step
         np.add(pairs, actions, out=pairs, casting="unsafe")  # unsigned ones too
-        self._count(pairs, step[1])
-        if step[4] is not None:
-            self._add_returns([step[4].returns])
+        self.count(pairs[None], rewards[None])
+        if ended is not None:
+            self._add_returns([ended.returns])
         return step
 
     def count(self, pairs: NDArray[Any], rewards: FloatArray) -> None:
         """Count n steps, `pairs` (n, num_envs) of state * A + action, and add the bonus to their rewards."""
-        if self.exploration_bonus:
-            for each in zip(pairs, rewards, strict=True):
-                self._count(*each)
-        else:
+        if not self.exploration_bonus:
             np.add.at(self._flat_visits, pairs.ravel(), 1)
+            return
+        for taken, paid in zip(pairs, rewards, strict=True):
+            np.add.at(self._flat_visits, taken, 1)
+            paid += self.exploration_bonus / np.sqrt(self._flat_visits.take(taken))
 
     def add_returns(self, steps: NDArray[Any], returns: FloatArray) -> None:
         """Add the returns (m,) of episodes that ended in `steps` (m,), ascending."""
         bounds = np.flatnonzero(np.diff(steps)) + 1
         self._add_returns(part for part in np.split(returns, bounds) if len(part))
-
-    def _count(self, pairs: NDArray[Any], rewards: FloatArray) -> None:
-        np.add.at(self._flat_visits, pairs, 1)
-        if self.exploration_bonus:
-            rewards += self.exploration_bonus / np.sqrt(self._flat_visits.take(pairs))
 
     def _add_returns(self, of_steps: Iterable[FloatArray]) -> None:
         """Add the returns of the episodes that each of some steps ended."""

@@ -132,20 +132,17 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
 
         # States are in numpy's own index type: smaller ones save nothing that counts and are converted at
         # every look-up.
-        self._num_actions = self.mdp.num_actions
-        self._num_outcomes = self.mdp.next_state.shape[2]
+        num_states, self._num_actions, self._num_outcomes = self.mdp.next_state.shape
         next_state = self.mdp.next_state.ravel().astype(np.int64)
-        thresholds = self.mdp.thresholds.reshape(self.mdp.num_states * self._num_actions, -1)
+        thresholds = self.mdp.thresholds.reshape(num_states * self._num_actions, -1)
         alike = (thresholds == thresholds[:1]).all()
         thresholds = thresholds[0] if alike else np.ascontiguousarray(thresholds.T)
         terminated = self.mdp.terminal[next_state]
         self.tables = Tables(next_state, self.mdp.reward.ravel(), terminated, thresholds)
-        self._next_state, self._reward, self._terminated, self._thresholds = self.tables
         self._state: StateArray = np.full(self.num_envs, self.mdp.start_states[0], dtype=np.int64)
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)  # steps of the episodes under way
         self._returns = np.zeros(self.num_envs)  # of these, undiscounted; counted where `ended` tells them
         self._over = np.zeros(self.num_envs, dtype=np.bool_)  # waiting for the reset of their next step
-        self._any_over = False
 
     @property
     def states(self) -> StateArray:
@@ -160,14 +157,11 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[StateArray, dict[str, Any]]:
-        """Start new episodes; those under way are given up.
+        """Start new episodes; those under way are given up. Returns states (num_envs,) and empty infos.
 
         Args:
             seed: one number, from which `np_random` begins anew; None: it continues.
             options: `reset_mask`, (num_envs,) booleans, says which environments; without it, all.
-
-        Returns:
-            (num_envs,) states, int64, and empty infos.
         """
         if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int | np.integer)):
             raise InputError(
@@ -187,14 +181,10 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         self._restart(which)
         self._returns[which] = 0.0
         self._over[which] = False
-        self._any_over = bool(self._over.any())
         return self._state.copy(), {}
 
     def step(self, actions: NDArray[Any]) -> Step:
-        """Move all environments once.
-
-        Args:
-            actions: (num_envs,), integers from 0 to 3.
+        """Move all environments once, by integer actions (num_envs,).
 
         Returns:
             (num_envs,) states (int64), rewards (float64), terminated and truncated (bool), and infos.
@@ -210,19 +200,18 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
 
     def advance(self, actions: NDArray[Any]) -> Advance:
         """`step` in arrays alone, for training; where it resets in the same step, with what ended."""
-        index = self._state * self._num_actions
+        tables, index = self.tables, self._state * self._num_actions
         index += self._check_actions(actions)
-        starting = np.flatnonzero(self._over) if self._any_over else None
+        starting = np.flatnonzero(self._over)
         if self._num_outcomes > 1:
             outcomes = self._draw_outcomes(index, starting)
             index *= self._num_outcomes
             index += outcomes
-        state = self._next_state.take(index)
-        rewards = self._reward.take(index)
-        terminated = self._terminated.take(index)
+        state, rewards = tables.next_state.take(index), tables.reward.take(index)
+        terminated = tables.terminated.take(index)
         self._state = state
         self._elapsed += 1
-        if starting is not None:
+        if starting.size:
             self._restart(starting)
             rewards[starting] = 0.0
             terminated[starting] = False
@@ -239,7 +228,6 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
                 self._returns[which] = 0.0
         elif self._autoreset is AutoresetMode.NEXT_STEP:
             self._over = over
-            self._any_over = bool(over.any())
         return self._state.copy(), rewards, terminated, truncated, ended
 
     def render(self) -> tuple[Frame, ...] | None:
@@ -266,7 +254,6 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         own = {"states": self._state, "elapsed": self._elapsed, "over": self._over, "returns": self._returns}
         for key, array in own.items():
             fill(array, state[key], key)
-        self._any_over = bool(self._over.any())
 
     @property
     def episode_state(self) -> tuple[StateArray, NDArray[np.int64], FloatArray]:
@@ -294,17 +281,14 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         self._state[which] = self.draw_starts(len(which))
         self._elapsed[which] = 0
 
-    def _draw_outcomes(
-        self, pairs: NDArray[np.int64], starting: NDArray[np.intp] | None
-    ) -> NDArray[np.int64]:
+    def _draw_outcomes(self, pairs: NDArray[np.int64], starting: NDArray[np.intp]) -> NDArray[np.int64]:
         """(num_envs,) outcomes of states and actions; who ended or starts anew draws nothing."""
         still = self.mdp.terminal[self._state]
-        if starting is not None:
-            still[starting] = True
+        still[starting] = True
         moving = np.flatnonzero(~still)
         draws = self.draw_numbers(pairs[moving])
         outcomes = np.zeros(self.num_envs, dtype=np.int64)
-        thresholds = self._thresholds
+        thresholds = self.tables.thresholds
         if thresholds.ndim == 2:
             thresholds = thresholds.take(pairs[moving], axis=1)
         drawn = (draws >= thresholds[0]).astype(np.int64)
@@ -329,8 +313,7 @@ def stratified_numbers(groups: IntArray, rng: np.random.Generator) -> FloatArray
     """Random numbers (n,) that the members of each of the `groups` (n,), integers, share out evenly.
 
     Those of a group of m are 1/m apart, from a random one on, so that an outcome of probability p meets np of
-    n environments, rounded down or up. Each number by itself is uniform in [0, 1), and independent of all
-    that came before; so each episode has the probabilities that it has anyway.
+    n environments, rounded down or up. Each by itself is uniform in [0, 1) and independent of earlier ones.
 
     References: R. Cranley and T. Patterson, Randomization of Number Theoretic Methods for Multiple
     Integration, 1976; P. L'Ecuyer, C. Lécot and B. Tuffin, A Randomized Quasi-Monte Carlo Simulation Method

@@ -1,6 +1,6 @@
 """A finished run as other programs take one: flat settings, numbers, curve, and verified copies of its files.
 
-The run's folder is data, as for a report: its settings are checked against the schema, its result against the
+The run's folder is data, as for a report: its settings are checked against the schema, its files against the
 manifest's checksums, and nothing in it is imported or unpickled.
 """
 
@@ -10,16 +10,15 @@ import dataclasses
 import math
 import os
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from gridworld.config.settings import flat, read_config
-from gridworld.config.train import PICTURES, TrainConfig
+from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import MapConfig
 from gridworld.errors import InputError
-from gridworld.process.console import plain, printable, tell
+from gridworld.process.console import plain
 from gridworld.report.evidence import ONLINE, Evidence, Unusable, read_columns
 from gridworld.report.evidence import read as read_evidence
 from gridworld.run.folder import WORLD
@@ -43,8 +42,8 @@ class ExportedRun:
     config: TrainConfig
     summary: dict[str, float]  # the numbers of summary.json, those in a group under dotted names
     curve: list[Row]  # one for each evaluation
-    models: tuple[Path, ...]  # copies: of the last one, and of the best one where it was kept
-    pictures: tuple[Path, ...]  # copies of the pictures and films that are there
+    models: tuple[Path, ...]  # copies: of the last one, and of the best one
+    pictures: tuple[Path, ...]  # copies of the pictures and films that the manifest has
     world: Path | None  # a copy of its tables; None: it is a map
 
     @property
@@ -63,11 +62,6 @@ class ExportedRun:
         return f"{self.group}-seed{self.evidence.seed}"
 
     @property
-    def steps(self) -> int:
-        """Environment steps at the end."""
-        return self.evidence.steps
-
-    @property
     def settings(self) -> dict[str, Any]:
         """All settings, flat: {"agent.gamma": 0.9, ...}; values as in JSON."""
         return {plain(key): value for key, value in flat(dataclasses.asdict(self.config))}
@@ -81,48 +75,37 @@ def read(folder: Path, copies: Path) -> ExportedRun:
     run = open_run(folder)
     config, sums = read_config(run.manifest["config"], str(run.manifest_file)), run.manifest["sha256"]
     numbers = {key: value for key, value in flat(run.read_summary()) if isinstance(value, int | float)}
-    models = [run.model_file]
-    models += [run.best_model_file] if run.best_model_file.name in sums else []  # earlier versions kept none
+
+    def copied(path: Path, most: int) -> Path:
+        copy = copies / path.name
+        copy.write_bytes(run.read(path, most))
+        return copy
+
     world = None
     if not isinstance(config.env, MapConfig):
         world = copies / WORLD
         world.write_bytes(world_bytes(stored_world(run, config.env)))
+    pictures = [run.folder / name for name in run.pictures() if os.path.lexists(run.folder / name)]
     return ExportedRun(
         identity=sha256(repr(sorted(sums.items())).encode())[:16],
         evidence=evidence,
         config=config,
         summary={key: value for key, value in numbers.items() if re.fullmatch(r"[\w.]+", key, re.ASCII)},
-        curve=list(_curve(run)),
-        models=tuple(_copied(run, path, copies, LARGEST_RESULT) for path in models),
-        pictures=tuple(_copied(run, path, copies, _LARGEST_PICTURE) for path in _pictures(run)),
+        curve=_curve(run),
+        models=tuple(copied(path, LARGEST_RESULT) for path in (run.model_file, run.best_model_file)),
+        pictures=tuple(copied(path, _LARGEST_PICTURE) for path in pictures),
         world=world,
     )
-
-
-def _copied(run: RunReader, path: Path, copies: Path, most: int) -> Path:
-    copy = copies / path.name
-    copy.write_bytes(run.read(path, most))
-    return copy
 
 
 def _safe(name: str) -> str:
     return re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII)
 
 
-def _curve(run: RunReader) -> Iterator[Row]:
+def _curve(run: RunReader) -> list[Row]:
     columns = {name: column.tolist() for name, column in read_columns(run, ("step", *_COLUMNS)).items()}
-    for step, *row in zip(*columns.values(), strict=True):
-        named = zip(list(columns)[1:], row, strict=True)
-        yield int(step), {name: number for name, number in named if math.isfinite(number)}
-
-
-def _pictures(run: RunReader) -> Iterator[Path]:
-    """Those that the folder still has; earlier versions noted no checksum of an episode's films."""
-    for picture in PICTURES:
-        path = run.folder / picture.file
-        if not path.suffix or not os.path.lexists(path):
-            continue
-        if picture.file in run.manifest["sha256"]:
-            yield path
-        else:
-            tell(printable(f"{path}: is left out, the run's manifest has no checksum of it"))
+    rows = (dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True))
+    return [
+        (int(row.pop("step")), {name: number for name, number in row.items() if math.isfinite(number)})
+        for row in rows
+    ]

@@ -2,26 +2,27 @@
 
 Printing never fails. A command continues when a reader leaves (`| head`), a terminal is hung up, a disk is
 full, or the locale cannot encode a character, which is then printed as `\\xNN`: a run is not lost to its own
-messages. A command whose result is what it prints fails at its end if that could not be written, unless the
-reader left. Names from files are escaped, so that none acts on a terminal.
+messages. A command fails at its end if there was no room for what it printed. Names from files are escaped,
+so that none acts on a terminal.
 """
 
 from __future__ import annotations
 
 import errno
+import gc
 import io
 import logging
 import os
 import re
+import shutil
 import sys
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import is_limited
@@ -36,7 +37,10 @@ _SCRIPT = re.compile(r"(?:python )?(?:scripts/)?\b(train|tune|record|report|eval
 
 _LONGEST = 2000  # characters of a message
 _SECONDS_BETWEEN_LINES = 5.0
-_CLEAR_TO_END = "\x1b[K"
+_SIZE_OF_NOTEBOOK = (120, 1)
+_OBJECTS_BETWEEN_COLLECTIONS = 50_000  # 700 is Python's own, and takes a sixth of the time of a short run
+_NO_READER = (errno.EPIPE, errno.EIO)  # it left, or its terminal was hung up
+_failures: list[OSError] = []  # to write to standard output
 
 TOLD = logging.getLogger("gridworld.told")  # has what `tell` prints, for a run's log
 TOLD.setLevel(logging.INFO)
@@ -96,22 +100,20 @@ def users_folder() -> Path:
 
 
 class _Forgiving(io.FileIO):
-    """A file whose `write` never fails, and which keeps the first error other than a closed pipe."""
-
-    failure: OSError | None = None
-    is_result = False  # whether the command is for what it prints
+    """Standard output or standard error: its `write` never fails, and notes where there is no room."""
 
     def write(self, content: ReadableBuffer, /) -> int:
         try:
             return super().write(content)
         except OSError as error:
-            if error.errno != errno.EPIPE:
-                self.failure = self.failure or error
+            if self.fileno() == 1 and error.errno not in _NO_READER:
+                _failures.append(error)
             return memoryview(content).nbytes
 
 
 def prepare() -> None:
-    """Let printing to standard output and standard error not fail in this process; see the module."""
+    """Let printing not fail in this process (see the module), and look for garbage less often."""
+    gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
     logging.getLogger("gridworld").addFilter(_make_printable)
     sys.stdout = _prepared(sys.stdout, sys.__stdout__, 1)
     sys.stderr = _prepared(sys.stderr, sys.__stderr__, 2)
@@ -123,43 +125,24 @@ def _prepared(stream: TextIO | None, original: TextIO | None, number: int) -> Te
     if stream is not original or not isinstance(stream, io.TextIOWrapper):
         return stream  # somebody has replaced it
     stream.flush()
-    raw = _Forgiving(number, "w", closefd=False)
-    raw.is_result = number == 1 and not stream.isatty()  # a terminal that is hung up has no reader
     lines = number == 2 or stream.isatty()
-    buffer = io.BufferedWriter(raw)
+    buffer = io.BufferedWriter(_Forgiving(number, "w", closefd=False))
     return io.TextIOWrapper(buffer, stream.encoding, errors="backslashreplace", line_buffering=lines)
-
-
-def result_is_in_files() -> None:
-    """Note that this command's result is the files that it writes, and not what it prints."""
-    if output := _output():
-        output.is_result = False
 
 
 @contextmanager
 def printing() -> Iterator[None]:
-    """Refuse at the end of the block, also of one that exits, a result that could not be printed."""
+    """Flush the output at the end of the block, and refuse one for which there was no room."""
     try:
         yield
-    except SystemExit:
-        _check_output()
-        raise
-    _check_output()
-
-
-def _check_output() -> None:
-    sys.stdout.flush()
-    output = _output()
-    if output and output.failure and output.is_result:
-        raise InputError(
-            f"standard output: cannot be written ({output.failure.strerror}), what was printed is not "
-            "complete; send it to where there is room"
-        )
-
-
-def _output() -> _Forgiving | None:
-    raw = getattr(getattr(sys.stdout, "buffer", None), "raw", None)
-    return raw if isinstance(raw, _Forgiving) else None
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        if _failures:
+            raise InputError(
+                f"standard output: cannot be written ({_failures[0].strerror}), what was printed is not "
+                "complete; send it to where there is room"
+            )
 
 
 def printable(text: str) -> str:
@@ -213,23 +196,23 @@ def aligned(rows: Sequence[Sequence[str]], columns: Sequence[str]) -> list[str]:
 class ProgressLine:
     """A line that may be offered at any time, and is printed when it is due; never if not `enabled`.
 
-    On a terminal it is rewritten in place; elsewhere a new one is printed now and then.
+    On a terminal and in a notebook it is rewritten in place; elsewhere a new one is printed now and then.
     """
 
     def __init__(self, enabled: bool, seconds_between_lines: float = 10.0) -> None:
         self._enabled = enabled
         self._seconds_between_lines = seconds_between_lines
-        self._terminal = sys.stderr.isatty()
+        shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+        self._in_place = sys.stderr.isatty() or "IPKernelApp" in getattr(shell, "config", {})
         self._printed = time.monotonic()
         self._shown = ""
 
     def show(self, text: Callable[[], str]) -> None:
         """Print the line that `text` returns; it is called only if a line is due."""
-        if self._enabled and self._terminal:
-            line = text()
-            if line != self._shown:
-                self._shown = line
-                print(f"\r{line}{_CLEAR_TO_END}", end="", file=sys.stderr, flush=True)
+        if self._enabled and self._in_place:
+            line = text()[: shutil.get_terminal_size(_SIZE_OF_NOTEBOOK).columns - 1]
+            print(f"\r{line:<{len(self._shown)}}", end="", file=sys.stderr, flush=True)
+            self._shown = line
         elif self._enabled and time.monotonic() - self._printed >= self._seconds_between_lines:
             self._printed = time.monotonic()
             print(text(), file=sys.stderr, flush=True)
@@ -237,41 +220,30 @@ class ProgressLine:
     def clear(self) -> None:
         """Remove the line from a terminal."""
         if self._shown:
-            print(f"\r{_CLEAR_TO_END}", end="", file=sys.stderr, flush=True)
+            print(f"\r{'':{len(self._shown)}}\r", end="", file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """Leave the line on a terminal as it is, and begin another."""
+        if self._shown:
+            print(file=sys.stderr)
 
 
-class Progress:
-    """Progress of a run in environment steps: a bar on a terminal or in a notebook, lines elsewhere."""
+class Progress(ProgressLine):
+    """Progress of a run in environment steps."""
 
     def __init__(self, total: int, label: str, enabled: bool = True) -> None:
-        self._total = total
-        self._label = printable(label)
-        self._line = ProgressLine(enabled, _SECONDS_BETWEEN_LINES)
-        self._bar: Any = None
-        shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-        is_notebook = "IPKernelApp" in getattr(shell, "config", {})
-        if enabled and (sys.stderr.isatty() or is_notebook):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # that there are no widgets, where text does as well
-                if is_notebook:
-                    from tqdm.auto import tqdm
-                else:
-                    from tqdm import tqdm
-            self._bar = tqdm(total=total, desc=self._label, unit="step", unit_scale=True, dynamic_ncols=True)
+        super().__init__(enabled, _SECONDS_BETWEEN_LINES)
+        self._total, self._label = total, printable(label)
+        self._first = (0, 0.0)  # the step and the moment of the first update
 
     def update(self, step: int, note: str) -> None:
         """Show that `step` steps are done; `note` says how it goes."""
-        if self._bar is not None:
-            self._bar.set_postfix_str(note, refresh=False)
-            self._bar.update(min(step, self._total) - self._bar.n)
-            return
-        share = min(step / self._total, 1.0)
-        self._line.show(lambda: f"{self._label}: step {step:,} of {self._total:,} ({share:.0%}), {note}")
-
-    def close(self) -> None:
-        """Leave the bar as it is."""
-        if self._bar is not None:
-            self._bar.close()
+        total, now = self._total, time.monotonic()
+        self._first = self._first if self._first[1] else (step, now)
+        first, begun = self._first
+        left = time_left(step - first, total - step, now - begun) if step < total else ""
+        share = min(step / total, 1.0)
+        self.show(lambda: f"{self._label}: step {step:,} of {total:,} ({share:.0%}){left}, {note}")
 
 
 _is_telling: ContextVar[bool] = ContextVar("is_telling", default=False)

@@ -1,25 +1,23 @@
 """One memory budget for whatever reads a folder that somebody else may have written.
 
 What opens a run is `limited`, and so is a command that reads sweeps or studies. Whoever then allocates by a
-number that was read calls `check_memory` first. The variable `GRIDWORLD_BUDGET` raises the budget, e.g. to
-8GB. Time has no limit: `console.telling_if_slow` says what takes long. Training has neither.
+number that was read calls `check_memory` first. The variable `GRIDWORLD_BUDGET` raises the budget. Time has
+no limit: `console.telling_if_slow` says what takes long. Training has neither.
 """
 
 from __future__ import annotations
 
-import gc
 import math
 import os
 import re
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from contextvars import ContextVar
 
 from gridworld.errors import InputError
 
 VARIABLE = "GRIDWORLD_BUDGET"
-_MEGABYTES = {"MB": 1, "GB": 1000}
-_OBJECTS_BETWEEN_COLLECTIONS = 50_000  # 700 is Python's own
+_BYTES = {"MB": 1e6, "GB": 1e9}
 
 _memory: ContextVar[float | None] = ContextVar("memory", default=None)  # bytes; None: no limit yet
 
@@ -29,28 +27,21 @@ class BudgetError(InputError):
 
 
 @contextmanager
-def limited(most: float | None = None) -> Iterator[None]:
-    """Apply a budget in bytes, by default the user's, to the block or the function that this decorates."""
-    if _memory.get() == math.inf:
-        most = math.inf
-    token = _memory.set(_users_budget() if most is None else most)
-    try:
-        yield
-    finally:
-        _memory.reset(token)
+def limited(is_own: bool = False) -> Iterator[None]:
+    """Apply the user's budget to the block, or to the function that this decorates.
 
-
-def _users_budget() -> float:
+    For what is this process's own there is none, nor for what is `limited` in the block.
+    """
     text = os.environ.get(VARIABLE) or "1GB"
     found = re.fullmatch(r"([1-9]\d{0,5})(MB|GB)", text.strip().upper(), re.ASCII)
     if found is None:
         raise InputError(f"{VARIABLE}={text[:80]}: must be an amount of memory, e.g. 500MB or 8GB")
-    return int(found[1]) * _MEGABYTES[found[2]] * 1e6
-
-
-def unlimited() -> AbstractContextManager[None]:
-    """Apply no budget to the block, nor to what is `limited` in it: this process wrote what it reads."""
-    return limited(math.inf)
+    most = math.inf if is_own or _memory.get() == math.inf else int(found[1]) * _BYTES[found[2]]
+    token = _memory.set(most)
+    try:
+        yield
+    finally:
+        _memory.reset(token)
 
 
 def is_limited() -> bool:
@@ -59,11 +50,7 @@ def is_limited() -> bool:
 
 
 def check_memory(what: object, size: float) -> None:
-    """Refuse what would take more bytes than the budget, if there is one; `what` is for the message.
-
-    Raises:
-        BudgetError: `size` is above the budget.
-    """
+    """Raise `BudgetError` for more bytes than the budget, if there is one; `what` is for the message."""
     most = _memory.get()
     if most is not None and size > most:
         enough = min(math.ceil(size / 1e9), 999_999)
@@ -76,8 +63,3 @@ def check_memory(what: object, size: float) -> None:
 def _shown(size: float) -> str:
     unit, factor = ("GB", 1e9) if size >= 1e9 else ("MB", 1e6)
     return f"{size / factor:,.3g} {unit}" if size < 1e15 else "more than a million GB"
-
-
-def collect_less_often() -> None:
-    """Set how often garbage is collected in this process: it is a sixth of the time of a short run."""
-    gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)

@@ -12,6 +12,7 @@ import signal
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -71,6 +72,9 @@ def run_in_processes(
 ) -> None:
     """Run tasks until all have ended. A process takes the next task when it has ended one.
 
+    The first signal to stop is passed on, so that tasks stop at a safe point; the second too, so that they
+    stop soon; at a third they are killed.
+
     Args:
         tasks: they begin in this order. They and what they return are pickled; they raise `SystemExit` only.
         count: how many processes.
@@ -81,74 +85,55 @@ def run_in_processes(
     Raises:
         SystemExit: this process was told to stop by SIGINT or SIGTERM, and so was each; all have ended.
     """
-    _Workers(tasks, forks, ended).run(min(count, len(tasks)), tick)
+    context: Any = multiprocessing.get_context("fork" if forks else "spawn")
+    waiting = deque(enumerate(tasks))
+    at_work: dict[Any, tuple[Any, int | None]] = {}  # by connection: a process, and its task's number
+    received: list[int] = []  # signals
 
+    def stop(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        for process, _ in at_work.values():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process.pid, signal.SIGKILL if len(received) > 2 else number)
 
-class _Workers:
-    def __init__(
-        self, tasks: Sequence[Callable[[], Any]], forks: bool, ended: Callable[[int, Any], None]
-    ) -> None:
-        self._waiting = list(enumerate(tasks))
-        self._context: Any = multiprocessing.get_context("fork" if forks else "spawn")
-        self._ended = ended
-        self._at_work: dict[Connection[Any, Any], tuple[Any, int | None]] = {}  # (process, its task)
-        self._received: list[int] = []  # signals
-
-    def run(self, count: int, tick: Callable[[], None]) -> None:
-        for stream in (sys.stdout, sys.stderr):
-            stream.flush()  # or a fork would write it once more
-        gc.freeze()  # so that forks share what there is
-        with handling(dict.fromkeys(_SIGNALS, self._stop)):
-            try:
-                for _ in range(count):
-                    self._start()
-                while self._at_work:
-                    for connection in wait(list(self._at_work), _SECONDS_BETWEEN_TICKS):
-                        self._take(connection)  # type: ignore[arg-type]
-                    tick()
-            finally:
-                for process, _ in self._at_work.values():
-                    process.kill()
-        if self._received:
-            raise SystemExit(128 + self._received[0])
-
-    def _start(self) -> None:
-        ours, theirs = self._context.Pipe()
-        process = self._context.Process(target=_work, args=(theirs, os.getpid()))
-        process.start()
-        theirs.close()
-        self._give(ours, process)
-
-    def _give(self, connection: Connection[Any, Any], process: Any) -> None:
+    def give(connection: Any, process: Any) -> None:
         """Let a process begin the next task, or end."""
-        number, task = (None, None) if self._received or not self._waiting else self._waiting.pop(0)
-        self._at_work[connection] = process, number
+        number, task = waiting.popleft() if waiting and not received else (None, None)
+        at_work[connection] = process, number
         with contextlib.suppress(OSError):  # it has ended
             connection.send(task)
 
-    def _take(self, connection: Connection[Any, Any]) -> None:
-        """Take a result, or note that the process has ended; another takes the place of a lost one."""
-        process, number = self._at_work[connection]
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()  # or a fork would write it once more
+    gc.freeze()  # so that forks share what there is
+    with handling(dict.fromkeys(_SIGNALS, stop)):
         try:
-            result = connection.recv()
-        except (EOFError, OSError):
-            del self._at_work[connection]
-            connection.close()
-            process.join()
-            if number is not None and not self._received:
-                self._ended(number, LostError(f"exit code {process.exitcode}"))
-                if self._waiting:
-                    self._start()
-        else:
-            self._ended(number, result)  # type: ignore[arg-type]
-            self._give(connection, process)
-
-    def _stop(self, number: int, frame: FrameType | None) -> None:
-        """Pass a signal on: the first stops tasks at a safe point, the second soon, a third at once."""
-        self._received.append(number)
-        for process, _ in self._at_work.values():
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process.pid, signal.SIGKILL if len(self._received) > 2 else number)
+            while at_work or (waiting and not received):
+                while waiting and not received and len(at_work) < count:
+                    connection, theirs = context.Pipe()
+                    process = context.Process(target=_work, args=(theirs, os.getpid()))
+                    process.start()
+                    theirs.close()
+                    give(connection, process)
+                for connection in list[Any](wait(list(at_work), _SECONDS_BETWEEN_TICKS)):
+                    process, number = at_work[connection]
+                    try:
+                        result = connection.recv()
+                    except (EOFError, OSError):
+                        del at_work[connection]
+                        process.join()
+                        if number is not None and not received:
+                            ended(number, LostError(f"exit code {process.exitcode}"))
+                    else:
+                        assert number is not None
+                        ended(number, result)
+                        give(connection, process)
+                tick()
+        finally:
+            for process, _ in at_work.values():
+                process.kill()
+    if received:
+        raise SystemExit(128 + received[0])
 
 
 def _work(connection: Connection[Any, Any], parent: int) -> None:

@@ -9,17 +9,12 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from types import FrameType
 from typing import Any, ClassVar
-
-Handler = Callable[[int, FrameType | None], Any]
-
-_SECONDS_TO_SAFE_POINT = 1.0  # training may continue for so long to come to where it can be saved
 
 
 class Interrupted(BaseException):
@@ -47,36 +42,19 @@ def listen() -> None:
 
 @contextmanager
 def at_work() -> Iterator[None]:
-    """Let SIGINT raise `KeyboardInterrupt` and SIGTERM `SystemExit`; flush the output at the block's end."""
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        os.write(2, b"stopped by SIGTERM\n")
-        raise SystemExit(128 + number)
-
-    handlers: dict[signal.Signals, Handler] = {signal.SIGTERM: stop}
-    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
-        handlers[signal.SIGINT] = signal.default_int_handler
-    with handling(handlers):
-        try:
-            yield
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-
-
-@contextmanager
-def handling(handlers: Mapping[signal.Signals, Handler]) -> Iterator[None]:
-    """Install handlers for the block, and put those back that were there before. For the main thread."""
-    with keeping(*handlers):
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+    """Let SIGINT raise `KeyboardInterrupt`, and SIGTERM `SystemExit`, which is told."""
+    ctrl_c = {signal.SIGINT: signal.default_int_handler}
+    with (
+        exiting(signal.SIGTERM, first=lambda number: os.write(2, b"stopped by SIGTERM\n")),
+        handling(ctrl_c if signal.getsignal(signal.SIGINT) is signal.SIG_DFL else {}),
+    ):
         yield
 
 
 @contextmanager
-def keeping(*numbers: signal.Signals) -> Iterator[None]:
-    """Put these signals' handlers back after the block, should it replace them. For the main thread."""
-    before = {number: signal.getsignal(number) for number in numbers}
+def handling(handlers: Mapping[signal.Signals, Any]) -> Iterator[None]:
+    """Install handlers for the block, and put those back that were there before. For the main thread."""
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield
     finally:
@@ -85,7 +63,7 @@ def keeping(*numbers: signal.Signals) -> Iterator[None]:
 
 
 @contextmanager
-def exiting(*numbers: signal.Signals, first: Callable[[int], None] = lambda number: None) -> Iterator[None]:
+def exiting(*numbers: signal.Signals, first: Callable[[int], object] = int) -> Iterator[None]:
     """Let these signals call `first` and raise `SystemExit` with 128 + their number. For the main thread."""
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -118,7 +96,7 @@ class StopRequest:
 
     Attributes:
         number: of the signal; None as long as there was none.
-        patient: whether training is left a second to come to a safe point. If not, and at a second signal,
+        patient: whether the training at work is left to come to a safe point. If not, and at a second signal,
             the handler raises `Interrupted` at once.
     """
 
@@ -142,7 +120,7 @@ class StopRequest:
         if self._listening:  # those that began before may have been asked already
             self.number = self._listening[0].number
         else:
-            for each in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
+            for each in (signal.SIGINT, signal.SIGTERM):
                 self._handlers[each] = signal.signal(each, self._handle)
         self._listening.append(self)
         token = _running.set(self)
@@ -159,7 +137,6 @@ class StopRequest:
             _running.reset(token)
             self._listening.remove(self)
             if not self._listening:
-                signal.setitimer(signal.ITIMER_REAL, 0)
                 for number, handler in self._handlers.items():
                     signal.signal(number, handler)
 
@@ -168,22 +145,13 @@ class StopRequest:
         if self.number is not None:
             raise Interrupted(self.number)
 
-    def take_time(self) -> None:
-        """Let what follows take longer than the second that a patient request leaves."""
-        signal.setitimer(signal.ITIMER_REAL, 0)
-
     @classmethod
     def _handle(cls, number: int, frame: FrameType | None) -> None:
         asked, running = cls._listening[0].number, _running.get()
-        if number == signal.SIGALRM:  # a second after the first signal
-            if asked is not None:
-                raise Interrupted(asked)
-            return
         for request in cls._listening:
             request.number = number
         if asked is not None or (running is not None and not running.patient):
             raise Interrupted(number)
-        signal.setitimer(signal.ITIMER_REAL, _SECONDS_TO_SAFE_POINT)
 
 
 _running: ContextVar[StopRequest | None] = ContextVar("running", default=None)

@@ -4,49 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextvars import ContextVar
 from types import MappingProxyType
 
 LARGEST = 32  # runs of a population unless more are asked for; larger ones train no faster
 
 
-class Clock:
-    """Counts the seconds that were spent on one run, with `shared`, its share of those spent on all."""
-
-    def __init__(self, shared: Callable[[], float]) -> None:
-        self._shared = shared
-        self._seconds = 0.0
-        self._resumed: float | None = None
-
-    @contextlib.contextmanager
-    def running(self) -> Iterator[None]:
-        """Count the block as this run's own."""
-        self._resumed = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._seconds += time.perf_counter() - self._resumed
-            self._resumed = None
-
-    def now(self) -> float:
-        """Seconds so far."""
-        own = 0.0 if self._resumed is None else time.perf_counter() - self._resumed
-        return self._seconds + own + self._shared()
-
-
-_now: ContextVar[Callable[[], float]] = ContextVar("now", default=time.perf_counter)
+_runs: ContextVar[int] = ContextVar("runs", default=1)
 _mixed: ContextVar[Mapping[str, str]] = ContextVar("mixed", default=MappingProxyType({}))
 
 
 def clock() -> float:
-    """Seconds since some moment; of a run among others, only those that were spent on it."""
-    return _now.get()()
+    """Seconds since some moment; of runs that train together, each counts its share of them."""
+    return time.perf_counter() / _runs.get()
 
 
-def set_clock(own: Clock) -> None:
-    """Let `clock` be this one in the present context."""
-    _now.set(own.now)
+def share_clock(runs: int) -> None:
+    """Let `clock` in the present context count for one of so many runs."""
+    _runs.set(runs)
 
 
 @contextlib.contextmanager

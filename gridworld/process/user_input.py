@@ -54,17 +54,12 @@ def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
 def npz_arrays(
     where: object, content: bytes | memoryview, kind: str, most: int | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Read all arrays of an .npz, where nothing pickled is read.
+    """Read all arrays of an .npz from its content, and nothing pickled; else an `InputError`.
 
     Args:
-        where: the file, for messages.
-        content: of the file.
-        kind: what the file must be, for messages.
+        where: the file, for messages; and `kind`, what it must be.
         most: bytes that they may have in memory, for a file that may be compressed. None: as many as the
             file has, which then must not be.
-
-    Raises:
-        InputError: it is no such file, or its arrays would take more than `most` or the memory budget.
     """
     import numpy as np
 
@@ -88,11 +83,7 @@ def npz_arrays(
 
 
 def imported(where: str, path: Any) -> Any:
-    """Import what a path in the setting `where` names; None where its module has no such name.
-
-    Raises:
-        InputError: there is no such module, or it cannot be imported.
-    """
+    """Import what a path in the setting `where` names; None where its module has no such name."""
     module, _, name = str(path).rpartition(".")
     try:
         return getattr(importlib.import_module(module), name, None)
@@ -100,11 +91,9 @@ def imported(where: str, path: Any) -> Any:
         if error.name in _EXTRAS:
             package, extra = _EXTRAS[error.name]
             raise InputError(f"{where}={path}: needs {package}; {install_command(extra)}") from None
-        if error.name and f"{module}.".startswith(f"{error.name}."):
-            raise InputError(
-                f"{where}={path}: there is no module {error.name}; is the folder that it is in on PYTHONPATH?"
-            ) from None
-        raise InputError(f"{where}={path}: {module} needs {error.name}, which is not installed") from None
+        raise InputError(
+            f"{where}={path}: there is no module {error.name}; is the folder that it is in on PYTHONPATH?"
+        ) from None
     except (ValueError, TypeError):  # no path at all
         return None
     except Exception as error:  # a module of the user's own may raise anything

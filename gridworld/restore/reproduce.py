@@ -14,15 +14,13 @@ from __future__ import annotations
 import csv
 import dataclasses
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gridworld.agents import family
 from gridworld.config.settings import flat
@@ -31,7 +29,7 @@ from gridworld.errors import InputError
 from gridworld.process.together import mixing
 from gridworld.restore.resume import open_unfinished
 from gridworld.restore.saved_run import read_visits, settings_of
-from gridworld.run.folder import BEST_MODEL, EVENTS, MANIFEST, MODEL
+from gridworld.run.folder import EVENTS, MANIFEST
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import LARGEST_RESULT, NUMBERS_DEPEND_ON, RunReader, read_run, stored_world
 from gridworld.run.summary import Summary
@@ -119,41 +117,32 @@ def repeat(
     trust: bool = False,
     members: Sequence[RunReader] = (),
 ) -> None:
-    """Train a run again.
+    """Train a run again in `folder`, which exists, with the members of its `population` elsewhere.
 
-    Args:
-        then: the run.
-        folder: where the new run is written; it exists.
-        config: the settings to train with.
-        mdp: the world.
-        trust: import the classes that the settings name, wherever they are from.
-        members: of `population`; they are trained with it, in a temporary folder.
-
-    Raises:
-        InputError: it cannot be trained here.
-        Interrupted: training was asked to stop.
+    `trust` imports the classes that its settings name, wherever they are from. It is an `InputError` if it
+    cannot be trained here.
     """
     first, *longer = lengths(then, config)
     overrides = then.manifest.get("overrides") or []
     config = dataclasses.replace(config, total_timesteps=first)
-    own = partial(training, config, folder, overrides, lambda env: mdp)
+    own = training(config, folder, overrides, lambda env: mdp)
     if not members:
-        run_alone(own())
+        run_alone(own)
     else:
         place = [run.folder.name for run in members].index(then.folder.resolve().name)
         with tempfile.TemporaryDirectory(prefix="gridworld-") as others:
-            tasks = [_again(run, Path(others), config, trust) for run in members]
-            tasks[place] = own
+            trainings = [_again(run, Path(others), config, trust) for run in members]
+            trainings[place] = own
             with mixing(then.manifest[NUMBERS_DEPEND_ON]):
-                result = run_together(tasks)[place]
+                result = run_together(trainings)[place]
         if isinstance(result, Exception):
             raise result
     for length in longer:
         open_unfinished(folder, trust).resume(length)
 
 
-def _again(run: RunReader, place: Path, like: TrainConfig, trust: bool) -> Callable[[], Training[Summary]]:
-    """What trains a run again in a folder of its own, on the machine's part that another is trained on."""
+def _again(run: RunReader, place: Path, like: TrainConfig, trust: bool) -> Training[Summary]:
+    """A run again, in a folder of its own, on the machine's part that another is trained on."""
     settings = settings_of(run, trust)
     config = dataclasses.replace(
         without_pictures(settings),
@@ -163,7 +152,7 @@ def _again(run: RunReader, place: Path, like: TrainConfig, trust: bool) -> Calla
     )
     mdp, folder = stored_world(run, config.env), place / run.folder.name
     folder.mkdir()
-    return partial(training, config, folder, [], lambda env: mdp)
+    return training(config, folder, [], lambda env: mdp)
 
 
 @dataclass(frozen=True)
@@ -180,94 +169,79 @@ def check_whole(then: RunReader, config: TrainConfig) -> None:
     for path in (then.curve_file, then.model_file, then.best_model_file, then.visits_file, then.summary_file):
         then.verify(path)
     if config.logging.tensorboard:
-        for _ in _points(then.folder):
+        for _ in _points(then):
             pass
 
 
 def compare(then: RunReader, now: RunReader, config: TrainConfig, mdp: Mdp) -> Iterator[Finding]:
     """Compare two finished runs of one configuration in one world, part by part of the result."""
-    curves = _curve(then), _curve(now)
-    _, difference = _first(_cells(curves[0]), _cells(curves[1]))
-    yield Finding("learning curve", difference or f"{len(curves[0]) - 1:,} rows", not difference)
-    yield _weights("final weights", then.folder / MODEL, now.folder / MODEL, config)
-    yield _weights("best weights", then.folder / BEST_MODEL, now.folder / BEST_MODEL, config)
-    before, after = (read_visits(run, mdp.probability.shape[:2]) for run in (then, now))
-    if (place := _first_unequal(before, after)) is None:
-        yield Finding("visits", f"{before.sum():,} steps")
+
+    def weights(path: Path, most: int) -> Entries:
+        return sorted(family(config.agent).weights(path, most).items())
+
+    def visits(run: RunReader) -> Entries:
+        counts = read_visits(run, mdp.probability.shape[:2])
+        for (state, action), count in np.ndenumerate(counts):
+            yield f"{mdp.state_name(state)}, {mdp.action_names[action]}", count
+
+    yield _finding("learning curve", _cells(then), _cells(now), "cells")
+    for part, old, new in (
+        ("final weights", then.model_file, now.model_file),
+        ("best weights", then.best_model_file, now.best_model_file),
+    ):
+        after = weights(new, LARGEST_RESULT)
+        before = weights(old, 2 * new.stat().st_size + _SPARE_BYTES)
+        yield _finding(part, before, after, "tensors and numbers")
+    yield _finding("visits", visits(then), visits(now), "counts")
+    yield _finding("summary", _summary(then), _summary(now), "entries, those of the clock aside")
+    if not config.logging.tensorboard:
+        return
+    if next(_points(then), None) is None:
+        yield Finding("TensorBoard points", "the run's folder has no event file any more", None)
     else:
-        where = f"{mdp.state_name(int(place[0]))}, {mdp.action_names[int(place[1])]}"
-        yield Finding("visits", _difference(where, before[place], after[place]), False)
-    entries = [
-        sorted((name, value) for name, value in flat(run.read_summary()) if name not in CLOCK)
-        for run in (then, now)
-    ]
-    count, difference = _first(*entries)
-    yield Finding("summary", difference or f"{count} entries, those of the clock aside", not difference)
-    if config.logging.tensorboard:
-        if next(_points(then.folder), None) is None:
-            yield Finding("TensorBoard points", "the run's folder has no event file any more", None)
-            return
-        count, difference = _first(_points(then.folder), _points(now.folder))
-        yield Finding("TensorBoard points", difference or f"{count:,} points", not difference)
+        yield _finding("TensorBoard points", _points(then), _points(now), "points")
 
 
-def _curve(run: RunReader) -> list[list[str]]:
-    return [*csv.reader(as_table(run.read(run.curve_file, LARGEST_CSV), run.curve_file).splitlines())]
-
-
-def _cells(curve: Sequence[Sequence[str]]) -> Iterator[tuple[str, str]]:
+def _cells(run: RunReader) -> Iterator[tuple[str, str]]:
     """The cells of a curve below the header, by step and column."""
-    header, *rows = curve
+    text = as_table(run.read(run.curve_file, LARGEST_CSV), run.curve_file)
+    header, *rows = csv.reader(text.splitlines())
     for row in rows:
-        for column, text in zip_longest(header, row):
-            yield f"step {row[0] if row else ''}, {column}", text
+        for column, cell in zip_longest(header, row):
+            yield f"step {row[0] if row else ''}, {column}", cell
 
 
-def _points(folder: Path) -> Iterator[tuple[str, float]]:
+def _summary(run: RunReader) -> Entries:
+    return sorted((name, value) for name, value in flat(run.read_summary()) if name not in CLOCK)
+
+
+def _points(run: RunReader) -> Iterator[tuple[str, float]]:
     """TensorBoard's points, without those of the clock, in the order in which they were written."""
-    for path in sorted(folder.glob(EVENTS)):
+    for path in sorted(run.folder.glob(EVENTS)):
         for tag, step, value in read_scalars(path):
             if not tag.startswith(CLOCK_TAGS):
                 yield f"step {step}, {tag}", value
 
 
-def _weights(part: str, then: Path, now: Path, config: TrainConfig) -> Finding:
-    read = family(config.agent).weights
-    after = read(now, LARGEST_RESULT)
-    before = read(then, 2 * now.stat().st_size + _SPARE_BYTES)
-    for name in sorted(before.keys() ^ after.keys()):
-        return Finding(part, f"{name[:80]} is in one of the models only", False)
-    for name, old in before.items():
-        new = after[name]
-        if (old.dtype, old.shape) != (new.dtype, new.shape):
-            found = _difference(name, f"{old.dtype} {old.shape}", f"{new.dtype} {new.shape}")
-            return Finding(part, found, False)
-        if (place := _first_unequal(old, new)) is not None:
-            where = f"{name}{list(map(int, place)) if place else ''}"
-            return Finding(part, _difference(where, old[place], new[place]), False)
-    return Finding(part, f"{len(before):,} tensors and numbers")
-
-
-def _first(then: Entries, now: Entries) -> tuple[int, str]:
-    """How many entries were compared, and the first difference; "" where there is none."""
+def _finding(part: str, then: Entries, now: Entries, what: str) -> Finding:
+    """Compare the entries of one part, which come in the same order; NaN equals NaN."""
     count = 0
     for (where, old), (other, new) in zip_longest(then, now, fillvalue=("", None)):
         if where and other and where != other:
-            return count, _difference(where, where, other)
-        if old != new and (old == old or new == new):  # NaN equals NaN
-            return count, _difference(where or other, old, new)
+            return _different(part, where, where, other)
+        if isinstance(old, np.ndarray) and isinstance(new, np.ndarray):
+            if (old.dtype, old.shape) != (new.dtype, new.shape):
+                return _different(part, where, f"{old.dtype} {old.shape}", f"{new.dtype} {new.shape}")
+            unequal = np.argwhere((old != new) & ((old == old) | (new == new)))
+            if len(unequal):
+                place = tuple(unequal[0].tolist())
+                return _different(part, f"{where}{list(place) or ''}", old[place], new[place])
+        elif old != new and (old == old or new == new):
+            return _different(part, where or other, old, new)
         count += 1
-    return count, ""
+    return Finding(part, f"{count:,} {what}")
 
 
-def _first_unequal(old: NDArray[Any], new: NDArray[Any]) -> tuple[Any, ...] | None:
-    """The index of the first element that differs in arrays of one type and shape; NaN equals NaN."""
-    same = old == new
-    if old.dtype.kind in "fc":
-        same |= np.isnan(old) & np.isnan(new)
-    return None if same.all() else tuple(np.argwhere(np.atleast_1d(~same))[0][: old.ndim])
-
-
-def _difference(where: str, old: object, new: object) -> str:
+def _different(part: str, where: str, old: object, new: object) -> Finding:
     then, now = ("nothing" if each is None else str(each)[:80] or "empty" for each in (old, new))
-    return f"first at {where[:80]}: {then} then, {now} now"
+    return Finding(part, f"first at {where[:80]}: {then} then, {now} now", False)

@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from gridworld.config.fields import falls
-from gridworld.config.settings import flat, foreign
+from gridworld.config.settings import flat
 from gridworld.config.train import TrainConfig
-from gridworld.config.worlds import BuiltConfig, GymnasiumConfig
+from gridworld.config.worlds import MapConfig
 from gridworld.errors import InputError
 from gridworld.process.console import printable, tell, telling_if_slow
 from gridworld.restore.saved_run import settings_of
@@ -27,14 +28,14 @@ from gridworld.run.provenance import environment, git, identity, settings, sourc
 from gridworld.run.reader import RunReader, read_run, stored_world
 from gridworld.run.summary import Summary
 from gridworld.run.writer import RunWriter, TrainLog
-from gridworld.storage.append_log import holds
+from gridworld.storage.atomic_write import holds
 from gridworld.storage.safe_read import open_ordinary
 from gridworld.storage.serialization import State, StateError
 from gridworld.training.learning_curve import CURVE_COLUMNS
-from gridworld.training.session import CONTENT, FORMAT, LOGS
+from gridworld.training.session import CONTENT, FORMAT, LOGS, OnBuilt, ignore
 from gridworld.training.setup import check_settings
-from gridworld.training.together import Training, run_alone
-from gridworld.training.train import OnBuilt, carry_out, ignore
+from gridworld.training.together import Training, alone
+from gridworld.training.train import carry_out
 from gridworld.world.mdp import Mdp
 
 _LONGEST_HEADER = 2**12  # bytes
@@ -79,27 +80,6 @@ class Unfinished:
     mdp: Mdp
     is_trusted: bool
 
-    def resume(
-        self,
-        total_timesteps: int | None = None,
-        anyway: bool = False,
-        progress: bool = True,
-        on_built: OnBuilt = ignore,
-    ) -> Summary:
-        """Train to the end.
-
-        Args:
-            total_timesteps: the run's length from here on, in environment steps; None: as it was.
-            anyway: accept an environment in which the last bits of the numbers may differ.
-            progress: show progress, where the run's settings do so.
-            on_built: takes the agent before it learns.
-
-        Raises:
-            InputError: the run cannot be resumed in this way.
-            Interrupted: training was asked to stop.
-        """
-        return run_alone(self.resumption(total_timesteps, anyway, progress, on_built))
-
     def resumption(
         self,
         total_timesteps: int | None = None,
@@ -107,7 +87,14 @@ class Unfinished:
         progress: bool = True,
         on_built: OnBuilt = ignore,
     ) -> Training[Summary]:
-        """The same as a generator, for `run_together`."""
+        """Train to the end.
+
+        Args:
+            total_timesteps: the run's length from here on, in environment steps; None: as it was.
+            anyway: accept an environment in which the last bits of the numbers may differ.
+            progress: show progress, where the run's settings do so.
+            on_built: takes the agent before it learns.
+        """
         run, folder, old_total = self.run, self.run.folder, self.config.total_timesteps
         total = old_total if total_timesteps is None else total_timesteps
         logging = self.config.logging
@@ -123,11 +110,13 @@ class Unfinished:
                     f"total_timesteps={2 * old_total}"
                 )
             mdp = check_settings(config, lambda env: self.mdp)
-            self._tell_if_world_changed()
+            self._tell_if_map_changed()
             with telling_if_slow(f"reading the checkpoints of {folder}"):
                 state = _newest_state(run, identity(config, mdp.text()))
             begin = partial(self._restart, config) if state is None else self._continue(config, state, anyway)
             return (yield from carry_out(config, folder, mdp, begin, log, self.is_trusted, state, on_built))
+
+    resume = alone(resumption)
 
     def _restart(self, config: TrainConfig) -> RunWriter:
         """Start again, which a finished run is too good for."""
@@ -141,7 +130,7 @@ class Unfinished:
         overrides = self.run.manifest.get("overrides", [])
         return RunWriter.start(self.run.folder, dataclasses.asdict(config), self.mdp, overrides, replace=True)
 
-    def _continue(self, config: TrainConfig, state: State, anyway: bool) -> partial[RunWriter]:
+    def _continue(self, config: TrainConfig, state: State, anyway: bool) -> Callable[[], RunWriter]:
         """Check that a state may be continued from, and tell what differs; what is returned does so."""
         run, folder, steps = self.run, self.run.folder, state["steps"]
         total, old_total = config.total_timesteps, self.config.total_timesteps
@@ -166,12 +155,16 @@ class Unfinished:
             scheduled = [key for key, value in agent if falls(value) or (value and key.endswith("_fraction"))]
             spread = f"; as in a run of that length: {', '.join(scheduled)}" if scheduled else ""
             tell(f"{folder}: {total:,} steps instead of {old_total:,}{spread}")
-        return partial(_continued, run, steps, total, differs)
 
-    def _tell_if_world_changed(self) -> None:
+        def begin() -> RunWriter:
+            Checkpoints(folder).forget_after(steps)
+            return RunWriter.resume(run, steps, total, differs)
+
+        return begin
+
+    def _tell_if_map_changed(self) -> None:
         env = self.config.env
-        is_foreign = not self.is_trusted and any(foreign({"env": dataclasses.asdict(env)}))
-        if is_foreign or isinstance(env, BuiltConfig | GymnasiumConfig):  # which would run their code
+        if not isinstance(env, MapConfig):
             return
         try:
             changed = env.compile().text() != self.mdp.text()
@@ -182,11 +175,6 @@ class Unfinished:
                 f"{self.run.folder}: its world {env.name} has changed since; it continues with the one that "
                 "it began with"
             )
-
-
-def _continued(run: RunReader, steps: int, total_timesteps: int, differs: list[str]) -> RunWriter:
-    Checkpoints(run.folder).forget_after(steps)
-    return RunWriter.resume(run, steps, total_timesteps, differs)
 
 
 def _resume_command(run: RunReader) -> str:

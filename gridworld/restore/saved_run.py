@@ -122,13 +122,9 @@ class SavedRun:
 def settings_of(
     run: RunReader, trust: bool = False, trains: bool = True, allow: str = "--trust"
 ) -> TrainConfig:
-    """Read the settings in a run's manifest.
+    """Read the settings in a run's manifest; where it `trains`, its callbacks are called too.
 
-    Args:
-        run: the run.
-        trust: as for `SavedRun`.
-        trains: whether it is to be trained, which calls its callbacks.
-        allow: the word by which the command's user says that the run is trusted.
+    `allow` is the word by which the command's user says that the run is trusted.
     """
     config = read_config(run.manifest["config"], str(run.manifest_file))
     for key, name in (("agent.name", config.agent.name), ("env", config.env.name)):

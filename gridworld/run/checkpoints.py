@@ -2,7 +2,7 @@
 
     checkpoints/000000012032.state    after 12,032 steps; `numpy.load` opens it
 
-A power cut harms none, since the files that a checkpoint has marks of (`storage.append_log`) are written
+A power cut harms none, since the files that a checkpoint has marks of (`storage.atomic_write`) are written
 first. A checkpoint that is damaged, or whose files are, is passed over for the one before.
 """
 
@@ -15,7 +15,7 @@ from gridworld.errors import InputError
 from gridworld.process.memory_budget import BudgetError
 from gridworld.process.together import clock
 from gridworld.run.folder import CHECKPOINTS
-from gridworld.storage.atomic_write import check_ours, remove_path, sync_folder, write_bytes
+from gridworld.storage.atomic_write import remove_path, sync_folder, write_bytes
 from gridworld.storage.safe_read import check_no_link, read_bytes
 from gridworld.storage.serialization import State, StateError, decode, encode
 
@@ -47,21 +47,12 @@ class Checkpoints:
     def save(self, steps: int, state: State, durable: bool = True, small: bool = False) -> None:
         """Write the state after so many environment steps, and remove the oldest checkpoint.
 
-        Args:
-            steps: environment steps so far.
-            state: what `storage.serialization` can encode.
-            durable: make it survive a power cut.
-            small: compress it, which takes longer.
-
-        Raises:
-            OSError: it could not be written; the ones before are still there.
+        An `OSError` leaves the ones before. `durable` makes it survive a power cut; `small` takes longer.
         """
         check_no_link(self.folder)
-        check_ours(self.folder)
-        is_new = not self.folder.exists()
         self.folder.mkdir(exist_ok=True)
         write_bytes(self._path(steps), encode(state, compress=small), durable)
-        if durable and is_new:
+        if durable:
             sync_folder(self.folder.parent)
         self.newest = steps
         self.keep(_KEPT)
@@ -77,7 +68,7 @@ class Checkpoints:
         return sorted(self.folder.glob(f"[0-9]*{_SUFFIX}"), reverse=True)
 
     def states(self) -> Iterator[tuple[Path, State | StateError]]:
-        """Each file, newest first, with its state or the error that says why it cannot be read."""
+        """Each file, newest first, with its state, or why it cannot be read."""
         for path in self.files():
             try:
                 yield path, decode(read_bytes(path, _MOST_BYTES), path)

@@ -34,9 +34,9 @@ from typing import Any
 
 from gridworld.config import train as schema
 from gridworld.config.settings import foreign
-from gridworld.errors import FolderLostError, InputError
+from gridworld.errors import InputError
 from gridworld.process.console import command, printable, users_folder
-from gridworld.storage.atomic_write import check_ours, locked, make_folder, remove_inside, tidy
+from gridworld.storage.atomic_write import inside, locked, make_folder, remove_path, tidy
 
 MANIFEST = "manifest.json"
 SOURCE_DIFF = "source.diff"
@@ -148,10 +148,9 @@ def claimed(folder: Path) -> Iterator[None]:
             raise
         finally:
             # Remove what Hydra wrote for a run that never started.
-            with contextlib.suppress(FolderLostError, OSError):
-                check_ours(folder / MANIFEST)
+            with contextlib.suppress(OSError):
                 if not (folder / MANIFEST).exists():
                     tidy(folder)
-                    remove_inside(folder, HYDRA)
+                    remove_path(inside(folder, HYDRA))
                     (folder / LOCK).unlink(missing_ok=True)
                     folder.rmdir()

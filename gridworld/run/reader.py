@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
@@ -70,10 +69,7 @@ class RunReader(RunFolder):
     def read(self, path: Path, most: int, copies: int = 1) -> bytes:
         """Read one of the run's files of at most `most` bytes, of which `copies` will be in memory.
 
-        Only a finished run has checksums; the files of another are read unverified.
-
-        Raises:
-            InputError: the file is missing, too large, or not the one that the run wrote.
+        Raises `InputError` for another file than the run wrote; without being finished, it has no checksums.
         """
         content = read_bytes(path, most, copies)
         if self.is_finished:
@@ -187,12 +183,7 @@ def check_free(folder: Path, key: str = "hydra.run.dir") -> None:
 def stored_world(run: RunReader, env: EnvConfig) -> Mdp:
     """The world that a run keeps, a map in its manifest or tables in its folder, whatever its settings say.
 
-    Args:
-        run: the run.
-        env: its settings of the world, whose name a map gets.
-
-    Raises:
-        InputError: it is no valid map; or its tables are missing, damaged, or not those of the manifest.
+    `env` are its settings of the world, whose name a map gets.
     """
     from gridworld.world.layout import parse  # here, since most commands need no world
     from gridworld.world.sources.arrays import world_from_bytes
@@ -215,55 +206,43 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     content = read_sealed(path)
     if not content.keys() >= {"status", "config", "layout"}:
         raise InputError(f"{path}: not the manifest of a run; it lacks status, config or layout")
-    for key, (fits, what) in _KINDS.items():
-        if key in content and not fits(content[key]):
+    for key, (kind, what) in _ENTRIES.items():
+        if key in content and not _is(kind, content[key]):
             raise InputError(f"{path}: {key} must be {what}")
     return content
 
 
-def _is(*kinds: type) -> Callable[[Any], bool]:
-    return lambda value: type(value) in kinds
+def _is(kind: Any, value: Any) -> bool:
+    """Whether a value is of a type, or a list of one; `{}` is texts by the names of files."""
+    if isinstance(kind, list):
+        return isinstance(value, list) and all(_is(kind[0], each) for each in value)
+    if kind == _RESUMPTION:
+        return isinstance(value, dict) and ("total_timesteps" not in value or type(value.get("step")) is int)
+    if kind == {}:
+        return isinstance(value, dict) and all(
+            isinstance(text, str) and name.isprintable() and PurePath(name).name == name not in ("", "..")
+            for name, text in value.items()
+        )
+    return isinstance(value, kind)
 
 
-def _is_list_of(kind: type, fits: Callable[[Any], bool] = lambda each: True) -> Callable[[Any], bool]:
-    return lambda value: (
-        isinstance(value, list) and all(isinstance(each, kind) and fits(each) for each in value)
-    )
-
-
-def _is_count(value: Any) -> bool:
-    return type(value) is int and value >= 0
-
-
-def _are_sums(value: Any) -> bool:
-    return isinstance(value, dict) and all(isinstance(digest, str) for digest in value.values())
-
-
-def _are_runs(value: Any) -> bool:
-    return _are_sums(value) and all(
-        name.isprintable() and PurePath(name).name == name not in ("", "..") for name in value
-    )
-
-
-def _is_resumption(value: dict[str, Any]) -> bool:
-    return "total_timesteps" not in value or _is_count(value.get("step"))
-
-
-_KINDS: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "status": (_is(str), "a word"),
-    "config": (_is(dict), "the run's settings; is it of another version?"),
-    "layout": (_is_list_of(str, str.isprintable), "a list of the map's rows; is it of another version?"),
-    "started": (_is(str), "a date"),
-    "ended": (_is(str, type(None)), "a date"),
-    "error": (_is(str), "a sentence"),
-    "overrides": (_is_list_of(str), "a list of what stood on the command line"),
-    "sha256": (_are_sums, "a checksum for each file"),
+_RESUMPTION = "resumption"
+_COUNT = (int | None, "a number of steps")
+_ENTRIES: dict[str, tuple[Any, str]] = {
+    "status": (str, "a word"),
+    "config": (dict, "the run's settings; is it of another version?"),
+    "layout": ([str], "a list of the map's rows; is it of another version?"),
+    "started": (str, "a date"),
+    "ended": (str | None, "a date"),
+    "error": (str, "a sentence"),
+    "overrides": ([str], "a list of what stood on the command line"),
+    "sha256": ({}, "a checksum for each file"),
     "resumed": (
-        _is_list_of(dict, _is_resumption),
+        [_RESUMPTION],
         "a list of when the run went on, with the step after which it was made longer",
     ),
-    NUMBERS_DEPEND_ON: (_are_runs, "a hash for each run, by the name of a folder beside this one"),
-    "reached": (lambda value: value is None or _is_count(value), "a number of steps"),
-    "checkpoint": (lambda value: value is None or _is_count(value), "a number of steps"),
-    "versions": (_is(dict), "a version for each package"),
+    NUMBERS_DEPEND_ON: ({}, "a hash for each run, by the name of a folder beside this one"),
+    "reached": _COUNT,
+    "checkpoint": _COUNT,
+    "versions": (dict, "a version for each package"),
 }

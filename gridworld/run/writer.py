@@ -30,8 +30,6 @@ from gridworld.world.mdp import Mdp
 from gridworld.world.sources.arrays import world_bytes
 
 NEEDED = ("step", "return", "length", "goal_probability")  # columns of a learning curve
-_WARNINGS = "py.warnings"  # the logger to which Python's warnings are sent
-_printed: set[str] = set()  # warnings that this process has printed
 
 
 class RunWriter(RunFolder):
@@ -46,17 +44,10 @@ class RunWriter(RunFolder):
     def start(
         cls, folder: Path, config: dict[str, Any], world: Mdp, overrides: list[str], replace: bool = False
     ) -> Self:
-        """Write the manifest of a new run.
+        """Write the manifest of a new run, with its resolved settings, its world and its command line.
 
         A new run loses nothing by a power cut before its first checkpoint, so its manifest is durable only
-        from then on (see `settle`); where it replaces another run, from the start.
-
-        Args:
-            folder: the run's folder, which exists.
-            config: the resolved settings.
-            world: the compiled world, which the manifest or the folder keeps.
-            overrides: the settings given on the command line.
-            replace: remove what the folder has of an earlier run; without it, a run there is refused.
+        from then on (see `settle`); where it is to `replace` another run in the folder, from the start.
         """
         content = {
             "status": "running",
@@ -83,13 +74,10 @@ class RunWriter(RunFolder):
 
     @classmethod
     def resume(cls, earlier: RunReader, step: int, total_timesteps: int, differs: list[str]) -> Self:
-        """Write the manifest of a run that is resumed from a checkpoint.
+        """Write the manifest of a run that is resumed from the checkpoint after `step` environment steps.
 
-        Args:
-            earlier: the run as its folder has it.
-            step: environment steps at the checkpoint.
-            total_timesteps: the run's length from here on.
-            differs: how the environment differs from the one that the run was started in.
+        `total_timesteps` is its length from here on; `differs`, how its environment differs from the one that
+        it was started in.
         """
         again: dict[str, Any] = {"at": _now(), "step": step, "command": recorded_command_line()}
         again |= _mixed_runs()
@@ -115,13 +103,11 @@ class RunWriter(RunFolder):
 
     def settle(self, *files: Path) -> None:
         """Make the manifest, then these files, and all names in the folder survive a power cut."""
-        if self._is_settled and not files:
+        if self._is_settled:
+            sync(files, self.folder)
             return
-        own = [] if self._is_settled else [self.manifest_file, self.world_file]
-        own += [] if self._is_settled else self.folder.glob("source*.diff")
-        sync([*own, *files], self.folder)
-        if not self._is_settled:
-            sync_folder(self.folder.parent)
+        sync([self.manifest_file, self.world_file, *self.folder.glob("source*.diff"), *files], self.folder)
+        sync_folder(self.folder.parent)
         self._is_settled = True
 
     @property
@@ -130,13 +116,9 @@ class RunWriter(RunFolder):
         return self._manifest
 
     def end(self, status: str, error: str | None = None, **progress: int | None) -> None:
-        """Record how the run ended.
+        """Record that the run "finished", which has its results settled, or was "interrupted", or "failed".
 
-        Args:
-            status: "finished", "interrupted" or "failed". The results of a finished run are durable already:
-                see `settle`.
-            error: why it did not finish.
-            progress: environment steps `reached`, and those at the newest `checkpoint`.
+        `error` says why; `progress`, environment steps `reached`, and those at the newest `checkpoint`.
         """
         self._manifest |= {"status": status, "ended": _now(), **progress}
         if error is not None:
@@ -174,14 +156,8 @@ def clear(folder: Path) -> None:
 def write_evaluations(path: Path, curve: Mapping[str, NDArray[Any]], **more: NDArray[Any]) -> None:
     """Write a learning curve as SB3's `EvalCallback` does, for the scripts that plot its `evaluations.npz`.
 
-    SB3 has a column per sampled episode. An exact evaluation has one number, the expectation, so there is one
-    column, whose mean is exact and whose standard deviation is 0.
-
-    Args:
-        path: the file.
-        curve: (n,) by name, those of `NEEDED`: they become `timesteps` (n,) and, (n, 1) each, `results`,
-            which are not discounted, `ep_lengths` and `successes`, the probability of the goal.
-        more: other arrays to put beside them.
+    SB3 has a column per sampled episode. Here is one, of expectations, which is exact. `curve` has (n,) by
+    name, those of `NEEDED`; the returns are not discounted.
     """
     columns = {
         **more,
@@ -208,11 +184,10 @@ def _now() -> str:
 
 
 class TrainLog:
-    """`train.log`: Python's warnings, what is logged as one, and what is told on standard error in its block.
+    """`train.log`: warnings, Python's and logged ones, and what is told on standard error in its block.
 
     The lines are kept until there is a file. What goes to the terminal is the same as without it. Of runs
-    that train together (`training.together`), each has its own, which takes what comes while its
-    run is at work.
+    that train together, each has its own, which takes what comes while its run is at work.
     """
 
     _all: ClassVar[list[TrainLog]] = []  # inside whose blocks the process is
@@ -222,6 +197,8 @@ class TrainLog:
         self._handler.addFilter(self._takes)
 
     def __enter__(self) -> Self:
+        if logging.lastResort is not None and not logging.getLogger().handlers:
+            logging.getLogger().addHandler(logging.lastResort)  # which prints only where there is no other
         for logger in (logging.getLogger(), TOLD):
             logger.addHandler(self._handler)
         with warnings.catch_warnings():  # forgets what was warned about before, in another run
@@ -234,9 +211,12 @@ class TrainLog:
     def __exit__(self, *error: object) -> None:
         _current.reset(self._token)
         self._all.remove(self)
-        logging.captureWarnings(bool(self._all))
         for logger in (logging.getLogger(), TOLD):
             logger.removeHandler(self._handler)
+        if not self._all:
+            logging.captureWarnings(False)
+            if logging.lastResort is not None:
+                logging.getLogger().removeHandler(logging.lastResort)
         if self._handler.target is not None:
             self._handler.target.close()
 
@@ -256,20 +236,10 @@ class TrainLog:
         self._handler.emit(TOLD.makeRecord(TOLD.name, level, "", 0, text, (), None))
 
     def _takes(self, record: logging.LogRecord) -> bool:
-        """Whether a record is for this run's log; what would be printed without the log still is."""
+        """Whether a record is for this run's log."""
         # In a thread, the log of the only run is meant, if there is one only.
         at_work = _current.get() or (self._all[0] if len(self._all) == 1 else None)
-        if at_work is not self or (record.name != TOLD.name and record.levelno < logging.WARNING):
-            return False
-        text, last = record.getMessage(), logging.lastResort
-        handlers = [*logging.getLogger().handlers, *logging.getLogger(record.name).handlers]
-        others = [each for each in handlers if not isinstance(each, MemoryHandler | logging.NullHandler)]
-        is_new = record.name != _WARNINGS or text not in _printed
-        if record.name == _WARNINGS:
-            _printed.add(text)
-        if last is not None and record.levelno >= last.level and not others and is_new:
-            last.handle(record)
-        return True
+        return at_work is self and (record.name == TOLD.name or record.levelno >= logging.WARNING)
 
 
 class _Lines(logging.Formatter):

@@ -1,81 +1,59 @@
-"""Atomic writes to folders that are this process's alone.
+"""Atomic writes: a file, a folder or a log's record is there whole or not at all, durably where asked for.
 
-A file or folder is written whole or not at all, and durably where that is asked for: after a power cut, a
-file that was renamed into its place may be empty, or its name may be the old one, since the disk has a file's
-content once the file is synced, and its name once the folder is. What is half written has a name of its own
-beside the path, with the process that is at it. Each process removes what killed ones left where it writes.
+After a power cut, a file that was renamed into its place may be empty, or its name may be the old one, since
+the disk has a file's content once the file is synced, and its name once the folder is. What is half written
+has a name of its own beside the path, `.NAME.PROCESS.part`.
 
 A process that is at work in a folder holds a lock in it (`locked`), which the operating system releases when
-the process ends, however it ends. A lock is on a file, not on its name. If somebody deletes the folder and
-begins anew at the same path, the new process locks another file, and the old one would write into a folder
-that is not its own any more. So whoever writes by path calls `check_ours`, as all functions here do.
+the process ends, however it ends.
+
+A mark of a log is the file's name, its length and the SHA-256 of its content. A run that continues from a
+checkpoint truncates its logs to the checkpoint's marks: no record is there twice, and none is missing.
 
 The folder `top` that a user named may be a link, since that is the user's. A link in it may be anybody's, and
-lead to any folder of the reader's: the functions `..._inside` go through none.
+lead to any folder of the reader's: `inside` goes through none.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import fcntl
+import hashlib
 import json
 import os
 import re
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, BinaryIO, cast
 
 from filelock import FileLock, Timeout
 
-from gridworld.errors import FolderLostError, InputError
+from gridworld.errors import FolderLostError
 from gridworld.storage.safe_read import check_no_link, open_ordinary
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
 _SECONDS_BETWEEN_TRIES = 0.02
-_NOT_SYNCED = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)  # where a file system cannot sync a folder
-_NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
-_HOST = os.uname().nodename
-_PART = re.compile(rf"\..+\.{re.escape(_HOST)}\.(\d+)\.(old\.)?part", re.DOTALL)
-
-_held: dict[Path, int] = {}  # the lock files in this process's folders, and their inodes
-_tidied: set[str] = set()  # folders, by this process
+_PIECE = 1 << 20  # bytes of a log that are read at once
+_PART = re.compile(r"\..+\.(\d+)\.(old\.)?part", re.DOTALL)
 
 
 @contextmanager
-def locked(path: Path, wait: float | None = None) -> Iterator[bool]:
-    """Take the lock for the block, and yield whether that was possible.
+def locked(path: Path, wait: float) -> Iterator[bool]:
+    """Take the lock for the block, and yield whether that was possible within `wait` seconds.
 
-    Args:
-        path: the lock's file. It is made where there is none, and stays.
-        wait: seconds; None waits for ever.
-
-    Raises:
-        InputError: the file system has no locks, or the file is a link.
-        FolderLostError: see `check_ours`.
+    The lock's file is made where there is none, and stays. Raises `InputError` where it is a link.
     """
-    check_ours(path)
     check_no_link(path)
-    lock = FileLock(path, timeout=-1 if wait is None else wait, fallback_to_soft=False)
+    lock = FileLock(path, timeout=wait, fallback_to_soft=False)
     try:
         lock.acquire(poll_interval=_SECONDS_BETWEEN_TRIES)
     except Timeout:
         yield False
         return
-    except OSError as error:
-        if error.errno not in _NO_LOCKS:
-            raise
-        raise InputError(
-            f"{path}: this file system has no locks ({error.strerror}); choose a folder on one that has, or "
-            "have it mounted with them (Lustre: -o flock)"
-        ) from None
     try:
-        with noted(path):
-            yield True
+        yield True
     finally:
         lock.release()
 
@@ -93,37 +71,6 @@ def is_locked(path: Path) -> bool:
 
 
 @contextmanager
-def noted(path: Path) -> Iterator[None]:
-    """Let `check_ours` look after the folder of a lock's file that exists; nobody is kept out."""
-    where = Path(os.path.abspath(path))
-    before = _held.get(where)
-    with open_ordinary(path) as file:  # while it is open, no other file gets its inode
-        _held[where] = os.fstat(file.fileno()).st_ino
-        try:
-            yield
-        finally:
-            if before is None:
-                del _held[where]
-
-
-def check_ours(path: Path) -> None:
-    """Check, before a write by path, that the folder is still this process's, if it ever was.
-
-    Raises:
-        FolderLostError: its lock file was removed or replaced.
-    """
-    for folder in Path(os.path.abspath(path)).parents if _held else ():
-        if locks := [lock for lock in _held if lock.parent == folder]:
-            for lock in locks:
-                if not os.path.lexists(lock) or os.lstat(lock).st_ino != _held[lock]:
-                    raise FolderLostError(
-                        f"{folder}: is no longer this process's, {lock.name} in it was removed or replaced "
-                        "while it was at work there; it ends and writes nothing more"
-                    )
-            return  # of nested folders: if the innermost is there, so are the others
-
-
-@contextmanager
 def replacing(path: Path, durable: bool = False) -> Iterator[Path]:
     """Replace a file atomically: the block writes to a path beside it, which then takes its place.
 
@@ -134,63 +81,56 @@ def replacing(path: Path, durable: bool = False) -> Iterator[Path]:
         durable: a power cut leaves the old content or the new one.
 
     Raises:
-        FolderLostError: the folder is no longer this process's.
         OSError: it names `path`, not the path beside it.
     """
-    with _beside(path) as part:
-        try:
-            yield part
-            if durable:
-                _sync(part)
-            check_ours(path)
-            os.replace(part, path)
-        finally:
-            part.unlink(missing_ok=True)
+    part = _part_of(path)
+    try:
+        remove_path(part)
+        yield part
         if durable:
-            sync_folder(path.parent)
+            _sync(part)
+        os.replace(part, path)
+    except OSError as error:
+        error.filename = str(path)
+        raise
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()
+    if durable:
+        sync_folder(path.parent)
 
 
 @contextmanager
 def replacing_folder(folder: Path) -> Iterator[Path]:
     """Replace a folder as a whole: the block fills a new one beside it, which then takes its place.
 
-    If the block raises, the folder stays as it was. Raises as `replacing` does.
+    If the block raises, the folder stays as it was.
     """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with _beside(folder) as new:
-        old = new.with_suffix(".old.part")
-        new.mkdir()
-        try:
-            yield new
-            check_ours(folder)
-            if os.path.lexists(folder):
-                folder.rename(old)
-            new.rename(folder)
-            remove_path(old)
-        finally:
-            shutil.rmtree(new, ignore_errors=True)
-
-
-@contextmanager
-def _beside(path: Path) -> Iterator[Path]:
-    """A free path that only this process writes to; an `OSError` about it names `path`."""
-    check_ours(path)
-    part = path.with_name(f".{path.name}.{_HOST}.{os.getpid()}.part")
+    new = _part_of(folder)
+    old = new.with_suffix(".old.part")
     try:
-        if (folder := os.path.abspath(path.parent)) not in _tidied:
-            _tidied.add(folder)
-            tidy(path.parent)
-        remove_path(part)
-        yield part
+        tidy(folder.parent)
+        for leftover in (new, old):
+            remove_path(leftover)
+        new.mkdir(parents=True)
+        yield new
+        if os.path.lexists(folder):
+            folder.rename(old)
+        new.rename(folder)
+        remove_path(old)
     except OSError as error:
-        where = Path(os.fsdecode(error.filename or part))
-        if where.is_relative_to(part):
-            error.filename = str(path / where.relative_to(part))
+        error.filename = str(error.filename or folder).replace(str(new), str(folder))
         raise
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+
+
+def _part_of(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}.part")
 
 
 def tidy(folder: Path) -> None:
-    """Remove what processes of this machine had half written that are not there any more."""
+    """Remove what processes that are not there any more left half written."""
     for path in folder.glob(".*.part"):
         if (found := _PART.fullmatch(path.name)) and not _is_alive(int(found[1])):
             remove_path(path)
@@ -222,14 +162,6 @@ def write_json(path: Path, content: Any, durable: bool = False) -> None:
     write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n", durable)
 
 
-def write_array(path: Path, array: NDArray[Any]) -> None:
-    """Write numpy's own format; `numpy.load` reads it without unpickling anything."""
-    import numpy as np  # here, since `train.py --help` does not need it
-
-    with replacing(path) as part, part.open("wb") as file:  # given a path, NumPy would add .npy to it
-        np.save(file, array, allow_pickle=False)
-
-
 def sync(files: Iterable[Path], folder: Path) -> None:
     """Make files survive a power cut, in this order, as far as they exist, then all names in `folder`."""
     for path in files:
@@ -239,13 +171,9 @@ def sync(files: Iterable[Path], folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder survive a power cut, as far as the file system can do that."""
-    with contextlib.suppress(PermissionError):  # who may write to a folder need not be allowed to list it
-        try:
-            _sync(folder)
-        except OSError as error:
-            if error.errno not in _NOT_SYNCED:
-                raise
+    """Make the names in a folder survive a power cut, as far as the file system lets this process do so."""
+    with contextlib.suppress(OSError):
+        _sync(folder)
 
 
 def _sync(path: Path) -> None:
@@ -266,41 +194,119 @@ def make_folder(folder: Path) -> None:
 
 def remove_path(path: Path) -> None:
     """Remove the file, folder or link (not what it leads to) at a path, if there is one."""
-    check_ours(path)
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
 
 
-def make_inside(top: Path, *names: str) -> Path:
-    """Make the folder `top`/names[0]/... and those between; refuses a link below `top`."""
-    path = _inside(top, names)
-    check_ours(path)
-    path.mkdir(parents=True, exist_ok=True)
-    return path
-
-
-def remove_inside(top: Path, *names: str) -> None:
-    """Remove what is at `top`/names[0]/..., if anything; refuses a link on the way to it."""
-    remove_path(_inside(top, names[:-1]) / names[-1])
-
-
-def names_inside(top: Path, *names: str) -> list[str]:
-    """The sorted names in the folder `top`/names[0]/..., if there is one; refuses a link below `top`."""
-    path = _inside(top, names)
-    return sorted(os.listdir(path)) if path.is_dir() else []
-
-
-def check_no_links(top: Path, *names: str) -> None:
-    """Refuse a folder to be written in that is reached through a link below `top`, or holds one."""
-    for name in names_inside(top, *names):
-        check_no_link(top.joinpath(*names, name))
-
-
-def _inside(top: Path, names: Iterable[str]) -> Path:
+def inside(top: Path, *names: str) -> Path:
+    """The path `top`/names[0]/...; refuses a link on the way, and at its end."""
     path = top
     for name in names:
         path = path / name
         check_no_link(path)
     return path
+
+
+def check_no_links(top: Path, *names: str) -> None:
+    """Refuse a folder to be written in that is reached through a link below `top`, or holds one."""
+    folder = inside(top, *names)
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        check_no_link(path)
+
+
+class AppendLog:
+    """An append-only file that is open for writing. Nothing is buffered: readers see each record at once.
+
+    The file also is the witness that the folder is still this process's: if somebody deleted it, and began
+    anew at the same path, whatever writes here raises `FolderLostError`.
+
+    Args:
+        path: of a new file, or with `mark` of an existing one.
+        mark: to which an existing file is truncated; check it by `holds` before.
+
+    Attributes:
+        length: bytes that are in it.
+    """
+
+    def __init__(self, path: Path, mark: dict[str, Any] | None = None) -> None:
+        self.path = path
+        self._file: BinaryIO
+        if mark is None:
+            path.unlink(missing_ok=True)  # it may be a link or a pipe
+            self._file = cast("BinaryIO", path.open("w+b", buffering=0))
+        else:
+            self._file = open_ordinary(path, "r+b")
+        self.length = 0 if mark is None else mark["length"]
+        self._sum = _sum_of(path, self.length)
+        self._truncate()
+
+    def append(self, record: bytes) -> None:
+        """Append a record; if that fails (the disk is full), the file ends with the record before."""
+        self.check()
+        rest = memoryview(record)
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except BaseException:
+            self._truncate()
+            raise
+        self.length += len(record)
+        self._sum.update(record)
+
+    def _truncate(self) -> None:
+        self._file.truncate(self.length)
+        self._file.seek(self.length)
+
+    def content(self) -> bytes:
+        """All records."""
+        return os.pread(self._file.fileno(), self.length, 0)
+
+    def mark(self) -> dict[str, Any]:
+        """The mark of the file's present end."""
+        return {"name": self.path.name, "length": self.length, "sha256": self._sum.hexdigest()}
+
+    def sync(self) -> None:
+        """Make the file survive a power cut."""
+        self.check()
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the file."""
+        if not self._file.closed:
+            try:
+                self.check()
+            finally:
+                self._file.close()
+
+    def check(self) -> None:
+        """Refuse to continue where the file at this path is not this one any more."""
+        opened = os.fstat(self._file.fileno())
+        if not os.path.lexists(self.path) or not os.path.samestat(os.lstat(self.path), opened):
+            raise FolderLostError(f"{self.path}: was deleted or replaced during the run, which ends here")
+
+
+def holds(folder: Path, mark: Any, pattern: str) -> bool:
+    """Whether the file of a mark, which may be anything, is in `folder` and unchanged up to the mark.
+
+    `pattern` says which names the file may have, as for `fnmatch`.
+    """
+    try:
+        path = folder / mark["name"]
+        if path.name != mark["name"] or not fnmatchcase(path.name, pattern):
+            return False  # it leads elsewhere
+        if type(mark["length"]) is not int or not 0 <= mark["length"] <= path.stat().st_size:
+            return False
+        return bool(_sum_of(path, mark["length"]).hexdigest() == mark["sha256"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return False
+
+
+def _sum_of(path: Path, length: int) -> hashlib._Hash:
+    """Of the first `length` bytes."""
+    found = hashlib.sha256()
+    with open_ordinary(path) as file:
+        for start in range(0, length, _PIECE):
+            found.update(file.read(min(_PIECE, length - start)))
+    return found

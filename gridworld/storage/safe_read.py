@@ -47,12 +47,13 @@ def open_ordinary(path: Path, mode: str = "rb", most: float = math.inf) -> Binar
         what = "read" if mode == "rb" else "written"
         raise InputError(f"{path}: cannot be {what} ({error.strerror})") from None
     found = os.fstat(descriptor)
-    is_ordinary = stat.S_ISREG(found.st_mode)
-    if not is_ordinary or found.st_size > most:
-        os.close(descriptor)
-        what = f"is larger than {_size(most)}" if is_ordinary else "is no ordinary file"
-        raise InputError(f"{path}: {what}")
-    return cast("BinaryIO", open(descriptor, mode, buffering=-1 if mode == "rb" else 0))
+    if stat.S_ISREG(found.st_mode) and found.st_size <= most:
+        return cast("BinaryIO", open(descriptor, mode, buffering=-1 if mode == "rb" else 0))
+    os.close(descriptor)
+    if not stat.S_ISREG(found.st_mode):
+        raise InputError(f"{path}: is no ordinary file")
+    size = f"{most / 2**20:,.0f} MiB" if most >= 2**20 else f"{most:,} bytes"
+    raise InputError(f"{path}: is larger than {size}")
 
 
 def read_bytes(path: Path, most: int, copies: int = 1) -> bytes:
@@ -63,11 +64,6 @@ def read_bytes(path: Path, most: int, copies: int = 1) -> bytes:
             return file.read(most)
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-
-
-def read_table(path: Path) -> str:
-    """Read the text of a table (CSV) of at most `LARGEST_CSV` bytes."""
-    return as_table(read_bytes(path, LARGEST_CSV), path)
 
 
 def read_object(path: Path, most: int = LARGEST_JSON) -> dict[str, Any]:
@@ -150,19 +146,6 @@ def _seal(content: Mapping[str, Any]) -> str:
     return sha256(json.dumps(unsealed, sort_keys=True).encode())
 
 
-def check_yaml(folder: Path) -> None:
-    """Refuse a configuration's folder with a yaml file that is no regular file, or is far too large.
-
-    Hydra would read a pipe or a device, which need not end, and follows links.
-    """
-    for depth in ("", "*/", "*/*/"):  # as deep as its groups are
-        for file in filter(Path.exists, sorted(folder.glob(f"{depth}*.yaml"))):
-            if not file.is_file():
-                raise InputError(f"{file}: is no ordinary file; give a yaml file, or take it away")
-            if file.stat().st_size > LARGEST_JSON:
-                raise InputError(f"{file}: is larger than {_size(LARGEST_JSON)}, which is no configuration")
-
-
 def check_no_link(path: Path) -> None:
     """Refuse a path that is a symbolic link, which writing would follow."""
     if path.is_symlink():
@@ -178,7 +161,3 @@ def file_sha256(path: Path, most: int) -> str:
     """SHA-256 of a file of at most `most` bytes, which is not held in memory."""
     with open_ordinary(path, most=most) as file:
         return hashlib.file_digest(cast("io.BufferedReader", file), "sha256").hexdigest()
-
-
-def _size(count: float) -> str:
-    return f"{count / 2**20:,.0f} MiB" if count >= 2**20 else f"{count:,} bytes"

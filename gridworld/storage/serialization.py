@@ -12,7 +12,6 @@ import io
 import json
 import random
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -31,9 +30,11 @@ _TREE = "state.json"
 _ARRAY = "@"
 _KINDS = "bfiu"  # of arrays, as numpy abbreviates them
 _PLAIN = frozenset((bool, int, float, str))
+_MISFITS = (  # what setting an object to a state that is not its own may raise
+    *(ArithmeticError, AttributeError, LookupError, MemoryError),
+    *(RuntimeError, TypeError, ValueError),
+)
 _MOST = 1 << 38  # bytes of arrays
-_SAMPLE = 1 << 12  # bytes of an array that say whether it gets smaller
-_WORTH_IT = 0.85  # of its size
 
 
 class StateError(ValueError):
@@ -41,20 +42,18 @@ class StateError(ValueError):
 
 
 def encode(state: State, compress: bool = False) -> memoryview:
-    """Encode a state; compressed where that is worth it, which is slower.
-
-    Raises:
-        TypeError: something in it is not part of a state.
-    """
+    """Encode a state, compressed or not; a `TypeError` where something in it is not part of a state."""
     arrays: dict[str, NDArray[Any]] = {}
     tree = json.dumps(_fold(state, arrays, "state"), separators=(",", ":"))
+    method = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         archive.writestr(zipfile.ZipInfo(_TREE), tree)
-        for name, array in arrays.items():
-            member = _npy(array)
-            how = zipfile.ZIP_DEFLATED if compress and _gets_smaller(member) else zipfile.ZIP_STORED
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), member, how, compresslevel=1)
+        for (
+            name,
+            array,
+        ) in arrays.items():  # `ZipInfo` by name alone has no time: the same state, the same bytes
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), npy_bytes(array), method, compresslevel=1)
     return content.getbuffer()
 
 
@@ -88,10 +87,7 @@ def fitting() -> Iterator[None]:
         yield
     except StateError:
         raise
-    except (
-        *(ArithmeticError, AttributeError, LookupError, MemoryError),
-        *(RuntimeError, TypeError, ValueError),
-    ) as error:
+    except _MISFITS as error:
         raise StateError(f"{type(error).__name__}: {error}") from error
 
 
@@ -107,16 +103,11 @@ def fill(target: NDArray[Any], value: Any, where: str) -> None:
     target[...] = value
 
 
-def _npy(array: NDArray[Any]) -> bytes:
+def npy_bytes(array: NDArray[Any]) -> bytes:
+    """An array in numpy's own format; `numpy.load` reads it without unpickling anything."""
     content = io.BytesIO()
     np.lib.format.write_array(content, np.asarray(array, order="C"), allow_pickle=False)
     return content.getvalue()
-
-
-def _gets_smaller(member: bytes) -> bool:
-    """Whether a sample does: weights do not."""
-    sample = member[len(member) // 2 :][:_SAMPLE]
-    return len(zlib.compress(sample, 1)) < _WORTH_IT * len(sample)
 
 
 def _fold(node: Any, arrays: dict[str, NDArray[Any]], where: str) -> Any:
@@ -151,13 +142,10 @@ def _unfold(node: Any, arrays: dict[str, NDArray[Any]]) -> Any:
 
 
 def independent_generator(seed: int) -> np.random.Generator:
-    """A generator that is independent of the one that the seed itself gives, `np.random.default_rng(seed)`.
+    """The generator of the seed's first spawned child (`numpy.random.SeedSequence.spawn`).
 
-    Two generators with the same seed are one stream of numbers used twice. Where both an environment and who
-    acts in it draw, actions, slips and starts would depend on each other; one of them takes this generator.
-
-    Returns:
-        The generator of the seed's first spawned child; see `numpy.random.SeedSequence.spawn`.
+    It is independent of `np.random.default_rng(seed)`. Where both an environment and who acts in it draw, one
+    of them takes this one; else actions, slips and starts would depend on each other.
     """
     return np.random.default_rng(np.random.SeedSequence(seed).spawn(1)[0])
 
@@ -184,14 +172,5 @@ def global_state() -> State:
 def set_global_state(state: State) -> None:
     """Set the global generators to a state; a `ValueError` where it is not theirs."""
     python = state["python"]
-    if state["numpy"].keys() != np.random.get_state(legacy=False).keys():
-        raise ValueError("numpy's generator has other parts")
     random.setstate((python["version"], tuple(map(int, python["numbers"])), python["gauss"]))
     np.random.set_state(state["numpy"])
-
-
-def set_plain_state(generator: np.random.RandomState, state: State) -> None:
-    """Set one of numpy's legacy generators to the state of another; else a `ValueError`."""
-    if state.keys() != generator.get_state(legacy=False).keys():
-        raise ValueError("numpy's generator has other parts")
-    generator.set_state(state)

@@ -11,7 +11,6 @@ import sys
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +21,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from gridworld.agents import family
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.errors import FolderLostError, InputError, MachineError, reason
-from gridworld.process.console import called_from
-from gridworld.process.memory_budget import collect_less_often
+from gridworld.process.console import called_from, prepare
 from gridworld.process.signals import Interrupted, exiting, handling, send_sigterm
 from gridworld.process.together import mixing
 from gridworld.restore.resume import unfinished_of
@@ -75,7 +73,7 @@ def run_in_sweep(
         raise JobError(one_line(reason(error))) from None
     except Exception as error:
         why = one_line(reason(error))
-        with contextlib.suppress(OSError, FolderLostError):
+        with contextlib.suppress(OSError):
             mark_failed(folder, why, "" if isinstance(error, InputError) else traceback.format_exc())
         if stop_at_failure:
             raise StopSweep(why) from None
@@ -116,14 +114,14 @@ class Worker:
 
     def __call__(self, jobs: Sequence[SweepJob]) -> list[str]:
         """Run the jobs of a population; returns the error of each, or ""."""
-        collect_less_often()
+        prepare()
         os.environ.update(self.master.hydra.job.env_set)
         configure_log(self.master.hydra.job_logging, self.master.hydra.verbose)
         config = jobs[0].config  # all have one device
         asked = self.master.hydra.sweeper.population != AUTO and len(jobs) > 1
         depend = asked and not family(config.agent).on_processor(config.device)
         with mixing({job.folder.name: job.hash for job in jobs} if depend else {}):
-            results = run_together([partial(self._run, job) for job in jobs])
+            results = run_together([self._run(job) for job in jobs])
         return [one_line(reason(result)) if isinstance(result, Exception) else "" for result in results]
 
     def on_node(self, groups: Sequence[Sequence[SweepJob]]) -> list[str]:

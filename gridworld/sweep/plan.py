@@ -36,7 +36,7 @@ from gridworld.run.provenance import settings_hash
 from gridworld.training.setup import check_settings, notes
 from gridworld.world.mdp import Mdp
 
-RUNS_FILES = 5  # that a run has open: its lock, its curve, its events, its log
+RUNS_FILES = 4  # that a run has open: its lock, its curve, its events, its log
 _SHARE_OF_MEMORY = 4  # a population takes a fourth of what is free, shared by the workers
 _RUNS_BYTES = 16 * 2**20  # of a run beside its agent, with its pictures
 _OTHER_FILES = 64  # of the process

@@ -17,8 +17,8 @@ from omegaconf import DictConfig
 
 from gridworld.config.sweep import SweepConfig
 from gridworld.config.words import prepared
-from gridworld.errors import EXIT_CODE, FolderLostError, InputError
-from gridworld.process.console import ProgressLine, tell, tell_error, time_left
+from gridworld.errors import InputError
+from gridworld.process.console import ProgressLine, tell, time_left
 from gridworld.process.processes import LostError, worker_count
 from gridworld.process.signals import exiting, signal_name
 from gridworld.run.folder import MANIFEST
@@ -84,9 +84,6 @@ def run_sweep(words: list[str], context: HydraContext, master: DictConfig, setti
     except OSError as error:
         console.tell_stopped_by(error, folder.path)
         code = 1
-    except FolderLostError as error:
-        tell_error(str(error))
-        code = EXIT_CODE
     if code:
         raise SystemExit(code)
 
@@ -213,7 +210,7 @@ class _Sweep:
         if began < self._due:
             return
         ended = {job: row for job, row in self._rows.items() if row.status in (DONE, FAILED)}
-        with contextlib.suppress(OSError, FolderLostError):
+        with contextlib.suppress(OSError):
             rows = self._table.inspect(self._folder.entries.values(), self._before, ended)
             if rows != self._rows:
                 self._table.write(rows)

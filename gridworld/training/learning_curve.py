@@ -10,7 +10,8 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -21,8 +22,8 @@ from gridworld.agents import Agent, PolicySnapshot
 from gridworld.config.train import TrainConfig
 from gridworld.envs.statistics_env import NO_EPISODES, Returns, StatisticsVectorEnv
 from gridworld.errors import InputError
-from gridworld.process.together import clock
-from gridworld.storage.append_log import AppendLog
+from gridworld.run.writer import NEEDED
+from gridworld.storage.atomic_write import AppendLog
 from gridworld.storage.csv_text import csv_text
 from gridworld.storage.serialization import State
 from gridworld.world.evaluation import Evaluator, Score
@@ -83,34 +84,12 @@ class BestModel:
         """Whether a policy with this score is better."""
         return self.step < 0 or score.shortfall < self.regret
 
-    def get_state(self) -> State:
-        return {"step": self.step, "regret": self.regret, "content": np.frombuffer(self.content, np.uint8)}
-
-
-@dataclass(frozen=True, eq=False)
-class Held:
-    """An evaluation that was due where training may be over, see `LearningCurve.on_step`."""
-
-    step: int
-    snapshot: PolicySnapshot
-    model: bytes  # if it was the best by then, else empty
-
-    def get_state(self) -> State:
-        snapshot, model = vars(self.snapshot).copy(), np.frombuffer(self.model, np.uint8)
-        return {"step": self.step, "snapshot": snapshot, "model": model}
-
 
 class LearningCurve:
     """Evaluates an agent every so many environment steps, and at the end.
 
     The evaluation at the end may come soon after the one before, with few episodes of its own; it takes those
-    of the one before too.
-
-    Args:
-        evaluator: scores policies exactly.
-        agent: the one that learns.
-        config: the run's settings; `evaluation` and `total_timesteps` say when an evaluation is due.
-        envs: those that the agent learns in, which count the returns of its episodes.
+    of the one before too. `envs`, in which the agent learns, count the returns of its episodes.
     """
 
     def __init__(
@@ -130,68 +109,69 @@ class LearningCurve:
         self._every, self._stop_after = config.evaluation.every, config.evaluation.stop_after
         self._total = config.total_timesteps
         self._next = self._every
-        self._held: Held | None = None
+        # One that was due where training may be over, with its model if that is the best; see `on_step`
+        self._held: tuple[Evaluation, bytes] | None = None
         self._due = NO_EPISODES  # those of the newest evaluation that was due, held or not
 
     def get_state(self) -> State:
-        """The schedule, the certificate, the best model; the newest snapshot, which gives its scores."""
-        newest = self.newest
+        """The schedule, the certificate, the best model; snapshots, which give their scores."""
+        newest, held, best = self.newest, None, self.best
+        if self._held is not None:
+            evaluation, model = self._held
+            held = {
+                "step": evaluation.step,
+                "snapshot": vars(evaluation.snapshot).copy(),
+                "model": np.frombuffer(model, np.uint8),
+            }
         return {
             "step": -1 if newest is None else newest.step,
             "next": self._next,
             **vars(self.certificate),
             "seconds": self.seconds,
             "snapshot": None if newest is None else vars(newest.snapshot).copy(),
-            "held": None if self._held is None else self._held.get_state(),
-            "best": self.best.get_state(),
+            "held": held,
+            "best": {**vars(best), "content": np.frombuffer(best.content, np.uint8)},
             "due": self._due._asdict(),
         }
 
     def set_state(self, state: State) -> None:
-        """Continue from a state; inside `storage.serialization.fitting`."""
+        """Mirrors `get_state`; inside `storage.serialization.fitting`."""
         self._next = int(state["next"])
         self.certificate = Certificate(
             int(state["streak"]), state["first_certified_step"], state["certified_since_step"]
         )
         self.seconds = float(state["seconds"])
-        if (held := state["held"]) is not None:
-            self._held = Held(int(held["step"]), _snapshot(held["snapshot"]), held["model"].tobytes())
-        best = state["best"]
+        best, held, due = state["best"], state["held"], state["due"]
         self.best = BestModel(int(best["step"]), float(best["regret"]), best["content"].tobytes())
-        self._due = Returns(int(state["due"]["episodes"]), float(state["due"]["total"]))
+        self._due = Returns(int(due["episodes"]), float(due["total"]))
         if state["snapshot"] is not None:
-            snapshot = _snapshot(state["snapshot"])
-            self.newest = Evaluation(int(state["step"]), snapshot, *self._scores(snapshot), NO_EPISODES)
+            self.newest = self._scored(int(state["step"]), _snapshot(state["snapshot"]), NO_EPISODES)
+        if held is not None:
+            evaluation = self._scored(int(held["step"]), _snapshot(held["snapshot"]), self._due)
+            self._held = evaluation, held["model"].tobytes()
 
     def write_held_of_shorter_run(self) -> None:
         """Write what was held at the end of a shorter run, if that is no longer the end."""
-        if self._held is not None and self._held.step < self._total:
+        if self._held is not None and self._held[0].step < self._total:
             self._write_held()
 
     def on_step(self, step: int) -> int:
-        """Evaluate if it is due.
+        """Evaluate if it is due; returns as `Agent.learn` wants it, 0 after `evaluation.stop_after`.
 
         The last step is left to the evaluation after training, since an update may still follow it. Which one
         is the last, training alone knows: from the configured end on, an evaluation is held until a step
         follows. So a run that is made longer later has it where the longer run has it.
-
-        Args:
-            step: environment steps so far.
-
-        Returns:
-            The steps by which it is to be called again; 0 once the certificate has held for long enough
-            (`evaluation.stop_after`).
         """
         self._write_held()
         if self._next <= step:
             self._next += self._every * ((step - self._next) // self._every + 1)
             self._due = self._take_returns()
+            evaluation = self._evaluation(step, self._due)
             if step < self._total:
-                self._evaluate(step, self._due)
+                self._write(evaluation)
             else:
-                snapshot = self._agent.snapshot()
-                is_best = self.best.is_beaten_by(self._greedy_score(snapshot))
-                self._held = Held(step, snapshot, self._agent.model_file() if is_best else b"")
+                is_best = self.best.is_beaten_by(evaluation.greedy)
+                self._held = evaluation, self._agent.model_file() if is_best else b""
         if self._stop_after is not None and self.certificate.streak >= self._stop_after:
             return 0
         return self._next if self._held is None else step + 1
@@ -201,47 +181,55 @@ class LearningCurve:
         self._held = None  # of this step, as it was before the last update
         if self.newest is not None and step == self.newest.step:
             return self.newest
-        return self._evaluate(step, self._due.merged(self._take_returns()))
+        evaluation = self._evaluation(step, self._due.merged(self._take_returns()))
+        self._write(evaluation)
+        return evaluation
 
     def _write_held(self) -> None:
         if self._held is not None:
             held, self._held = self._held, None
-            self._evaluate(held.step, self._due, held)
+            self._write(*held)
 
     def _take_returns(self) -> Returns:
         return NO_EPISODES if self._envs is None else self._envs.take_returns()
 
-    def _evaluate(self, step: int, returns: Returns, held: Held | None = None) -> Evaluation:
-        started = clock()
-        snapshot, before = self._agent.snapshot() if held is None else held.snapshot, self.newest
+    def _evaluation(self, step: int, returns: Returns) -> Evaluation:
+        """Of the agent as it is now."""
+        started = time.perf_counter()
+        snapshot = self._agent.snapshot()
         if not (np.isfinite(snapshot.values).all() and np.isfinite(snapshot.sampled).all()):
             raise InputError(
                 f"training diverged: the agent's values are no finite numbers after {step} steps; "
                 "try a smaller learning rate"
             )
-        is_new = before is None or not np.array_equal(before.snapshot.values, snapshot.values)
-        self.newest = evaluation = Evaluation(step, snapshot, *self._scores(snapshot), returns)
-        self.certificate.update(step, evaluation.greedy.certified, is_new)
-        if self.best.is_beaten_by(evaluation.greedy):
-            content = self._agent.model_file() if held is None else held.model
-            self.best = BestModel(step, evaluation.greedy.shortfall, content)
-        self.seconds += clock() - started
-        for take in self.sinks:
-            take(evaluation)
+        evaluation = self._scored(step, snapshot, returns)
+        self.seconds += time.perf_counter() - started
         return evaluation
 
-    def _scores(self, snapshot: PolicySnapshot) -> tuple[Score, Score]:
-        """Of the greedy and of the sampled policy; the newest ones where a policy is the same."""
-        newest, greedy = self.newest, self._greedy_score(snapshot)
-        if newest is not None and np.array_equal(newest.snapshot.sampled, snapshot.sampled):
-            return greedy, newest.sampled
-        return greedy, self.evaluator.score(snapshot.sampled)
-
-    def _greedy_score(self, snapshot: PolicySnapshot) -> Score:
-        newest = self.newest
+    def _scored(self, step: int, snapshot: PolicySnapshot, returns: Returns) -> Evaluation:
+        """With the newest evaluation's scores where a policy is the same."""
+        newest, score = self.newest, self.evaluator.score
         if newest is not None and np.array_equal(newest.snapshot.greedy, snapshot.greedy):
-            return newest.greedy
-        return self.evaluator.score(snapshot.greedy_policy())
+            greedy = newest.greedy
+        else:
+            greedy = score(snapshot.greedy_policy())
+        if newest is not None and np.array_equal(newest.snapshot.sampled, snapshot.sampled):
+            sampled = newest.sampled
+        else:
+            sampled = score(snapshot.sampled)
+        return Evaluation(step, snapshot, greedy, sampled, returns)
+
+    def _write(self, evaluation: Evaluation, model: bytes | None = None) -> None:
+        """Take in an evaluation and hand it on; `model` is its model's file, None: as it is now."""
+        before, self.newest = self.newest, evaluation
+        values, step = evaluation.snapshot.values, evaluation.step
+        is_new = before is None or not np.array_equal(before.snapshot.values, values)
+        self.certificate.update(step, evaluation.greedy.certified, is_new)
+        if self.best.is_beaten_by(evaluation.greedy):
+            content = self._agent.model_file() if model is None else model
+            self.best = BestModel(step, evaluation.greedy.shortfall, content)
+        for take in self.sinks:
+            take(evaluation)
 
 
 def _snapshot(state: State) -> PolicySnapshot:
@@ -266,15 +254,14 @@ def write_row(log: AppendLog, evaluation: Evaluation) -> None:
     log.append(csv_text([*head, [row[name] for name in CURVE_COLUMNS]]).encode())
 
 
-def read_curve(log: AppendLog, columns: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-    """Read columns of the `curve.csv` of this process, (evaluations,) each, that have no empty field."""
-    rows = csv.DictReader(io.StringIO(log.content().decode(), newline=""))
-    found = np.array([[float(row[name]) for name in columns] for row in rows])
-    return dict(zip(columns, found.reshape(-1, len(columns)).T, strict=True))
+def read_curve(log: AppendLog) -> dict[str, NDArray[np.float64]]:
+    """Read the columns of this process's `curve.csv` that `evaluations.npz` has, (evaluations,) each."""
+    rows = list(csv.DictReader(io.StringIO(log.content().decode(), newline="")))
+    return {name: np.array([float(row[name]) for row in rows]) for name in NEEDED}
 
 
 def show_progress(progress: Progress, evaluation: Evaluation) -> None:
-    """Show how good the greedy policy is, next to the progress bar."""
+    """Show how good the greedy policy is, next to the progress."""
     greedy = evaluation.greedy
     note = f"regret {greedy.regret:.3g}, goal {greedy.outcome.goal:.0%}"
     progress.update(evaluation.step, note + (", certified optimal" if greedy.certified else ""))

@@ -6,8 +6,9 @@ not have to scale, in its Images tab: the policy while it develops, the others w
 
 from __future__ import annotations
 
+import contextlib
 import logging
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,13 +17,13 @@ from numpy.typing import NDArray
 
 from gridworld.agents import PolicySnapshot
 from gridworld.config.train import PICTURES, Picture, TrainConfig
-from gridworld.envs.rendering import Frame, fitting_cell_size
+from gridworld.envs.rendering import fitting_cell_size
 from gridworld.errors import InputError
 from gridworld.storage.serialization import State
 from gridworld.training.learning_curve import Evaluation
 from gridworld.training.tensorboard import EventWriter
 from gridworld.visualization.animation import Animation
-from gridworld.visualization.files import encode_gif, save
+from gridworld.visualization.files import encode_gif, encode_png, save
 from gridworld.visualization.picture import Draw, PolicyHistory, drawer
 from gridworld.world.evaluation import Evaluator
 
@@ -47,16 +48,7 @@ class _Subject:
 
 
 class Pictures:
-    """Draws evaluations.
-
-    Args:
-        config: the run's settings; `recording` and `logging` say what is drawn.
-        folder: that the files go to.
-        evaluator: the evaluator of the run's world.
-        visits: (S, A), the environments' own counts, which grow.
-        events: where TensorBoard's pictures go, if anywhere.
-        is_trusted: see `visualization.picture.Subject`.
-    """
+    """Draws evaluations, as the run's `recording` and `logging` say; `visits` (S, A) grow meanwhile."""
 
     def __init__(
         self,
@@ -74,17 +66,8 @@ class Pictures:
         self._shown_at: int | None = None  # the step of the newest policy in TensorBoard
         self._too_large: set[str] = set()
 
-    def write(self, evaluation: Evaluation) -> None:
-        """Keep the policy for the animation of learning; show it in TensorBoard if that is due."""
-        if self._history is not None:
-            self._history.add(evaluation.step, evaluation.snapshot)
-        every = self._config.logging.policy_map_every
-        if every and self._evaluations % every == 0:
-            self._show_development(evaluation)
-        self._evaluations += 1
-
     def get_state(self) -> State:
-        """What was kept and shown."""
+        """What was kept and shown; a picture is told once to be too large."""
         return {
             "history": None if self._history is None else self._history.get_state(),
             "evaluations": self._evaluations,
@@ -99,65 +82,62 @@ class Pictures:
         self._evaluations, self._shown_at = int(state["evaluations"]), state["shown_at"]
         self._too_large = set(state["too_large"])
 
+    def write(self, evaluation: Evaluation) -> None:
+        """Keep the policy for the animation of learning; show it in TensorBoard if that is due."""
+        if self._history is not None:
+            self._history.add(evaluation.step, evaluation.snapshot)
+        every = self._config.logging.policy_map_every
+        if every and self._evaluations % every == 0:
+            self._show_development(evaluation)
+        self._evaluations += 1
+
     def finish(self, evaluation: Evaluation) -> None:
         """Draw everything that is asked for, as training has ended with this evaluation."""
         if self._config.logging.policy_map_every and self._shown_at != evaluation.step:
             self._show_development(evaluation)
         subject, prepared = self._subject(evaluation, self._visits), dict[str, Draw]()
         for picture in PICTURES:
-            if getattr(self._config.recording, picture.setting):
-                self._attempt(picture.label, self._keep, picture, subject, prepared)
+            if not getattr(self._config.recording, picture.setting):
+                continue
+            with self._left_out_if_too_large(picture.label):
+                if picture.drawer not in prepared:
+                    prepared[picture.drawer] = drawer(picture.drawer)(subject)
+                draw = prepared[picture.drawer]
+                save(draw(None), self._folder / picture.file, self._config.recording.fps)
+                if picture.is_in_tensorboard and not picture.while_training:
+                    self._show(picture, draw, evaluation.step)
 
     def _show_development(self, evaluation: Evaluation) -> None:
         self._shown_at = evaluation.step
-        if self._events is None:
-            return
         # Without visits: an evaluation may be written some steps after its own, when they have grown.
         subject = self._subject(evaluation, np.zeros_like(self._visits))
         for picture in PICTURES:
-            if picture.while_training:
-                self._attempt(f"TensorBoard's {picture.name}", self._draw_and_show, picture, subject)
+            if picture.while_training and self._events is not None:
+                with self._left_out_if_too_large(f"TensorBoard's {picture.name}"):
+                    self._show(picture, drawer(picture.drawer)(subject), evaluation.step)
 
     def _subject(self, evaluation: Evaluation, visits: NDArray[np.int64]) -> _Subject:
-        snapshot, step = evaluation.snapshot, evaluation.step
-        return _Subject(
-            self._config, self._is_trusted, self._evaluator, snapshot, step, visits, self._history
-        )
+        of_run = self._config, self._is_trusted, self._evaluator
+        return _Subject(*of_run, evaluation.snapshot, evaluation.step, visits, self._history)
 
-    def _attempt(self, label: str, function: Callable[..., None], *arguments: object) -> None:
+    @contextlib.contextmanager
+    def _left_out_if_too_large(self, label: str) -> Iterator[None]:
         """A picture that cannot be drawn does not fail a run that is trained."""
         try:
-            function(*arguments)
+            yield
         except InputError as error:
             if label not in self._too_large:
                 self._too_large.add(label)
                 _log.warning("%s: %s is left out, %s", self._folder, label, error)
 
-    def _draw_and_show(self, picture: Picture, subject: _Subject) -> None:
-        draw = drawer(picture.drawer)(subject)
-        self._show(picture, self._for_tensorboard(picture, draw), subject.steps)
-
-    def _keep(self, picture: Picture, subject: _Subject, prepared: dict[str, Draw]) -> None:
-        """Write the file, and show it in TensorBoard where it has not been shown while training."""
-        if picture.drawer not in prepared:
-            prepared[picture.drawer] = drawer(picture.drawer)(subject)
-        draw = prepared[picture.drawer]
-        drawn = draw(None)
-        content = save(drawn, self._folder / picture.file, self._config.recording.fps)
-        if self._events is None or picture.while_training or not picture.is_in_tensorboard:
+    def _show(self, picture: Picture, draw: Draw, step: int) -> None:
+        if self._events is None:
             return
-        shown = self._for_tensorboard(picture, draw)
-        self._show(picture, shown, subject.steps, content if shown is drawn else None)
-
-    def _for_tensorboard(self, picture: Picture, draw: Draw) -> Frame | Animation:
         side = _IMAGES_TAB if picture.is_map else _TIME_SERIES_CARD
-        return draw(fitting_cell_size(self._evaluator.mdp, side))
-
-    def _show(self, picture: Picture, drawn: Frame | Animation, steps: int, gif: bytes | None = None) -> None:
-        assert self._events is not None
+        drawn = draw(fitting_cell_size(self._evaluator.mdp, side))
         tag = f"{_GROUP}/{picture.name}"
         if isinstance(drawn, Animation):
-            gif = encode_gif(drawn, self._config.recording.fps) if gif is None else gif
-            self._events.animation(tag, gif, drawn.size, steps)
+            encoded, size = encode_gif(drawn, self._config.recording.fps), drawn.size
         else:
-            self._events.image(tag, drawn, steps)
+            encoded, size = encode_png(drawn), (drawn.shape[1], drawn.shape[0])
+        self._events.image(tag, encoded, size, step)

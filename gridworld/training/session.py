@@ -1,26 +1,28 @@
 """One run's training, from its first step or from a checkpoint to its last file.
 
-What a checkpoint holds is in plain sight here: `Parts` has what continues from a state of its own, `LOGS` the
-files that grow while training and are cut back to the checkpoint, `CONTENT` all keys. The files that are
-written when training is over can be written again: a run that is killed there does so.
+What a checkpoint holds is in plain sight here: `Session._state` makes it, `CONTENT` has its keys, `LOGS` the
+files that grow while training and are cut back to the checkpoint. The files that are written when training is
+over can be written again: a run that is killed there does so.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 import math
 import shlex
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gridworld.agents import Agent, Learning, TrainingContext
+from gridworld.agents import Agent, Learning, family
 from gridworld.config.settings import privileges
 from gridworld.config.train import AUTO, TrainConfig
+from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.process.console import Progress, tell
 from gridworld.process.signals import StopRequest
@@ -29,10 +31,9 @@ from gridworld.run.checkpoints import Checkpoints, Pace
 from gridworld.run.folder import CURVE, EVENTS
 from gridworld.run.provenance import environment, identity
 from gridworld.run.summary import MOST_NAMED, Summary
-from gridworld.run.writer import NEEDED, RunWriter, write_evaluations
-from gridworld.storage.append_log import AppendLog
-from gridworld.storage.atomic_write import sync, write_array, write_bytes, write_json
-from gridworld.storage.serialization import State, fitting
+from gridworld.run.writer import RunWriter, write_evaluations
+from gridworld.storage.atomic_write import AppendLog, sync, write_bytes, write_json
+from gridworld.storage.serialization import State, fitting, npy_bytes
 from gridworld.training.learning_curve import (
     CHARTS,
     CurveScalars,
@@ -43,54 +44,16 @@ from gridworld.training.learning_curve import (
     write_row,
 )
 from gridworld.training.pictures import Pictures
+from gridworld.training.setup import make_context
 from gridworld.training.tensorboard import EventWriter, as_markdown, hparams
 from gridworld.training.together import Training
 from gridworld.world.evaluation import Evaluator
-from gridworld.world.mdp import EXACT
+from gridworld.world.mdp import EXACT, Mdp
 from gridworld.world.metrics import numbers, optimal_numbers
 
 CLOCK = {"train_seconds", "evaluation_seconds"}  # the summary's times
-
-_log = logging.getLogger("gridworld")
-
-
-class Learner:
-    """An agent, which takes its state when it begins to learn."""
-
-    def __init__(self, agent: Agent) -> None:
-        self.agent = agent
-        self.state: State | None = None
-
-    def get_state(self) -> State:
-        """The agent's, with its environments."""
-        return self.agent.get_state()
-
-    def set_state(self, state: State) -> None:
-        self.state = state
-
-
-@dataclass(frozen=True, eq=False)
-class Parts:
-    """What has a state: a field's name is the checkpoint's key, its type has `get_state` and `set_state`."""
-
-    agent: Learner
-    curve: LearningCurve
-    pictures: Pictures
-
-    def get_state(self) -> State:
-        """{name of the part: its state}."""
-        return {name: getattr(self, name).get_state() for name in PARTS}
-
-    def set_state(self, state: State) -> None:
-        """Continue from the state of a whole checkpoint."""
-        with fitting():
-            for name in PARTS:
-                getattr(self, name).set_state(state[name])
-
-
-PARTS = tuple(field.name for field in dataclasses.fields(Parts))
 LOGS = {"curve": CURVE, "events": EVENTS}  # that a checkpoint has marks of, and the pattern of their names
-FORMAT = 5  # of a checkpoint; a number more where a part's state has other keys or another meaning
+FORMAT = 6  # of a checkpoint; a number more where a part's state has other keys or another meaning
 CONTENT = {  # the type of each key of a checkpoint
     "format": int,
     "identity": str,
@@ -98,64 +61,65 @@ CONTENT = {  # the type of each key of a checkpoint
     "steps": int,
     "total_timesteps": int,
     "seconds": float,
-    **dict.fromkeys(PARTS, dict),
+    "agent": dict,
+    "curve": dict,
+    "pictures": dict,
     "marks": dict,
 }
+OnBuilt = Callable[[Agent], None]
+
+_log = logging.getLogger("gridworld")
+
+
+def ignore(agent: Agent) -> None:
+    """No-op `OnBuilt`."""
 
 
 class Session:
-    """The training of one run, new or continued; nothing is written before `run`.
+    """The training of one run, new or continued from a checkpoint's `state`; nothing is written before `run`.
 
-    Args:
-        config: the run's settings.
-        folder: the run's.
-        evaluator: the evaluator of its world.
-        agent: ready to learn.
-        context: where the agent learns.
-        events: the event file, if there is to be one.
-        state: the content of a checkpoint to continue from; None: from the start.
-        is_trusted: whether the environment that the settings name may be made.
-
-    Raises:
-        StateError: for a state that does not fit.
+    `is_trusted`: the environment that the settings name may be made, which runs its code. `on_built` takes
+    the agent before it learns. A state that does not fit is a `StateError`.
     """
 
     def __init__(
         self,
         config: TrainConfig,
         folder: Path,
-        evaluator: Evaluator,
-        agent: Agent,
-        context: TrainingContext,
-        events: EventWriter | None,
-        state: State | None,
+        mdp: Mdp,
         is_trusted: bool,
+        state: State | None = None,
+        on_built: OnBuilt = ignore,
     ) -> None:
-        self._config, self._events = config, events
-        self._evaluator, self._visits = evaluator, context.envs.visits
-        self._is_new = state is None
-        self._curve_mark = None if state is None else state["marks"]["curve"]
-        self.reached = 0 if state is None else int(state["steps"])  # environment steps
+        self._config, self._continued_from = config, state
+        self._evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
+        self._events: EventWriter | None = None
+        if config.logging.tensorboard:
+            self._events = EventWriter(folder, None if state is None else state["marks"]["events"])
+        observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
+        write_scalars = None if self._events is None else self._events.scalars
+        context = make_context(config, mdp, observation, write_scalars)
+        self._agent = family(config.agent).build(config.agent, context)
+        on_built(self._agent)
+        self._visits = context.envs.visits
+        self._curve = LearningCurve(self._evaluator, self._agent, config, context.envs)
+        self._pictures = Pictures(config, folder, self._evaluator, self._visits, self._events, is_trusted)
+        self.reached, seconds = 0, 0.0  # environment steps; spent on them
         self.checkpoints = Checkpoints(folder)
-        self.checkpoints.newest = None if state is None else self.reached
-        self._origin = {
-            "identity": identity(config, evaluator.mdp.text()),
-            "environment": environment(config.agent),
-        }
-        self._pace = Pace(self._checkpoint_every(agent), self.reached)
-        self._stop = StopRequest()
-        self._started = clock() - (0.0 if state is None else float(state["seconds"]))
-        self._parts = Parts(
-            Learner(agent),
-            LearningCurve(evaluator, agent, config, envs=context.envs),
-            Pictures(config, folder, evaluator, self._visits, events, is_trusted),
-        )
         if state is not None:
-            self._parts.set_state(state)
+            with fitting():
+                self._curve.set_state(state["curve"])
+                self._pictures.set_state(state["pictures"])
+                self.reached, seconds = int(state["steps"]), float(state["seconds"])
+            self.checkpoints.newest = self.reached
+        self._origin = {"identity": identity(config, mdp.text()), "environment": environment(config.agent)}
+        self._pace = Pace(self._checkpoint_every(), self.reached)
+        self._stop = StopRequest()
+        self._started = clock() - seconds
 
-    def _checkpoint_every(self, agent: Agent) -> int | str | None:
+    def _checkpoint_every(self) -> int | str | None:
         every = self._config.checkpoint.every
-        if every is not None and (unknown := agent.class_without_state()) is not None:
+        if every is not None and (unknown := self._agent.class_without_state()) is not None:
             tell(f"checkpoints: none, since {unknown} does not define get_state and set_state")
             return None
         return every
@@ -172,7 +136,13 @@ class Session:
             with self._stop.listening():
                 self._begin()
                 self._stop.patient = not self._pace.never
-                yield self._learning()
+                yield Learning(
+                    self._agent,
+                    self._config.total_timesteps,
+                    self._on_step,
+                    None if self._pace.never else self._on_safe_point,
+                    None if self._continued_from is None else self._continued_from["agent"],
+                )
                 self._stop.patient = False
                 self._stop.obey()
                 summary = self._finish()
@@ -183,38 +153,32 @@ class Session:
 
     def _open(self, run: RunWriter) -> None:
         """Open the curve's file, cut back to the state, and the rest that takes evaluations."""
-        config, events, curve = self._config, self._events, self._parts.curve
+        config, events, state = self._config, self._events, self._continued_from
         self._run = run
-        self._curve_log = AppendLog(run.curve_file, self._curve_mark)
+        self._curve_log = AppendLog(run.curve_file, None if state is None else state["marks"]["curve"])
         label = f"{config.agent.name} on {self._evaluator.mdp.name}"
         self._progress = Progress(config.total_timesteps, label, config.logging.progress)
-        curve.sinks.append(partial(write_row, self._curve_log))
+        self._curve.sinks.append(partial(write_row, self._curve_log))
         if events is not None:
-            curve.sinks.append(CurveScalars(events, self._evaluator).write)
-        curve.sinks += [partial(show_progress, self._progress), self._parts.pictures.write]
+            self._curve.sinks.append(CurveScalars(events, self._evaluator).write)
+        self._curve.sinks += [partial(show_progress, self._progress), self._pictures.write]
 
     def _begin(self) -> None:
-        if not self._is_new:
-            self._parts.curve.write_held_of_shorter_run()
+        if self._continued_from is not None:
+            self._curve.write_held_of_shorter_run()
             return
         if self._events is not None:
             self._events.hparams(hparams(self._config))
             self._events.charts("greedy and sampled policy beside the optimum", CHARTS)
             self._events.text("run/command", f"    {shlex.join(self._run.manifest['command'])}", 0)
             self._events.text("run/settings", as_markdown(dataclasses.asdict(self._config)), 0)
-        self._parts.curve.evaluate(0)
-
-    def _learning(self) -> Learning:
-        learner = self._parts.agent
-        state, learner.state = learner.state, None  # it may be large
-        on_safe_point = None if self._pace.never else self._on_safe_point
-        return Learning(learner.agent, self._config.total_timesteps, self._on_step, on_safe_point, state)
+        self._curve.evaluate(0)
 
     def _on_step(self, steps: int) -> int:
         self.reached = steps
         if self._pace.never:  # else a safe point will come
             self._stop.obey()
-        return self._parts.curve.on_step(steps)
+        return self._curve.on_step(steps)
 
     def _on_safe_point(self, steps: int) -> None:
         """Save if it is time for it; nothing is half done here."""
@@ -223,51 +187,55 @@ class Session:
         if not (asked or is_last or self._pace.is_due(steps)) or steps == self.checkpoints.newest:
             self._stop.obey()
             return
-        self._stop.take_time()
-        started = clock()
+        started = time.perf_counter()
         try:
             self._save(steps, is_last)
         except OSError as error:
             _log.warning("%s: no checkpoint after step %s, %s", self._run.folder, steps, error.strerror)
-        self._pace.took(steps, clock() - started)
+        self._pace.took(steps, time.perf_counter() - started)
         self._stop.obey()
 
     def _save(self, steps: int, is_last: bool) -> None:
         # A short run is over before a disk has anything, and waits for it at its end only (see `_settle`).
         durable = not is_last or self.checkpoints.newest is not None
-        logs = {"curve": self._curve_log, "events": None if self._events is None else self._events.log}
         if durable:
-            for log in logs.values():
-                if log is not None:
-                    log.sync()
+            self._curve_log.sync()
+            if self._events is not None:
+                self._events.log.sync()
             self._run.settle()
-        state = {
+        self.checkpoints.save(steps, self._state(steps), durable, small=is_last)
+
+    def _state(self, steps: int) -> State:
+        return {
             "format": FORMAT,
             **self._origin,
             "steps": steps,
             "total_timesteps": self._config.total_timesteps,
             "seconds": clock() - self._started,
-            **self._parts.get_state(),
-            "marks": {name: None if log is None else log.mark() for name, log in logs.items()},
+            "agent": self._agent.get_state(),
+            "curve": self._curve.get_state(),
+            "pictures": self._pictures.get_state(),
+            "marks": {
+                "curve": self._curve_log.mark(),
+                "events": None if self._events is None else self._events.log.mark(),
+            },
         }
-        self.checkpoints.save(steps, state, durable, small=is_last)
 
     def _finish(self) -> Summary:
-        seconds = clock() - self._started
-        run, parts = self._run, self._parts
-        last = parts.curve.evaluate(self.reached)
-        write_bytes(run.model_file, parts.agent.agent.model_file())
-        write_bytes(run.best_model_file, parts.curve.best.content)
+        seconds, run = clock() - self._started, self._run
+        last = self._curve.evaluate(self.reached)
+        write_bytes(run.model_file, self._agent.model_file())
+        write_bytes(run.best_model_file, self._curve.best.content)
         self._write_evaluations()
-        write_array(run.visits_file, self._visits)
-        summary = summarise(self._config, parts.curve, last, seconds)
+        write_bytes(run.visits_file, npy_bytes(self._visits))
+        summary = summarise(self._config, self._curve, last, seconds)
         write_json(run.summary_file, _as_json(summary))
         if self._events is not None:
             timeless = {key: value for key, value in summary.items() if key not in CLOCK}
             self._events.text("run/summary", as_markdown(timeless), last.step)
         with ThreadPoolExecutor(1) as disk:  # pictures are drawn while it is waited for
             settling = disk.submit(self._settle)
-            parts.pictures.finish(last)
+            self._pictures.finish(last)
         settling.result()
         return summary
 
@@ -279,25 +247,20 @@ class Session:
             sync([], self.checkpoints.folder)
 
     def _write_evaluations(self) -> None:
-        if self._parts.curve.newest is not None:
-            write_evaluations(self._run.evaluations_file, read_curve(self._curve_log, NEEDED))
+        self._curve_log.check()
+        if self._curve.newest is not None:
+            write_evaluations(self._run.evaluations_file, read_curve(self._curve_log))
 
     def _close(self, succeeded: bool) -> None:
-        """Close what is open; on a full disk, without a last word."""
-        closing: list[Callable[[], None]] = [self._curve_log.close, self._progress.close]
+        """Close what is open; after a failure, which is on its way up, without a word of further ones."""
+        closing: list[Callable[[], None]] = [] if succeeded else [self._write_evaluations]
+        closing += [self._curve_log.close, self._progress.close]
         if self._events is not None:
             events = self._events
-            closing += [lambda: events.end_session(succeeded), lambda: events.log.sync(), events.close]
-        if not succeeded:
-            closing.insert(0, self._write_evaluations)
-        failures: list[Exception] = []
+            closing += [partial(events.end_session, succeeded), lambda: events.log.sync(), events.close]
         for close in closing:
-            try:
+            with contextlib.nullcontext() if succeeded else contextlib.suppress(OSError, InputError):
                 close()
-            except (OSError, InputError) as error:
-                failures.append(error)
-        if succeeded and failures:
-            raise failures[0]
 
 
 def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, seconds: float) -> Summary:

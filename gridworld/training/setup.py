@@ -20,15 +20,7 @@ _QUICKLY_SOLVED = 6000  # outcomes of all states and actions
 
 
 def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = compiled) -> Mdp:
-    """Check everything that can be checked without the agent's library.
-
-    Args:
-        config: the settings of a run.
-        world: makes the world, or returns one that several runs share.
-
-    Returns:
-        The run's world.
-    """
+    """Check everything that can be checked without the agent's library; returns the run's world."""
     check(config)
     family(config.agent).check(config)
     mdp = world(config.env)
@@ -51,27 +43,23 @@ def make_context(
     observation: ObservationTable,
     write_scalars: WriteScalars | None = None,
 ) -> TrainingContext:
-    """Make `config.n_envs` fresh environments, and what else an agent is built from.
-
-    `write_scalars` takes the agent's own training metrics.
-    """
+    """Make `config.n_envs` fresh environments, and what else an agent is built from."""
     share = config.exploring_starts
-    envs = StatisticsVectorEnv(
-        config.n_envs,
-        exploration_bonus=config.exploration_bonus,
-        max_episode_steps=config.env.step_limit(mdp),
-        mdp=_with_exploring_starts(mdp, share) if share else mdp,
-        stratified=config.stratified_draws,
-    )
     return TrainingContext(
-        envs,
-        observation,
-        config.seed,
-        config.device,
-        config.threads,
-        write_scalars,
-        config.callbacks,
-        config.observation.policy_kwargs(),
+        envs=StatisticsVectorEnv(
+            config.n_envs,
+            exploration_bonus=config.exploration_bonus,
+            max_episode_steps=config.env.step_limit(mdp),
+            mdp=_with_exploring_starts(mdp, share) if share else mdp,
+            stratified=config.stratified_draws,
+        ),
+        observation=observation,
+        seed=config.seed,
+        device=config.device,
+        threads=config.threads,
+        write_scalars=write_scalars,
+        callbacks=config.callbacks,
+        features=config.observation.policy_kwargs(),
     )
 
 

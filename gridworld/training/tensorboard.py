@@ -29,12 +29,10 @@ from tensorboard.plugins.text import metadata as text_metadata
 
 from gridworld.config.settings import ON_RESULT, flat, with_effects
 from gridworld.config.train import TrainConfig
-from gridworld.envs.rendering import Frame
 from gridworld.errors import InputError
 from gridworld.process.memory_budget import check_memory
-from gridworld.storage.append_log import AppendLog
+from gridworld.storage.atomic_write import AppendLog
 from gridworld.storage.safe_read import open_ordinary
-from gridworld.visualization.files import encode_png
 
 HParamValue = bool | float | str | None
 
@@ -60,12 +58,7 @@ def as_markdown(content: Mapping[str, Any]) -> str:
 
 
 class EventWriter:
-    """Writes one event file, which is opened when it is first needed. Steps are environment steps.
-
-    Args:
-        folder: where the file is.
-        mark: where a file ended that is to be continued, see `storage.append_log`; None: a new one.
-    """
+    """Writes one event file, new or continued from its `mark`, which is opened when it is first needed."""
 
     def __init__(self, folder: Path, mark: dict[str, Any] | None = None) -> None:
         self._folder, self._mark = folder, mark
@@ -85,13 +78,11 @@ class EventWriter:
         """Write one event with a value for every tag."""
         self._add([{"tag": tag, "simple_value": value} for tag, value in values.items()], step)
 
-    def image(self, tag: str, frame: Frame, step: int) -> None:
-        """Write a picture as PNG."""
-        self._image(tag, encode_png(frame), (frame.shape[1], frame.shape[0]), step)
-
-    def animation(self, tag: str, gif: bytes, size: tuple[int, int], step: int) -> None:
-        """Write an encoded GIF, `size` pixels wide and high; TensorBoard's Images tab plays it."""
-        self._image(tag, gif, size, step)
+    def image(self, tag: str, encoded: bytes, size: tuple[int, int], step: int) -> None:
+        """Write an encoded PNG or GIF, `size` pixels wide and high; TensorBoard's Images tab plays it."""
+        width, height = size
+        image = {"height": height, "width": width, "colorspace": 3, "encoded_image_string": encoded}
+        self._add([{"tag": tag, "image": image}], step)
 
     def hparams(self, values: Mapping[str, HParamValue]) -> None:
         """Write the run's entry in the HParams table; its metrics are scalar tags of this same run.
@@ -144,11 +135,6 @@ class EventWriter:
         tensor = {"dtype": DT_STRING, "string_val": [content], "tensor_shape": {}}
         shown_by = {"plugin_data": {"plugin_name": plugin}}
         self._add([{"tag": tag, "metadata": shown_by, "tensor": tensor}], step)
-
-    def _image(self, tag: str, encoded: bytes, size: tuple[int, int], step: int) -> None:
-        width, height = size
-        image = {"height": height, "width": width, "colorspace": 3, "encoded_image_string": encoded}
-        self._add([{"tag": tag, "image": image}], step)
 
     def _session(self, tag: str, **content: Any) -> None:
         data = plugin_data_pb2.HParamsPluginData(version=metadata.PLUGIN_DATA_VERSION, **content)

@@ -12,11 +12,9 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from gridworld.agents import Agent, family
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import EnvConfig, compiled
-from gridworld.envs.observations import make_observation
-from gridworld.errors import InputError, MachineError, reason
+from gridworld.errors import FolderLostError, InputError, MachineError, reason
 from gridworld.process.console import recorded_command_line, tell
 from gridworld.process.signals import Interrupted
 from gridworld.run.folder import MANIFEST, RunFolder, shown
@@ -25,27 +23,19 @@ from gridworld.run.summary import Summary, interruption_text
 from gridworld.run.writer import RunWriter, TrainLog
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.serialization import State, StateError
-from gridworld.training.session import Session
-from gridworld.training.setup import check_settings, make_context, notes
-from gridworld.training.tensorboard import EventWriter
-from gridworld.training.together import Training, run_alone
-from gridworld.world.evaluation import Evaluator
+from gridworld.training.session import OnBuilt, Session, ignore
+from gridworld.training.setup import check_settings, notes
+from gridworld.training.together import Training, alone
 from gridworld.world.mdp import Mdp
 
-OnBuilt = Callable[[Agent], None]
 
-
-def ignore(agent: Agent) -> None:
-    """No-op `OnBuilt`."""
-
-
-def train(
+def training(
     config: TrainConfig,
     folder: Path,
     overrides: list[str],
     world: Callable[[EnvConfig], Mdp] = compiled,
     on_built: OnBuilt = ignore,
-) -> Summary:
+) -> Training[Summary]:
     """Train, evaluate and record as configured.
 
     Args:
@@ -60,17 +50,6 @@ def train(
         MachineError: where files cannot be written.
         Interrupted: by a signal, after a checkpoint.
     """
-    return run_alone(training(config, folder, overrides, world, on_built))
-
-
-def training(
-    config: TrainConfig,
-    folder: Path,
-    overrides: list[str],
-    world: Callable[[EnvConfig], Mdp] = compiled,
-    on_built: OnBuilt = ignore,
-) -> Training[Summary]:
-    """The same as a generator, for `run_together`."""
     with TrainLog() as log:
         mdp = check_settings(config, world)
         for note in notes(config, mdp) if config.logging.progress else ():
@@ -83,6 +62,9 @@ def training(
         return (yield from carry_out(config, folder, mdp, begin, log, world is compiled, on_built=on_built))
 
 
+train = alone(training)
+
+
 def carry_out(
     config: TrainConfig,
     folder: Path,
@@ -93,29 +75,17 @@ def carry_out(
     state: State | None = None,
     on_built: OnBuilt = ignore,
 ) -> Training[Summary]:
-    """Train from the start or continue from a checkpoint's state, with settings that were checked.
-
-    `begin` writes the manifest, once everything is built. `is_trusted`: the environment that the settings
-    name may be made, which runs its code.
-    """
-    observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
-    evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
-    events = None
-    if config.logging.tensorboard:
-        events = EventWriter(folder, None if state is None else state["marks"]["events"])
-    context = make_context(config, mdp, observation, None if events is None else events.scalars)
-    agent = family(config.agent).build(config.agent, context)
-    on_built(agent)
-    run = None
+    """Train from the start or continue from a state, see `Session`; `begin` writes the manifest."""
+    run = session = None
     try:
-        session = Session(config, folder, evaluator, agent, context, events, state, is_trusted)
+        session = Session(config, folder, mdp, is_trusted, state, on_built)
         run = begin()
         log.open(run.log_file)
         if state is None:
             log.add(f"begins: {shlex.join(recorded_command_line())}")
         summary = yield from session.run(run)
     except BaseException as error:
-        if run is not None:
+        if run is not None and session is not None and not isinstance(error, FolderLostError):
             with contextlib.suppress(OSError):  # nothing can be written perhaps
                 _note_end(run, log, error, session.progress())
         if isinstance(error, StateError):

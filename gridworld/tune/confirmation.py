@@ -14,8 +14,6 @@ import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +28,7 @@ from gridworld.report import statistics
 from gridworld.report.tables import number, steps_up_to
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import find_run
-from gridworld.storage.atomic_write import check_no_links, make_inside, names_inside, remove_inside
+from gridworld.storage.atomic_write import check_no_links, inside, remove_path
 from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.job_table import FAILED, JobTable
 from gridworld.training.together import Training, run_together
@@ -135,14 +133,14 @@ class HeldOutRuns:
     runs: tuple[HeldOutRun, ...]
 
     def __call__(self, ask: Ask) -> bool:
-        for result in run_together([partial(_run, run) for run in self.runs]):
+        for result in run_together([_run(run) for run in self.runs]):
             if isinstance(result, Exception):
                 raise result
         return True
 
 
 def _run(run: HeldOutRun) -> Training[None]:
-    make_inside(run.folder.parents[1], CONFIRM, run.folder.name)
+    inside(run.folder.parents[1], CONFIRM, run.folder.name).mkdir(parents=True, exist_ok=True)
     try:
         yield from run_in_sweep(run.config, run.folder, [], stop_at_failure=False)
     except JobError as error:
@@ -164,17 +162,18 @@ def held_out_runs(folder: Path, name: str, config: TrainConfig, seeds: Sequence[
 
 def prepare(folder: Path, runs: Sequence[HeldOutRun]) -> None:
     """Make the runs' folder in the study's, and remove damaged runs and those of an earlier winner."""
-    make_inside(folder, CONFIRM)
+    there = inside(folder, CONFIRM)
+    there.mkdir(parents=True, exist_ok=True)
     names = {run.folder.name for run in runs}
     for name in names:
         check_no_links(folder, CONFIRM, name)
-    for name in names_inside(folder, CONFIRM):
-        if fnmatchcase(name, "*,seed=*") and name not in names:
-            remove_inside(folder, CONFIRM, name)
+    for path in there.glob("*,seed=*"):
+        if path.name not in names:
+            remove_path(path)
     for run in runs:
         if damaged := _damage(run.folder):
             tell(f"{'; '.join(damaged)}; it is run again")
-            remove_inside(folder, CONFIRM, run.folder.name)
+            remove_path(run.folder)
 
 
 def _damage(folder: Path) -> list[str]:

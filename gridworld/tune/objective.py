@@ -136,7 +136,7 @@ class Trials:
     def __call__(self, ask: Ask) -> list[Outcome]:
         places = range(len(self.objective.seeds))
         trials = [_Trial(self.objective, number, values, ask) for number, values in self.values.items()]
-        run_together([partial(trial.training, place) for trial in trials for place in places])
+        run_together([trial.training(place) for trial in trials for place in places])
         return [trial.outcome or Outcome() for trial in trials]
 
 
@@ -219,7 +219,7 @@ class FinalRuns:
     runs: Mapping[str, tuple[Values, int]]
 
     def __call__(self, ask: Ask) -> dict[str, SeedScore | str]:
-        found = run_together([partial(self._run, *run) for run in self.runs.values()])
+        found = run_together([self._run(*run) for run in self.runs.values()])
         told = [reason(result) if isinstance(result, Exception) else result for result in found]
         return dict(zip(self.runs, told, strict=True))
 

@@ -16,12 +16,12 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from gridworld.config.compose import without_hydra
+from gridworld.config.compose import to_config
 from gridworld.config.fields import Effect
 from gridworld.config.recipe_file import IN_A_STUDY, overrides
 from gridworld.config.settings import ON_RESULT, with_effects
 from gridworld.config.train import TrainConfig
-from gridworld.storage.atomic_write import make_inside, write_text
+from gridworld.storage.atomic_write import inside, write_text
 from gridworld.tune.study_spec import ConfFolders, compose_in
 
 EXPERIMENT, _FILE = IN_A_STUDY
@@ -34,17 +34,18 @@ def write_recipe(
 ) -> Path:
     """Write the recipe, and check that it composes to `config` again."""
     chosen = [f"{group}={choice}" for group, choice in choices.items()]
-    bare = without_hydra(compose_in(folders, "train", chosen))
+    bare = to_config(compose_in(folders, "train", chosen))
     values = OmegaConf.create(_difference(_relevant(bare), _relevant(config)))
     lines = ["# @package _global_", f"# {about}", "defaults:"]
     lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
     lines += ["  - _self_", ""]
-    path = make_inside(folder, EXPERIMENT) / _FILE
+    path = inside(folder, EXPERIMENT) / _FILE
+    path.parent.mkdir(exist_ok=True)
     own = dataclasses.replace(folders, own=(*folders.own, folder))
     text = OmegaConf.to_yaml(values) if values else ""
     write_text(path, "\n".join([*lines, text]), durable=True)
-    again = without_hydra(compose_in(own, "train", [f"experiment={RECIPE}"]))
-    for found in (again, without_hydra(compose_in(own, "train", overrides(path, trust=True)))):
+    again = to_config(compose_in(own, "train", [f"experiment={RECIPE}"]))
+    for found in (again, to_config(compose_in(own, "train", overrides(path, trust=True)))):
         assert _relevant(found) == _relevant(config), f"{path} does not say what the winner is"
     return path
 

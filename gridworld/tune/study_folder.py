@@ -30,7 +30,7 @@ from gridworld.process.console import recorded_command_line
 from gridworld.report.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
 from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, alone_in, check_writable
 from gridworld.run.provenance import versions
-from gridworld.storage.atomic_write import check_no_links, make_folder, noted, tidy, write_json, write_text
+from gridworld.storage.atomic_write import check_no_links, make_folder, tidy, write_json, write_text
 from gridworld.storage.csv_text import csv_text
 from gridworld.storage.safe_read import LARGEST_CSV, file_sha256, read_sealed, sealed
 from gridworld.tune.confirmation import CONFIRM
@@ -57,10 +57,8 @@ def check_study_folder(folder: Path) -> None:
 def at_work_in(folder: Path, is_shared: bool = False) -> Iterator[None]:
     """Make the folder and hold it, unless others share the study; one that stays empty is removed."""
     make_folder(folder)
-    if is_shared:
-        (folder / LOCK).touch()
     try:
-        with noted(folder / LOCK) if is_shared else alone_in(folder):
+        with contextlib.nullcontext() if is_shared else alone_in(folder):
             if not is_shared:
                 tidy(folder)
             yield

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from gridworld.config.compose import compose_whole, register_schemas, search_path, slug, without_hydra
+from gridworld.config.compose import compose_whole, register_schemas, search_path, slug, to_config
 from gridworld.config.recipe_file import CHOSEN, with_recipe
 from gridworld.config.sweep import TuneConfig
 from gridworld.config.train import AUTO, TrainConfig, check_bounds
@@ -96,7 +96,7 @@ def compose_study(folders: ConfFolders, words: Sequence[str]) -> StudySpec:
         choices = {group: str(whole.hydra.runtime.choices[group]) for group in CHOSEN}
         if choices["preset"] == AUTO:  # nothing was chosen, and nothing is to be for the winner
             choices["preset"] = "none"
-        base = without_hydra(whole)
+        base = to_config(whole)
         if base.recipe is None:  # the pair has none
             choices["tuned"] = "none"
         if not any(override.key_or_group == "tune" for override in of_search):
@@ -104,11 +104,7 @@ def compose_study(folders: ConfFolders, words: Sequence[str]) -> StudySpec:
         search = compose_in(folders, "tune", of_search)
         space_name = str(search.hydra.runtime.choices["tune"])
         settings = cast(TuneConfig, OmegaConf.to_object(search.tune))
-    except YAMLError as error:
-        mark: Any = getattr(error, "problem_mark", None)
-        where = f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}" if mark else "a yaml file"
-        raise InputError(f"{where}: cannot be read ({getattr(error, 'problem', None) or error})") from None
-    except (HydraException, OmegaConfBaseException) as error:
+    except (YAMLError, HydraException, OmegaConfBaseException) as error:
         raise InputError(sentence(error)) from None
     _check(settings)
     settings = _completed(settings, choices["agent"], base)

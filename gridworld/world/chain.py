@@ -39,30 +39,26 @@ _STEPS_AT_ONCE = 32  # of an episode, before looking whether it can still go on
 def in_one_thread() -> Iterator[None]:
     """OpenBLAS in one thread, however many the machine has; another library is left as it is.
 
-    It divides products and systems of a hundred states or more among threads. That changes their last bits,
-    so that a run's numbers would depend on the number of cores. And its threads wait for one another at work:
-    where other processes need the cores, for ten times the processor time.
+    Systems divided among threads have other last bits with another number of cores, and the threads wait for
+    one another at work.
     """
     count, limit = _openblas()
     before = count()
-    if before != 1:
-        limit(1)
+    limit(1)
     try:
         yield
     finally:
-        if before != 1:
-            limit(before)
+        limit(before)
 
 
 @functools.cache
 def _openblas() -> tuple[Callable[[], int], Callable[[int], Any]]:
     """OpenBLAS's functions that tell and set the number of its threads."""
     library: Any = ctypes.CDLL(np.linalg._umath_linalg.__file__)
-    for prefix in ("scipy_openblas", "openblas"):
-        for suffix in ("64_", "_64", ""):
-            tell, limit = (f"{prefix}_{verb}_num_threads{suffix}" for verb in ("get", "set"))
-            if hasattr(library, tell) and hasattr(library, limit):
-                return getattr(library, tell), getattr(library, limit)
+    for prefix, suffix in itertools.product(("scipy_openblas", "openblas"), ("64_", "_64", "")):
+        tell, limit = (f"{prefix}_{verb}_num_threads{suffix}" for verb in ("get", "set"))
+        if hasattr(library, tell) and hasattr(library, limit):
+            return getattr(library, tell), getattr(library, limit)
     return (lambda: 1), (lambda threads: None)
 
 
@@ -83,9 +79,8 @@ class Evaluation:
 
     value: FloatArray  # (S,), V_π = E Σ γ^t r_t
     scale: FloatArray  # (S,), E Σ γ^t |r_t|, what a relative error is relative to
-    slope: FloatArray | None = (
-        None  # (S,), dV_π/dγ = E Σ t γ^(t-1) r_t: of equal values, the sooner is smaller
-    )
+    # (S,), dV_π/dγ = E Σ t γ^(t-1) r_t: of equal values, the sooner is smaller
+    slope: FloatArray | None = None
     slope_scale: FloatArray | None = None  # (S,), the same of |r_t|
 
 
@@ -97,9 +92,7 @@ class Chain:
         self.policy = check_policy(mdp, policy)  # (S, A), rows sum to 1
         self._weight = self.policy[:, :, None] * mdp.probability  # (S, A, K)
         self.reward: FloatArray = (self._weight * mdp.reward).sum(axis=(1, 2))  # (S,), r_π
-        self.transition = (
-            self._transition()
-        )  # (S, S), P_π, a numpy array, or in large worlds a scipy CSR array
+        self.transition = self._transition()  # (S, S), P_π, numpy, or in large worlds a scipy CSR array
 
     def _transition(self) -> Any:
         size, weight = self.mdp.num_states, self._weight
@@ -187,12 +180,12 @@ class Chain:
         return visits
 
     def endless_states(self) -> IntArray:
-        """(n,), ascending, where an episode may walk for ever: of a deterministic policy its cycle."""
-        mdp, taken = self.mdp, self._weight > 0
-        reached = steps_from(mdp.start_states, mdp.next_state, taken) >= 0
-        states: IntArray = np.flatnonzero(reached & ~can_reach(mdp, taken, mdp.terminal))
+        """(n,), ascending, where an episode may go on for ever: of a deterministic policy its cycle."""
+        mdp = self.mdp
+        reached = steps_from(mdp.start_states, mdp.next_state, self._taken) >= 0
+        states: IntArray = np.flatnonzero(reached & ~can_reach(mdp, self._taken, mdp.terminal))
         while True:  # what lies on the way into a cycle has no predecessor here and drops out
-            following = np.unique(mdp.next_state[states][taken[states]])
+            following = np.unique(mdp.next_state[states][self._taken[states]])
             if following.size == states.size:
                 return states
             states = following
@@ -205,7 +198,10 @@ class Chain:
         sums = np.zeros_like(right)
         playing = ~self.mdp.absorbing
         if gamma == 1:
-            sums[self._growing(right)] = np.inf
+            for column, collected in zip(sums.T, right.T, strict=True):
+                paying = np.unique(self._recurrent[(self._recurrent > 0) & (collected > 0)])
+                if paying.size:
+                    column[can_reach(self.mdp, self._taken, np.isin(self._recurrent, paying))] = np.inf
             playing = playing & ~(self._recurrent > 0) & np.isfinite(sums).all(axis=1)
         states = np.flatnonzero(playing)
         if states.size:
@@ -214,22 +210,17 @@ class Chain:
             sums[states] = factor(gamma * self.transition[states][:, states], leak)(right[states])
         return sums
 
-    def _growing(self, right: FloatArray) -> BoolArray:
-        """(S, columns), states from which a column is collected for ever with some probability."""
-        growing = np.zeros(right.shape, dtype=np.bool_)
-        for column, collected in zip(growing.T, right.T, strict=True):
-            paying = np.unique(self._recurrent[(self._recurrent > 0) & (collected > 0)])
-            if paying.size:
-                column[:] = can_reach(self.mdp, self._weight > 0, np.isin(self._recurrent, paying))
-        return growing
+    @cached_property
+    def _taken(self) -> BoolArray:
+        """(S, A, K), the outcomes that the policy may have."""
+        return np.asarray(self._weight > 0)
 
     @cached_property
     def _recurrent(self) -> IntArray:
         """(S,), a number from 1 on for each class of states that it never leaves, 0 for all other states."""
         recurrent = np.zeros(self.mdp.num_states, dtype=np.int64)
-        endless = np.flatnonzero(
-            ~self.mdp.absorbing & ~can_reach(self.mdp, self._weight > 0, self.mdp.terminal)
-        )
+        ends = can_reach(self.mdp, self._taken, self.mdp.terminal)
+        endless = np.flatnonzero(~self.mdp.absorbing & ~ends)
         if endless.size:
             from scipy.sparse import coo_array
             from scipy.sparse.csgraph import connected_components
@@ -265,8 +256,7 @@ def discounted_visits(chain: Chain, gamma: float, stops: BoolArray) -> FloatArra
         from scipy.sparse import eye_array
         from scipy.sparse.linalg import spsolve
 
-        matrix = (eye_array(len(going)) - ahead[:, going].T).tocsc()
-        visits[going] = spsolve(matrix, start[going])
+        visits[going] = spsolve((eye_array(len(going)) - ahead[:, going].T).tocsc(), start[going])
     visits[stops] += (ahead.T @ visits[going])[stops]
     visits[visits < 0] = 0.0  # rounding
     return visits
@@ -398,13 +388,11 @@ def factor(weights: Any, leak: FloatArray) -> Callable[[FloatArray], FloatArray]
     weights.eliminate_zeros()
     matrix = diags_array(leak + weights.sum(axis=1), format="csr") - weights
     try:
-        factors = splu(
-            matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
-        is_accurate = np.abs(factors.solve(leak) - 1).max() <= _ACCURACY
+        symmetric = {"SymmetricMode": True}
+        factors = splu(matrix.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=symmetric)
+        if np.abs(factors.solve(leak) - 1).max() <= _ACCURACY:
+            solve: Callable[[FloatArray], FloatArray] = factors.solve
+            return solve
     except RuntimeError:  # rounding has made it singular
-        is_accurate = False
-    solve: Callable[[FloatArray], FloatArray] = (
-        factors.solve if is_accurate else BandedElimination(weights, leak).solve
-    )
-    return solve
+        pass
+    return BandedElimination(weights, leak).solve

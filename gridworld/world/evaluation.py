@@ -37,8 +37,7 @@ class Score:
 
 
 class Evaluator:
-    """Scores policies of one world under one discount and step limit. Solves the world when it is built,
-    unless this process has.
+    """Scores policies of one world under one discount and step limit, whose optimum it solves for.
 
     Args:
         mdp: the world.

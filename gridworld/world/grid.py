@@ -79,12 +79,8 @@ def compile_mdp(
     slip = finite("slip", slip)
     if not 0 <= slip <= 1:
         raise InputError(f"slip={slip}: must be a probability, from 0 to 1")
-    rewards: dict[str, Any] = {
-        "step_reward": step_reward,
-        "goal_reward": goal_reward,
-        "trap_reward": trap_reward,
-    }
-    rewards = {key: checked_reward(key, value) for key, value in rewards.items()}
+    given = {"step_reward": step_reward, "goal_reward": goal_reward, "trap_reward": trap_reward}
+    rewards: dict[str, Any] = {key: checked_reward(key, value) for key, value in given.items()}
     step_reward, goal_reward, trap_reward = rewards.values()
     if layout.cliffs and trap_reward > 0:
         raise InputError(

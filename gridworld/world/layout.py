@@ -34,15 +34,8 @@ MOVES: tuple[Cell, ...] = ((-1, 0), (0, 1), (1, 0), (0, -1))  # up, right, down,
 
 CLASSIC = "classic"
 NUM_ROWS, NUM_COLS = 5, 6  # of classic
+LEAST_ROWS, LEAST_COLS = 4, 3
 _TILES = "SGTC#."
-
-
-class MapError(InputError):
-    """Cells that make no world. Its arguments are the map's name, what is wrong and what would be right."""
-
-    def __str__(self) -> str:
-        name, mistake, remedy = self.args
-        return f"{name}: {mistake}; {remedy}"
 
 
 @dataclass(frozen=True)
@@ -93,15 +86,14 @@ def classic(num_rows: int = NUM_ROWS, num_cols: int = NUM_COLS) -> Layout:
     Only the cell right of the goal leads into it, by a way around the traps.
     """
     num_rows, num_cols = positive_int("num_rows", num_rows), positive_int("num_cols", num_cols)
+    if num_rows < LEAST_ROWS or num_cols < LEAST_COLS:
+        raise InputError(
+            f"layout classic of {num_rows} x {num_cols} cells: cannot hold the goal, its traps and a way to "
+            f"it; give at least {LEAST_ROWS} rows and {LEAST_COLS} columns"
+        )
     row, col = num_rows // 2, num_cols - 2
     traps = ((row + 1, col), (row, col - 1), (row - 1, col))
-    try:
-        return Layout(CLASSIC, num_rows, num_cols, starts=((0, 0),), goals=((row, col),), traps=traps)
-    except MapError as error:
-        _, mistake, _ = error.args
-        raise InputError(
-            f"layout classic of {num_rows} x {num_cols} cells: {mistake}; give at least 4 rows and 3 columns"
-        ) from None
+    return Layout(CLASSIC, num_rows, num_cols, starts=((0, 0),), goals=((row, col),), traps=traps)
 
 
 def parse(text: str, name: str) -> Layout:
@@ -174,10 +166,7 @@ def positive_int(what: str, value: Any) -> int:
 
 
 def _read(layout: str | PathLike[str]) -> Layout:
-    try:
-        given = fspath(layout)
-    except TypeError:
-        given = None
+    given = fspath(layout) if isinstance(layout, str | PathLike) else None
     if not isinstance(given, str) or not given:
         raise InputError(f"layout={layout!r}: must be a layout's name, a map file's path or a Layout")
     if given in shipped_layouts():
@@ -212,8 +201,8 @@ def _check_size(name: str, num_rows: int, num_cols: int) -> None:
 
 
 def _check(layout: Layout) -> None:
-    def refused(mistake: str, remedy: str) -> MapError:
-        return MapError(layout.name, mistake, remedy)
+    def refused(mistake: str, remedy: str) -> InputError:
+        return InputError(f"{layout.name}: {mistake}; {remedy}")
 
     positive_int("num_rows", layout.num_rows)
     positive_int("num_cols", layout.num_cols)

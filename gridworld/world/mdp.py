@@ -51,9 +51,8 @@ class Mdp:
     number: IntArray  # (S,), int64, what the environment calls each state, its observation
     places: IntArray | None = None  # (S, 3), int64: panel, row and column in pictures, -1 where it has none
     panel_names: tuple[str, ...] = ()  # what pictures call each panel, if anything
-    state_names: tuple[
-        str, ...
-    ] = ()  # what messages call the state of each number, if not by place or number
+    # what messages call the state of each number, if not by place or number
+    state_names: tuple[str, ...] = ()
     max_episode_steps: int | None = None  # the step limit that belongs to the world, if any
     own_observation: NDArray[Any] | None = field(default=None, repr=False)  # (S, ...), the environment's own
     truth: str = EXACT  # where the tables come from, as tables and pictures say it

@@ -19,6 +19,7 @@ from gridworld.errors import InputError
 from gridworld.process.memory_budget import check_memory
 from gridworld.world.layout import positive_int
 from gridworld.world.mdp import (
+    EXACT,
     LEAST_REWARD,
     MOST_REWARD,
     BoolArray,
@@ -32,13 +33,11 @@ from gridworld.world.mdp import (
 
 MOST_ACTIONS = 256
 MOST_STATES = 512 * 512
-_SUM = 1e-9  # how far probabilities may be from 1 in sum
-_DOUBLE = 8  # bytes of a number
+_ROUNDING = 1e-9  # how far a sum of probabilities may be from 1, and a threshold from its sum
 _BYTES = 64  # of an outcome in all tables, and while they are made
 _MOST_BYTES = 4 * 2**30
 _LONGEST_TEXT = 200
 _MOST_PLACES = 2**22  # cells of all panels
-_SAME = 1e-9  # how far a threshold may be from the sum of its probabilities
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -71,7 +70,7 @@ def mdp_from_outcomes(
     panel_names: Sequence[str] = (),
     max_episode_steps: int | None = None,
     own_observation: NDArray[Any] | None = None,
-    truth: str = "exact",
+    truth: str = EXACT,
 ) -> Mdp:
     """Compile what a source says into a world, whose states 0 to N - 1 are the numbered ones.
 
@@ -95,7 +94,6 @@ def mdp_from_outcomes(
     probability[terminal] = np.eye(count)[0]
     reward[terminal] = 0.0
     reward[probability == 0] = 0.0
-    stays = (next_state == np.arange(size)[:, None, None]) & (reward == 0)
     names = tuple(action_names) if action_names is not None else tuple(map(str, range(actions)))
     return Mdp(
         name=name,
@@ -107,7 +105,7 @@ def mdp_from_outcomes(
         goal=frozen(goal),
         start=frozen(np.concatenate([outcomes.start, np.zeros(further)])),
         thresholds=frozen(thresholds_of(probability)),
-        absorbing=frozen(terminal | (stays | (probability == 0)).all(axis=(1, 2))),
+        absorbing=frozen(absorbing_states(next_state, probability, reward, terminal)),
         number=frozen(number),
         places=None if places is None else frozen(places[number].astype(np.int64)),
         panel_names=tuple(panel_names),
@@ -156,6 +154,14 @@ def thresholds_of(probability: FloatArray) -> FloatArray:
     return sums
 
 
+def absorbing_states(
+    next_state: IntArray, probability: FloatArray, reward: FloatArray, terminal: BoolArray
+) -> BoolArray:
+    """`Mdp.absorbing`."""
+    stays = (next_state == np.arange(len(next_state))[:, None, None]) & (reward == 0)
+    return np.asarray(terminal | (stays | (probability == 0)).all(axis=(1, 2)))
+
+
 def check_size(name: str, states: int, actions: int, outcomes: int) -> None:
     """Refuse tables that are too large; call it before they are allocated."""
     if states > MOST_STATES or actions > MOST_ACTIONS:
@@ -172,13 +178,14 @@ def check_size(name: str, states: int, actions: int, outcomes: int) -> None:
     check_memory(name, size)
 
 
+_NUMBERS, _WHOLE, _BOOLEANS = ("fiu", "numbers"), ("iu", "whole numbers"), ("b", "booleans")
 _KINDS = {  # of arrays, as numpy's `dtype.kind` names them
-    "next_state": ("iu", "whole numbers"),
-    "probability": ("fiu", "numbers"),
-    "reward": ("fiu", "numbers"),
-    "terminated": ("b", "booleans"),
-    "success": ("b", "booleans"),
-    "start": ("fiu", "numbers"),
+    "next_state": _WHOLE,
+    "probability": _NUMBERS,
+    "reward": _NUMBERS,
+    "terminated": _BOOLEANS,
+    "success": _BOOLEANS,
+    "start": _NUMBERS,
 }
 
 
@@ -215,8 +222,8 @@ def checked(name: str, outcomes: Outcomes) -> Outcomes:
 def _distribution(name: str, what: str, given: NDArray[Any]) -> FloatArray:
     """Probabilities along the last axis as float64; less precise ones are made to sum to 1."""
     table: FloatArray = np.asarray(given, dtype=np.float64)
-    inexact = given.dtype.kind == "f" and given.dtype.itemsize < _DOUBLE
-    most = max(_SUM, table.shape[-1] * float(np.finfo(given.dtype).eps)) if inexact else _SUM
+    inexact = given.dtype.kind == "f" and given.dtype.itemsize < table.itemsize
+    most = max(_ROUNDING, table.shape[-1] * float(np.finfo(given.dtype).eps)) if inexact else _ROUNDING
     wrong = ~((table >= 0).all(axis=-1) & (np.abs(table.sum(axis=-1) - 1) <= most))
     for where in np.argwhere(wrong)[:1]:
         row = table[tuple(where)]
@@ -235,19 +242,21 @@ def _check_kinds(name: str, outcomes: Outcomes) -> None:
     for what, table in given.items():
         kinds, words = _KINDS[what]
         if not isinstance(table, np.ndarray) or table.dtype.kind not in kinds:
-            found = table.dtype if isinstance(table, np.ndarray) else type(table).__name__
-            raise InputError(f"{name}: {what} is {found}, must be an array of {words}")
+            raise InputError(f"{name}: {what} is {_described(table)}, must be an array of {words}")
     shape = outcomes.next_state.shape
     if len(shape) != 3 or 0 in shape:
         raise InputError(f"{name}: next_state has shape {shape}, must be (states, actions, outcomes)")
     for what, table in given.items():
-        if what != "start" and table.shape != shape:
+        wanted = shape[:1] if what == "start" else shape
+        if table.shape != wanted:
             raise InputError(
-                f"{name}: {what} has shape {table.shape}, next_state has {shape}; give one shape"
+                f"{name}: {what} has shape {table.shape}, next_state has {shape}; must be {wanted}"
             )
-    if outcomes.start.shape != shape[:1]:
-        raise InputError(f"{name}: start has shape {outcomes.start.shape}, must be ({shape[0]},)")
     check_size(name, *shape)
+
+
+def _described(table: Any) -> str:
+    return f"{table.dtype} {table.shape}" if isinstance(table, np.ndarray) else type(table).__name__
 
 
 def _check_extras(
@@ -279,9 +288,9 @@ def verified(mdp: Mdp, where: str) -> Mdp:
     """The same world, if all of its tables are what `Mdp` says; `where` is what messages call it."""
     if not isinstance(mdp.action_names, tuple) or not mdp.action_names:
         raise InputError(f"{where}: action_names is {str(mdp.action_names)[:50]}, must be a tuple of strings")
-    texts = [("name", mdp.name), ("truth", mdp.truth), *(("action_names", each) for each in mdp.action_names)]
-    for key, text in texts:
-        checked_text(where, key, text)
+    for key, texts in (("name", [mdp.name]), ("truth", [mdp.truth]), ("action_names", mdp.action_names)):
+        for text in texts:
+            checked_text(where, key, text)
     if mdp.max_episode_steps is not None:
         positive_int(f"{where}: max_episode_steps", mdp.max_episode_steps)
     _check_shapes(mdp, where)
@@ -311,9 +320,8 @@ def _check_shapes(mdp: Mdp, where: str) -> None:
     }
     for name, (dtype, wanted) in expected.items():
         table = getattr(mdp, name)
-        if not isinstance(table, np.ndarray) or table.dtype != dtype or table.shape != wanted:
-            found = f"{table.dtype} {table.shape}" if isinstance(table, np.ndarray) else type(table).__name__
-            raise InputError(f"{where}: {name} is {found}, must be {np.dtype(dtype)} {wanted}")
+        if not isinstance(table, np.ndarray) or (table.dtype, table.shape) != (dtype, wanted):
+            raise InputError(f"{where}: {name} is {_described(table)}, must be {np.dtype(dtype)} {wanted}")
     shown = np.zeros(size) if mdp.own_observation is None else mdp.own_observation
     if not isinstance(shown, np.ndarray) or shown.dtype.kind not in "biuf" or shown.shape[:1] != (size,):
         raise InputError(f"{where}: own_observation must be numbers, the first of its axes {size} states")
@@ -326,8 +334,8 @@ def _check_states(mdp: Mdp, where: str) -> None:
     unpaid = (~possible | (mdp.reward == 0)).all(axis=(1, 2))
     sums = thresholds_of(mdp.probability)
     last = np.isinf(sums)  # behind the last possible outcome
-    near = np.abs(np.where(last, 0.0, mdp.thresholds - np.where(last, 0.0, sums))) <= _SAME
-    fine = np.where(last, mdp.thresholds >= 1 - _SAME, near)
+    near = np.abs(np.where(last, 0.0, mdp.thresholds - np.where(last, 0.0, sums))) <= _ROUNDING
+    fine = np.where(last, mdp.thresholds >= 1 - _ROUNDING, near)
     fine[:, :, 1:] &= mdp.thresholds[:, :, 1:] >= mdp.thresholds[:, :, :-1]
     number = mdp.number
     for wrong, mistake in (

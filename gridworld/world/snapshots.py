@@ -1,14 +1,17 @@
-"""What Python objects hold: copies of an environment's state, and digests that are equal where states are.
+"""What objects hold: copies and digests of an environment's state, and what a method could remember by.
 
-A state is what the attributes of the environment hold, everything that they refer to included, but for its
+A state is what the attributes of an environment hold, everything that they refer to included, but for its
 random generators. Attributes are copied by pickle, which is four times as fast as `copy.deepcopy`. What
 cannot change or cannot be copied (spaces, functions, modules) is kept as it is.
+
+A method is a function of its argument alone if it gives the same whenever it is asked, and all that it could
+remember by or draw from stays the same: attributes, and by cloudpickle also classes, defaults, closures and
+globals, but for those of libraries.
 """
 
 from __future__ import annotations
 
 import copy
-import dis
 import functools
 import hashlib
 import io
@@ -17,43 +20,38 @@ import pickle
 import random
 import sys
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable
 from enum import Enum
-from types import BuiltinFunctionType, CodeType, FunctionType, GeneratorType, MethodType, ModuleType
+from types import BuiltinFunctionType, FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
+import cloudpickle
 import gymnasium as gym
 import numpy as np
 
 from gridworld.errors import InputError, in_short
 
-GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
-_SPEC = gym.envs.registration.EnvSpec
-_KEPT = (gym.Space, _SPEC, FunctionType, BuiltinFunctionType, ModuleType, *GENERATORS)
+_GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
+_KEPT = (
+    *(gym.Space, gym.envs.registration.EnvSpec, FunctionType, BuiltinFunctionType, ModuleType),
+    *_GENERATORS,
+)
 _PLAIN = frozenset({int, float, complex, str, bool, bytes, type(None)})
-_NUMBERS_AND_TEXTS: tuple[type, ...] = (
-    int,
-    float,
-    complex,
-    str,
-    bytes,
-    bytearray,
-)  # and classes made of them
-_REDUCED = (*_NUMBERS_AND_TEXTS, list, tuple, dict, set, frozenset, deque, functools.partial)
-_OF_ITS_RANDOMNESS = ("_np_random", "_np_random_seed")
+_REDUCED = (  # classes made of these are read as pickle reduces them
+    *(int, float, complex, str, bytes, bytearray, list, tuple, dict, set, frozenset, deque),
+    functools.partial,
+)
 _SHORT = 16  # numbers; a position is the same whether it is a tuple or an array
-_MOST_READ = 20_000  # objects that a deep reader follows
 _LIBRARIES = {
     *sys.stdlib_module_names,
-    *("gymnasium", "gridworld", "minigrid", "numpy", "sb3_contrib", "scipy", "stable_baselines3", "torch"),
+    *("cloudpickle", "gymnasium", "gridworld", "minigrid", "numpy", "sb3_contrib", "scipy"),
+    *("stable_baselines3", "torch"),
 } - {"__main__"}
-_REFERENCES = {  # that a deep reader follows
-    MethodType: ("__self__", "__func__"),
-    BuiltinFunctionType: ("__self__",),
-    staticmethod: ("__func__",),
-    classmethod: ("__func__",),
-    property: ("fget", "fset"),
-}
+_CALLS = 1000  # at least
+SO_UNKNOWN = (
+    ", so what it makes of the task is not exactly known; "
+    "leave it out, or make it a function of its argument alone"
+)
 
 
 class Snapshots:
@@ -76,42 +74,16 @@ class Snapshots:
         attributes.update(_Unpickler(io.BytesIO(snapshot), self._kept).load())
 
     def key(self, without: Collection[str] = ()) -> bytes:
-        """A digest of the state, 16 bytes, but for some attributes; TypeError where it cannot be compared."""
-        return Reader([self._env]).digest({k: v for k, v in self._attributes() if k not in without})
+        """A digest of the state, but for some attributes; TypeError where it cannot be compared."""
+        return digest(self._attributes(without), self._env)
 
-    def keys(self) -> dict[str, bytes]:
+    def keys(self, without: Collection[str] = ()) -> dict[str, bytes]:
         """A digest of each attribute."""
-        return {name: Reader([self._env]).digest(value) for name, value in self._attributes()}
+        return {name: digest(value, self._env) for name, value in self._attributes(without).items()}
 
-    def _attributes(self) -> list[tuple[str, Any]]:
-        return [each for each in vars(self._env).items() if each[0] not in _OF_ITS_RANDOMNESS]
-
-
-def key_of(value: Any) -> bytes:
-    """A digest, 16 bytes, of an observation."""
-    return Reader().digest(value)
-
-
-def random_states(env: gym.Env[Any, Any] | None = None) -> list[Any]:
-    """The states of all generators that a step may draw from: the environment's, and those that all share."""
-    torch = sys.modules.get("torch")
-    shared = [] if torch is None else [torch.get_rng_state().numpy().tobytes()]
-    shared += [random.getstate(), generator_state(np.random.mtrand._rand)]
-    if env is None:
-        return shared
-    sources = [env, *(each for each in vars(env).values() if isinstance(each, (gym.Space, *GENERATORS)))]
-    found = [getattr(each, "_np_random", each) for each in sources]
-    return shared + [generator_state(each) for each in found if isinstance(each, GENERATORS)]
-
-
-def generator_state(generator: Any) -> Any:
-    """Where a generator of `GENERATORS` is, as a value to compare."""
-    if isinstance(generator, random.Random):
-        return generator.getstate()
-    if isinstance(generator, np.random.Generator):
-        return repr(generator.bit_generator.state)
-    state = generator.get_state(legacy=False)["state"]
-    return state["key"].tobytes(), state["pos"]
+    def _attributes(self, without: Collection[str]) -> dict[str, Any]:
+        left_out = {"_np_random", "_np_random_seed", *without}
+        return {name: value for name, value in vars(self._env).items() if name not in left_out}
 
 
 def _kept(number: int) -> Any:
@@ -124,7 +96,7 @@ class _Pickler(pickle.Pickler):
         super().__init__(file, protocol=5)
         self._env, self._kept_by_id = env, kept
 
-    def reducer_override(self, obj: Any) -> Any:
+    def reducer_override(self, obj: Any) -> Any:  # three times as fast as `persistent_id`
         local = isinstance(obj, type) and "<locals>" in obj.__qualname__
         if obj is not _kept and (obj is self._env or local or isinstance(obj, _KEPT)):
             self._kept_by_id[id(obj)] = obj
@@ -142,97 +114,35 @@ class _Unpickler(pickle.Unpickler):
         return self._kept_by_id.__getitem__ if ours else super().find_class(module, name)
 
 
-class AnotherEnvError(Exception):
-    """An environment is referred to that is not one of those known."""
-
-
-class Reader:
-    """Reads values into a list of plain ones; an object met again is its place in the order.
-
-    `known` are objects that are not read. A `deep` reader also follows what functions, classes, modules and
-    generators could remember by, libraries excepted; other environments are an `AnotherEnvError`, or skipped.
-    """
-
-    def __init__(self, known: Iterable[Any] = (), deep: bool = False, skips_envs: bool = False) -> None:
-        self.is_complete = True
-        self._found: list[Any] = []
-        self._deep, self._skips_envs = deep, skips_envs
-        # Objects are kept, so that ids stay apart.
-        self._met: dict[int, tuple[int, Any]] = {id(each): (n, each) for n, each in enumerate(known)}
-
-    def digest(self, *values: Any) -> bytes:
-        """16 bytes, equal for equal values."""
-        self._read(values)
-        # Version 2 of the format writes equal values alike; later ones refer back to the same object.
-        return hashlib.blake2b(marshal.dumps(self._found, 2), digest_size=16).digest()
-
-    def _read(self, waiting: Iterable[Any]) -> None:
-        waiting = list(waiting)
-        while waiting:
-            value = waiting.pop()
-            kind = type(value)
-            if kind in _PLAIN:
-                self._found.append(value)
-            elif kind is tuple:
-                self._found.append((None, len(value)))
-                waiting.extend(value)
-            elif id(value) in self._met:
-                self._found.append(("again", self._met[id(value)][0]))
-            elif isinstance(value, np.generic):
-                plain = value.item()
-                waiting.append(repr(plain) if isinstance(plain, np.generic) else plain)
-            elif self._deep:
-                if len(self._met) >= _MOST_READ:
-                    self.is_complete = False
-                    return
-                self._met[id(value)] = len(self._met), value
-                self._add(*self._followed(value, kind), waiting)
-            elif (label := _label(value, kind)) is not None:
-                self._found.append(label)
-            elif isinstance(value, np.ndarray):
-                waiting.append(tuple(value.tolist()))
-            else:
-                self._met[id(value)] = len(self._met), value
-                self._add(*_parts(value, kind), waiting)
-
-    def _add(self, label: Any, parts: Collection[Any], waiting: list[Any]) -> None:
-        self._found.append((label, len(parts)))
-        waiting.extend(parts)
-
-    def _followed(self, value: Any, kind: type) -> tuple[Any, Collection[Any]]:
-        """What a deep reader reads of a value, and follows."""
-        name = kind.__qualname__
-        if isinstance(value, gym.Env):
-            if self._skips_envs:
-                return "environment", ()
-            raise AnotherEnvError
-        if isinstance(value, GENERATORS):
-            return repr(generator_state(value)), ()
-        if isinstance(value, gym.Space):
-            return repr(value), () if self._skips_envs else (value._np_random,)
-        if isinstance(value, np.ndarray):
-            objects = value.dtype.hasobject
-            label = value.dtype.str, value.shape, b"" if objects else value.tobytes()
-            return label, (value.tolist(),) if objects else ()
-        if isinstance(value, FunctionType):
-            return value.__qualname__, () if _is_library(value) else list(_of_function(value))
-        if isinstance(value, GeneratorType):
-            frame = value.gi_frame
-            return name, () if frame is None else (frame.f_lasti, dict(frame.f_locals))
-        if isinstance(value, ModuleType):
-            return value.__name__, () if _is_library(value) else list(_of_module(value))
-        if isinstance(value, type):
-            return value.__qualname__, () if _is_library(value) else list(vars(value).values())
-        if kind in (dict, set, frozenset):  # in their own order, which may be a memory too
-            return name, [part for each in value.items() for part in each] if kind is dict else list(value)
-        for kinds, references in _REFERENCES.items():
-            if isinstance(value, kinds):
-                return name, [getattr(value, each, None) for each in references]
-        try:
-            _, parts = _parts(value, kind)
-        except Exception:  # what cannot be read is known by its text
-            return repr(value), ()
-        return name, [*parts, *(() if kind is list or _is_library(kind) else (kind,))]
+def digest(value: Any, *known: Any) -> bytes:
+    """16 bytes, equal for equal values; an object met again is a place in the order; `known` are not read."""
+    found: list[Any] = []
+    waiting = [value]
+    met = {id(each): (place, each) for place, each in enumerate(known)}  # objects are kept: ids stay apart
+    while waiting:
+        value = waiting.pop()
+        kind = type(value)
+        if kind in _PLAIN:
+            found.append(value)
+        elif kind is tuple:
+            found.append((None, len(value)))
+            waiting.extend(value)
+        elif id(value) in met:
+            found.append(("again", met[id(value)][0]))
+        elif isinstance(value, np.generic):
+            plain = value.item()
+            waiting.append(repr(plain) if isinstance(plain, np.generic) else plain)
+        elif (label := _label(value, kind)) is not None:
+            found.append(label)
+        elif isinstance(value, np.ndarray):
+            waiting.append(tuple(value.tolist()))
+        else:
+            met[id(value)] = len(met), value
+            name, parts = _parts(value, kind)
+            found.append((name, len(parts)))
+            waiting.extend(parts)
+    # Version 2 of the format writes equal values alike; later ones refer back to the same object.
+    return hashlib.blake2b(marshal.dumps(found, 2), digest_size=16).digest()
 
 
 def _label(value: Any, kind: type) -> Any:
@@ -243,10 +153,9 @@ def _label(value: Any, kind: type) -> Any:
         return value.__module__, value.__qualname__
     if isinstance(value, _KEPT):
         return kind.__qualname__, getattr(value, "__qualname__", "")
-    if isinstance(value, np.ndarray) and not (
-        value.dtype.hasobject or (value.ndim == 1 and value.size <= _SHORT)
-    ):
-        return value.dtype.str, value.shape, value.tobytes()
+    if isinstance(value, np.ndarray):
+        is_short = value.dtype.hasobject or (value.ndim == 1 and value.size <= _SHORT)
+        return None if is_short else (value.dtype.str, value.shape, value.tobytes())
     return None
 
 
@@ -255,9 +164,13 @@ def _parts(value: Any, kind: type) -> tuple[Any, Collection[Any]]:
     if kind is list:
         return None, value
     if kind is dict:
-        return "dict", [part for name in _in_order(value) for part in (name, value[name])]
+        try:
+            names = sorted(value)  # attributes are set in any order
+        except TypeError:
+            names = list(value)
+        return "dict", [part for name in names for part in (name, value[name])]
     if kind in (set, frozenset):
-        return "set", sorted(value, key=key_of)
+        return "set", sorted(value, key=digest)
     if hasattr(value, "__dict__") and not isinstance(value, _REDUCED):
         return kind.__qualname__, (object.__getstate__(value),)
     made_by = value.__reduce_ex__(4)
@@ -265,47 +178,30 @@ def _parts(value: Any, kind: type) -> tuple[Any, Collection[Any]]:
     return kind.__qualname__, [list(each) if hasattr(each, "__next__") else each for each in items]
 
 
-def _in_order(names: dict[Any, Any]) -> list[Any]:
-    """Sorted where they can be: attributes are set in any order."""
-    try:
-        return sorted(names)
-    except TypeError:
-        return list(names)
+def random_states(env: gym.Env[Any, Any] | None = None) -> list[Any]:
+    """The states of all generators that a step may draw from: the environment's, and those that all share."""
+    torch = sys.modules.get("torch")
+    shared = [] if torch is None else [torch.get_rng_state().numpy().tobytes()]
+    shared += [random.getstate(), _generator_state(np.random.mtrand._rand)]
+    held = [] if env is None else [env, *vars(env).values()]
+    found = [getattr(each, "_np_random", each) for each in held]
+    return shared + [_generator_state(each) for each in found if isinstance(each, _GENERATORS)]
 
 
-def _is_library(value: Any) -> bool:
-    name = value.__name__ if isinstance(value, ModuleType) else value.__module__
-    return str(name or "").partition(".")[0] in _LIBRARIES
+def _generator_state(generator: Any) -> Any:
+    if isinstance(generator, random.Random):
+        return generator.getstate()
+    if isinstance(generator, np.random.Generator):
+        return repr(generator.bit_generator.state)
+    state = generator.get_state(legacy=False)["state"]
+    return state["key"].tobytes(), state["pos"]
 
 
-def _of_function(function: FunctionType) -> Iterator[Any]:
-    yield from (function.__defaults__, function.__kwdefaults__, vars(function), function.__code__.co_code)
-    for cell in function.__closure__ or ():
-        try:
-            yield cell.cell_contents
-        except ValueError:  # it has no value yet
-            yield None
-    for name in sorted(_globals_of(function.__code__)):
-        yield function.__globals__.get(name)
-
-
-def _globals_of(code: CodeType) -> set[str]:
-    names = {str(each.argval) for each in dis.get_instructions(code) if each.opname == "LOAD_GLOBAL"}
-    return names.union(*(_globals_of(each) for each in code.co_consts if isinstance(each, CodeType)))
-
-
-def _of_module(module: ModuleType) -> Iterator[Any]:
-    """Its data: what it imports and defines may be anything."""
-    for value in list(vars(module).values()):
-        if isinstance(value, (int, float, str, list, dict, set, np.ndarray, *GENERATORS)):
-            yield value if not isinstance(value, dict) or "__name__" not in value else None
-
-
-_CALLS = 1000  # at least
-SO_UNKNOWN = (
-    ", so what it makes of the task is not exactly known; "
-    "leave it out, or make it a function of its argument alone"
-)
+def same(one: Any, other: Any) -> bool:
+    """Whether two observations, actions or rewards are equal, dictionaries of arrays included."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    return np.array_equal(np.asarray(one), np.asarray(other))
 
 
 def asked(where: str, owner: Any, method: str, arguments: list[Any], chain: Iterable[Any] = ()) -> list[Any]:
@@ -337,33 +233,85 @@ def asked(where: str, owner: Any, method: str, arguments: list[Any], chain: Iter
     return found
 
 
-def same(one: Any, other: Any) -> bool:
-    """Whether two observations, actions or rewards are equal, dictionaries of arrays included."""
-    if isinstance(one, dict) and isinstance(other, dict):
-        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
-    return np.array_equal(np.asarray(one), np.asarray(other))
+class _AnotherEnvError(Exception):
+    """An environment is referred to that is not one of those known."""
 
 
-def alike(one: Any, other: Any, without: Iterable[str] = ()) -> bool:
+class _Reader(cloudpickle.Pickler):  # type: ignore[misc]
+    """Writes what objects hold. `known` are not read; other environments are refused, or `skips_envs`."""
+
+    def __init__(self, write: Any, known: Iterable[Any], skips_envs: bool) -> None:
+        super().__init__(SimpleNamespace(write=write), protocol=5)
+        self._known = {id(each): place for place, each in enumerate(known)}
+        self._skips_envs = skips_envs
+
+    def persistent_id(self, obj: Any) -> Any:
+        if id(obj) in self._known:
+            return self._known[id(obj)]
+        if isinstance(obj, FunctionType | type) and _is_library(obj):
+            return obj.__qualname__
+        if isinstance(obj, gym.Env) and not self._skips_envs:
+            raise _AnotherEnvError
+        if self._skips_envs and isinstance(obj, gym.Env | gym.Space):
+            return repr(obj) if isinstance(obj, gym.Space) else "environment"
+        return None
+
+    def reducer_override(self, obj: Any) -> Any:
+        kind = type(obj)
+        if not (_is_library(kind) or _is_library(obj) or isinstance(obj, (type, *_REDUCED))):
+            # also what its own way of being pickled hides
+            return object, (), (kind, object.__getstate__(obj), obj.__reduce_ex__(pickle.HIGHEST_PROTOCOL))
+        return super().reducer_override(obj)
+
+
+def _is_library(thing: Any) -> bool:
+    return str(getattr(thing, "__module__", None)).partition(".")[0] in _LIBRARIES
+
+
+def _content(value: Any, known: Iterable[Any], skips_envs: bool = False) -> bytes:
+    """A digest of what a value holds, and of the code that it refers to, but for that of libraries."""
+    found = hashlib.sha256()
+    modules = {
+        module.__name__: module
+        for name, module in list(sys.modules.items())
+        if isinstance(module, ModuleType) and name.partition(".")[0] not in _LIBRARIES
+    }
+    names = modules.keys() & sys.modules.keys() - cloudpickle.list_registry_pickle_by_value()
+    for name in names:
+        cloudpickle.register_pickle_by_value(modules[name])
+    try:
+        _Reader(found.update, known, skips_envs).dump(value)
+    finally:
+        for name in names:
+            cloudpickle.unregister_pickle_by_value(modules[name])
+    return found.digest()
+
+
+def _held(owner: Any, without: Collection[str]) -> list[tuple[str, Any]]:
+    return [(name, value) for name, value in sorted(vars(owner).items()) if name not in without]
+
+
+def alike(one: Any, other: Any, without: Collection[str] = ()) -> bool:
     """Whether two objects of one class hold the same values and functions, but for some attributes."""
     if type(one) is not type(other):
         return False
-    digests = set()
-    for each in (one, other):
-        reader = Reader([each], deep=True, skips_envs=True)
-        digests.add(reader.digest(*((k, v) for k, v in sorted(vars(each).items()) if k not in without)))
-        if not reader.is_complete:
-            return False
-    return len(digests) == 1
+    try:
+        mine, theirs = (_content(_held(each, without), [each], skips_envs=True) for each in (one, other))
+    except Exception:  # what cannot be read may differ
+        return False
+    return mine == theirs
 
 
 def remembered(where: str, name: str, owner: Any, chain: Iterable[Any] = ()) -> list[Any]:
-    """Whatever a method of `owner` could change or draw from, to compare; refuses other environments."""
+    """Whatever a method of `owner` could change or draw from, to compare; refuses what cannot be read."""
     known = [*chain, owner]
-    held = {key: value for key, value in vars(owner).items() if key != "env"}
-    generators = [each.np_random for each in known if isinstance(each, gym.Env)]
+    envs = [each for each in known if isinstance(each, gym.Env)]
+    generators = [(env.np_random, env.action_space, env.observation_space) for env in envs]
     try:
-        digest = Reader(known, deep=True).digest(generators, held, *type(owner).__mro__)
-    except AnotherEnvError:
+        found = _content((generators, _held(owner, ("env",)), type(owner)), known)
+    except _AnotherEnvError:
         raise InputError(f"{where}: {name} looks into an environment{SO_UNKNOWN}") from None
-    return [digest, *random_states()]
+    except Exception as error:  # locks, open files, generators
+        cannot = f"what {name} refers to cannot be read ({in_short(error)})"
+        raise InputError(f"{where}: {cannot}{SO_UNKNOWN}") from error
+    return [found, *random_states()]

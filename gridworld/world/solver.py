@@ -9,12 +9,11 @@ found by value iteration and made exact by policy iteration.
 Without discount (γ = 1) this equation may have other fixed points, and greedy actions may never end. There V*
 is the largest expected total reward that any policy has, one that never ends included. Of the actions that
 keep it, those are optimal that bring gains sooner and losses later: with the smallest Σ_t t E[r_t], the slope
-of the value in γ. Both are what discounting prefers as γ goes to 1 (the first two orders of Blackwell's
-optimality). Policy iteration in this order begins with a policy that is worth something everywhere: it rests
-where it can stay for ever without a reward, and elsewhere surely comes to such states or to an end if that is
-possible. So no fixed point but the optimum can hold it: where the optimum is better by the largest margin, it
-would have to stay among such states for ever, earn nothing there, and be no better than resting. Discounts
-just below 1 are treated in the same way, since the cost of a step gets lost in rounding beside the value.
+of the value in γ (the first two orders of Blackwell's optimality). Policy iteration in this order begins with
+a policy that rests where it can stay for ever without a reward, and elsewhere surely comes to such states or
+to an end if that is possible. So no fixed point but the optimum can hold it: to be better by the largest
+margin, the optimum would have to stay among such states for ever, earn nothing there, and be no better than
+resting. Discounts just below 1 are treated in the same way: the cost of a step gets lost in rounding.
 
 References: M. L. Puterman, Markov Decision Processes, 1994, chapters 6, 7 and 10; R. Sutton and A. Barto,
 Reinforcement Learning, 2nd ed., 2018, chapter 4; A. Veinott, Discrete dynamic programming with sensitive
@@ -39,7 +38,7 @@ from gridworld.world.chain import (
     one_hot_policy,
     steps_to,
 )
-from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, frozen
+from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 # Two actions whose values agree to this relative precision are equally good. Rounding stays far below it.
 TIE = 1e-9
@@ -108,7 +107,7 @@ def solved(mdp: Mdp, gamma: float) -> Solution:
     if gamma not in solutions:
         solution = value_iteration(mdp, gamma)
         for table in (solution.v, solution.q, solution.optimal, solution.scale):
-            frozen(table)
+            table.setflags(write=False)
         while len(solutions) >= _MOST_SOLUTIONS:
             del solutions[next(iter(solutions))]
         solutions[gamma] = solution
@@ -143,7 +142,7 @@ def swept_values(mdp: Mdp, gamma: float) -> FloatArray:
     """
     v = np.zeros(mdp.num_states)
     playing = ~mdp.absorbing
-    active = np.flatnonzero(playing)
+    active: IntArray = np.flatnonzero(playing)
     ways = np.ones(mdp.next_state.shape, dtype=np.bool_)
     farthest = max(int(steps_to(mdp, ways, ends).max()) for ends in (mdp.goal, mdp.trap))
     for _ in range(102 + 2 * farthest):
@@ -152,10 +151,8 @@ def swept_values(mdp: Mdp, gamma: float) -> FloatArray:
         new = backup(mdp, v, gamma, active).max(axis=1)
         changed = active[np.abs(new - v[active]) > _NOTHING + _SWEEP_TOLERANCE * np.abs(new)]
         v[active] = new
-        affected = np.zeros(mdp.num_states, dtype=np.bool_)
-        affected[changed] = True
-        affected[mdp.predecessors(changed)] = True
-        active = np.flatnonzero(affected & playing)
+        affected = np.union1d(changed, mdp.predecessors(changed))
+        active = affected[playing[affected]]
     return v
 
 

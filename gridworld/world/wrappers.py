@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from gridworld.errors import InputError, in_short
 from gridworld.world.mdp import Mdp, checked_reward, frozen
-from gridworld.world.outcomes import thresholds_of
+from gridworld.world.outcomes import absorbing_states, thresholds_of
 from gridworld.world.snapshots import SO_UNKNOWN, asked, remembered, same
 from gridworld.world.solver import backup, swept_values
 
@@ -135,18 +135,16 @@ class Wrapped:
         roles = [(wrapper, role_of(where, wrapper)) for wrapper in list(wrappers_of(env))[::-1]]
         self.memory = [type(wrapper).__name__ for wrapper, role in roles if role == MEMORY]
         self.transforms = [wrapper for wrapper, role in roles if role in ("observation", "reward", "action")]
-        changing = [wrapper for wrapper, role in roles if role in ("reward", "action")]
+        changing = [type(wrapper).__name__ for wrapper, role in roles if role in ("reward", "action")]
         self.mdp = mdp
         if changing:
-            self._copied  # noqa: B018 - refused if it cannot be copied
             for wrapper in self._copied_transforms:
                 if isinstance(wrapper, gym.RewardWrapper):
                     self.mdp = self._paid(self.mdp, wrapper)
                 elif isinstance(wrapper, gym.ActionWrapper):
                     self.mdp = self._acted(self.mdp, wrapper)
-            names = ", ".join(type(wrapper).__name__ for wrapper in changing)
-            self.mdp = replace(self.mdp, name=f"{mdp.name} in {names}")
-            self._check_steps(None)
+            self.mdp = replace(self.mdp, name=f"{mdp.name} in {', '.join(changing)}")
+            self._check_steps(lambda number, observation: None)
 
     @cached_property
     def observations(self) -> list[Any]:
@@ -157,12 +155,19 @@ class Wrapped:
                 "table of the policy can be evaluated exactly; leave it out"
             )
         rows: list[Any] = self._bare.number.tolist()
-        if not self.transforms:
-            return rows
-        for wrapper in self._copied_transforms:
-            if isinstance(wrapper, gym.ObservationWrapper):
-                rows = self._asked(wrapper, "observation", rows)
-        self._check_steps(rows)
+
+        def compare(number: int, observation: Any) -> None:
+            if not same(rows[number], observation):
+                raise InputError(
+                    f"{self._where}: what is seen of state {number} through its wrappers is not always the "
+                    f"same{SO_UNKNOWN}"
+                )
+
+        if self.transforms:
+            for wrapper in self._copied_transforms:
+                if isinstance(wrapper, gym.ObservationWrapper):
+                    rows = self._asked(wrapper, "observation", rows)
+            self._check_steps(compare)
         return rows
 
     @cached_property
@@ -170,11 +175,11 @@ class Wrapped:
         """What `action_masks()` of the environment allows, (S, A); None: there is none."""
         if not self._env.has_wrapper_attr("action_masks"):
             return None
-        env, chain = self._copied, [self._copied.unwrapped, *wrappers_of(self._copied)]
+        env = self._copied
         masks = env.get_wrapper_attr("action_masks")
-        for each in chain:
+        for each in self._chain:
             if hasattr(type(each), "action_masks"):
-                remembered(self._where, "action_masks()", each, chain)  # refuses another environment
+                remembered(self._where, "action_masks()", each, self._chain)  # refuses another environment
         if self._attribute is None:
             raise InputError(
                 f"{self._where}: action_masks() cannot be asked for each state, since the state of "
@@ -182,46 +187,42 @@ class Wrapped:
             )
         found = np.ones((self._bare.num_states, self.mdp.num_actions), dtype=np.bool_)
         for state in np.flatnonzero(self._bare.acting).tolist():
-            setattr(env.unwrapped, self._attribute, int(self._bare.number[state]))
+            self._set(state)
             with self._refusing("action_masks() failed"):
                 found[state] = masks()
 
-        def check(state: int) -> None:
-            if self._bare.acting[state] and not np.array_equal(found[state], masks()):
+        def compare(number: int, observation: Any) -> None:
+            if self._bare.acting[number] and not np.array_equal(found[number], masks()):
                 raise InputError(
-                    f"{self._where}: action_masks() does not always allow the same in state {state}"
+                    f"{self._where}: action_masks() does not always allow the same in state {number}"
                     f"{SO_UNKNOWN}"
                 )
 
-        self._check_steps(None, check)
+        self._check_steps(compare)
         return found
 
     @cached_property
     def _copied(self) -> gym.Env[Any, Any]:
         """A copy of the environment to ask and to step, without what draws and what only shows more."""
-        real = copied(self._env.unwrapped)
-        seen: dict[int, Any] = {id(self._env.unwrapped): real}
+        env: Any = _Probe(copied(self._env.unwrapped))
+        self._probe, seen = env, {id(self._env.unwrapped): env.unwrapped}
         for wrapper in list(wrappers_of(self._env))[::-1]:
             kind = type(wrapper)
             only_adds = kind.step is gym.Wrapper.step and kind.reset is gym.Wrapper.reset
             if wrapper in self.transforms or kind.__name__ in _COPIED or only_adds:
                 seen[id(getattr(wrapper, "results_writer", None))] = None  # an open file, of a Monitor
                 try:
-                    real = copy.deepcopy(wrapper, seen)
+                    other = copy.deepcopy(wrapper, seen)
                 except Exception as error:
                     raise InputError(
-                        f"{self._where}: its wrapper {type(wrapper).__name__} cannot be copied "
-                        f"({in_short(error)}), so what it changes cannot be found out; leave it out"
+                        f"{self._where}: its wrapper {kind.__name__} cannot be copied ({in_short(error)}), "
+                        "so what it changes cannot be found out; leave it out"
                     ) from None
-            seen[id(wrapper)] = real
-        wrappers, self._probe = list(wrappers_of(real)), _Probe(real.unwrapped)
-        if wrappers:
-            wrappers[-1].env = self._probe
-        else:
-            real = self._probe
+                other.env, env = env, other
+            seen[id(wrapper)] = env
         with self._refusing("cannot be reset"):
-            real.reset()
-        return real
+            env.reset()
+        return env  # type: ignore[no-any-return]
 
     @contextmanager
     def _refusing(self, what: str) -> Iterator[None]:
@@ -234,10 +235,20 @@ class Wrapped:
             raise InputError(f"{self._where}: {what} ({in_short(error)})") from error
 
     @property
+    def _chain(self) -> list[Any]:
+        """The copied environment and its wrappers, from the inside."""
+        return [self._copied.unwrapped, *[*wrappers_of(self._copied)][::-1]]
+
+    @property
     def _copied_transforms(self) -> list[Any]:
-        """The copies of the transforms, from the inside."""
         kinds = gym.ObservationWrapper | gym.RewardWrapper | gym.ActionWrapper
-        return [wrapper for wrapper in wrappers_of(self._copied) if isinstance(wrapper, kinds)][::-1]
+        return [each for each in self._chain if isinstance(each, kinds) and each is not self._probe]
+
+    def _asked(self, wrapper: Any, method: str, arguments: list[Any]) -> list[Any]:
+        return asked(self._where, wrapper, method, arguments, self._chain)
+
+    def _set(self, state: int) -> None:
+        setattr(self._copied.unwrapped, str(self._attribute), int(self._bare.number[state]))
 
     def _paid(self, mdp: Mdp, wrapper: Any) -> Mdp:
         """The world with a wrapper's rewards; an end pays nothing, nor does a state without a way to it."""
@@ -265,52 +276,43 @@ class Wrapped:
         chosen_tables = {key: getattr(mdp, key)[:, np.array(chosen, dtype=int)] for key in tables}
         return _changed(mdp, action_names=tuple(mdp.action_names[each] for each in chosen), **chosen_tables)
 
-    def _asked(self, wrapper: Any, method: str, arguments: list[Any]) -> list[Any]:
-        chain = [self._copied.unwrapped, *wrappers_of(self._copied)]
-        return asked(self._where, wrapper, method, arguments, chain)
-
-    def _check_steps(self, rows: list[Any] | None, also: Callable[[int], None] = lambda state: None) -> None:
+    def _check_steps(self, compare: Callable[[int, Any], None]) -> None:
         """Step the copy beside the tables: from every state that can be set, then in whole episodes.
 
-        `rows` is what is seen of each state, if that counts; `also` compares something else in a state.
+        `compare` is called with every number and what is seen of it.
         """
-        env = self._copied
-        probe, rng = self._probe, np.random.default_rng(_SEED)
+        env, probe, rng = self._copied, self._probe, np.random.default_rng(_SEED)
+        actions, acting = self.mdp.num_actions, self._bare.acting
+        tried = np.zeros(self.mdp.num_states, dtype=np.int64)
 
         def reset(**given: Any) -> None:
             with self._refusing("cannot be reset"):
                 observation = env.reset(**given)[0]
-            self._check_seen(rows, observation)
-            also(probe.number)
+            compare(probe.number, observation)
 
         def step(state: int, action: int) -> None:
             with self._refusing("cannot be stepped"):
-                found = env.step(action)
-            self._check_step(rows, state, action, found)
-            if found[2] or found[3]:
+                observation, reward, terminated, truncated, _ = env.step(action)
+            tried[state] += 1
+            self._check_step(state, action, float(_plain(reward)), bool(terminated))
+            compare(probe.number, observation)
+            if terminated or truncated:
                 reset()
-            else:
-                also(probe.number)
 
         reset(seed=_SEED)
-        actions, acting = self.mdp.num_actions, self._bare.acting
-        tried = np.zeros(self.mdp.num_states, dtype=np.int64)
         if self._attribute is not None:
             pairs = np.flatnonzero(np.repeat(acting, actions))
             pairs = pairs if len(pairs) <= _ROWS else rng.choice(pairs, _ROWS, replace=False)
             for pair in pairs.tolist():
-                setattr(env.unwrapped, self._attribute, int(self._bare.number[pair // actions]))
+                self._set(pair // actions)
                 step(*divmod(pair, actions))
-                tried[pair // actions] += 1
         reset()
         good = backup(self.mdp, swept_values(self.mdp, _GAMMA), _GAMMA).argmax(axis=1).tolist()
         for number in range(_MOST_STEPS):
             if number >= _STEPS and tried[self.mdp.acting].all():
                 break
-            state = probe.number
-            is_random = rng.random() < (number // 500) % 3 / 2
+            state, is_random = probe.number, rng.random() < (number // 500) % 3 / 2
             step(state, int(rng.integers(actions)) if is_random else good[state])
-            tried[state] += 1
         unmet = np.flatnonzero(self.mdp.acting & (tried == 0))
         if unmet.size and self._attribute is None:
             raise InputError(
@@ -318,12 +320,10 @@ class Wrapped:
                 "make of it could not be compared; leave them out"
             )
 
-    def _check_step(self, rows: list[Any] | None, state: int, action: int, step: Any) -> None:
-        observation, reward, terminated, _, _ = step
-        reward = float(_plain(reward))
+    def _check_step(self, state: int, action: int, reward: float, terminated: bool) -> None:
         mdp, pair, number = self.mdp, (state, action), self._probe.number
         following = mdp.next_state[pair]
-        same_end = (mdp.number[following] == number) & (mdp.terminal[following] == bool(terminated))
+        same_end = (mdp.number[following] == number) & (mdp.terminal[following] == terminated)
         possible = same_end & (mdp.reward[pair] == reward) & (mdp.probability[pair] > 0)
         if not possible.any():
             raise InputError(
@@ -332,31 +332,16 @@ class Wrapped:
                 "not what reward() and action() gave when they were asked; make them functions of their "
                 "argument alone"
             )
-        self._check_seen(rows, observation)
-
-    def _check_seen(self, rows: list[Any] | None, observation: Any) -> None:
-        number = self._probe.number
-        if rows is not None and not same(rows[number], observation):
-            raise InputError(
-                f"{self._where}: what is seen of state {number} through its wrappers is not always the same"
-                f"{SO_UNKNOWN}"
-            )
 
 
-class _Probe(gym.Wrapper[Any, Any, Any, Any]):
+class _Probe(gym.ObservationWrapper[Any, Any, Any]):
     """Remembers the number that the environment below all wrappers showed last."""
 
     number = -1
 
-    def reset(self, **arguments: Any) -> Any:
-        found = self.env.reset(**arguments)
-        self.number = int(found[0])
-        return found
-
-    def step(self, action: Any) -> Any:
-        found = self.env.step(action)
-        self.number = int(found[0])
-        return found
+    def observation(self, observation: Any) -> Any:
+        self.number = int(observation)
+        return observation
 
 
 def copied(real: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
@@ -380,17 +365,10 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic | np.ndarray) and value.size == 1 else value
 
 
-def _changed(mdp: Mdp, **tables: Any) -> Mdp:
+def _changed(mdp: Mdp, **changes: Any) -> Mdp:
     """A world with other tables, which is not that of a map any more."""
-    kept = {field.name: getattr(mdp, field.name) for field in fields(Mdp)}
-    made = Mdp(**{**kept, **tables})
-    stays = (made.next_state == np.arange(mdp.num_states)[:, None, None]) & (made.reward == 0)
-    absorbing = made.terminal | (stays | (made.probability == 0)).all(axis=(1, 2))
-    return replace(
-        made,
-        next_state=frozen(made.next_state),
-        probability=frozen(made.probability),
-        reward=frozen(made.reward),
-        thresholds=frozen(thresholds_of(made.probability)),
-        absorbing=frozen(absorbing),
-    )
+    kept = {field.name: getattr(mdp, field.name) for field in fields(Mdp)} | changes
+    tables = {key: kept[key] for key in ("next_state", "probability", "reward")}
+    tables["absorbing"] = absorbing_states(**tables, terminal=mdp.terminal)
+    tables["thresholds"] = thresholds_of(tables["probability"])
+    return Mdp(**kept | {key: frozen(table) for key, table in tables.items()})

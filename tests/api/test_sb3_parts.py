@@ -142,7 +142,6 @@ def test_the_batch_is_one_for_sb3() -> None:
 @pytest.mark.parametrize(
     ("named", "sentence"),
     [
-        ({"slipp": 0.1}, "slipp=0.1: is no argument of a world; there are num_rows"),
         ({"slip": 2}, "slip=2.0: must be a probability"),
         ({"layout": "nowhere"}, "neither a shipped layout"),
         ({"observation": "pixels"}, "observation kind 'pixels': must be one_hot"),

@@ -2,14 +2,12 @@
 
 import dataclasses
 import json
-import re
 import sys
-import time
 from importlib import import_module
 from pathlib import Path
 
 import pytest
-from helpers.support import ROOT, script
+from helpers.support import ROOT
 from omegaconf import OmegaConf
 
 import gridworld
@@ -45,11 +43,8 @@ def test_the_benchmark_prints_tables_and_writes_json(
     benchmark.main(["--quick", "--only", "stepping", "training", "worlds", "--out", str(out)])
     output = capsys.readouterr().out
     results = json.loads(out.read_text())["results"]
-    assert {result["table"] for result in results} == {
-        "stepping, environment steps per second",
-        "training, environment steps per second",
-        "compiling, seconds",
-    }
+    tables = {result["table"].partition(",")[0] for result in results}
+    assert tables == {"stepping", "training", "compiling"}
     for result in results:
         assert result["name"] in output
         assert result["ours"] > 0
@@ -70,93 +65,25 @@ def test_a_measurement_compares_pair_by_pair() -> None:
 def test_rl_zoo_is_given_the_same_steps_of_the_same_world(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def row(agent: str) -> measure.Comparison:
-        (found,) = [
-            row for row in whole.comparisons(measure.QUICK) if row.peer.startswith(f"RL Zoo's {agent}")
-        ]
-        return found
-
-    def python(*lines: str) -> None:  # stands in for one that has RL Zoo
-        executable = tmp_path / "python"
-        executable.write_text("\n".join(["#!/bin/sh", *lines, ""]))
-        executable.chmod(0o755)
-        monkeypatch.setenv("RL_ZOO_PYTHON", str(executable))
-
-    python(f'printf "%s\\n" "$PYTHONPATH" "$@" > "{tmp_path}/seen"')
-    theirs = row("ppo").theirs
-    assert theirs is not None
-    assert theirs() > 0
+    executable = tmp_path / "python"  # stands in for one that has RL Zoo
+    executable.write_text(f'#!/bin/sh\nprintf "%s\\n" "$PYTHONPATH" "$@" > "{tmp_path}/seen"\n')
+    executable.chmod(0o755)
+    monkeypatch.setenv("RL_ZOO_PYTHON", str(executable))
+    [row] = [row for row in whole.comparisons(measure.QUICK) if row.peer.startswith("RL Zoo's ppo")]
+    assert row.theirs is not None
+    assert row.theirs() > 0
     path, *words = (tmp_path / "seen").read_text().splitlines()
     given = dict(zip(words[2::2], words[3::2], strict=True))
     assert (path, words[:2]) == (str(ROOT), ["-m", "rl_zoo3.train"])
     assert (given["--algo"], given["--env"], given["--n-timesteps"]) == ("ppo", "GridWorld-v0", "20000")
-    assert "20,000 steps" in row("ppo").name
+    assert "20,000 steps" in row.name
     settings = OmegaConf.load(given["--conf-file"])["GridWorld-v0"]
     assert settings["env_wrapper"] == f"gridworld.{gridworld.OneHotObservation.__name__}"
-
-    python("echo no such algorithm >&2", "exit 1")
-    theirs = row("dqn").theirs
-    assert theirs is not None
-    with pytest.raises(InputError, match=r"rl_zoo3\.train.*: no such algorithm$"):
-        theirs()
 
 
 def test_a_peers_python_is_tried_by_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NAVIX_PYTHON", str(tmp_path / "none"))
     assert peers.why_not("NAVIX") == "not measured, NAVIX_PYTHON names no Python that has it"
     monkeypatch.setenv("NAVIX_PYTHON", sys.executable)
-    assert peers.why_not("NAVIX") == ""
     with pytest.raises(InputError, match=r"^NAVIX_PYTHON=.*: ModuleNotFoundError: No module"):
         peers.navix()
-
-
-def test_populations_are_measured() -> None:
-    rows = list(population.comparisons(measure.QUICK))
-    commands = [row for row in rows if "whole command" in row.table]
-    assert len(commands) == 6
-    assert all(row.theirs is not None for row in commands)
-    assert population._shipped("a2c", 2) > 0
-
-
-@pytest.mark.slow
-def test_whole_runs_are_measured(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv("RL_ZOO_PYTHON", raising=False)
-    train, run, measured = whole.train, whole.run, {}
-
-    def shorter(*words: str) -> list[str]:
-        """How long a run is measured is not the point here, where the table does not name its steps."""
-        named = f"total_timesteps={whole._STEPS}" in words
-        return train(*words, *(() if named else ("total_timesteps=2000",)))
-
-    monkeypatch.setattr(whole, "train", shorter)
-
-    def once(command: list[str], env: dict[str, str] | None = None) -> tuple[float, float]:
-        """Commands that differ in the agent or the steps alone are measured once, a peer's import too.
-
-        What else is short and has no bound to keep runs in a fork.
-        """
-        kind = tuple(word for word in command if not word.startswith(("agent=", "total_timesteps=")))
-        if kind not in measured:
-            is_short = command[:4] == whole.train()[:4] and "env.num_rows=200" not in command
-            measured[kind] = in_a_fork(command[4:]) if is_short else run(command, env)
-        return measured[kind]
-
-    def in_a_fork(words: list[str]) -> tuple[float, float]:
-        began = time.monotonic()
-        done = script("train.py", *words, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-        return time.monotonic() - began, 1.0
-
-    monkeypatch.setattr(whole, "run", once)
-    benchmark.main(["--quick", "--only", "whole", "--out", str(tmp_path / "benchmark.json")])
-    output = capsys.readouterr().out
-    assert re.search(r"dqn, median of 1 seeds +[\d.]+", output)
-    assert len(re.findall(r"20,000 steps +[\d.]+ +RL Zoo's .*: not measured, RL_ZOO_PYTHON", output)) == 2
-    memory = {
-        result["name"]: result["ours"]
-        for result in json.loads((tmp_path / "benchmark.json").read_text())["results"]
-        if "memory" in result["table"]
-    }
-    assert max(memory.values()) < 2000  # 200x200 in under 2 GB

@@ -1,5 +1,6 @@
 """The command lines, as a user types them: train, look, sweep, stop."""
 
+import contextlib
 import errno
 import fcntl
 import json
@@ -15,7 +16,6 @@ import time
 from pathlib import Path
 from typing import IO, Any
 
-import numpy as np
 import pytest
 from helpers.support import CONF, ROOT, SHORT, script, start
 
@@ -73,10 +73,8 @@ def test_runs_get_folders_of_their_own_even_in_the_same_second(tmp_path: Path) -
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_a_run_cleanly(number: signal.Signals, code: int, tmp_path: Path) -> None:
-    words = ("total_timesteps=100000000", "hydra.run.dir=run")
-    with start("train.py", *words, cwd=tmp_path) as process:
-        curve = tmp_path / "run" / "curve.csv"
-        deadline = time.monotonic() + 60
+    with start("train.py", "total_timesteps=100000000", "hydra.run.dir=run", cwd=tmp_path) as process:
+        curve, deadline = tmp_path / "run" / "curve.csv", time.monotonic() + 60
         while not (curve.exists() and curve.read_text().count("\n") > 2) and time.monotonic() < deadline:
             time.sleep(0.05)
         process.send_signal(number)
@@ -86,25 +84,18 @@ def test_a_signal_ends_a_run_cleanly(number: signal.Signals, code: int, tmp_path
     assert "steps are saved; go on with  python scripts/train.py resume=run" in errors
     assert "Traceback" not in errors
     assert json.loads((tmp_path / "run" / "manifest.json").read_text())["status"] == "interrupted"
-    again = script("evaluate.py", "run", cwd=tmp_path)
-    assert again.returncode == 2
-    assert "this run is 'interrupted'" in again.stderr
 
 
 def test_progress_is_a_bar_on_a_terminal_only(finished: Path, tmp_path: Path) -> None:
     main, terminal = pty.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
     command = [sys.executable, str(ROOT / "scripts" / "train.py"), *SHORT["sarsa"], "hydra.run.dir=run"]
+    shown = b""
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=terminal) as process:
         os.close(terminal)
-        shown = b""
-        while True:
-            try:
-                shown += (part := os.read(main, 4096))
-            except OSError:
-                break
-            if not part:
-                break
+        with contextlib.suppress(OSError):  # at the end
+            while part := os.read(main, 4096):
+                shown += part
     os.close(main)
     assert process.returncode == 0
     assert b"sarsa on classic: 100%" in shown
@@ -115,7 +106,7 @@ def test_progress_is_a_bar_on_a_terminal_only(finished: Path, tmp_path: Path) ->
 def test_help_is_a_manual_with_every_choice(tmp_path: Path) -> None:
     done = script("train.py", "--help", cwd=tmp_path)
     assert done.returncode == 0
-    assert done.stdout.strip() == manual(CONF).strip()
+    assert done.stdout.strip() == manual().strip()
     for file in CONF.glob("*/**/*.yaml"):
         if file.parent.name in ("tuned", "settings"):
             continue  # listed by world, see test_recipes.py; chosen by a preset
@@ -124,21 +115,18 @@ def test_help_is_a_manual_with_every_choice(tmp_path: Path) -> None:
     assert done.stdout.count("python scripts/train.py") >= 5
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["--cfg", "job"]])
-def test_asking_imports_nothing_heavy(arguments: list[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize("command", ["-m gridworld --help", "{train} --help", "{train} --cfg job"])
+def test_asking_imports_nothing_heavy(command: str, tmp_path: Path) -> None:
+    words = command.format(train=ROOT / "scripts" / "train.py").split()
     done = subprocess.run(
-        [sys.executable, "-X", "importtime", str(ROOT / "scripts" / "train.py"), *arguments],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=60,
+        [sys.executable, "-X", "importtime", *words], cwd=tmp_path, capture_output=True, text=True, timeout=60
     )
     assert done.returncode == 0
     modules = {line.rsplit("|", 1)[1].strip() for line in done.stderr.splitlines() if "|" in line}
-    assert "hydra" in modules
+    assert ("hydra" in modules) == ("train.py" in command)
     assert not modules & {"torch", "stable_baselines3", "gymnasium", "scipy", "pygame", "tensorboard"}
     # A tabular agent's settings stand in one module with its arithmetic, and composing reads all settings.
-    assert ("numpy" in modules) <= (arguments != ["--help"])
+    assert ("numpy" in modules) <= ("--cfg" in command)
 
 
 def test_evaluate_scores_again_exactly_and_by_sampling(
@@ -191,34 +179,19 @@ def test_record_draws_the_maps_again(
     for name in maps:
         assert (tmp_path / f"{name}.png").read_bytes() == (finished / f"{name}.png").read_bytes()
 
-    copy = tmp_path / "copy"
-    subprocess.run(["cp", "-r", str(finished), str(copy)], check=True)
-    for content, words in ((b"", "is not the file"), (None, "has no visits.npy"), ("other", "is not the")):
-        (copy / "visits.npy").unlink(missing_ok=True)
-        if content == "other":
-            np.save(copy / "visits.npy", np.zeros((3, 4), dtype=int))
-        elif content is not None:
-            (copy / "visits.npy").write_bytes(content)
-        with pytest.raises(InputError, match=words):
-            record_command.main([str(copy), "--format", "visits"])
-    assert not (copy / "recording").exists()
-
 
 def test_record_says_where_it_cannot_write(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").touch()
-    line = [str(finished), "--format", "gif", "--out"]
-    with pytest.raises(
-        InputError, match=r"file/below: cannot be made, .*file is a file; choose another --out"
-    ):
+    out, line = tmp_path / "below", [str(finished), "--format", "gif", "--out"]
+    told = "file/below: cannot be made, .*file is a file; choose another --out"
+    with pytest.raises(InputError, match=told):
         record_command.main([*line, str(tmp_path / "file" / "below")])
     with monkeypatch.context() as patched:
         patched.setattr(os, "access", lambda path, mode: False)
-        with pytest.raises(
-            InputError, match=rf"below: cannot be written, {tmp_path} is read-only; choose an"
-        ):
-            record_command.main([*line, str(tmp_path / "below")])
+        with pytest.raises(InputError, match=f"below: cannot be written, {tmp_path} is read-only; choose an"):
+            record_command.main([*line, str(out)])
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
     def refuse(path: Path, mode: str = "r", *more: Any, **named: Any) -> IO[Any]:
@@ -227,36 +200,14 @@ def test_record_says_where_it_cannot_write(
         return path_open(path, mode, *more, **named)
 
     path_open = Path.open
-    out = tmp_path / "below"
     monkeypatch.setattr(sys, "argv", ["record.py", *line, str(out)])
     monkeypatch.setattr(Path, "open", refuse)  # as a file server may, whatever the permissions say
     with pytest.raises(SystemExit) as ended:
         run(record_command.main)
-    assert ended.value.code == 2
-    assert capsys.readouterr().err == (
-        f"error: {out}/episode.gif: Permission denied; choose another folder than {out}, "
-        "or get the right to write to it\n"
+    told = (
+        f"{out}/episode.gif: Permission denied; choose another folder than {out}, or get the right to write"
     )
-
-
-def test_a_run_whose_files_were_damaged_is_refused(finished: Path, tmp_path: Path) -> None:
-    for name, damage, words in (
-        ("model.zip", b"no zip", "model.zip: is not the file that the run wrote"),
-        ("model.zip", None, "copy: has no model.zip"),
-        ("manifest.json", b"{", "manifest.json: is no JSON, it was changed or cut off"),
-        ("manifest.json", b"[]", "manifest.json: holds no JSON object"),
-        ("manifest.json", b"\xff\xfe", "manifest.json: cannot be read"),
-    ):
-        copy = tmp_path / "copy"
-        subprocess.run(["cp", "-r", str(finished), str(copy)], check=True)
-        if damage is None:
-            (copy / name).unlink()
-        else:
-            (copy / name).write_bytes(damage)
-        done = script("evaluate.py", "copy", cwd=tmp_path)
-        assert (done.returncode, "Traceback" in done.stderr) == (2, False)
-        assert words in done.stderr
-        subprocess.run(["rm", "-r", str(copy)], check=True)
+    assert (ended.value.code, capsys.readouterr().err) == (2, f"error: {told} to it\n")
 
 
 def test_a_reader_that_leaves_does_not_end_a_run_badly(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The console command `gridworld`, in the checkout and from a wheel; what both tell people to type."""
 
+import contextlib
 import json
 import os
 import re
@@ -14,6 +15,7 @@ from helpers.support import CONF, ROOT, SHORT, script
 
 from gridworld import __version__
 from gridworld.commands import COMMANDS
+from gridworld.commands import console as main
 from gridworld.config.words import conf_folder
 from gridworld.errors import DISTRIBUTION
 from gridworld.process import console
@@ -22,53 +24,42 @@ from gridworld.run.provenance import code
 TEXTS = (".py", ".md", ".yaml", ".toml", ".cff", ".j2")
 
 
-def gridworld(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """The command in a process of its own."""
-    command = [sys.executable, "-m", "gridworld", *words]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=120)
-
-
 def test_a_command_for_each_script() -> None:
-    assert {path.stem for path in (ROOT / "scripts").glob("*.py")} == set(COMMANDS)
-
-
-@pytest.mark.parametrize("words", [[], ["--help"], ["-h"], ["help"]])
-def test_help_has_a_line_for_each_command(words: list[str], tmp_path: Path) -> None:
-    done = gridworld(*words, cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    for name, about in COMMANDS.items():
-        assert re.search(rf"^  {name} +{re.escape(about)}$", done.stdout, re.MULTILINE)
-
-
-def test_version_and_checkout(tmp_path: Path) -> None:
+    for name in COMMANDS:
+        assert f'call("{name}")' in (ROOT / "scripts" / f"{name}.py").read_text("utf-8")
+    assert len(list((ROOT / "scripts").glob("*.py"))) == len(COMMANDS)
     assert conf_folder() == CONF
-    assert gridworld("--version", cwd=tmp_path).stdout == f"gridworld {__version__}\n"
 
 
-@pytest.mark.parametrize(
-    ("word", "advice"),
-    [
+def test_help_version_and_words_that_are_no_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def told(*words: str, code: int = 0) -> tuple[str, str]:
+        monkeypatch.setattr(sys, "argv", ["gridworld", *words])
+        with pytest.raises(SystemExit) if code else contextlib.nullcontext():
+            main()
+        return capsys.readouterr()
+
+    assert told("--version") == (f"gridworld {__version__}\n", "")
+    for words in ((), ("--help",), ("-h",), ("help",)):
+        out, errors = told(*words)
+        for name, about in COMMANDS.items():
+            assert re.search(rf"^  {name} +{re.escape(about)}$", out, re.MULTILINE)
+    for word, advice in (
         ("trian", "did you mean gridworld train?"),
         ("evaluate.py", "did you mean gridworld evaluate?"),
         ("agent=dqn", "settings stand after a command: gridworld train agent=dqn"),
         ("x\x1b[1m", f"it is one of {', '.join(COMMANDS)}"),
-    ],
-)
-def test_a_word_that_is_no_command(word: str, advice: str, tmp_path: Path) -> None:
-    done = gridworld(word, cwd=tmp_path)
-    shown = word.replace("\x1b", "\\x1b")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f"error: gridworld: there is no command {shown}; {advice}\n"
+    ):
+        out, errors = told(word, code=2)
+        shown = word.replace("\x1b", "\\x1b")
+        assert (out, errors) == ("", f"error: gridworld: there is no command {shown}; {advice}\n")
 
 
-def test_asking_imports_nothing_heavy(tmp_path: Path) -> None:
-    command = [sys.executable, "-X", "importtime", "-m", "gridworld", "--help"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    loaded = {line.split("|")[-1].strip() for line in done.stderr.splitlines()}
-    assert "gridworld.commands" in loaded
-    assert not loaded & {"numpy", "hydra", "torch", "gymnasium", "scipy"}
-    ours = (ROOT / "gridworld" / "__main__.py").read_text()
-    assert ours.index("listen()  # before") < ours.index("from gridworld.commands")
+def test_signals_are_listened_for_before_what_takes_time() -> None:
+    for file in (ROOT / "gridworld" / "__main__.py", *(ROOT / "scripts").glob("*.py")):
+        text = file.read_text("utf-8")
+        assert text.index("listen()  # before") < text.index("from gridworld.commands import")
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
@@ -96,17 +87,6 @@ def test_what_is_typed_and_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert console.command("report") == "python scripts/report.py"
     monkeypatch.setattr(console, "_SCRIPTS", Path("nowhere"))
     assert console.command("report") == "gridworld report"
-
-
-def test_a_run_is_told_as_it_was_started(tmp_path: Path) -> None:
-    done = gridworld("train", *SHORT["q_learning"], "hydra.run.dir=run", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
-    assert manifest["command"] == ["gridworld", "train", *SHORT["q_learning"], "hydra.run.dir=run"]
-    assert manifest["versions"]["gridworld"] == __version__
-    again = gridworld("train", "agent=sarsa", "hydra.run.dir=run", cwd=tmp_path)
-    assert again.returncode == 2
-    assert "gridworld train resume=run total_timesteps=..." in again.stderr
 
 
 def test_nobody_is_sent_to_the_other_project_on_pypi() -> None:
@@ -168,9 +148,13 @@ def test_it_trains_from_the_wheel(wheel: Path, tmp_path: Path) -> None:
     same = "from gridworld.run.provenance import code; print(code())"
     assert run(sys.executable, "-c", same).strip() == code()  # a run may go on in a checkout
     command = str(site / "bin" / "gridworld")
-    run(command, "train", *SHORT["q_learning"], "hydra.run.dir=run")
+    words = [*SHORT["q_learning"], "hydra.run.dir=run"]
+    run(command, "train", *words)
     manifest = json.loads((here / "run" / "manifest.json").read_text())
-    assert manifest["git"] is None
+    assert (manifest["git"], manifest["command"]) == (None, ["gridworld", "train", *words])
+    assert manifest["versions"]["gridworld"] == __version__
+    refused = subprocess.run([command, "train", *words], cwd=here, env=environment, capture_output=True)
+    assert b"gridworld train resume=run total_timesteps=..." in refused.stderr
     told = run(
         *(command, "train", "-m", *SHORT["q_learning"], "seed=0,1"),
         *("hydra.sweep.dir=sweep", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),

@@ -1,6 +1,7 @@
 """A run's folder is data: nothing that a stranger puts into one is run, leaks, or writes elsewhere.
 
-Every entry of the catalogue in hostile.py meets every command that reads a run. CI takes a third of it:
+Every entry of the catalogue in hostile.py meets every command that reads a run. CI takes a third of it, each
+with half of the commands that only look:
 GRIDWORLD_HOSTILE=all python -m pytest tests/commands/test_hostile_runs.py
 takes all.
 """
@@ -11,9 +12,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from helpers.forks import run_watched
+from helpers import forks
 from helpers.hostile import CATALOGUE, FINE, SECRET, Hostile
-from helpers.support import SHORT, train_in
+from helpers.support import ROOT, SHORT, train_in
 from PIL import Image
 
 WORDS = {
@@ -33,12 +34,8 @@ MOST_SECONDS = 20
 
 # One of each kind at least; the rest has the same behind other doors.
 FIRST = {
-    *(
-        "pickle_where_sb3_would_read_one",
-        "pickle_in_torchs_own_file",
-        "zip_bomb",
-        "weights_that_are_no_numbers",
-    ),
+    *("pickle_where_sb3_would_read_one", "pickle_in_torchs_own_file", "zip_bomb"),
+    "weights_that_are_no_numbers",
     *("one_weight_changed_and_not_sealed", "model_that_never_ends", "pickle_in_a_table", "pickle_as_visits"),
     *("target_among_an_optimisers_arguments", "interpolation_in_names", "algorithm_of_ones_own"),
     *("class_that_opens_a_file", "map_file_that_is_the_secret", "settings_nested_as_deep_as_json_goes"),
@@ -57,6 +54,7 @@ FIRST = {
 RUNS = SHORT | {"lake": [*SHORT["q_learning"], "env=frozen_lake_v1", "n_envs=4"]}  # which has tables
 ALL = os.environ.get("GRIDWORLD_HOSTILE") == "all"
 CASES = [case for case in CATALOGUE if ALL or case.name in FIRST]
+ALWAYS = ("evaluate", "play", "resume")
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +68,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_first_are_of_the_catalogue() -> None:
     assert {case.name for case in CATALOGUE} >= FIRST
-    assert len(FIRST) >= 15
+    assert len(FIRST) >= 40
     assert len(CATALOGUE) >= 50
 
 
@@ -79,6 +77,8 @@ def test_nothing_of_a_hostile_run_gets_out(case: Hostile, good: Path, tmp_path: 
     base = tmp_path / "base"
     outside = base / "outside"
     outside.mkdir(parents=True)
+    (outside / "kept").write_text("kept")
+    (base / "evil.py").write_text(f"open({str(base / 'canary')!r}, 'w')\nclass Agent: pass\n")
     (base / "secret.txt").write_text(f"S{SECRET}G\n")
     (base / "secret.json").write_text(f'{{"status": "{SECRET}", "timesteps": "{SECRET}"}}')
     Image.new("RGB", (16, 16), "red").save(base / "secret.png")
@@ -91,9 +91,13 @@ def test_nothing_of_a_hostile_run_gets_out(case: Hostile, good: Path, tmp_path: 
     assert not (base / "canary").exists()
 
     looked_at = -1
-    for command, words in WORDS.items():
-        secret = base / "secret"
-        ended = run_watched(SCRIPTS[command], *words, cwd=place, secret=secret, environment=AWAY, timeout=60)
+    for number, (command, words) in enumerate(WORDS.items(), CATALOGUE.index(case)):
+        if not ALL and command not in ALWAYS and number % 2:
+            continue
+        variables = {**AWAY, "PYTHONPATH": f"{ROOT}{os.pathsep}{base}"}
+        ended = forks.run(
+            SCRIPTS[command], *words, cwd=place, secret=base / "secret", environment=variables, timeout=60
+        )
         where = f"{command}: {ended.output[-2000:]}"
         assert ended.deeds == [], where
         assert not (base / "canary").exists(), where

@@ -35,13 +35,6 @@ def test_commands_name_folders_from_where_the_user_is(
     assert shown(tmp_path / "runs" / "a") == "."
 
 
-def test_dashes_are_answered_before_anything_is_read(tmp_path: Path) -> None:
-    for name in ("train.py", "tune.py"):
-        done = script(name, "agent=q_learning", "--seed", "3", cwd=tmp_path)
-        assert (done.returncode, done.stdout) == (2, "")
-        assert done.stderr == "error: --seed 3: a setting is written without dashes; write seed=3\n"
-
-
 def test_tune_shows_what_train_would_run(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     words = ["agent=q_learning", "total_timesteps=1e3", "tune.trials=1e1"]
 

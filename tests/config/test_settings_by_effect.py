@@ -1,4 +1,4 @@
-"""What every setting affects, and that everybody who asks goes by it: hashes, groups, recipes, searches."""
+"""What a setting affects is declared at it; everybody goes by that: hashes, reports, recipes, searches."""
 
 import copy
 import dataclasses
@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from helpers.runs_folder import Maker
-from helpers.support import CONF, configure
+from helpers.support import configure
 
 from gridworld.config.fields import Effect
 from gridworld.config.settings import agent_schemas, effect_of, flat, with_effects
@@ -20,9 +20,8 @@ from gridworld.report.evidence import Evidence, read
 from gridworld.report.grouping import arrange, learning_key, task_key
 from gridworld.run.provenance import identity, settings_hash
 from gridworld.training.tensorboard import hparams
-from gridworld.tune.recipe import _relevant, write_recipe
+from gridworld.tune.recipe import _relevant
 from gridworld.tune.search_space import SearchSpace
-from gridworld.tune.study_spec import ConfFolders
 
 DECLARED = {
     Effect.LENGTH: {"total_timesteps"},
@@ -63,31 +62,31 @@ CONFIGS = {
     for name, schema in agent_schemas().items()
 }
 CONFIGS["sb3"].agent.arguments = {"stats_window_size": 100, "gae_lambda": 0.5}  # type: ignore[attr-defined]
-FIELDS = sorted(
-    {key: agent for agent, config in CONFIGS.items() for key, _ in flat(dataclasses.asdict(config))}.items()
-)
+FIELDS = {key: agent for agent, config in CONFIGS.items() for key, _ in flat(dataclasses.asdict(config))}
 
 
 def test_every_field_affects_what_is_declared() -> None:
     """Outside of the agent's section, a new one has to be added above."""
     found = defaultdict(set)
-    for key, _ in FIELDS:
+    for key in FIELDS:
         found[effect_of(key)].add(key)
     learning = found.pop(Effect.LEARNING)
     assert found == DECLARED
-    others = {key for key in learning if not key.startswith("agent.")}
-    exploring = {"exploration_bonus", "exploring_starts", "stratified_draws"}
-    observed = {"observation.kind", "observation.cell_size", "observation.features"}
-    assert others == exploring | observed | {"callbacks", "n_envs"}
+    assert {key for key in learning if not key.startswith("agent.")} == {
+        *("exploration_bonus", "exploring_starts", "stratified_draws", "callbacks", "n_envs"),
+        *("observation.kind", "observation.cell_size", "observation.features"),
+    }
 
 
-@pytest.mark.parametrize(("key", "agent"), FIELDS)
-def test_everybody_goes_by_what_a_field_affects(key: str, agent: str) -> None:
-    config = CONFIGS[agent]
-    other = changed(config, key)
-    seen = {name for name in answers(config) if answers(config)[name] != answers(other)[name]}
-    seen |= {"search"} if is_searched(key) else set()
-    assert seen == GO_BY[effect_of(key)] - ({"task"} if key in OF_THE_MAP else set())
+@pytest.mark.parametrize("effect", Effect)
+def test_everybody_goes_by_what_a_field_affects(effect: Effect) -> None:
+    before = {agent: answers(config) for agent, config in CONFIGS.items()}
+    for key, agent in FIELDS.items():
+        if effect_of(key) is effect:
+            after = answers(changed(CONFIGS[agent], key))
+            seen = {name for name, answer in after.items() if answer != before[agent][name]}
+            seen |= {"search"} if is_searched(key) else set()
+            assert seen == GO_BY[effect] - ({"task"} if key in OF_THE_MAP else set()), key
 
 
 def changed(config: TrainConfig, key: str) -> TrainConfig:
@@ -106,7 +105,11 @@ def changed(config: TrainConfig, key: str) -> TrainConfig:
 
 def answers(config: TrainConfig) -> dict[str, Any]:
     """By which everybody tells two settings apart."""
-    run = evidence(config)
+    run = object.__new__(Evidence)  # as much of a run as its keys are of
+    settings = {key: json.dumps(value) for key, value in flat(dataclasses.asdict(config))}
+    for name, value in {"settings": settings, "layout": "S.G", "env": "classic"}.items():
+        object.__setattr__(run, name, value)
+    object.__setattr__(run, "gamma", config.evaluation.gamma)
     return {
         "identity": identity(config, "S.G"),
         "sweep": settings_hash(dataclasses.asdict(config), "S.G"),
@@ -115,16 +118,6 @@ def answers(config: TrainConfig) -> dict[str, Any]:
         "task": task_key(run),
         "recipe": _relevant(config),
     }
-
-
-def evidence(config: TrainConfig) -> Evidence:
-    """As much of a run as its keys are of."""
-    run = object.__new__(Evidence)
-    gamma = config.evaluation.gamma
-    settings = {key: json.dumps(value) for key, value in flat(dataclasses.asdict(config))}
-    for name, value in {"settings": settings, "layout": "S.G", "env": "classic", "gamma": gamma}.items():
-        object.__setattr__(run, name, value)
-    return run
 
 
 def is_searched(key: str) -> bool:
@@ -154,48 +147,29 @@ def test_hashes_are_those_of_folders_that_are_there_already() -> None:
 
 
 def test_what_a_run_is_known_by_leaves_out_what_it_may_change_on_its_way() -> None:
-    config = configure("agent=a2c_sb3_defaults", "env=maze")
-    content = dataclasses.asdict(config)
+    content = dataclasses.asdict(configure("agent=a2c_sb3_defaults", "env=maze"))
+    kept = frozenset(Effect) - {Effect.LENGTH, Effect.NOTHING}
+    found = with_effects(kept, content)
     del content["checkpoint"], content["total_timesteps"], content["logging"]["progress"]
     del content["recipe"], content["preset"], content["known_failure"], content["observation"]["features"]
     newer = ("callbacks", "exploration_bonus", "exploring_starts", "stratified_draws")
     assert [content.pop(key) for key in newer] == [[], 0, 0, False]  # as if there were none
-    assert (
-        with_effects(frozenset(Effect) - {Effect.LENGTH, Effect.NOTHING}, dataclasses.asdict(config))
-        == content
-    )
+    assert found == content
 
 
 def test_runs_that_differ_in_nothing_that_is_learnt_are_one_configuration(tmp_path: Path) -> None:
-    maker = Maker("agent=dqn")
+    def groups(agent: str, variants: list[dict[str, Any]]) -> list[int]:
+        maker = Maker(f"agent={agent}")
+        runs = [
+            read(maker.write(tmp_path / f"{agent}{seed}", seed, 3000, **settings))
+            for seed, settings in enumerate(variants)
+        ]
+        study = arrange(run for run in runs if isinstance(run, Evidence))
+        assert study.notes == () or agent != "dqn"
+        return sorted(len(group.runs) for group in study.groups)
+
     kinds = (Effect.MACHINE, Effect.LABELS, Effect.FILES, Effect.NOTHING)
-    keys = [key for kind in kinds for key in sorted(DECLARED[kind]) if "arguments" not in key]
-    keys.remove("agent.name")  # is told apart by that
-    runs = [
-        read(maker.write(tmp_path / f"run{seed}", seed, 3000, **({key: 7} if key else {})))
-        for seed, key in enumerate(["", *keys])
-    ]
-    assert "checkpoint.every" in keys
-    study = arrange(run for run in runs if isinstance(run, Evidence))
-    (group,) = study.groups
-    assert (group.agent, len(group.runs)) == ("dqn", len(keys) + 1)
-    assert study.notes == ()
-
-
-def test_an_argument_of_a_class_that_is_only_told_does_not_split(tmp_path: Path) -> None:
-    maker = Maker("agent=a2c_sb3_defaults")
-    runs = [
-        read(maker.write(tmp_path / f"run{seed}", seed, 3000, agent__arguments=arguments))
-        for seed, arguments in enumerate([{}, {"stats_window_size": 7}, {"n_steps": 7}])
-    ]
-    study = arrange(run for run in runs if isinstance(run, Evidence))
-    assert sorted(len(group.runs) for group in study.groups) == [1, 2]
-
-
-def test_a_recipe_has_no_checkpoints_and_comes_to_the_winner(tmp_path: Path) -> None:
-    config = configure("agent=q_learning", "checkpoint.every=150", "agent.gamma=0.5", "seed=9")
-    choices = {"agent": "q_learning", "env": "classic", "observation": "one_hot"}
-    path = write_recipe(tmp_path, ConfFolders(CONF), choices, config, "a winner")
-    recipe = path.read_text()
-    assert "gamma: 0.5" in recipe
-    assert "checkpoint" not in recipe
+    keys = {key for kind in kinds for key in DECLARED[kind] if "arguments" not in key} - {"agent.name"}
+    assert groups("dqn", [{}, *({key: 7} for key in sorted(keys))]) == [len(keys) + 1]
+    arguments: list[dict[str, Any]] = [{}, {"stats_window_size": 7}, {"n_steps": 7}]
+    assert groups("a2c_sb3_defaults", [{"agent__arguments": each} for each in arguments]) == [1, 2]

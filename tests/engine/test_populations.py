@@ -9,11 +9,8 @@ import numpy as np
 import pytest
 import torch
 from helpers.support import configure
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from gridworld.agents import Learning, family, learn_together
-from gridworld.agents.sb3.agent import ACTIVATIONS
 from gridworld.engine import population
 from gridworld.envs.observations import make_observation
 from gridworld.training.setup import check_settings, make_context
@@ -125,75 +122,37 @@ def meetings(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 @pytest.mark.parametrize("agent", SMALL)
 def test_seeds_train_as_alone(agent: str, meetings: list[int]) -> None:
-    runs = [(*SMALL[agent], f"seed={n}", f"exploration_bonus={n / 4}", "env.slip=0.1") for n in range(4)]
+    runs = [(*SMALL[agent], f"seed={n}", f"exploration_bonus={n / 4}", "env.slip=0.1") for n in range(3)]
     assert_as_alone(runs)
-    assert meetings == [1, 1, 1, 1, 4]
+    assert meetings == [1, 1, 1, 3]
 
 
-# Settings that may differ within a population, and those that are the same for all that train at once.
-OF_ALL: list[list[Words]] = [
-    [(), ("env.slip=0.3",), ("env.slip=0.1", "env.max_episode_steps=7"), ("env.step_reward=-0.5",)],
-    [(), ("total_timesteps=110",), ("total_timesteps=300",)],
-    [("env.slip=0.1", f"stratified_draws={value}") for value in ("true", "false")],
-]
-OPTIMIZERS = [f"policy_kwargs.optimizer_class=torch.optim.{name}" for name in ("AdamW", "SGD", "RMSprop")] + [
-    ""
-]
+# Arguments of which each run of a population may have its own; those of one place go together.
 OF_DQN = [
-    ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
-    ["gamma=0.5", "gamma=1", ""],
-    ["exploration_fraction=0.3", "exploration_final_eps=0.5", "exploration_initial_eps=0.2"],
-    ["target_update_interval=2", "target_update_interval=37", ""],
-    ["tau=0.5", "", ""],
-    ["max_grad_norm=0.01", "max_grad_norm=1000", ""],
-    ["learning_starts=0", "learning_starts=100", ""],
-    ["buffer_size=40", "buffer_size=1000", ""],
-    OPTIMIZERS,
+    ("learning_rate=lin_0.01", "learning_rate=1e-4", ""),
+    ("gamma=0.5", "gamma=1", ""),
+    ("exploration_fraction=0.3", "exploration_final_eps=0.5", "exploration_initial_eps=0.2"),
+    ("max_grad_norm=0.01", "max_grad_norm=1000", ""),
 ]
-DIFFERENT: dict[str, list[list[str]]] = {  # of each argument; the empty one is the agent's own
+OF_POLICY = [("learning_rate=lin_0.01", "learning_rate=1e-4", ""), ("gamma=0.5", "gae_lambda=lin_0.9", "")]
+DIFFERENT: dict[str, list[tuple[str, ...]]] = {
     "dqn": OF_DQN,
     "dqn that counts": OF_DQN,
-    "qrdqn": [
-        ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
-        ["gamma=0.5", "gamma=1", ""],
-        ["exploration_fraction=0.3", "exploration_final_eps=0.5", ""],
-        ["target_update_interval=8", "tau=0.3", ""],
-        ["max_grad_norm=0.01", ""],
-    ],
+    "qrdqn": OF_DQN,
     "ppo": [
-        ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
-        ["gamma=0.5", "gae_lambda=0", ""],
-        ["ent_coef=0.1", "vf_coef=2", ""],
-        ["target_kl=0.0001", "target_kl=0.003", ""],
-        ["clip_range=0.01", "clip_range=lin_0.5", ""],
-        ["clip_range_vf=0.01", "clip_range_vf=lin_1", ""],
-        ["max_grad_norm=0.01", "max_grad_norm=1000", ""],
-        OPTIMIZERS,
-        ["ent_coef=quad_0.3", "gae_lambda=lin_0.9", "learning_rate=sqrt_0.01", ""],
+        *OF_POLICY,
+        ("ent_coef=quad_0.3", "vf_coef=2", "ent_coef=0.1"),
+        ("target_kl=0.0001", "target_kl=0.003", ""),
+        ("clip_range=0.01", "clip_range=lin_0.5", ""),
+        ("max_grad_norm=0.01", "max_grad_norm=1000", "learning_rate=sqrt_0.01"),
     ],
-    "a2c": [
-        ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
-        ["gamma=0.5", "gae_lambda=0.5", "gae_lambda=lin_0.5", ""],
-        ["ent_coef=0.3", "vf_coef=2", ""],
-        ["max_grad_norm=0.01", ""],
-        OPTIMIZERS,
-    ],
+    "a2c": [*OF_POLICY, ("ent_coef=0.3", "vf_coef=2", ""), ("max_grad_norm=0.01", "", "gae_lambda=0")],
     "trpo": [
-        ["learning_rate=lin_0.01", "learning_rate=1e-4", ""],
-        ["gamma=0.5", "gae_lambda=0.5", "gae_lambda=lin_0.5", ""],
-        ["target_kl=0.5", "target_kl=1e-5", ""],
-        ["line_search_shrinking_factor=0.3", "line_search_shrinking_factor=0.99", ""],
-        OPTIMIZERS,
+        *OF_POLICY,
+        ("target_kl=0.5", "target_kl=1e-5", ""),
+        ("line_search_shrinking_factor=0.3", "line_search_shrinking_factor=0.99", ""),
     ],
 }
-# Settings of which the runs of a population have one value.
-OF_SHAPE = {
-    *("target_update_interval=2", "target_update_interval=8", "tau=0.5", "learning_starts=0"),
-    *("buffer_size=40", "clip_range_vf=0.01"),
-}
-OBSERVATIONS: list[Words] = [(), ("observation=coordinates",), ("observation=none",), ("observation=image",)]
-NETS = ["", "net_arch=[20]", "net_arch=[7,1]", "net_arch=[]", "net_arch=[33,5,16]"]
-SPLIT_NETS = ["net_arch={pi:[9],vf:[4,3]}", "net_arch={pi:[],vf:[20]}"]
 
 
 def word(agent: str, setting: str, inside: str = "") -> Words:
@@ -204,38 +163,12 @@ def word(agent: str, setting: str, inside: str = "") -> Words:
     return (f"++agent.{'arguments.' if of_class else ''}{inside}{setting}",)
 
 
-@st.composite
-def populations(draw: Callable[..., Any]) -> list[Words]:
-    """Members of one or two shapes, with whatever settings of their own."""
-    shapes = []
-    for _ in range(draw(st.sampled_from([1, 1, 2]))):
-        agent = draw(st.sampled_from(sorted(SMALL)))
-        nets = NETS if "dqn" in agent else NETS + SPLIT_NETS
-        net = word(agent, draw(st.sampled_from(nets)), "policy_kwargs.")
-        shapes.append((agent, (*SMALL[agent], *draw(st.sampled_from(OBSERVATIONS)), *net)))
-    members = []
-    for seed in range(draw(st.integers(2, 5))):
-        agent, shape = draw(st.sampled_from(shapes))
-        of_agent = [word(agent, draw(st.sampled_from(values))) for values in DIFFERENT[agent]]
-        of_all = [draw(st.sampled_from(values)) for values in OF_ALL]
-        members.append((*shape, *(each for words in (*of_all, *of_agent) for each in words), f"seed={seed}"))
-    return members
-
-
-@settings(max_examples=10)
-@given(runs=populations())
-def test_whatever_their_settings_runs_train_as_alone(runs: list[Words]) -> None:
-    assert_as_alone(runs)
-
-
 @pytest.mark.parametrize("agent", SMALL)
 def test_runs_that_differ_in_all_that_may_differ(agent: str, meetings: list[int]) -> None:
-    """Scalars that cost nothing to mix: each value occurs, and all are updated at once."""
-    scalars = [values for values in DIFFERENT[agent] if values != OPTIMIZERS and not OF_SHAPE & set(values)]
     runs = [
         tuple(
             each
-            for place, values in enumerate(scalars)
+            for place, values in enumerate(DIFFERENT[agent])
             for each in word(agent, values[(member + place) % len(values)])
         )
         for member in range(3)
@@ -246,13 +179,12 @@ def test_runs_that_differ_in_all_that_may_differ(agent: str, meetings: list[int]
 
 # Settings of which each needs its own arrays, or its own branch of an update, beside the agent's own.
 APART = [
-    *("env.slip=0", "env.slip=0.1", "env.slip=0.2", "env.step_reward=-0.1", "env.goal_reward=2"),
-    *("env.trap_reward=-2", "exploring_starts=0.5", "env=cliff", "env.max_episode_steps=9"),
-    *("stratified_draws=true", "n_envs=8"),
+    *("env.slip=0.1", "env.slip=0.2", "env.step_reward=-0.1", "exploring_starts=0.5", "env=cliff"),
+    *("env.max_episode_steps=9", "stratified_draws=true", "n_envs=8", "total_timesteps=110"),
 ]
 OWN_APART = {
-    "ppo": ["agent.clip_range_vf=0.2", "agent.target_kl=1e-4"],
-    "dqn": ["agent.reward_scale=0.5", f"agent.replay_buffer_class={COUNTS}"],
+    "ppo": ["agent.clip_range_vf=0.2", "agent.clip_range_vf=lin_1"],
+    "dqn": ["agent.reward_scale=0.5", "agent.tau=0.5", f"agent.replay_buffer_class={COUNTS}"],
 }
 
 
@@ -264,60 +196,51 @@ def test_runs_of_other_worlds_or_branches_train_as_alone_in_either_order(agent: 
 
 SHORT_SEARCH = ("line_search_max_iter=2", "cg_max_steps=3", "cg_damping=1e-4", "target_kl=1")
 ONE_SAMPLE = ("agent.batch_size=1", "total_timesteps=24", "agent.normalize_advantage=false")
-WRITTEN = {
-    "ppo one step": ("ppo", ("agent.n_steps=1", "agent.batch_size=4")),
+KWARGS, LATER = "agent.policy_kwargs", "agent.arguments"
+WRITTEN: dict[str, tuple[str, Words]] = {
+    "ppo one step": ("ppo", ("agent.n_steps=1", "agent.batch_size=4", f"{KWARGS}.net_arch=[]")),
     "ppo one sample": ("ppo", ("agent.n_steps=2", *ONE_SAMPLE)),
-    "ppo whole batch": ("ppo", ("agent.batch_size=32", "agent.normalize_advantage=false")),
     "ppo whole rollout": ("ppo", ("agent.batch_size=32", "agent.n_epochs=4", "agent.target_kl=0.002")),
     "ppo one environment": ("ppo", ("n_envs=1", "agent.n_steps=15", "agent.batch_size=5")),
-    "a2c one step": ("a2c", ("agent.arguments.n_steps=1", "total_timesteps=24")),
-    "a2c scaled": ("a2c", ("++agent.arguments.normalize_advantage=true",)),
-    "a2c adam": ("a2c", ("++agent.arguments.use_rms_prop=false",)),
-    "trpo parts": (
-        "trpo",
-        ("+agent.arguments.sub_sampling_factor=3", "+agent.arguments.normalize_advantage=false"),
-    ),
-    "trpo short searches": (
-        "trpo",
-        tuple(f"++agent.arguments.{each}" for each in SHORT_SEARCH),
-    ),
+    "ppo on images": ("ppo", ("observation=image", f"{KWARGS}.net_arch=[33,5,16]")),
+    "ppo of two sizes": ("ppo", ("observation=coordinates", f"{KWARGS}.net_arch={{pi:[9],vf:[4,3]}}")),
+    "ppo by torch": ("ppo", (f"{KWARGS}.activation_fn=torch.nn.ELU", f"{KWARGS}.net_arch=[16,16]")),
+    "a2c one step": ("a2c", (f"{LATER}.n_steps=1", "total_timesteps=24")),
+    "a2c scaled": ("a2c", (f"++{LATER}.normalize_advantage=true", "observation=coordinates")),
+    "a2c adam": ("a2c", (f"++{LATER}.use_rms_prop=false",)),
+    "trpo parts": ("trpo", (f"+{LATER}.sub_sampling_factor=3", f"+{LATER}.normalize_advantage=false")),
+    "trpo short searches": ("trpo", tuple(f"++{LATER}.{each}" for each in SHORT_SEARCH)),
     "dqn one sample": ("dqn", ("agent.batch_size=1", "agent.gradient_steps=1", "agent.train_freq=1")),
-    "dqn many steps": ("dqn", ("agent.gradient_steps=-1", "n_envs=3")),
+    "dqn many steps": ("dqn", ("agent.gradient_steps=-1", "n_envs=3", "observation=coordinates")),
     "dqn episodes": ("dqn", ("agent.train_freq=[2,episode]", "n_envs=1")),
-    "dqn sgd": ("dqn", ("agent.policy_kwargs.optimizer_class=torch.optim.SGD",)),
-    "dqn amsgrad": ("dqn", ("+agent.policy_kwargs.optimizer_kwargs={amsgrad: true}",)),
-    "dqn decay": ("dqn", ("+agent.policy_kwargs.optimizer_kwargs={weight_decay: 0.1, betas: [0.5, 0.9]}",)),
-    "qrdqn one quantile": ("qrdqn", ("agent.arguments.policy_kwargs.n_quantiles=1",)),
+    "dqn sgd": ("dqn", (f"{KWARGS}.optimizer_class=torch.optim.SGD", f"{KWARGS}.net_arch=[7,1]")),
+    "dqn amsgrad": ("dqn", (f"+{KWARGS}.optimizer_kwargs={{amsgrad: true, weight_decay: 0.1}}",)),
+    "dqn one by one": ("dqn", ("agent.target_update_interval=2", "agent.buffer_size=40", "observation=none")),
+    "qrdqn one quantile": ("qrdqn", (f"{LATER}.policy_kwargs.n_quantiles=1",)),
 }
 
 
+ODD = ("ppo on images", "ppo of two sizes")  # a processor may add up otherwise for several of these at once
+
+
 @pytest.mark.parametrize("name", WRITTEN)
-def test_buffers_batches_and_optimisers_of_other_kinds(name: str, meetings: list[int]) -> None:
+def test_buffers_batches_networks_and_optimisers_of_other_kinds(name: str, meetings: list[int]) -> None:
     agent, words = WRITTEN[name]
-    assert_as_alone([(*SMALL[agent], *words, f"seed={seed}") for seed in range(3)])
-    assert max(meetings) == (1 if "episodes" in name else 3)
-
-
-@pytest.mark.parametrize("activation", [each.__name__ for each in ACTIVATIONS])
-def test_all_activations(activation: str, meetings: list[int]) -> None:
-    """Networks with others than tanh and ReLU are differentiated by torch, one by one."""
-    given = word("ppo", f"activation_fn=torch.nn.{activation}", "policy_kwargs.")
-    shape = (*SMALL["ppo"], *given, "total_timesteps=64", "agent.policy_kwargs.net_arch=[16,16]")
-    assert_as_alone([(*shape, f"seed={seed}", "observation=coordinates") for seed in range(2)])
-    assert max(meetings) == (2 if activation in ("Tanh", "ReLU") else 1)
+    assert_as_alone([(*SMALL[agent], *words, f"seed={seed}") for seed in range(2)])
+    if name not in ODD:
+        assert max(meetings) == (1 if name in ("dqn episodes", "ppo by torch") else 2)
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@pytest.mark.parametrize("place", [0, 1])
 @pytest.mark.parametrize("agent", SMALL)
-def test_one_that_diverges_leaves_the_others_alone(agent: str, place: int) -> None:
+def test_one_that_diverges_leaves_the_others_alone(agent: str) -> None:
     # so that gradients are clipped at the step, too
     tight = word(agent, "max_grad_norm=0.01" if agent != "trpo" else "")
     runs = [(*SMALL[agent], *tight, f"seed={seed}") for seed in range(3)]
-    runs[place] = (*runs[place], *word(agent, "learning_rate=1e38"))
+    runs[1] = (*runs[1], *word(agent, "learning_rate=1e38"))
     found = together(runs)
-    assert isinstance(found[place], Exception)
-    assert "no finite number" in str(found[place])
+    assert isinstance(found[1], Exception)
+    assert "is not finite" in str(found[1])
     expected = [alone(words) for words in runs]
     assert [differences(*pair) for pair in zip(found, expected, strict=True)] == [[]] * 3
 
@@ -361,3 +284,14 @@ def test_where_products_add_up_otherwise_runs_train_one_by_one(
     assert set(meetings) == {1}
     told = capsys.readouterr().err
     assert len(re.findall(r"^population: .* train one by one$", told, re.MULTILINE)) == 1
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_a_trust_region_that_there_is_not_ends_its_own_run() -> None:
+    runs = [(*SMALL["trpo"], f"seed={seed}") for seed in range(3)]
+    learned = [Learned(words) for words in runs]
+    learnings = [each.learning() for each in learned]
+    learned[1].agent.run.model.target_kl = -1.0  # which no settings can be
+    errors = learn_together(learnings)
+    assert "a weight is not finite" in str(errors[1])
+    assert [differences(learned[place].found(), alone(runs[place])) for place in (0, 2)] == [[], []]

@@ -8,12 +8,12 @@ import pytest
 import torch
 from sb3_contrib import QRDQN, TRPO
 from stable_baselines3 import A2C, DQN, PPO
-from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.logger import Logger
 
-from gridworld.agents.sb3.agent import extractors_kind
 from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
-from gridworld.engine import a2c, dqn, on_policy, population
+from gridworld.engine import dqn, on_policy, population
+from gridworld.engine.networks import aligned
 from gridworld.engine.population import Run
 from gridworld.engine.sb3_format import algorithm_of, make_run, put_weights
 from gridworld.envs.observations import make_observation
@@ -21,19 +21,6 @@ from gridworld.envs.statistics_env import StatisticsVectorEnv
 
 NUM_ENVS, STEPS = 16, 32
 KINDS = ["one_hot", "coordinates", "none", "image"]
-
-
-class Keep(KVWriter):
-    """Keeps what was logged."""
-
-    def __init__(self) -> None:
-        self.values: dict[str, Any] = {}
-
-    def write(self, key_values: dict[str, Any], key_excluded: Any, step: int = 0) -> None:
-        self.values.update(key_values)
-
-    def close(self) -> None:
-        pass
 
 
 def twins(algorithm: type, kind: str, **arguments: Any) -> tuple[Run, Any]:
@@ -46,11 +33,11 @@ def twins(algorithm: type, kind: str, **arguments: Any) -> tuple[Run, Any]:
         model = algorithm(
             policy, GridWorldVecEnv(envs, observation), seed=0, device="cpu", **copy.deepcopy(arguments)
         )
-        model.set_logger(Logger(None, [Keep()]))
+        model.set_logger(Logger(None, []))
         model._setup_learn(10_000)
         models.append(model)
     models[1].policy.load_state_dict(models[0].policy.state_dict())
-    run = make_run(models[0], observation, envs, 0, extractors_kind(models[0]))
+    run = make_run(models[0], observation, envs, 0)
     run.begin(10_000)
     found = algorithm_of(algorithm)
     assert found is not None
@@ -80,14 +67,8 @@ def assert_same(run: Run, theirs: Any) -> None:
     put_weights(run)
     for mine, peer in zip(run.model.policy.parameters(), theirs.policy.parameters(), strict=True):
         assert torch.allclose(mine, peer, rtol=1e-5, atol=1e-6)
-    for model in (run.model, theirs):
-        model.logger.dump()
     logged, expected = (
-        {
-            key: value
-            for key, value in model.logger.output_formats[0].values.items()
-            if key.startswith("train/")
-        }
+        {key: value for key, value in model.logger.name_to_value.items() if key.startswith("train/")}
         for model in (run.model, theirs)
     )
     of_the_rollout = {"train/explained_variance", "train/n_updates", "train/learning_rate"}
@@ -110,31 +91,28 @@ RMSPROP = {"optimizer_class": torch.optim.RMSprop, "optimizer_kwargs": {"eps": 1
 RELU = {"policy_kwargs": {"activation_fn": torch.nn.ReLU, **RMSPROP}}
 ELU = {"policy_kwargs": {"activation_fn": torch.nn.ELU}}
 FEW_PRODUCTS = {"cg_max_steps": 2, "cg_damping": 1.0, "n_critic_updates": 1}
+COEFFICIENTS = {"ent_coef": 0.3, "vf_coef": 0.1, "max_grad_norm": 0.01}
+NETWORKS: list[tuple[str, dict[str, Any]]] = [
+    *[(kind, {}) for kind in KINDS],
+    *[("none", LINEAR), ("coordinates", TWO_SIZES), ("coordinates", SEPARATE), ("image", SEPARATE)],
+    *[("coordinates", FOURIER), ("coordinates", APART), ("image", CELLS), ("image", PIXELS)],
+    *[("one_hot", RELU), ("one_hot", ELU)],
+]
 ON_POLICY: list[tuple[type, str, dict[str, Any]]] = [
-    *[(PPO, kind, {}) for kind in KINDS],
-    (PPO, "one_hot", {"clip_range": 0.02, "ent_coef": 0.3, "vf_coef": 0.1}),
+    *[(PPO, kind, arguments) for kind, arguments in NETWORKS],
+    (PPO, "one_hot", {"clip_range": 0.02, "normalize_advantage": False, **COEFFICIENTS}),
     (PPO, "one_hot", {"clip_range_vf": 0.05}),
-    (PPO, "one_hot", {"normalize_advantage": False}),
-    (PPO, "one_hot", {"max_grad_norm": 0.01}),
     (PPO, "one_hot", {"target_kl": 1e-3, "n_epochs": 3}),
     (PPO, "one_hot", {"n_epochs": 3, "batch_size": 100}),
     (PPO, "one_hot", {"n_epochs": 3, "batch_size": 10_000}),
-    *[(PPO, "none", LINEAR), (PPO, "coordinates", TWO_SIZES), (PPO, "coordinates", SEPARATE)],
-    *[(PPO, "image", SEPARATE), (PPO, "coordinates", FOURIER), (PPO, "image", CELLS)],
-    *[(PPO, "image", PIXELS), (PPO, "coordinates", APART), (PPO, "one_hot", RELU), (PPO, "one_hot", ELU)],
-    *[(A2C, kind, {}) for kind in KINDS],
-    (A2C, "one_hot", {"ent_coef": 0.3, "vf_coef": 0.1, "normalize_advantage": True}),
-    (A2C, "one_hot", {"use_rms_prop": False, "max_grad_norm": 0.01}),
-    *[(A2C, "none", LINEAR), (A2C, "coordinates", TWO_SIZES), (A2C, "image", SEPARATE)],
-    *[(A2C, "coordinates", FOURIER), (A2C, "image", PIXELS)],
-    *[(TRPO, kind, {}) for kind in KINDS if kind != "image"],
-    *[(TRPO, "image", FEW_PRODUCTS), (TRPO, "image", {**SEPARATE, **FEW_PRODUCTS})],
+    *[(A2C, "one_hot", {}), (A2C, "coordinates", TWO_SIZES), (A2C, "image", PIXELS)],
+    (A2C, "one_hot", {"normalize_advantage": True, "use_rms_prop": False, **COEFFICIENTS}),
+    *[(TRPO, "one_hot", {}), (TRPO, "none", LINEAR), (TRPO, "coordinates", TWO_SIZES)],
+    *[(TRPO, "one_hot", RELU), (TRPO, "one_hot", ELU), (TRPO, "image", {**PIXELS, **FEW_PRODUCTS})],
     (TRPO, "one_hot", {"normalize_advantage": False, "cg_max_steps": 3, "cg_damping": 1.0}),
     (TRPO, "one_hot", {"sub_sampling_factor": 3, "batch_size": 100, "n_critic_updates": 2}),
     (TRPO, "one_hot", {"target_kl": 0.5, "line_search_shrinking_factor": 0.5, "cg_damping": 1.0}),
     (TRPO, "one_hot", {"line_search_max_iter": 0}),
-    *[(TRPO, "none", LINEAR), (TRPO, "coordinates", TWO_SIZES), (TRPO, "coordinates", FOURIER)],
-    *[(TRPO, "one_hot", RELU), (TRPO, "one_hot", ELU), (TRPO, "image", {**PIXELS, **FEW_PRODUCTS})],
 ]
 
 
@@ -144,7 +122,7 @@ ON_POLICY: list[tuple[type, str, dict[str, Any]]] = [
 def test_updates_from_rollouts(
     algorithm: Any, kind: str, arguments: dict[str, Any], few_states: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (population, on_policy, a2c):
+    for module in (population, on_policy):
         monkeypatch.setattr(module, "FEW_STATES", few_states)
     n_steps = STEPS
     if algorithm is PPO:
@@ -178,7 +156,7 @@ def test_updates_from_rollouts(
     assert run.error is None
     assert_same(run, theirs)
     if algorithm is TRPO:
-        is_improved = run.model.logger.output_formats[0].values["train/is_line_search_success"]
+        is_improved = run.model.logger.name_to_value["train/is_line_search_success"]
         assert is_improved == ("line_search_max_iter" not in arguments)
         kept = run.model.policy.optimizer.state_dict()["state"].keys()  # those of the values alone
         assert kept == theirs.policy.optimizer.state_dict()["state"].keys()
@@ -190,10 +168,8 @@ OFF_POLICY: list[tuple[type, str, dict[str, Any]]] = [
     *[(DQN, "one_hot", LINEAR), (DQN, "coordinates", FOURIER), (DQN, "image", CELLS), (DQN, "image", PIXELS)],
     (DQN, "none", {"policy_kwargs": {"net_arch": [8], "activation_fn": torch.nn.Tanh}}),
     (DQN, "one_hot", {"policy_kwargs": {"activation_fn": torch.nn.PReLU}}),
-    *[(QRDQN, kind, {}) for kind in KINDS],
-    (QRDQN, "one_hot", {"max_grad_norm": 1e-3, "gamma": 0.5}),
-    (QRDQN, "coordinates", FOURIER),
-    (QRDQN, "one_hot", {"policy_kwargs": {"net_arch": [], "n_quantiles": 7}}),
+    *[(QRDQN, "one_hot", {"max_grad_norm": 1e-3, "gamma": 0.5}), (QRDQN, "coordinates", FOURIER)],
+    (QRDQN, "image", {"policy_kwargs": {"net_arch": [], "n_quantiles": 7}}),
     (QRDQN, "none", {"policy_kwargs": {"n_quantiles": 1, **SGD}}),
 ]
 
@@ -279,3 +255,35 @@ def test_rollouts_and_advantages_are_sb3s(algorithm: Any) -> None:
     buffer.compute_returns_and_advantage(last, ends[-1])
     for name, table in (("advantages", advantages), ("returns", returns)):
         assert np.allclose(getattr(buffer, name).T.ravel(), table[0], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("states", [None, np.array([3, 7, 8])], ids=["all states", "some states"])
+@pytest.mark.parametrize(
+    ("kind", "arguments"),
+    [
+        *[("one_hot", RELU), ("one_hot", ELU), ("one_hot", LINEAR)],
+        *[("coordinates", TWO_SIZES), ("image", {})],
+    ],
+    ids=str,
+)
+def test_products_with_the_jacobian_agree_from_both_sides(
+    kind: str, arguments: dict[str, Any], states: Any
+) -> None:
+    """uᵀ(J v) = (uᵀJ) v, and J v is what small changes v of the weights do."""
+    run, _ = twins(TRPO, kind, batch_size=64, n_steps=4, **arguments)
+    for networks in run.population.all_networks:
+        (outputs,) = (each.copy() for each in networks.run(states))
+        change = torch.randn(networks.weights.shape, generator=torch.Generator().manual_seed(1))
+        slopes = np.random.default_rng(1).normal(size=outputs.shape).astype(np.float32)
+        (moved,) = networks.push(aligned(change))
+        networks.backward(slopes)
+        scale = float(np.abs(slopes * moved).sum())
+        assert float((networks.gradients * change).sum()) == pytest.approx(
+            (slopes * moved).sum(), abs=1e-5 * scale
+        )
+        weights, length = networks.weights.clone(), 1e-5  # little: ReLU has kinks
+        networks.weights.copy_(weights + length * change)
+        (ahead,) = (each.copy() for each in networks.run(states))
+        networks.weights.copy_(weights - length * change)
+        (behind,) = networks.run(states)
+        assert np.allclose((ahead - behind) / (2 * length), moved, atol=0.02 * np.abs(moved).max())

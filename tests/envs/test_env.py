@@ -4,13 +4,12 @@ import pickle
 import random
 import subprocess
 import sys
-from collections import Counter
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from helpers.oracle import World, worlds
+from helpers.oracle import worlds
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -43,20 +42,14 @@ def test_gymnasium_knows_the_id(imports, env_id):
         f"envs = gym.make_vec('{env_id}', num_envs=3, layout='cliff', slip=0.1);"
         "print(env.reset()[0], type(env.unwrapped).__name__, env.unwrapped.mdp.slip);"
         "print(*envs.reset()[0], type(envs.unwrapped).__name__, envs.unwrapped.mdp.slip);"
-        "import sys; print(*[finder for finder in sys.meta_path if 'gridworld' in str(finder)])"
+        "import sys; print(*[finder for finder in sys.meta_path if 'gridworld' in str(finder)]);"
+        "import gridworld; gridworld.register_envs(); assert gym.spec(gridworld.ENV_ID) is env.unwrapped.spec"
     )
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=60
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.splitlines() == ["36 GridWorldEnv 0.1", "36 36 36 GridWorldVectorEnv 0.1", ""]
-
-
-def test_registering_again_changes_nothing():
-    spec = gym.spec("GridWorld-v0")
-    gridworld.register_envs()
-    assert gym.spec("GridWorld-v0") is spec
-    assert spec.id == gridworld.ENV_ID
 
 
 def walk(env, seed, steps=300):
@@ -110,38 +103,6 @@ def test_every_transition_is_one_of_the_rules(world, seed):
             assert world.cells[state] in world.starts
 
 
-def counts_agree(counts, probabilities, draws):
-    """Each count lies within five standard deviations of its expectation."""
-    assert set(counts) <= set(probabilities)
-    for what, p in probabilities.items():
-        assert abs(counts[what] - p * draws) <= 5 * (p * (1 - p) * draws) ** 0.5, what
-
-
-@pytest.mark.parametrize("action", range(4))
-def test_slips_are_as_frequent_as_they_should_be(action):
-    rows, draws = ("S....", "..#..", ".....", "....G"), 4000
-    world, env = World(rows, slip=0.3), GridWorldEnv(layout=parse("\n".join(rows), "map"), slip=0.3)
-    env.reset(seed=action)
-    for cell in ((2, 2), (1, 1)):
-        counts = Counter()
-        for _ in range(draws):
-            env.state = world.state(cell)
-            counts[env.step(action)[0]] += 1
-        counts_agree(counts, {world.state(c): p for p, c, _, _ in world.outcomes(cell, action)}, draws)
-
-
-def test_a_wall_is_no_place_to_be():
-    env = GridWorldEnv(layout=load("aima_4x3"))
-    with pytest.raises(InputError, match=r"state=5.*wall"):
-        env.state = 5
-
-
-@pytest.mark.parametrize("delay", [-1, float("nan"), float("inf"), "0.1", None, True])
-def test_a_delay_is_a_number_of_seconds(delay):
-    with pytest.raises(InputError, match="delay"):
-        GridWorldEnv(delay=delay)
-
-
 @pytest.mark.parametrize("make", [GridWorldEnv, GridWorldVectorEnv])
 def test_an_env_takes_a_compiled_world_alone(make):
     mdp = compile_mdp(load("four_rooms"), slip=0.3, step_reward=-0.1)
@@ -157,3 +118,24 @@ def test_an_env_takes_a_compiled_world_alone(make):
             make(mdp=mdp, **other)
     with pytest.raises(InputError, match="mdp=classic: must be a compiled world"):
         make(mdp="classic")
+
+
+REFUSED = [  # (class, a setting, values that it cannot have)
+    (GridWorldEnv, "delay", [-1, float("nan"), float("inf"), "0.1", None, True]),
+    (GridWorldEnv, "cell_size", [0, -1, 2.5, "10", True]),
+    (GridWorldEnv, "render_mode", ["rgb", "", "Human", 1]),
+    (GridWorldVectorEnv, "num_envs", [0, 2.0]),
+    (GridWorldVectorEnv, "max_episode_steps", [0, 1.5]),
+    (GridWorldVectorEnv, "autoreset_mode", ["Never"]),
+    (GridWorldVectorEnv, "render_mode", ["human"]),
+    (GridWorldVectorEnv, "slip", [2]),
+    (GridWorldVectorEnv, "num_rows", [-1]),
+    (GridWorldVectorEnv, "stratified", ["false", None, 2]),
+]
+
+
+@pytest.mark.parametrize(("make", "name", "values"), REFUSED)
+def test_settings_that_make_no_environment_are_refused(make, name, values):
+    for value in values:
+        with pytest.raises(InputError, match=name):
+            make(**{name: value})

@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -14,7 +15,7 @@ import gridworld
 from gridworld import GridWorldEnv, InputError
 from gridworld.agents import family
 from gridworld.envs.inspection import observation_like
-from gridworld.envs.observations import KINDS, TableObservation, VectorTableObservation, make_observation
+from gridworld.envs.observations import KINDS, TableObservation, make_observation
 from gridworld.training.setup import make_context
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import classic, parse
@@ -113,13 +114,6 @@ def test_wrappers_refuse_what_they_cannot_show():
         make_observation(GridWorldEnv().mdp, "pixels")
 
 
-def test_a_wrapped_env_can_be_made_again_from_its_spec():
-    env = gridworld.ImageObservation(gym.make("GridWorld-v0", layout="cliff", slip=0.1), cell_size=10)
-    again = gym.make(env.spec)
-    assert again.observation_space == env.observation_space
-    assert np.array_equal(again.reset(seed=0)[0], env.reset(seed=0)[0])
-
-
 @pytest.mark.parametrize("kind", ["one_hot", "coordinates", "image"])
 def test_a_batch_that_resets_in_the_same_step_is_wrapped_no_more_than_gymnasium_does(kind):
     """A vector wrapper would leave `final_obs` as it is; wrap the single environment instead."""
@@ -129,15 +123,19 @@ def test_a_batch_that_resets_in_the_same_step_is_wrapped_no_more_than_gymnasium_
             wrap(envs)
 
 
-@pytest.mark.parametrize("kind", sorted(set(KINDS) - {"own"}))  # a map has none
-def test_any_kind_is_shown_by_the_generic_wrappers(kind):
-    env = TableObservation(gym.make("GridWorld-v0", layout="cliff"), kind)
-    envs = VectorTableObservation(gridworld.GridWorldVectorEnv(3, layout="cliff"), kind)
-    table = make_observation(env.unwrapped.mdp, kind).table()
-    start = env.unwrapped.mdp.start_states[0]
-    assert np.array_equal(env.reset()[0], table[start])
-    assert np.array_equal(envs.reset()[0], np.stack([table[start]] * 3))
-    assert gym.make(env.spec).observation_space == env.observation_space
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        partial(gridworld.ImageObservation, cell_size=10),
+        gridworld.OneHotObservation,
+        *(partial(TableObservation, kind=kind) for kind in sorted(set(KINDS) - {"own"})),  # a map has none
+    ],
+)
+def test_a_wrapped_env_can_be_made_again_from_its_spec(wrap):
+    env = wrap(gym.make("GridWorld-v0", layout="cliff", slip=0.1))
+    again = gym.make(env.spec)
+    assert again.observation_space == env.observation_space
+    assert np.array_equal(again.reset(seed=0)[0], env.reset(seed=0)[0])
 
 
 @pytest.mark.parametrize("kind", ["one_hot", "coordinates", "image"])

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.support import LEARNING, SHORT, train_in
+from helpers.support import SHORT, train_in
 
-from gridworld.engine.environments import Environments, Step
+from gridworld.engine.environments import Environments
 from gridworld.envs.statistics_env import StatisticsVectorEnv
-from gridworld.envs.vector_env import Advance, GridWorldVectorEnv
+from gridworld.envs.vector_env import GridWorldVectorEnv
 
 
 @pytest.mark.parametrize(("dtype", "bonus"), [(np.int64, 0.0), (np.int32, 0.0), (np.uint8, 0.7)])
@@ -91,7 +91,7 @@ def test_an_episode_given_up_is_not_one_that_ended() -> None:
     assert envs.take_returns().mean == -3
 
 
-@pytest.mark.parametrize("agent", LEARNING)
+@pytest.mark.parametrize("agent", ["dqn", "ppo", "qrdqn", "q_learning"])
 def test_a_run_tells_what_training_brought_and_where_it_was(agent: str, tmp_path: Path) -> None:
     rewards = ["env.step_reward=-1", "env.trap_reward=0", "env.goal_reward=0"]
     overrides = ["total_timesteps=2000", "env.max_episode_steps=40", *rewards]
@@ -109,64 +109,3 @@ def test_a_run_tells_what_training_brought_and_where_it_was(agent: str, tmp_path
     told = [float(row["online_return"]) for row in rows if row["online_return"]]
     assert len(told) > 5
     assert all(-40 <= value <= -1 for value in told)  # minus the episode's length
-
-
-@pytest.mark.parametrize(
-    ("words", "end"),
-    [
-        ([*SHORT["dqn"], "total_timesteps=1000"], [640, 800, 960, 1024]),
-        ([*SHORT["dqn"], "total_timesteps=955"], [640, 800, 960]),  # is due at the last step
-        ([*SHORT["dqn"], "total_timesteps=950", "agent.train_freq=7"], [640, 800, 960, 1008]),  # held at 960
-        ([*SHORT["q_learning"], "total_timesteps=1015"], [640, 800, 960, 1024]),
-        ([*SHORT["q_learning"], "total_timesteps=100"], [0, 112]),
-    ],
-    ids=["dqn", "dqn due last", "dqn due before", "q_learning", "q_learning once"],
-)
-def test_the_last_row_does_not_stand_on_the_few_episodes_since_the_row_before(
-    words: list[str], end: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where it comes before its time, it has those of the row before too; any other row has its own."""
-    ended = ended_episodes(monkeypatch)
-    world = ["env=frozen_lake_4x4", "env.max_episode_steps=6", "env.step_reward=-1"]
-    train_in(tmp_path, *words, *world, "n_envs=16", "evaluation.every=160")
-    with (tmp_path / "curve.csv").open(newline="") as file:
-        rows = [(int(row["step"]), row["online_return"]) for row in csv.DictReader(file)]
-    steps = [step for step, _ in rows]
-    assert steps[-len(end) :] == end
-    for index, (step, told) in enumerate(rows[1:], start=1):
-        is_early = step - steps[index - 1] < 160
-        since = steps[max(index - 1 - is_early, 0)]
-        own = [total for at, total in ended if steps[index - 1] < at <= step]
-        both = [total for at, total in ended if since < at <= step]
-        assert own
-        assert (len(both) > len(own)) == (is_early and index > 1)
-        assert float(told) == pytest.approx(np.mean(both))
-
-
-def ended_episodes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
-    """Filled while training: after how many steps of the batch each episode ended, and its return."""
-    ended: list[tuple[int, float]] = []
-    taken, under_way, advance = 0, np.zeros(16), StatisticsVectorEnv.advance
-
-    def watched(envs: StatisticsVectorEnv, actions: np.ndarray) -> Advance:
-        nonlocal taken
-        states, rewards, terminated, truncated, over = advance(envs, actions)
-        taken += len(rewards)
-        for index in range(len(rewards)):
-            under_way[index] += rewards[index]
-            if terminated[index] or truncated[index]:
-                ended.append((taken, under_way[index]))
-                under_way[index] = 0.0
-        return states, rewards, terminated, truncated, over
-
-    def stepped(environments: Environments, actions: np.ndarray) -> Step:
-        nonlocal taken
-        found = step(environments, actions)
-        taken += len(actions)
-        ended.extend((taken, total) for total in found.returns)
-        return found
-
-    step = Environments.step
-    monkeypatch.setattr(StatisticsVectorEnv, "advance", watched)
-    monkeypatch.setattr(Environments, "step", stepped)
-    return ended

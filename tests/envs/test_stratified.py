@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import stats
 
 from gridworld import GridWorldEnv
 from gridworld.engine.environments import Environments
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.vector_env import GridWorldVectorEnv, stratified_numbers
-from gridworld.errors import InputError
 from gridworld.world.mdp import FloatArray, IntArray
 
 GROUPS = st.lists(st.integers(0, 9), min_size=1, max_size=60).map(np.array)
@@ -47,26 +45,6 @@ def test_a_part_of_the_interval_gets_its_share_of_a_group_rounded_down_or_up(
         of_group = numbers[groups == group]
         met, share = int(((of_group >= low) & (of_group < high)).sum()), len(of_group) * (high - low)
         assert math.floor(share - 1e-9) <= met <= math.ceil(share + 1e-9)
-
-
-def test_the_numbers_of_a_place_are_uniform_and_independent() -> None:
-    """Whatever the groups are: of 400 places, as many fail a test as should."""
-    rng, draws = np.random.default_rng(5), np.random.default_rng(6)
-    groups = draws.integers(0, 12, (2000, 400))
-    numbers = np.stack([stratified_numbers(row, rng) for row in groups])
-    uniform = stats.kstest(numbers, "uniform").pvalue
-    steps = np.floor(numbers * 4).astype(int)
-    pairs = steps[:-1:2] * 4 + steps[1::2]  # of consecutive draws
-    counts = np.stack([np.bincount(column, minlength=16) for column in pairs.T])
-    independent = stats.chisquare(counts, axis=1).pvalue
-    for values in (uniform, independent):
-        assert stats.binomtest(int((values < 0.05).sum()), 400, 0.05).pvalue > 1e-3
-
-
-@pytest.mark.parametrize("value", ["false", None, 2])
-def test_another_value_than_true_or_false_is_refused(value: object) -> None:
-    with pytest.raises(InputError, match=rf"stratified={value!r}: must be True or False"):
-        GridWorldVectorEnv(2, stratified=value)  # type: ignore[arg-type]
 
 
 def test_the_starts_are_spread_over_the_states() -> None:

@@ -5,7 +5,7 @@ import signal
 import sys
 from typing import Any
 
-from gridworld.commands.train import main
+from gridworld.commands import call
 from gridworld.run.checkpoints import Checkpoints
 
 save, left = Checkpoints.save, int(sys.argv.pop(1))
@@ -20,4 +20,4 @@ def dying(*arguments: Any, **options: Any) -> None:
 
 
 Checkpoints.save = dying  # type: ignore[method-assign]
-main()
+call("train")

@@ -1,10 +1,11 @@
 """Run folders as somebody would make them who means harm, or does not care: a catalogue.
 
 Each entry takes a good run's folder and spoils it. Whatever can be sealed again, is: checksums in a
-stranger's manifest are the stranger's. `base` is the folder that the run is in; beside it are
+stranger's manifest are the stranger's. `base`, in texts `{base}`, holds the folder with the run, and
 
     secret.txt, secret.json, secret.png   that no command may read, or tell of
-    outside/     that no command may write to
+    outside/     that no command may write to; it has a file, kept
+    evil.py      a module that no command may import, with a class Agent
     canary       a path that code out of a run would create
 """
 
@@ -34,34 +35,20 @@ from gridworld.storage.serialization import decode, encode
 from gridworld.training.tensorboard import _checksum
 
 SECRET = "the-secret-7f3a"
-Spoil = Callable[[Path, Path], None]
+FINE = "policy of run on"  # evaluate answers as for a good run
+Spoil = Callable[[Path, Path], object]  # (run, base)
+Content = bytes | Callable[[Path], bytes]  # of a file; the function takes base
 
 
 @dataclass(frozen=True)
 class Hostile:
     """An entry."""
 
-    name: str
-    spoil: Spoil  # (run, base)
     agent: str  # whose run it is made of
+    name: str
     words: str  # of evaluate's answer
+    spoil: Spoil
     megabytes: int = 200  # that a command may take
-
-
-CATALOGUE: list[Hostile] = []
-
-
-def hostile(words: str, agent: str = "sarsa", megabytes: int = 200) -> Callable[[Spoil], Spoil]:
-    """Put the function into the catalogue; evaluate's answer has `words`, or is as for a good run."""
-
-    def add(spoil: Spoil) -> Spoil:
-        CATALOGUE.append(Hostile(spoil.__name__, spoil, agent, words, megabytes))
-        return spoil
-
-    return add
-
-
-FINE = "policy of run on"
 
 
 class Bomb:
@@ -74,16 +61,14 @@ class Bomb:
         return os.system, (self.command,)
 
 
+# ---- changes of a run, which other tests make too ----------------------------------------------------------
+
+
 def manifest(run: Path, edit: Callable[[dict[str, Any]], object]) -> None:
     """Change the manifest, and seal it."""
     content = json.loads((run / "manifest.json").read_text())
     edit(content)
     (run / "manifest.json").write_text(json.dumps(sealed(content)))
-
-
-def agent_has(run: Path, **values: Any) -> None:
-    """Change settings of the agent."""
-    manifest(run, lambda content: content["config"]["agent"].update(values))
 
 
 def seal(run: Path, name: str, content: bytes | None = None) -> None:
@@ -94,12 +79,35 @@ def seal(run: Path, name: str, content: bytes | None = None) -> None:
     manifest(run, lambda told: told["sha256"].update({name: digest}))
 
 
-def link(path: Path, target: Path | str) -> None:
-    """Put a symbolic link in the place of whatever is there."""
-    if path.is_dir() and not path.is_symlink():
-        path.rename(path.with_name(f"{path.name}-before"))
-    path.unlink(missing_ok=True)
-    path.symlink_to(target)
+def weights(run: Path, edit: Callable[[dict[str, torch.Tensor]], object]) -> None:
+    """Change the policy's tensors."""
+    content = torch.load(io.BytesIO(_members(run / "model.zip")["policy.pth"]), weights_only=True)
+    edit(content)
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    members("model.zip", {"policy.pth": buffer.getvalue()})(run, run)
+
+
+# ---- kinds of damage ---------------------------------------------------------------------------------------
+
+
+def members(file: str, changes: dict[str, Content], kind: int = zipfile.ZIP_STORED) -> Spoil:
+    """Replace members of a zip file, or put them in."""
+
+    def spoil(run: Path, base: Path) -> None:
+        changed = {name: _bytes(content, base) for name, content in changes.items()}
+        seal(run, file, zipped(_members(run / file) | changed, kind))
+
+    return spoil
+
+
+def _members(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def _bytes(content: Content, base: Path) -> bytes:
+    return content if isinstance(content, bytes) else content(base)
 
 
 def zipped(members: dict[str, bytes], kind: int = zipfile.ZIP_STORED) -> bytes:
@@ -111,42 +119,200 @@ def zipped(members: dict[str, bytes], kind: int = zipfile.ZIP_STORED) -> bytes:
     return buffer.getvalue()
 
 
-def model(run: Path, **changes: bytes) -> None:
-    """Replace members of the model file; `policy__pth` is policy.pth."""
-    with zipfile.ZipFile(run / "model.zip") as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    members |= {name.replace("__", "."): content for name, content in changes.items()}
-    seal(run, "model.zip", zipped(members))
+def file(name: str, content: Content) -> Spoil:
+    """Write a file, and its checksum."""
+    return lambda run, base: seal(run, name, _bytes(content, base))
 
 
-def weights(run: Path, edit: Callable[[dict[str, torch.Tensor]], object]) -> None:
-    """Change the policy's tensors."""
-    with zipfile.ZipFile(run / "model.zip") as archive:
-        content = torch.load(io.BytesIO(archive.read("policy.pth")), weights_only=True)
-    edit(content)
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    model(run, policy__pth=buffer.getvalue())
+def packed(name: str, member: str, size: int) -> Spoil:
+    """A zip file of zeros, which takes no room, and its checksum where it has one."""
+
+    def spoil(run: Path, base: Path) -> None:
+        content = zipped({"state.json": b"{}", member: bytes(size)}, zipfile.ZIP_DEFLATED)
+        (run / name).write_bytes(content)
+        if name != LAST:
+            seal(run, name)
+
+    return spoil
 
 
-def torch_file(pickled: bytes, kind: int = zipfile.ZIP_STORED) -> bytes:
+def linked(name: str, target: str) -> Spoil:
+    """A symbolic link in the place of whatever is there."""
+
+    def spoil(run: Path, base: Path) -> None:
+        path = run / name
+        path.parent.mkdir(exist_ok=True)
+        if path.is_dir() and not path.is_symlink():
+            path.rename(path.with_name(f"{path.name}-before"))
+        path.unlink(missing_ok=True)
+        path.symlink_to(target.format(base=base))
+
+    return spoil
+
+
+def waiting(name: str) -> Spoil:
+    """A pipe: whoever opens it waits for a writer."""
+
+    def spoil(run: Path, base: Path) -> None:
+        (run / name).unlink(missing_ok=True)
+        os.mkfifo(run / name)
+
+    return spoil
+
+
+def grown(name: str, size: int) -> Spoil:
+    """A file that claims to be large and takes no room."""
+
+    def spoil(run: Path, base: Path) -> None:
+        (run / name).write_bytes(b"")
+        os.truncate(run / name, size)
+
+    return spoil
+
+
+def said(**values: Any) -> Spoil:
+    """Entries of the manifest."""
+    return lambda run, base: manifest(run, lambda content: content.update(_placed(values, base)))
+
+
+def settings(changes: dict[str, Any]) -> Spoil:
+    """Settings in the manifest, by dotted names."""
+
+    def spoil(run: Path, base: Path) -> None:
+        def edit(content: dict[str, Any]) -> None:
+            for name, value in _placed(changes, base).items():
+                *path, last = name.split(".")
+                section = content["config"]
+                for part in path:
+                    section = section[part]
+                section[last] = value
+
+        manifest(run, edit)
+
+    return spoil
+
+
+def _placed(value: Any, base: Path) -> Any:
+    """With the base in the place of `{base}`."""
+    if isinstance(value, dict):
+        return {key: _placed(each, base) for key, each in value.items()}
+    return value.replace("{base}", str(base)) if isinstance(value, str) else value
+
+
+def world(**values: Any) -> Spoil:
+    """Settings of the world, so that resume goes on with them and draws the episode."""
+
+    def spoil(run: Path, base: Path) -> None:
+        changes = {f"env.{name}": value for name, value in values.items()}
+        settings({**changes, "recording.gif": True})(run, base)
+        content = json.loads((run / "manifest.json").read_text())
+        own = identity(read_config(content["config"], ""), "\n".join(content["layout"]))
+        checkpoint(lambda state: state.update(identity=own))(run, base)
+
+    return spoil
+
+
+def checkpoint(edit: Callable[[dict[str, Any]], object]) -> Spoil:
+    """Change the newest checkpoint, whose checksum is right again."""
+
+    def spoil(run: Path, base: Path) -> None:
+        path = max((run / "checkpoints").glob("*.state"))
+        state = decode(path.read_bytes())
+        edit(state)
+        path.write_bytes(encode(state))
+
+    return spoil
+
+
+def mark_of_nothing(part: str, name: str) -> Spoil:
+    """A mark in the checkpoint that every file holds, and that a run would cut it back to."""
+    mark = {"name": name, "length": 0, "sha256": hashlib.sha256(b"").hexdigest()}
+    return checkpoint(lambda state: state["marks"].update({part: mark}))
+
+
+def newest_checkpoint(text: Content, arrays: dict[str, bytes] | None = None) -> Spoil:
+    """One of this JSON and these files of arrays, whose checksums are right."""
+
+    def spoil(run: Path, base: Path) -> None:
+        (run / LAST).write_bytes(zipped({"state.json": _bytes(text, base), **(arrays or {})}))
+
+    return spoil
+
+
+def tensor(edit: Callable[[torch.Tensor], torch.Tensor | None]) -> Spoil:
+    """Another tensor in the place of the first weights; None leaves them out."""
+
+    def changed(content: dict[str, torch.Tensor]) -> None:
+        name = "q_net.q_net.0.weight"
+        new = edit(content.pop(name))
+        if new is not None:
+            content[name] = new
+
+    return lambda run, base: weights(run, changed)
+
+
+def array(name: str, edit: Callable[[Any], Any]) -> Spoil:
+    """Change an array of the world's file, whose checksum is right again."""
+
+    def spoil(run: Path, base: Path) -> None:
+        with np.load(run / "world.npz") as there:
+            content = dict(there)
+        seal(run, "world.npz", npz_bytes(content | {name: edit(content[name])}))
+
+    return spoil
+
+
+def unsealed(name: str, spoil: Spoil) -> Spoil:
+    """Damage to a file whose checksum stays as it was."""
+
+    def spoil_alone(run: Path, base: Path) -> None:
+        before = json.loads((run / "manifest.json").read_text())["sha256"][name]
+        spoil(run, base)
+        manifest(run, lambda told: told["sha256"].update({name: before}))
+
+    return spoil_alone
+
+
+def all_of(*spoils: Spoil) -> Spoil:
+    """One after the other."""
+
+    def spoil(run: Path, base: Path) -> None:
+        for each in spoils:
+            each(run, base)
+
+    return spoil
+
+
+# ---- contents of files -------------------------------------------------------------------------------------
+
+
+def pickled(protocol: int | None = None) -> Content:
+    """A pickle that runs a command."""
+    return lambda base: pickle.dumps(Bomb(base), protocol)
+
+
+def sb3_data(base: Path) -> bytes:
+    """What SB3 would unpickle beside the weights."""
+    payload = base64.b64encode(pickle.dumps(Bomb(base))).decode()
+    policy = {":type:": "x", ":serialized:": payload}
+    return json.dumps({"policy_class": policy, "exploration_rate": 0.1}, indent=4).encode()
+
+
+def torch_file(content: Content, kind: int = zipfile.ZIP_STORED) -> Content:
     """What torch would write, had it written this pickle."""
-    return zipped(
-        {"archive/data.pkl": pickled, "archive/version": b"3\n", "archive/byteorder": b"little"}, kind
-    )
+    others = {"archive/version": b"3\n", "archive/byteorder": b"little"}
+    return lambda base: zipped({"archive/data.pkl": _bytes(content, base), **others}, kind)
 
 
-def arrays(run: Path, name: str, content: bytes) -> None:
-    """Replace an array of a table's model file."""
-    with zipfile.ZipFile(run / "model.zip") as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    seal(run, "model.zip", zipped(members | {f"{name}.npy": content}))
-
-
-def header(text: str) -> bytes:
+def npy_header(text: str) -> bytes:
     """The beginning of a file in NumPy's format."""
     line = text.encode().ljust(117) + b"\n"
     return b"\x93NUMPY\x01\x00" + len(line).to_bytes(2, "little") + line
+
+
+def npy(descr: str, *shape: int) -> bytes:
+    """The same of an array, of which nothing follows."""
+    return npy_header(f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}")
 
 
 def pickled_array(base: Path) -> bytes:
@@ -156,80 +322,8 @@ def pickled_array(base: Path) -> bytes:
     return buffer.getvalue()
 
 
-def sparse(path: Path, size: int) -> None:
-    """A file that claims to be large and takes no room."""
-    path.unlink(missing_ok=True)
-    with path.open("wb") as file:
-        file.truncate(size)
-
-
-def png(width: int, height: int) -> bytes:
-    """A picture whose pixels are much larger than its file."""
-    packer = zlib.compressobj(9)
-    rows = b"".join(packer.compress(bytes(1 + 3 * width)) for _ in range(height)) + packer.flush()
-    size = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes([8, 2, 0, 0, 0])
-
-    def chunk(name: bytes, content: bytes) -> bytes:
-        parts = len(content).to_bytes(4, "big"), name, content, zlib.crc32(name + content).to_bytes(4, "big")
-        return b"".join(parts)
-
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", size) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
-
-
-# ---- the model of a network --------------------------------------------------------------------------------
-
-
-@hostile(FINE, "dqn")
-def pickle_where_sb3_would_read_one(run: Path, base: Path) -> None:
-    payload = base64.b64encode(pickle.dumps(Bomb(base))).decode()
-    text = json.dumps(
-        {"policy_class": {":type:": "x", ":serialized:": payload}, "exploration_rate": 0.1}, indent=4
-    )
-    model(run, data=text.encode())
-
-
-@hostile("not a model of dqn", "dqn")
-def pickle_as_weights(run: Path, base: Path) -> None:
-    model(run, policy__pth=pickle.dumps(Bomb(base)))
-
-
-@hostile("its pickle asks for posix system", "dqn")
-def pickle_in_torchs_own_file(run: Path, base: Path) -> None:
-    model(run, policy__pth=torch_file(pickle.dumps(Bomb(base), protocol=2)))
-
-
-@hostile("its pickle asks for", "dqn")
-def pickle_of_a_newer_protocol(run: Path, base: Path) -> None:
-    model(run, policy__pth=torch_file(pickle.dumps(Bomb(base), protocol=4)))
-
-
-@hostile("not a model of dqn", "dqn")
-def pickle_beside_the_weights(run: Path, base: Path) -> None:
-    model(run, evil__pth=pickle.dumps(Bomb(base)))
-
-
-@hostile(FINE, "dqn")
-def pickle_as_sb3s_variables(run: Path, base: Path) -> None:
-    model(run, pytorch_variables__pth=pickle.dumps(Bomb(base)))
-
-
-@hostile("its pickle asks for builtins bytearray", "dqn")
-def pickle_that_asks_for_memory(run: Path, base: Path) -> None:
-    model(run, policy__pth=torch_file(b"\x80\x02cbuiltins\nbytearray\n\x8a\x05\x00\xe8vH\x17\x85R."))
-
-
-@hostile("compressed members", "dqn")
-def zip_bomb(run: Path, base: Path) -> None:
-    seal(run, "model.zip", zipped({"policy.pth": bytes(2**28)}, zipfile.ZIP_DEFLATED))
-
-
-@hostile("compressed members", "dqn")
-def zip_bomb_inside(run: Path, base: Path) -> None:
-    model(run, policy__pth=torch_file(bytes(2**28), zipfile.ZIP_DEFLATED))
-
-
-@hostile("members are larger than itself", "dqn")
-def zip_whose_members_share_their_bytes(run: Path, base: Path) -> None:
+def shared_members(base: Path) -> bytes:
+    """A zip file of 500 members that are the same bytes."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         archive.writestr("a.pth", bytes(2**20))
@@ -239,506 +333,66 @@ def zip_whose_members_share_their_bytes(run: Path, base: Path) -> None:
             again.header_offset, again.CRC = first.header_offset, first.CRC
             again.file_size = again.compress_size = first.file_size
             archive.filelist.append(again)
-    seal(run, "model.zip", buffer.getvalue())
+    return buffer.getvalue()
 
 
-@hostile("its pickle asks for torch._utils _rebuild_sparse_tensor", "dqn")
-def a_tensor_without_numbers(run: Path, base: Path) -> None:
-    def edit(content: dict[str, torch.Tensor]) -> None:
-        content["q_net.q_net.0.weight"] = content["q_net.q_net.0.weight"].to_sparse()
+def png(side: int) -> bytes:
+    """A white square whose pixels are much larger than its file."""
+    packer = zlib.compressobj(9)
+    rows = b"".join(packer.compress(bytes(1 + 3 * side)) for _ in range(side)) + packer.flush()
+    size = side.to_bytes(4, "big") * 2 + bytes([8, 2, 0, 0, 0])
 
-    weights(run, edit)
+    def chunk(name: bytes, content: bytes) -> bytes:
+        checksum = zlib.crc32(name + content).to_bytes(4, "big")
+        return len(content).to_bytes(4, "big") + name + content + checksum
 
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", size) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
 
-@hostile("it must be float32", "dqn")
-def a_tensor_of_a_trillion_numbers(run: Path, base: Path) -> None:
-    weights(run, lambda content: content.update({"q_net.q_net.0.weight": torch.zeros(1).expand(10**12)}))
 
+def event(content: bytes) -> bytes:
+    """A record of an event file."""
+    length = struct.pack("<Q", len(content))
+    return b"".join([length, _checksum(length), content, _checksum(content)])
 
-@hostile("holds numbers that are not finite", "dqn")
-def weights_that_are_no_numbers(run: Path, base: Path) -> None:
-    weights(run, lambda content: content["q_net.q_net.0.weight"].fill_(float("nan")))
 
+def events(content: Callable[[], bytes]) -> Spoil:
+    """Another content of the file for TensorBoard."""
+    return lambda run, base: next(run.glob("events*")).write_bytes(content())
 
-@hostile("it must be float32", "dqn")
-def weights_of_another_type(run: Path, base: Path) -> None:
-    key = "q_net.q_net.0.weight"
-    weights(run, lambda content: content.update({key: content[key].double()}))
 
+def exabyte() -> bytes:
+    """A record that claims to be that long."""
+    length = struct.pack("<Q", 2**60)
+    return length + _checksum(length) + b"x"
 
-@hostile("is missing", "dqn")
-def weights_left_out(run: Path, base: Path) -> None:
-    weights(run, lambda content: content.pop("q_net.q_net.0.weight"))
 
+# ---- damage of one kind ------------------------------------------------------------------------------------
 
-@hostile("exploration_rate=7.0: must be from 0 to 1", "dqn")
-def exploration_beyond_all_bounds(run: Path, base: Path) -> None:
-    model(run, data=b'{\n    "exploration_rate": 7\n}')
 
+def nested_settings(run: Path, base: Path) -> None:
+    """As deep as JSON goes."""
+    head, begin, tail = (run / "manifest.json").read_text().partition('"arguments": {')
+    (run / "manifest.json").write_text(
+        head + begin + '"deep": ' + '{"a":' * 900 + "1" + "}" * 900 + "," + tail
+    )
 
-@hostile("is not the file that the run wrote", "dqn")
-def one_weight_changed_and_not_sealed(run: Path, base: Path) -> None:
-    before = json.loads((run / "manifest.json").read_text())["sha256"]
-    weights(run, lambda content: content["q_net.q_net.0.weight"][0, 0].add_(1))
-    manifest(run, lambda told: told.update(sha256=before))
 
+def guessed_names(*names: str) -> Spoil:
+    """Links to the outside for files, and for those that a reader would write first, in `recording`."""
 
-@hostile("has no checksum (sha256) of model.zip", "dqn")
-def checksums_taken_out(run: Path, base: Path) -> None:
-    manifest(run, lambda content: content.pop("sha256"))
+    def spoil(run: Path, base: Path) -> None:
+        for name in names:
+            target = base / "outside" / ("" if name == "frames" else name)
+            linked(f"recording/{name}", str(target))(run, base)
+            for process in range(os.getpid(), os.getpid() + 2000):  # the reader's may be guessed
+                for kind in ("part", "old.part"):
+                    (run / "recording" / f".{name}.{process}.{kind}").symlink_to(target)
 
+    return spoil
 
-@hostile("model.zip: is a symbolic link", "dqn")
-def model_that_is_the_secret(run: Path, base: Path) -> None:
-    link(run / "model.zip", base / "secret.txt")
 
-
-@hostile("model.zip: is a symbolic link", "dqn")
-def model_that_never_ends(run: Path, base: Path) -> None:
-    link(run / "model.zip", "/dev/zero")
-
-
-@hostile("model.zip: is no ordinary file", "dqn")
-def model_that_waits_for_a_writer(run: Path, base: Path) -> None:
-    (run / "model.zip").unlink()
-    os.mkfifo(run / "model.zip")
-
-
-@hostile("model.zip: is larger than", "dqn")
-def model_of_twenty_gigabytes(run: Path, base: Path) -> None:
-    sparse(run / "model.zip", 20 * 2**30)
-
-
-# ---- tables ------------------------------------------------------------------------------------------------
-
-
-@hostile("Object arrays cannot be loaded")
-def pickle_in_a_table(run: Path, base: Path) -> None:
-    arrays(run, "q", pickled_array(base))
-
-
-@hostile("not a model of sarsa")
-def table_of_a_trillion_numbers(run: Path, base: Path) -> None:
-    arrays(run, "q", header(f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({10**12},), }}"))
-
-
-@hostile("its members are larger than itself")
-def table_that_is_a_bomb(run: Path, base: Path) -> None:
-    seal(run, "model.zip", zipped({"q.npy": bytes(2**28)}, zipfile.ZIP_DEFLATED))
-
-
-@hostile(FINE)
-def pickle_as_visits(run: Path, base: Path) -> None:
-    seal(run, "visits.npy", pickled_array(base))
-
-
-@hostile(FINE)
-def visits_that_are_the_secret(run: Path, base: Path) -> None:
-    link(run / "visits.npy", base / "secret.txt")
-
-
-@hostile(FINE)
-def visits_of_a_trillion_cells(run: Path, base: Path) -> None:
-    seal(run, "visits.npy", header(f"{{'descr': '<i8', 'fortran_order': False, 'shape': ({10**12}, 4), }}"))
-
-
-# ---- settings ----------------------------------------------------------------------------------------------
-
-
-@hostile("config.agent: has an unknown key _target_")
-def target_among_the_settings(run: Path, base: Path) -> None:
-    agent_has(run, _target_="os.system", command=f"touch {base}/canary")
-
-
-@hostile("optimizer_kwargs.eps._target_=os.system is no plain word", "dqn")
-def target_among_an_optimisers_arguments(run: Path, base: Path) -> None:
-    target = {"_target_": "os.system", "command": f"touch {base}/canary", "_recursive_": True}
-    manifest(run, lambda c: c["config"]["agent"]["policy_kwargs"].update(optimizer_kwargs={"eps": target}))
-
-
-@hostile("policy of run on ${oc.env:HOME}")
-def interpolation_in_names(run: Path, base: Path) -> None:
-    def edit(content: dict[str, Any]) -> None:
-        content["config"]["agent"]["name"] = "${oc.env:GRIDWORLD_SECRET}"
-        content["config"]["env"]["layout"] = "${oc.env:HOME}"
-
-    manifest(run, edit)
-
-
-@hostile("unknown tile")
-def interpolation_in_the_map(run: Path, base: Path) -> None:
-    manifest(run, lambda content: content.update(layout=["${oc.env:GRIDWORLD_SECRET}"]))
-
-
-@hostile("must be float")
-def interpolation_in_a_number(run: Path, base: Path) -> None:
-    manifest(run, lambda content: content["config"]["env"].update(slip="${oc.env:GRIDWORLD_SECRET}"))
-
-
-@hostile("activation_fn=os.system is from none of", "dqn")
-def function_in_a_classs_place(run: Path, base: Path) -> None:
-    manifest(run, lambda c: c["config"]["agent"]["policy_kwargs"].update(activation_fn="os.system"))
-
-
-@hostile("must be the import path of a", "dqn")
-def function_of_a_known_library(run: Path, base: Path) -> None:
-    path = "stable_baselines3.common.save_util.load_from_pkl"
-    manifest(run, lambda c: c["config"]["agent"]["policy_kwargs"].update(features_extractor_class=path))
-
-
-@hostile("agent.replay_buffer_kwargs.filename_or_file=", "dqn")
-def class_that_opens_a_file(run: Path, base: Path) -> None:
-    name = {"filename_or_file": str(base / "outside" / "log")}
-    path = "stable_baselines3.common.logger.HumanOutputFormat"
-    agent_has(run, replay_buffer_class=path, replay_buffer_kwargs=name)
-
-
-def plant(base: Path) -> None:
-    """A module of the stranger's, where Python would find it."""
-    (base / "evil.py").write_text(f"open({str(base / 'canary')!r}, 'w')\nclass Agent: pass\n")
-
-
-@hostile("algorithm=evil.Agent is from none of", "qrdqn")
-def algorithm_of_ones_own(run: Path, base: Path) -> None:
-    plant(base)
-    agent_has(run, algorithm="evil.Agent")
-
-
-@hostile("policy=evil.Agent is from none of", "qrdqn")
-def policy_of_ones_own(run: Path, base: Path) -> None:
-    plant(base)
-    agent_has(run, policy="evil.Agent")
-
-
-@hostile("optimizer_class=evil.Agent is from none of", "qrdqn")
-def class_deep_among_the_arguments(run: Path, base: Path) -> None:
-    plant(base)
-    agent_has(run, arguments={"policy_kwargs": [[{"x": [{"optimizer_class": "evil.Agent"}]}]]})
-
-
-@hostile("agent.arguments.tensorboard_log=", "qrdqn")
-def log_folder_among_the_arguments(run: Path, base: Path) -> None:
-    agent_has(run, arguments={"tensorboard_log": str(base / "outside")})
-
-
-@hostile(FINE)
-def map_file_that_is_the_secret(run: Path, base: Path) -> None:
-    manifest(run, lambda content: content["config"]["env"].update(layout="secret.txt"))
-
-
-@hostile(FINE)
-def map_file_elsewhere_that_is_the_secret(run: Path, base: Path) -> None:
-    world_is(run, layout=str(base / "secret.txt"))
-
-
-def world_is(run: Path, **values: Any) -> None:
-    """Change the settings of the world, so that resume goes on with them and draws the episode."""
-
-    def edit(content: dict[str, Any]) -> None:
-        content["config"]["env"].update(values)
-        content["config"]["recording"].update(gif=True)
-
-    manifest(run, edit)
-    content = json.loads((run / "manifest.json").read_text())
-    own = identity(read_config(content["config"], ""), "\n".join(content["layout"]))
-    checkpoint(run, lambda state: state.update(identity=own))
-
-
-@hostile(FINE, "lake")
-def environment_of_a_module(run: Path, base: Path) -> None:
-    plant(base)
-    world_is(run, id="evil:FrozenLake-v1")
-
-
-@hostile(FINE, "lake")
-def environment_that_opens_a_file(run: Path, base: Path) -> None:
-    world_is(run, id="gridworld:GridWorld-v0", kwargs={"layout": str(base / "secret.txt")})
-
-
-@hostile(FINE, "lake", megabytes=1000)
-def environment_of_four_million_cells(run: Path, base: Path) -> None:
-    world_is(run, kwargs={"desc": ["S" + "F" * 1998 + "G"] * 2000})
-
-
-@hostile(FINE, "lake")
-def environment_of_another_kind(run: Path, base: Path) -> None:
-    world_is(run, id="Pendulum-v1", kwargs={})
-
-
-@hostile(FINE, "lake")
-def environment_that_a_command_builds(run: Path, base: Path) -> None:
-    built = {"source": "built", "builder": "os.system", "kwargs": {"command": f"touch {base}/canary"}}
-    manifest(run, lambda content: content["config"].update(env=built | {"max_episode_steps": None}))
-
-
-@hostile("world.npz: is a symbolic link", "lake")
-def world_that_is_the_secret(run: Path, base: Path) -> None:
-    link(run / "world.npz", base / "secret.txt")
-
-
-@hostile("world.npz: is a symbolic link", "lake")
-def world_that_never_ends(run: Path, base: Path) -> None:
-    link(run / "world.npz", "/dev/zero")
-
-
-@hostile("world.npz: is no ordinary file", "lake")
-def world_that_waits_for_a_writer(run: Path, base: Path) -> None:
-    (run / "world.npz").unlink()
-    os.mkfifo(run / "world.npz")
-
-
-def in_world(run: Path, **arrays: Any) -> None:
-    """Change arrays of the world's file, whose checksum is right again."""
-    with np.load(run / "world.npz") as there:
-        seal(
-            run, "world.npz", npz_bytes(dict(there) | {key: np.asarray(each) for key, each in arrays.items()})
-        )
-
-
-@hostile("world.npz: would take about 1.35 GB", "lake")
-def world_of_450_megabytes(run: Path, base: Path) -> None:
-    sparse(run / "world.npz", 450_000_000)
-
-
-@hostile("world.npz: not a world that can be read (its members are larger than itself)", "lake")
-def world_that_grows(run: Path, base: Path) -> None:
-    with zipfile.ZipFile(run / "world.npz") as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    zeros = header("{'descr': '|u1', 'fortran_order': False, 'shape': (200000000,), }") + bytes(200_000_000)
-    content = zipped(members | {"own_observation.npy": zeros}, zipfile.ZIP_DEFLATED)
-    seal(run, "world.npz", content)
-
-
-@hostile("world.npz: not a world that can be read (('EOF in multi-line", "lake")
-def world_whose_header_is_cut_off(run: Path, base: Path) -> None:
-    with zipfile.ZipFile(run / "world.npz") as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    seal(run, "world.npz", zipped(members | {"reward.npy": header("((((")}))
-
-
-@hostile(FINE)
-def visits_whose_header_is_cut_off(run: Path, base: Path) -> None:
-    seal(run, "visits.npy", header("(((("))
-
-
-@hostile("world.npz: not a world", "lake")
-def world_that_is_pickled(run: Path, base: Path) -> None:
-    with zipfile.ZipFile(run / "world.npz") as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    seal(run, "world.npz", zipped(members | {"name.npy": pickled_array(base)}))
-
-
-@hostile("world.npz: is not the world that manifest.json names", "lake")
-def world_with_another_digit(run: Path, base: Path) -> None:
-    with np.load(run / "world.npz") as there:
-        in_world(run, reward=np.where(there["reward"] == 1, 0.5, there["reward"]))
-
-
-@hostile("world.npz: is not the file that the run wrote", "lake")
-def world_that_shows_another_digit(run: Path, base: Path) -> None:
-    sums = json.loads((run / "manifest.json").read_text())["sha256"]["world.npz"]
-    in_world(run, action_names=["a", "b", "c", "e"])
-    manifest(run, lambda told: told["sha256"].update({"world.npz": sums}))
-
-
-@hostile(FINE)
-def films_that_are_the_secret(run: Path, base: Path) -> None:
-    link(run / "episode.gif", base / "secret.png")
-    link(run / "episode.mp4", "/dev/zero")
-
-
-@hostile("at most 262144 cells")
-def map_of_a_million_cells(run: Path, base: Path) -> None:
-    manifest(run, lambda content: content.update(layout=["S" + "." * 998 + "G"] * 1000))
-
-
-@hostile("n_envs=1000000000000: must be from 1 to")
-def a_trillion_environments(run: Path, base: Path) -> None:
-    manifest(run, lambda content: content["config"].update(n_envs=10**12))
-
-
-@hostile(FINE, "dqn")
-def a_replay_of_a_trillion_steps(run: Path, base: Path) -> None:
-    agent_has(run, buffer_size=10**13)
-
-
-@hostile("must be layer widths", "dqn")
-def a_network_of_a_trillion_weights(run: Path, base: Path) -> None:
-    manifest(run, lambda c: c["config"]["agent"]["policy_kwargs"].update(net_arch=[10**6, 10**6]))
-
-
-@hostile("env.max_episode_steps=1000000000000: must be from 1 to")
-def an_episode_of_a_trillion_steps(run: Path, base: Path) -> None:
-    manifest(run, lambda content: content["config"]["env"].update(max_episode_steps=10**12))
-
-
-def seen_as_image(run: Path, cell_size: int) -> None:
-    """Have the agent see frames."""
-    agent_has(run, policy="CnnPolicy")
-    manifest(run, lambda c: c["config"]["observation"].update(kind="image", cell_size=cell_size))
-
-
-@hostile("its network: would take about", "qrdqn", 1000)
-def ten_million_quantiles(run: Path, base: Path) -> None:
-    agent_has(run, arguments={"policy_kwargs": {"n_quantiles": 10_000_000}})
-
-
-@hostile("image, cells of 400 pixels: would take about", "dqn", 1000)
-def images_of_cells_of_400_pixels(run: Path, base: Path) -> None:
-    seen_as_image(run, 400)
-
-
-@hostile("its network: would take about", "dqn", 1000)
-def images_that_fill_the_memory(run: Path, base: Path) -> None:
-    seen_as_image(run, 4)
-    manifest(run, lambda c: c.update(layout=["S" + "." * 64 + "G"] * 66))
-
-
-@hostile("its network: would take about", "dqn", 1000)
-def sixteen_layers_of_4096(run: Path, base: Path) -> None:
-    manifest(run, lambda c: c["config"]["agent"]["policy_kwargs"].update(net_arch=[4096] * 16))
-
-
-@hostile("its network: would take about", "qrdqn", 1000)
-def many_quantiles_of_every_state(run: Path, base: Path) -> None:
-    agent_has(run, arguments={"policy_kwargs": {"n_quantiles": 20_000}})
-    manifest(run, lambda c: c.update(layout=["S" + "." * 62 + "G"] * 64))
-
-
-@hostile(FINE, "dqn", 1000)
-def a_replay_of_gigabytes(run: Path, base: Path) -> None:
-    agent_has(run, buffer_size=500_000_000)
-
-
-# ---- the manifest as a file --------------------------------------------------------------------------------
-
-
-@hostile("manifest.json: is larger than 4 MiB")
-def manifest_of_ten_gigabytes(run: Path, base: Path) -> None:
-    sparse(run / "manifest.json", 10 * 2**30)
-
-
-@hostile("manifest.json: is no JSON")
-def manifest_nested_a_hundred_thousand_deep(run: Path, base: Path) -> None:
-    (run / "manifest.json").write_text("[" * 100_000 + "]" * 100_000)
-
-
-@hostile("nested too deeply", "qrdqn")
-def settings_nested_as_deep_as_json_goes(run: Path, base: Path) -> None:
-    text = (run / "manifest.json").read_text()
-    deep = '{"a":' * 900 + "1" + "}" * 900
-    at = text.index('"arguments": {') + len('"arguments": {')
-    text = f'{text[:at]}"deep": {deep},{text[at:]}'
-    (run / "manifest.json").write_text(text)
-
-
-@hostile("manifest.json: is a symbolic link")
-def manifest_that_is_the_secret(run: Path, base: Path) -> None:
-    link(run / "manifest.json", base / "secret.json")
-
-
-@hostile("manifest.json: is no ordinary file")
-def manifest_that_waits_for_a_writer(run: Path, base: Path) -> None:
-    (run / "manifest.json").unlink()
-    os.mkfifo(run / "manifest.json")
-
-
-@hostile("config.agent.name='\\x1b]0;owned")
-def names_that_act_on_the_terminal(run: Path, base: Path) -> None:
-    agent_has(run, name="\x1b]0;owned\x07\x1b[2J\r\n\u202e")
-
-
-@hostile("this run is '\\x1b[2J")
-def status_that_acts_on_the_terminal(run: Path, base: Path) -> None:
-    manifest(run, lambda content: content.update(status="\x1b[2J", error="\x1b[31m" * 1000))
-
-
-@hostile("must be a plain name")
-def names_that_are_no_text(run: Path, base: Path) -> None:
-    manifest(run, lambda content: content["config"]["env"].update(layout="\ud800\x00"))
-
-
-@hostile("config.seed=a list: must be int")
-def a_megabyte_in_a_numbers_place(run: Path, base: Path) -> None:
-    manifest(run, lambda content: content["config"].update(seed=["\x1b"] * 100_000))
-
-
-# ---- what the report shows ---------------------------------------------------------------------------------
-
-
-@hostile(FINE)
-def names_that_are_scripts(run: Path, base: Path) -> None:
-    agent_has(run, name="<script>fetch('//x')</script><img src=x onerror=alert(1)>{{7*7}}](javascript:x)")
-
-
-@hostile(FINE)
-def curve_of_a_million_columns(run: Path, base: Path) -> None:
-    seal(run, "curve.csv", (",".join(f"c{i}" for i in range(10**6)) + "\n" + "1," * 10**6 + "\n").encode())
-
-
-@hostile(FINE)
-def curve_that_is_the_secret(run: Path, base: Path) -> None:
-    link(run / "curve.csv", base / "secret.txt")
-
-
-@hostile(FINE)
-def summary_that_is_the_secret(run: Path, base: Path) -> None:
-    link(run / "summary.json", base / "secret.json")
-
-
-@hostile(FINE)
-def picture_that_is_the_secret(run: Path, base: Path) -> None:
-    link(run / "policy.png", base / "secret.png")
-
-
-@hostile(FINE)
-def picture_of_eighty_million_pixels(run: Path, base: Path) -> None:
-    (run / "policy.png").write_bytes(png(9_000, 9_000))
-
-
-@hostile(FINE)
-def picture_that_waits_for_a_writer(run: Path, base: Path) -> None:
-    (run / "learning.gif").unlink()
-    os.mkfifo(run / "learning.gif")
-
-
-# ---- where things are written ------------------------------------------------------------------------------
-
-
-@hostile(FINE)
-def recordings_that_lead_outside(run: Path, base: Path) -> None:
-    link(run / "recording", base / "outside")
-
-
-@hostile(FINE)
-def frames_that_lead_outside(run: Path, base: Path) -> None:
-    (run / "recording").mkdir()
-    link(run / "recording" / "frames", base / "outside")
-    for process in range(os.getpid(), os.getpid() + 2000):  # the reader's may be guessed
-        for kind in ("part", "old.part"):
-            link(run / "recording" / f".frames.{process}.{kind}", base / "outside")
-    link(run / "frames", base / "outside")
-
-
-@hostile(FINE)
-def files_that_lead_outside(run: Path, base: Path) -> None:
-    (run / "recording").mkdir()
-    for name in ("episode.gif", "policy.png", "visits.png"):
-        link(run / "recording" / name, base / "outside" / name)
-        for process in range(os.getpid(), os.getpid() + 2000):  # the reader's may be guessed
-            link(run / "recording" / f".{name}.{process}.part", base / "outside" / name)
-
-
-@hostile(FINE)
-def report_that_leads_outside(run: Path, base: Path) -> None:
-    link(run / "report", base / "outside")
-
-
-# ---- files that nobody should need -------------------------------------------------------------------------
-
-
-@hostile(FINE)
-def yaml_that_runs_and_grows(run: Path, base: Path) -> None:
+def hydra_files(run: Path, base: Path) -> None:
+    """Yaml that runs a command, and grows to a terabyte."""
     (run / ".hydra").mkdir(exist_ok=True)
     lines = ["a0: &a0 [x, x]", *(f"a{i}: &a{i} [*a{i - 1}, *a{i - 1}]" for i in range(1, 40))]
     for name in ("config.yaml", "hydra.yaml", "overrides.yaml"):
@@ -746,167 +400,236 @@ def yaml_that_runs_and_grows(run: Path, base: Path) -> None:
         (run / ".hydra" / name).write_text("\n".join([*lines, evil, "b: ${oc.env:GRIDWORLD_SECRET}"]))
 
 
-@hostile(FINE)
-def modules_that_shadow_pythons(run: Path, base: Path) -> None:
+def shadowing_modules(run: Path, base: Path) -> None:
+    """Modules in the run's folder with the names of others."""
     for name in ("json", "numpy", "torch", "gridworld", "sitecustomize", "usercustomize", "conftest"):
         (run / f"{name}.py").write_text(f"open({str(base / 'canary')!r}, 'w')\n")
 
 
-@hostile(FINE)
-def diff_that_is_the_secret(run: Path, base: Path) -> None:
-    link(run / "source.diff", base / "secret.txt")
-
-
-@hostile(FINE)
-def event_of_an_exabyte(run: Path, base: Path) -> None:
-    length = struct.pack("<Q", 2**60)
-    next(run.glob("events*")).write_bytes(length + _checksum(length) + b"x")
-
-
-def record(content: bytes) -> bytes:
-    """A record of an event file."""
-    length = struct.pack("<Q", len(content))
-    return b"".join([length, _checksum(length), content, _checksum(content)])
-
-
-@hostile(FINE, megabytes=1000)
-def event_of_many_empty_values(run: Path, base: Path) -> None:
-    values = b"\n\0" * 20_000_000  # a protocol buffer's field 1, empty
-    length = b"\x80\xb4\x89\x13"  # 40,000,000 in sevens of bits
-    next(run.glob("events*")).write_bytes(record(b"\x2a" + length + values))
-
-
-@hostile(FINE, megabytes=1000)
-def a_million_events(run: Path, base: Path) -> None:
-    event = record(b"\x10\x01\x2a\x0a\n\x08\n\x01a\x15\0\0\x80\x3f")  # step 1, a = 1
-    next(run.glob("events*")).write_bytes(event * 1_000_000)
-
-
-@hostile(FINE, megabytes=1000)
-def curve_of_millions_of_short_rows(run: Path, base: Path) -> None:
-    seal(run, "curve.csv", b"ab,12\n" * 10_000_000)
-
-
-@hostile(FINE)
-def events_that_wait_for_a_writer(run: Path, base: Path) -> None:
-    os.mkfifo(run / "events.out.tfevents.0.a.1")
-
-
-@hostile(FINE)
-def events_that_are_the_secret(run: Path, base: Path) -> None:
-    link(run / "events.out.tfevents.0.a.1", base / "secret.txt")
-
-
-# ---- what resume goes on with ------------------------------------------------------------------------------
-
-
-def checkpoint(run: Path, edit: Callable[[dict[str, Any]], object]) -> None:
-    """Change the newest checkpoint, whose checksum is right again."""
-    path = max((run / "checkpoints").glob("*.state"))
-    state = decode(path.read_bytes())
-    edit(state)
-    path.write_bytes(encode(state))
-
-
-def mark_of_nothing(run: Path, part: str, name: str) -> None:
-    """A mark that every file holds, and that a run would cut it back to."""
-    mark = {"name": name, "length": 0, "sha256": hashlib.sha256(b"").hexdigest()}
-    checkpoint(run, lambda state: state["marks"].update({part: mark}))
-
-
-@hostile(FINE)
-def mark_of_a_curve_outside(run: Path, base: Path) -> None:
-    mark_of_nothing(run, "curve", "curve.csv")
-    (base / "outside" / "kept").write_text("kept")
-    link(run / "curve.csv", base / "outside" / "kept")
-
-
-@hostile(FINE)
-def mark_of_events_outside(run: Path, base: Path) -> None:
-    mark_of_nothing(run, "events", "x")
-    (base / "outside" / "kept").write_text("kept")
-    link(run / "x", base / "outside" / "kept")
-
-
-@hostile(FINE)
-def mark_of_another_file_of_the_run(run: Path, base: Path) -> None:
-    mark_of_nothing(run, "curve", "manifest.json")
-
-
-@hostile(FINE)
-def checkpoints_that_lead_outside(run: Path, base: Path) -> None:
+def checkpoints_outside(run: Path, base: Path) -> None:
+    """The folder of checkpoints is a link."""
     shutil.copytree(run / "checkpoints", base / "outside" / "checkpoints")
     for name in ("000000000001.state", "999999999999.state", ".x.part"):
         (base / "outside" / "checkpoints" / name).write_text("kept")
-    link(run / "checkpoints", base / "outside" / "checkpoints")
+    linked("checkpoints", "{base}/outside/checkpoints")(run, base)
 
 
-@hostile(FINE)
-def curve_that_waits_for_a_writer(run: Path, base: Path) -> None:
-    (run / "curve.csv").unlink()
-    os.mkfifo(run / "curve.csv")
+# ---- the catalogue -----------------------------------------------------------------------------------------
+
+LAST = "checkpoints/999999999999.state"
+_PACKED, _TRILLION = zipfile.ZIP_DEFLATED, 10**12
+_CANARY = "touch {base}/canary"
+_SECRET_WORD = "${oc.env:GRIDWORLD_SECRET}"
+_KWARGS = "agent.policy_kwargs"
+_ESCAPES = "\x1b]0;owned\x07\x1b[2J\r\n\u202e"
+_SCRIPT = "<script>fetch('//x')</script><img src=x onerror=alert(1)>{{7*7}}](javascript:x)"
+_HUNGRY = "its network: would take about"
+_NO_WORLD = "world.npz: not a world that can be read"
+_RESUMED = "resumed must be a list of when the run went on"
 
 
-@hostile(FINE)
-def checkpoint_that_waits_for_a_writer(run: Path, base: Path) -> None:
-    os.mkfifo(run / "checkpoints" / "999999999999.state")
+def model(**changes: Content) -> Spoil:
+    """Members of the model file; `policy__pth` is policy.pth."""
+    return members("model.zip", {name.replace("__", "."): content for name, content in changes.items()})
 
 
-@hostile(FINE)
-def checkpoint_that_is_a_folder(run: Path, base: Path) -> None:
-    (run / "checkpoints" / "999999999999.state").mkdir()
+def _seen_as_image(cell_size: int) -> Spoil:
+    seen = {"observation.kind": "image", "observation.cell_size": cell_size}
+    return settings({"agent.policy": "CnnPolicy", **seen})
 
 
-@hostile(FINE)
-def checkpoint_that_acts_on_the_terminal(run: Path, base: Path) -> None:
-    forged_checkpoint(run, b'{"a":{"@":"x"}}', {"\x1b[31m\x1b]0;x\x07.npy": b"x"})
+def _corridors(rows: int, floor: int) -> Spoil:
+    return said(layout=["S" + "." * floor + "G"] * rows)
 
 
-def forged_checkpoint(run: Path, text: bytes, arrays: dict[str, bytes] | None = None) -> None:
-    """A newest one of this JSON and these files of arrays, whose checksums are right."""
-    content = zipped({"state.json": text, **(arrays or {})})
-    (run / "checkpoints" / "999999999999.state").write_bytes(content)
+def _argument(**arguments: Any) -> Spoil:
+    return settings({"agent.arguments": arguments})
 
 
-@hostile(FINE, megabytes=1000)
-def checkpoint_of_seven_gigabytes(run: Path, base: Path) -> None:
-    sparse(run / "checkpoints" / "999999999999.state", 7 * 2**30)
-
-
-@hostile(FINE, megabytes=1000)
-def checkpoint_of_sixty_megabytes_of_json(run: Path, base: Path) -> None:
-    forged_checkpoint(run, b'{"arrays":[],"state":{"a":[' + b"[],[]," * 10_000_000 + b"[]]}}")
-
-
-@hostile(FINE, megabytes=1000)
-def checkpoint_of_an_array_that_is_left_out(run: Path, base: Path) -> None:
-    head = io.BytesIO()
-    about = {"descr": "<f8", "fortran_order": False, "shape": (30_000_000_000,)}
-    np.lib.format.write_array_header_1_0(head, about)
-    forged_checkpoint(run, b'{"a":{"@":"a"}}', {"a.npy": head.getvalue()})
-
-
-@hostile(FINE, megabytes=1000)
-def checkpoint_of_zeros_that_are_packed(run: Path, base: Path) -> None:
-    content = zipped({"state.json": b"{}", "a.npy": bytes(2 * 10**9)}, zipfile.ZIP_DEFLATED)
-    (run / "checkpoints" / "999999999999.state").write_bytes(content)
-
-
-@hostile("resumed must be a list of when the run went on")
-def continuations_that_are_no_list(run: Path, base: Path) -> None:
-    manifest(run, lambda content: content.update(resumed={"a": 1}))
-
-
-@hostile("resumed must be a list of when the run went on")
-def continuations_without_a_step(run: Path, base: Path) -> None:
-    manifest(run, lambda content: content.update(resumed=[{"total_timesteps": 1}]))
-
-
-@hostile("resumed must be a list of when the run went on")
-def continuations_after_no_number_of_steps(run: Path, base: Path) -> None:
-    manifest(run, lambda content: content.update(resumed=[{"total_timesteps": 1, "step": "x"}]))
-
-
-@hostile("manifest.json: is no JSON")
-def numbers_that_json_has_not(run: Path, base: Path) -> None:
-    manifest(run, lambda content: content.update(reached=float("nan"), seed=float("inf")))
+# Of an agent's run: the entry's name, words of evaluate's answer, what is done; and a wider limit of memory.
+# fmt: off
+_ROWS: dict[str, list[tuple[Any, ...]]] = {
+"dqn": [
+    # the model file
+    ("pickle_where_sb3_would_read_one", FINE, model(data=sb3_data)),
+    ("pickle_as_weights", "not a model of dqn", model(policy__pth=pickled())),
+    ("pickle_in_torchs_own_file", "its pickle asks for posix system",
+     model(policy__pth=torch_file(pickled(2)))),
+    ("pickle_of_a_newer_protocol", "its pickle asks for", model(policy__pth=torch_file(pickled(4)))),
+    ("pickle_beside_the_weights", "not a model of dqn", model(evil__pth=pickled())),
+    ("pickle_as_sb3s_variables", FINE, model(pytorch_variables__pth=pickled())),
+    ("pickle_that_asks_for_memory", "its pickle asks for builtins bytearray",
+     model(policy__pth=torch_file(b"\x80\x02cbuiltins\nbytearray\n\x8a\x05\x00\xe8vH\x17\x85R."))),
+    ("zip_bomb", "compressed members", packed("model.zip", "policy.pth", 2**28)),
+    ("zip_bomb_inside", "compressed members", model(policy__pth=torch_file(lambda _: bytes(2**28), _PACKED))),
+    ("zip_whose_members_share_their_bytes", "members are larger than itself",
+     file("model.zip", shared_members)),
+    ("a_tensor_without_numbers", "its pickle asks for torch._utils _rebuild_sparse_tensor",
+     tensor(lambda there: there.to_sparse())),
+    ("a_tensor_of_a_trillion_numbers", "it must be float32",
+     tensor(lambda _: torch.zeros(1).expand(_TRILLION))),
+    ("weights_that_are_no_numbers", "holds numbers that are not finite",
+     tensor(lambda there: there.fill_(float("nan")))),
+    ("weights_of_another_type", "it must be float32", tensor(lambda there: there.double())),
+    ("weights_left_out", "is missing", tensor(lambda _: None)),
+    ("exploration_beyond_all_bounds", "exploration_rate=7.0: must be from 0 to 1",
+     model(data=b'{\n    "exploration_rate": 7\n}')),
+    ("one_weight_changed_and_not_sealed", "is not the file that the run wrote",
+     unsealed("model.zip", tensor(lambda there: there + torch.eye(*there.shape)))),
+    ("checksums_taken_out", "has no checksum (sha256) of model.zip", said(sha256={})),
+    ("model_that_is_the_secret", "model.zip: is a symbolic link", linked("model.zip", "{base}/secret.txt")),
+    ("model_that_never_ends", "model.zip: is a symbolic link", linked("model.zip", "/dev/zero")),
+    ("model_that_waits_for_a_writer", "model.zip: is no ordinary file", waiting("model.zip")),
+    ("model_of_twenty_gigabytes", "model.zip: is larger than", grown("model.zip", 20 * 2**30)),
+    # settings
+    ("target_among_an_optimisers_arguments", "optimizer_kwargs.eps._target_=os.system is no plain word",
+     settings({f"{_KWARGS}.optimizer_kwargs": {"eps": {"_target_": "os.system", "command": _CANARY}}})),
+    ("function_in_a_classs_place", "activation_fn=os.system is from none of",
+     settings({f"{_KWARGS}.activation_fn": "os.system"})),
+    ("function_of_a_known_library", "must be the import path of a",
+     settings({f"{_KWARGS}.features_extractor_class": "stable_baselines3.common.save_util.load_from_pkl"})),
+    ("class_that_opens_a_file", "agent.replay_buffer_kwargs.filename_or_file=",
+     settings({"agent.replay_buffer_class": "stable_baselines3.common.logger.HumanOutputFormat",
+               "agent.replay_buffer_kwargs": {"filename_or_file": "{base}/outside/log"}})),
+    ("a_replay_of_a_trillion_steps", FINE, settings({"agent.buffer_size": 10**13})),
+    ("a_replay_of_gigabytes", FINE, settings({"agent.buffer_size": 500_000_000}), 1000),
+    ("a_network_of_a_trillion_weights", "must be layer widths",
+     settings({f"{_KWARGS}.net_arch": [10**6, 10**6]})),
+    ("sixteen_layers_of_4096", _HUNGRY, settings({f"{_KWARGS}.net_arch": [4096] * 16}), 1000),
+    ("images_of_cells_of_400_pixels", "image, cells of 400 pixels: would take about",
+     _seen_as_image(400), 1000),
+    ("images_that_fill_the_memory", _HUNGRY, all_of(_seen_as_image(4), _corridors(66, 64)), 1000),
+],
+"qrdqn": [
+    ("algorithm_of_ones_own", "algorithm=evil.Agent is from none of",
+     settings({"agent.algorithm": "evil.Agent"})),
+    ("policy_of_ones_own", "policy=evil.Agent is from none of", settings({"agent.policy": "evil.Agent"})),
+    ("class_deep_among_the_arguments", "optimizer_class=evil.Agent is no plain word",
+     _argument(policy_kwargs=[[{"x": [{"optimizer_class": "evil.Agent"}]}]])),
+    ("log_folder_among_the_arguments", "agent.arguments.tensorboard_log=",
+     _argument(tensorboard_log="{base}/outside")),
+    ("settings_nested_as_deep_as_json_goes", "nested too deeply", nested_settings),
+    ("ten_million_quantiles", _HUNGRY, _argument(policy_kwargs={"n_quantiles": 10_000_000}), 1000),
+    ("many_quantiles_of_every_state", _HUNGRY,
+     all_of(_argument(policy_kwargs={"n_quantiles": 20_000}), _corridors(64, 62)), 1000),
+],
+"lake": [
+    ("environment_of_a_module", FINE, world(id="evil:FrozenLake-v1")),
+    ("environment_that_opens_a_file", FINE,
+     world(id="gridworld:GridWorld-v0", kwargs={"layout": "{base}/secret.txt"})),
+    ("environment_of_four_million_cells", FINE,
+     world(kwargs={"desc": ["S" + "F" * 1998 + "G"] * 2000}), 1000),
+    ("environment_of_another_kind", FINE, world(id="Pendulum-v1", kwargs={})),
+    ("environment_that_a_command_builds", FINE,
+     settings({"env": {"source": "built", "builder": "os.system", "kwargs": {"command": _CANARY},
+                       "max_episode_steps": None}})),
+    ("world_that_is_the_secret", "world.npz: is a symbolic link", linked("world.npz", "{base}/secret.txt")),
+    ("world_that_never_ends", "world.npz: is a symbolic link", linked("world.npz", "/dev/zero")),
+    ("world_that_waits_for_a_writer", "world.npz: is no ordinary file", waiting("world.npz")),
+    ("world_of_450_megabytes", "world.npz: would take about 1.35 GB", grown("world.npz", 450_000_000)),
+    ("world_that_grows", f"{_NO_WORLD} (its members are larger than itself)",
+     members("world.npz", {"own_observation.npy": lambda _: npy("|u1", 2 * 10**8) + bytes(2 * 10**8)},
+             _PACKED)),
+    ("world_whose_header_is_cut_off", f"{_NO_WORLD} (('EOF in multi-line",
+     members("world.npz", {"reward.npy": npy_header("((((")})),
+    ("world_that_is_pickled", "world.npz: not a world", members("world.npz", {"name.npy": pickled_array})),
+    ("world_with_another_digit", "world.npz: is not the world that manifest.json names",
+     array("reward", lambda there: np.where(there == 1, 0.5, there))),
+    ("world_that_shows_another_digit", "world.npz: is not the file that the run wrote",
+     unsealed("world.npz", array("action_names", lambda _: np.array(["a", "b", "c", "e"])))),
+],
+"sarsa": [
+    # a table's files
+    ("pickle_in_a_table", "Object arrays cannot be loaded", model(q__npy=pickled_array)),
+    ("table_of_a_trillion_numbers", "not a model of sarsa", model(q__npy=npy("<f8", _TRILLION))),
+    ("table_that_is_a_bomb", "its members are larger than itself", packed("model.zip", "q.npy", 2**28)),
+    ("pickle_as_visits", FINE, file("visits.npy", pickled_array)),
+    ("visits_that_are_the_secret", FINE, linked("visits.npy", "{base}/secret.txt")),
+    ("visits_of_a_trillion_cells", FINE, file("visits.npy", npy("<i8", _TRILLION, 4))),
+    ("visits_whose_header_is_cut_off", FINE, file("visits.npy", npy_header("(((("))),
+    # settings
+    ("target_among_the_settings", "config.agent: has an unknown key _target_",
+     settings({"agent._target_": "os.system", "agent.command": _CANARY})),
+    ("interpolation_in_names", "policy of run on ${oc.env:HOME}",
+     settings({"agent.name": _SECRET_WORD, "env.layout": "${oc.env:HOME}"})),
+    ("interpolation_in_the_map", "unknown tile", said(layout=[_SECRET_WORD])),
+    ("interpolation_in_a_number", "must be float", settings({"env.slip": _SECRET_WORD})),
+    ("map_file_that_is_the_secret", FINE, settings({"env.layout": "secret.txt"})),
+    ("map_file_elsewhere_that_is_the_secret", FINE, world(layout="{base}/secret.txt")),
+    ("map_of_a_million_cells", "at most 262144 cells", _corridors(1000, 998)),
+    ("a_trillion_environments", "n_envs=1000000000000: must be from 1 to", settings({"n_envs": _TRILLION})),
+    ("an_episode_of_a_trillion_steps", "env.max_episode_steps=1000000000000: must be from 1 to",
+     settings({"env.max_episode_steps": _TRILLION})),
+    # the manifest as a file
+    ("manifest_of_ten_gigabytes", "manifest.json: is larger than 4 MiB",
+     grown("manifest.json", 10 * 2**30)),
+    ("manifest_nested_a_hundred_thousand_deep", "manifest.json: is no JSON",
+     lambda run, base: (run / "manifest.json").write_text("[" * 100_000 + "]" * 100_000)),
+    ("manifest_that_is_the_secret", "manifest.json: is a symbolic link",
+     linked("manifest.json", "{base}/secret.json")),
+    ("manifest_that_waits_for_a_writer", "manifest.json: is no ordinary file", waiting("manifest.json")),
+    ("names_that_act_on_the_terminal", "config.agent.name='\\x1b]0;owned",
+     settings({"agent.name": _ESCAPES})),
+    ("status_that_acts_on_the_terminal", "this run is '\\x1b[2J",
+     said(status="\x1b[2J", error="\x1b[31m" * 1000)),
+    ("names_that_are_no_text", "must be a plain name", settings({"env.layout": "\ud800\x00"})),
+    ("a_megabyte_in_a_numbers_place", "config.seed=a list: must be int",
+     settings({"seed": ["\x1b"] * 10**5})),
+    ("continuations_that_are_no_list", _RESUMED, said(resumed={"a": 1})),
+    ("continuations_without_a_step", _RESUMED, said(resumed=[{"total_timesteps": 1}])),
+    ("continuations_after_no_number_of_steps", _RESUMED, said(resumed=[{"total_timesteps": 1, "step": "x"}])),
+    ("numbers_that_json_has_not", "manifest.json: is no JSON",
+     said(reached=float("nan"), seed=float("inf"))),
+    # what the report shows
+    ("names_that_are_scripts", FINE, settings({"agent.name": _SCRIPT})),
+    ("curve_of_a_million_columns", FINE,
+     file("curve.csv", lambda _: (",".join(map(str, range(10**6))) + "\n" + "1," * 10**6 + "\n").encode())),
+    ("curve_of_millions_of_short_rows", FINE, file("curve.csv", lambda _: b"ab,12\n" * 10_000_000), 1000),
+    ("curve_that_is_the_secret", FINE, linked("curve.csv", "{base}/secret.txt")),
+    ("curve_that_waits_for_a_writer", FINE, waiting("curve.csv")),
+    ("summary_that_is_the_secret", FINE, linked("summary.json", "{base}/secret.json")),
+    ("picture_that_is_the_secret", FINE, linked("policy.png", "{base}/secret.png")),
+    ("picture_of_eighty_million_pixels", FINE,
+     lambda run, base: (run / "policy.png").write_bytes(png(9_000))),
+    ("picture_that_waits_for_a_writer", FINE, waiting("learning.gif")),
+    ("films_that_are_the_secret", FINE,
+     all_of(linked("episode.gif", "{base}/secret.png"), linked("episode.mp4", "/dev/zero"))),
+    ("event_of_an_exabyte", FINE, events(exabyte)),
+    # field 5 of a record is its summary, whose field 1 is a value: 20 million empty ones
+    ("event_of_many_empty_values", FINE,
+     events(lambda: event(b"\x2a\x80\xb4\x89\x13" + b"\n\0" * 20_000_000)), 1000),
+    ("a_million_events", FINE,  # step 1, a = 1
+     events(lambda: event(b"\x10\x01\x2a\x0a\n\x08\n\x01a\x15\0\0\x80\x3f") * 10**6), 1000),
+    ("events_that_wait_for_a_writer", FINE, waiting("events.out.tfevents.0.a.1")),
+    ("events_that_are_the_secret", FINE, linked("events.out.tfevents.0.a.1", "{base}/secret.txt")),
+    # where things are written
+    ("recordings_that_lead_outside", FINE, linked("recording", "{base}/outside")),
+    ("frames_that_lead_outside", FINE,
+     all_of(guessed_names("frames"), linked("frames", "{base}/outside"))),
+    ("files_that_lead_outside", FINE, guessed_names("episode.gif", "policy.png", "visits.png")),
+    ("report_that_leads_outside", FINE, linked("report", "{base}/outside")),
+    # files that nobody should need
+    ("yaml_that_runs_and_grows", FINE, hydra_files),
+    ("modules_that_shadow_pythons", FINE, shadowing_modules),
+    ("diff_that_is_the_secret", FINE, linked("source.diff", "{base}/secret.txt")),
+    # what resume goes on with
+    ("mark_of_a_curve_outside", FINE,
+     all_of(mark_of_nothing("curve", "curve.csv"), linked("curve.csv", "{base}/outside/kept"))),
+    ("mark_of_events_outside", FINE,
+     all_of(mark_of_nothing("events", "x"), linked("x", "{base}/outside/kept"))),
+    ("mark_of_another_file_of_the_run", FINE, mark_of_nothing("curve", "manifest.json")),
+    ("checkpoints_that_lead_outside", FINE, checkpoints_outside),
+    ("checkpoint_that_waits_for_a_writer", FINE, waiting(LAST)),
+    ("checkpoint_that_is_a_folder", FINE, lambda run, base: (run / LAST).mkdir()),
+    ("checkpoint_that_acts_on_the_terminal", FINE,
+     newest_checkpoint(b'{"a":{"@":"x"}}', {"\x1b[31m\x1b]0;x\x07.npy": b"x"})),
+    ("checkpoint_of_seven_gigabytes", FINE, grown(LAST, 7 * 2**30), 1000),
+    ("checkpoint_of_sixty_megabytes_of_json", FINE,
+     newest_checkpoint(lambda _: b'{"arrays":[],"state":{"a":[' + b"[],[]," * 10_000_000 + b"[]]}}"), 1000),
+    ("checkpoint_of_an_array_that_is_left_out", FINE,
+     newest_checkpoint(b'{"a":{"@":"a"}}', {"a.npy": npy("<f8", 30_000_000_000)}), 1000),
+    ("checkpoint_of_zeros_that_are_packed", FINE, packed(LAST, "a.npy", 2 * 10**9), 1000),
+],
+}
+# fmt: on
+CATALOGUE = [Hostile(agent, *row) for agent, rows in _ROWS.items() for row in rows]

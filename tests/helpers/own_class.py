@@ -1,5 +1,9 @@
-"""A class with SB3's interface of one's own, and settings that train any class without its arguments."""
+"""Custom classes: an algorithm, layers, a policy, an optimiser; and settings that train any class."""
 
+import sys
+from pathlib import Path
+
+import pytest
 from helpers.support import SHORT, configure
 
 OWN_CLASS = """
@@ -10,6 +14,36 @@ class Mine(A2C):
         super().__init__(*arguments, **options)
         self.caution = caution
 """
+
+
+OWN_MODULES = """
+import torch
+from stable_baselines3.dqn.policies import DQNPolicy
+from torch import nn
+
+class Drawn(nn.Module):  # at random, in either mode
+    def forward(self, x):
+        return x.relu() + 0.1 * torch.randn_like(x)
+
+class Among(nn.Module):  # looks at the other rows
+    def forward(self, x):
+        return x - x.mean(dim=0)
+
+class ReLU(nn.ReLU):  # is not what it is called
+    def forward(self, x):
+        return super().forward(x) + self.training
+
+class Policy(DQNPolicy): pass
+class Adam(torch.optim.Adam): pass
+"""
+
+
+def importable(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make `own_modules` importable."""
+    folder.mkdir(exist_ok=True)
+    (folder / "own_modules.py").write_text(OWN_MODULES)
+    monkeypatch.syspath_prepend(str(folder))
+    monkeypatch.delitem(sys.modules, "own_modules", raising=False)
 
 
 def any_class(algorithm: str, *overrides: str) -> list[str]:

@@ -1,6 +1,11 @@
-"""PPO, A2C, DQN and QR-DQN with one bug each, as implementations have them; `CAUGHT` has the probes."""
+"""PPO, A2C, DQN and QR-DQN with one bug each, as implementations have them.
 
-from typing import Any, ClassVar
+Each call below makes a class of this module: its name, what is wrong with it, the probes that it must fail
+(the first is its own), and the methods that are changed, of the algorithm, of its buffer or of its policy.
+"""
+
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,472 +15,294 @@ from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.dqn.policies import DQNPolicy
 
+Patch = Callable[..., Any]  # takes the object, the method that it has otherwise, and the method's arguments
+CAUGHT: dict[type, tuple[str, ...]] = {}  # by class: the probes that it must fail
+_CLASSES: dict[str, type] = {}
 
-class _BuggyRollouts(PPO):
-    buffer: type[RolloutBuffer]
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, rollout_buffer_class=self.buffer, **options)
+def __getattr__(name: str) -> Any:
+    if name in _CLASSES:
+        return _CLASSES[name]
+    raise AttributeError(name)
 
 
-class _BuggyReplay(DQN):
-    buffer: type[ReplayBuffer]
+def _derived(name: str, base: type, patches: dict[str, Patch], **members: Any) -> type:
+    kind = type(name, (base,), {"__module__": __name__, **members})
+    for method, patch in patches.items():
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, replay_buffer_class=self.buffer, **options)
+        def call(self: Any, *given: Any, method: str = method, patch: Patch = patch, **named: Any) -> Any:
+            return patch(self, getattr(super(kind, self), method), *given, **named)
 
+        setattr(kind, method, call)
+    return kind
 
-class _Negated(RolloutBuffer):
-    def compute_returns_and_advantage(self, last_values: torch.Tensor, dones: np.ndarray) -> None:
-        super().compute_returns_and_advantage(last_values, dones)
-        self.advantages *= -1
 
+def _bug(name: str, base: type, what: str, probes: str, **patches: Patch) -> None:
+    _CLASSES[name] = _derived(name, base, patches, __doc__=what)
+    CAUGHT[_CLASSES[name]] = tuple(probes.split())
 
-class WrongSign(_BuggyRollouts):
-    """The advantage has the wrong sign."""
 
-    buffer = _Negated
+def _policy_bug(name: str, base: type, what: str, probes: str, **patches: Patch) -> None:
+    policy = _derived(f"{name}Policy", ActorCriticPolicy if base is PPO else DQNPolicy, patches)
+    _bug(name, base, what, probes)
+    _CLASSES[name].policy_aliases = {"MlpPolicy": policy}  # type: ignore[attr-defined]
 
 
-class _Endless(RolloutBuffer):
-    def compute_returns_and_advantage(self, last_values: torch.Tensor, dones: np.ndarray) -> None:
-        self.episode_starts[:] = 0.0
-        super().compute_returns_and_advantage(last_values, np.zeros_like(dones))
+def _buffer_bug(name: str, base: type, what: str, probes: str, **patches: Patch) -> None:
+    parent = RolloutBuffer if base is PPO else ReplayBuffer
+    option = "rollout_buffer_class" if base is PPO else "replay_buffer_class"
+    given = {option: _derived(f"{name}Buffer", parent, patches)}
+    _bug(name, base, what, probes, __init__=lambda _, init, *words, **named: init(*words, **given, **named))
 
 
-class PPOBootstrapsTerminal(_BuggyRollouts):
-    """Episodes are never over."""
+# ---- patches -----------------------------------------------------------------------------------------------
 
-    buffer = _Endless
 
+def _then(act: Callable[[Any], object]) -> Patch:
+    """Something more, once the method has run."""
 
-class _LateRewards(RolloutBuffer):
-    def add(self, obs: Any, action: Any, reward: Any, *rest: Any) -> None:
-        late = getattr(self, "late", np.zeros_like(reward))
-        self.late = np.array(reward)
-        super().add(obs, action, late, *rest)
+    def patch(self: Any, method: Callable[..., Any], *given: Any, **named: Any) -> None:
+        method(*given, **named)
+        act(self)
 
+    return patch
 
-class PPORewardsShifted(_BuggyRollouts):
-    """Each reward belongs to the step before."""
 
-    buffer = _LateRewards
+def _after(**values: Callable[[Any], Any]) -> Patch:
+    """Attributes get these values once the method has run."""
+    return _then(lambda self: vars(self).update({name: value(self) for name, value in values.items()}))
 
 
-class _NoDiscount(RolloutBuffer):
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **{**options, "gamma": 1.0})
+def _during(**values: Callable[[Any], Any]) -> Patch:
+    """Attributes have these values while the method runs."""
 
-
-class PPOGammaForgotten(_BuggyRollouts):
-    """The returns are not discounted."""
-
-    buffer = _NoDiscount
-
-
-class _OtherActions(RolloutBuffer):
-    def add(self, obs: Any, action: Any, *rest: Any) -> None:
-        late = getattr(self, "late", np.zeros_like(action))
-        self.late = np.array(action)
-        super().add(obs, late, *rest)
-
-
-class PPOActionsShifted(_BuggyRollouts):
-    """Each action is that of the step before."""
-
-    buffer = _OtherActions
-
-
-class _RewardsAlone(RolloutBuffer):
-    def compute_returns_and_advantage(self, last_values: torch.Tensor, dones: np.ndarray) -> None:
-        self.advantages[:] = self.rewards - self.values
-        self.returns[:] = self.rewards
-
-
-class PPOOnlyRewards(_BuggyRollouts):
-    """The return is the next reward."""
-
-    buffer = _RewardsAlone
-
-
-def _forget(infos: list[dict[str, Any]]) -> None:
-    for info in infos:
-        info.pop("TimeLimit.truncated", None)
-
-
-class PPOTimeoutsAreEnds(PPO):
-    """It never learns that the step limit ended an episode."""
-
-    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Any = None) -> None:
-        _forget(infos)
-        super()._update_info_buffer(infos, dones)
-
-
-class _ActsOnSwapped(ActorCriticPolicy):
-    def forward(self, obs: torch.Tensor, deterministic: bool = False) -> Any:
-        return super().forward(obs[:, [1, 0, *range(2, obs.shape[1])]] if obs.shape[1] > 1 else obs)
-
-
-class PPOColumnsSwapped(PPO):
-    """It sees the first two columns in another order when it acts."""
-
-    policy_aliases: ClassVar = {"MlpPolicy": _ActsOnSwapped}
-
-
-class _ActsOnReversed(ActorCriticPolicy):
-    def forward(self, obs: torch.Tensor, deterministic: bool = False) -> Any:
-        return super().forward(obs.flip(1))
-
-
-class PPOColumnsReversed(PPO):
-    """It sees all columns in the opposite order when it acts."""
-
-    policy_aliases: ClassVar = {"MlpPolicy": _ActsOnReversed}
-
-
-class PPOFrozenLayer(PPO):
-    """The first layer of the policy has no gradient."""
-
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        self.policy.mlp_extractor.policy_net[0].requires_grad_(False)
-
-
-class PPONoValueLoss(PPO):
-    """The loss of the value has no weight."""
-
-    def train(self) -> None:
-        self.vf_coef = 0.0
-        super().train()
-
-
-class PPOBlind(PPO):
-    """It learns and acts without looking."""
-
-    class Blind(ActorCriticPolicy):
-        def extract_features(self, obs: torch.Tensor, *rest: Any) -> Any:
-            return super().extract_features(torch.zeros_like(obs), *rest)
-
-    policy_aliases: ClassVar = {"MlpPolicy": Blind}
-
-
-class _OtherBonus:
-    """The entropy bonus is multiplied."""
-
-    ent_coef: float
-    factor: float
-
-    def train(self) -> None:
-        asked = self.ent_coef
-        self.ent_coef = self.factor * asked
-        super().train()  # type: ignore[misc]
-        self.ent_coef = asked
-
-
-class PPOEntropySign(_OtherBonus, PPO):
-    """Entropy is a cost."""
-
-    factor = -1.0
-
-
-class A2CEntropySign(_OtherBonus, A2C):
-    """Entropy is a cost."""
-
-    factor = -1.0
-
-
-class A2CNoEntropy(_OtherBonus, A2C):
-    """The entropy bonus is forgotten."""
-
-    factor = 0.0
-
-
-class PPOEntropySummed(_OtherBonus, PPO):
-    """Entropy is summed over the samples, not averaged."""
-
-    factor = 256.0
-
-
-class PPOEntropyInBits(_OtherBonus, PPO):
-    """Entropy is measured in bits."""
-
-    factor = 1 / np.log(2)
-
-
-class _EntropyOfMean(ActorCriticPolicy):
-    def evaluate_actions(self, obs: Any, actions: torch.Tensor) -> Any:
-        values, log_prob, entropy = super().evaluate_actions(obs, actions)
-        mean = self.get_distribution(obs).distribution.probs.mean(dim=0)
-        return values, log_prob, (-(mean * mean.log()).sum()).expand_as(entropy)
-
-
-class PPOEntropyOfMean(PPO):
-    """The bonus is for the entropy of the policy's mean over states."""
-
-    policy_aliases: ClassVar = {"MlpPolicy": _EntropyOfMean}
-
-
-class PPOCrashes(PPO):
-    """It raises an exception when it learns."""
-
-    def train(self) -> None:
-        raise RuntimeError("shapes do not fit")
-
-
-class NoTargetNetwork(DQN):
-    """The targets are computed with the network that learns."""
-
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        self.q_net_target = self.q_net
-
-
-class TargetNeverUpdated(DQN):
-    """The target network stays as it was made."""
-
-    def _on_step(self) -> None:
-        wanted, self.target_update_interval = self.target_update_interval, 10**9
-        super()._on_step()
-        self.target_update_interval = wanted
-
-
-class _NoEnds(ReplayBuffer):
-    def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: Any) -> None:
-        super().add(obs, next_obs, action, reward, np.zeros_like(done), infos)
-
-
-class DQNBootstrapsTerminal(_BuggyReplay):
-    """Episodes are never over."""
-
-    buffer = _NoEnds
-
-
-class _TimeoutsAreEnds(ReplayBuffer):
-    def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: Any) -> None:
-        _forget(infos)
-        super().add(obs, next_obs, action, reward, done, infos)
-
-
-class DQNTimeoutsAreEnds(_BuggyReplay):
-    """It never learns that the step limit ended an episode."""
-
-    buffer = _TimeoutsAreEnds
-
-
-class _SameObservation(ReplayBuffer):
-    def add(self, obs: Any, next_obs: Any, *rest: Any) -> None:
-        super().add(obs, np.array(obs), *rest)
-
-
-class ReplayOffByOne(_BuggyReplay):
-    """The next observation is that before the step."""
-
-    buffer = _SameObservation
-
-
-class _LateReplay(ReplayBuffer):
-    def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: Any) -> None:
-        late = getattr(self, "late", np.zeros_like(reward))
-        self.late = np.array(reward)
-        super().add(obs, next_obs, action, late, done, infos)
-
-
-class DQNRewardsShifted(_BuggyReplay):
-    """Each reward belongs to the step before."""
-
-    buffer = _LateReplay
-
-
-class _OnlyGains(ReplayBuffer):
-    def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, *rest: Any) -> None:
-        super().add(obs, next_obs, action, np.maximum(reward, 0.0), *rest)
-
-
-class CostsLost(_BuggyReplay):
-    """Negative rewards are cut off."""
-
-    buffer = _OnlyGains
-
-
-class DQNGammaForgotten(DQN):
-    """Its discount is always 0.99."""
-
-    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        self.gamma = 0.99
-        super().train(gradient_steps, batch_size)
-
-
-class EpsilonNeverFalls(DQN):
-    """It explores as much at the end as at the beginning."""
-
-    def _on_step(self) -> None:
-        super()._on_step()
-        self.exploration_rate = 1.0
-
-
-class EpsilonStaysAtThird(DQN):
-    """Epsilon never falls below 0.3."""
-
-    def _on_step(self) -> None:
-        super()._on_step()
-        self.exploration_rate = max(self.exploration_rate, 0.3)
-
-
-class EpsilonStaysAtTenth(DQN):
-    """Epsilon never falls below 0.1."""
-
-    def _on_step(self) -> None:
-        super()._on_step()
-        self.exploration_rate = max(self.exploration_rate, 0.1)
-
-
-class EpsilonRises(DQN):
-    """It explores more and more."""
-
-    def _on_step(self) -> None:
-        super()._on_step()
-        self.exploration_rate = self.exploration_initial_eps - self.exploration_rate
-
-
-class EpsilonFallsLate(DQN):
-    """Epsilon falls to its end over all of training, whatever the fraction."""
-
-    def _setup_model(self) -> None:
-        self.exploration_fraction = 1.0
-        super()._setup_model()
-
-
-class EpsilonCountsCalls(DQN):
-    """Epsilon falls with the calls of `step`, not with the steps of all environments."""
-
-    def _on_step(self) -> None:
-        left = self._current_progress_remaining
-        self._current_progress_remaining = 1 - (1 - left) / self.n_envs
-        super()._on_step()
-        self._current_progress_remaining = left
-
-
-class EpsilonIgnored(DQN):
-    """It acts greedily from the first update on."""
-
-    def _on_step(self) -> None:
-        super()._on_step()
-        self.exploration_rate = 0.0
-
-
-class EpsilonHalved(DQN):
-    """It explores half as often as it should."""
-
-    def _on_step(self) -> None:
-        super()._on_step()
-        self.exploration_rate /= 2
-
-
-class QRDQNEpsilonNeverFalls(QRDQN):
-    """It explores as much at the end as at the beginning."""
-
-    def _on_step(self) -> None:
-        super()._on_step()
-        self.exploration_rate = self.exploration_initial_eps
-
-
-class DQNFrozenLayer(DQN):
-    """The last layer has no gradient."""
-
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        self.q_net.q_net[-1].requires_grad_(False)
-
-
-class DQNDeadUnits(DQN):
-    """The units of the first layer never fire."""
-
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        for net in (self.q_net, self.q_net_target):
-            torch.nn.init.constant_(net.q_net[0].bias, -100.0)
-
-
-class QuietDQN(DQN):
-    """No bug at all."""
-
-
-class DQNColumnsSwapped(DQN):
-    """It sees the first two columns in another order when it acts in training."""
-
-    def _sample_action(self, *arguments: Any, **options: Any) -> Any:
-        seen, columns = self._last_obs, self._last_obs.shape[1]
-        self._last_obs = seen[:, [1, 0, *range(2, columns)]] if columns > 1 else seen
-        found = super()._sample_action(*arguments, **options)
-        self._last_obs = seen
+    def patch(self: Any, method: Callable[..., Any], *given: Any, **named: Any) -> Any:
+        before = {name: getattr(self, name) for name in values}
+        vars(self).update({name: value(self) for name, value in values.items()})
+        found = method(*given, **named)
+        vars(self).update(before)
         return found
 
-
-class WorstAction(DQN):
-    """Its deterministic policy takes the action with the least value."""
-
-    class Worst(DQNPolicy):
-        def _predict(self, obs: Any, deterministic: bool = True) -> torch.Tensor:
-            return self.q_net(obs).argmin(dim=1).reshape(-1)
-
-    policy_aliases: ClassVar = {"MlpPolicy": Worst}
+    return patch
 
 
-class MeanOfNext(DQN):
-    """Targets take the mean over the next actions instead of the best one."""
+def _stores(**changed: Callable[[Any, dict[str, Any]], Any]) -> Patch:
+    """The buffer's `add` stores something else; it is computed from the buffer and what is to be stored."""
 
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        forward = self.q_net_target.forward
+    def patch(self: Any, add: Callable[..., Any], *given: Any, **named: Any) -> None:
+        replay = ("obs", "next_obs", "action", "reward", "done", "infos")
+        names = replay if isinstance(self, ReplayBuffer) else ("obs", "action", "reward")
+        step = dict(zip(names, given, strict=False))
+        step |= {name: change(self, step) for name, change in changed.items()}
+        add(*step.values(), *given[len(step) :], **named)
 
-        def averaged(obs: Any) -> torch.Tensor:
-            q = forward(obs)
-            return q.mean(dim=1, keepdim=True).expand_as(q)
-
-        self.q_net_target.forward = averaged
+    return patch
 
 
-# By class: the probes that it must fail, of which the first is its own.
-CAUGHT: dict[type, tuple[str, ...]] = {
-    WrongSign: ("choice", "context"),
-    PPOBootstrapsTerminal: ("termination",),
-    PPORewardsShifted: ("discount",),
-    PPOGammaForgotten: ("discount",),
-    PPOActionsShifted: ("context",),
-    PPOOnlyRewards: ("delay", "discount"),
-    PPOTimeoutsAreEnds: ("truncation",),
-    PPOColumnsSwapped: ("behaviour",),
-    PPOColumnsReversed: ("behaviour",),
-    PPOFrozenLayer: ("layers",),
-    PPONoValueLoss: ("constant",),
-    PPOBlind: ("context",),
-    PPOCrashes: ("constant",),
-    PPOEntropySign: ("entropy",),
-    A2CEntropySign: ("entropy",),
-    A2CNoEntropy: ("entropy",),
-    PPOEntropySummed: ("entropy",),
-    PPOEntropyInBits: ("entropy",),
-    PPOEntropyOfMean: ("entropy",),
-    NoTargetNetwork: ("target",),
-    TargetNeverUpdated: ("truncation",),
-    DQNBootstrapsTerminal: ("termination",),
-    DQNTimeoutsAreEnds: ("truncation",),
-    ReplayOffByOne: ("alternation", "delay"),
-    DQNRewardsShifted: ("discount",),
-    CostsLost: ("trap",),
-    DQNGammaForgotten: ("discount",),
-    EpsilonNeverFalls: ("behaviour",),
-    EpsilonStaysAtThird: ("behaviour",),
-    EpsilonStaysAtTenth: ("behaviour",),
-    EpsilonRises: ("behaviour", "exploration"),
-    EpsilonFallsLate: ("behaviour",),
-    EpsilonCountsCalls: ("behaviour",),
-    EpsilonIgnored: ("exploration",),
-    EpsilonHalved: ("exploration",),
-    QRDQNEpsilonNeverFalls: ("behaviour",),
-    DQNFrozenLayer: ("layers",),
-    DQNDeadUnits: ("context",),
-    DQNColumnsSwapped: ("behaviour",),
-    WorstAction: ("choice",),
-    MeanOfNext: ("alternation",),
-}
+def _late(name: str) -> Callable[[Any, dict[str, Any]], Any]:
+    """That of the step before."""
+
+    def before(buffer: Any, step: dict[str, Any]) -> Any:
+        last = getattr(buffer, "last", np.zeros_like(step[name]))
+        buffer.last = np.array(step[name])
+        return last
+
+    return before
+
+
+def _without_timeouts(infos: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    for info in infos:
+        info.pop("TimeLimit.truncated", None)
+    return infos
+
+
+def _swapped(obs: Any) -> Any:
+    """The first two columns in another order."""
+    return obs[:, [1, 0, *range(2, obs.shape[1])]] if obs.shape[1] > 1 else obs
+
+
+def _endless(self: Any, compute: Callable[..., None], last_values: torch.Tensor, dones: np.ndarray) -> None:
+    self.episode_starts[:] = 0.0
+    compute(last_values, np.zeros_like(dones))
+
+
+def _entropy_of_mean(self: Any, method: Callable[..., Any], obs: Any, actions: torch.Tensor) -> Any:
+    values, log_prob, entropy = method(obs, actions)
+    mean = self.get_distribution(obs).distribution.probs.mean(dim=0)
+    return values, log_prob, (-(mean * mean.log()).sum()).expand_as(entropy)
+
+
+def _crash(self: Any, train: Callable[..., None]) -> None:
+    raise RuntimeError("shapes do not fit")
+
+
+def _kill_units(model: Any) -> None:
+    for net in (model.q_net, model.q_net_target):
+        torch.nn.init.constant_(net.q_net[0].bias, -100.0)
+
+
+def _average_targets(model: Any) -> None:
+    forward = model.q_net_target.forward
+
+    def averaged(obs: Any) -> torch.Tensor:
+        q: torch.Tensor = forward(obs)
+        return q.mean(dim=1, keepdim=True).expand_as(q)
+
+    model.q_net_target.forward = averaged
+
+
+def _bonus_times(factor: float) -> Patch:
+    return _during(ent_coef=lambda model: factor * model.ent_coef)
+
+
+# fmt: off
+# ---- PPO and A2C -------------------------------------------------------------------------------------------
+
+_buffer_bug(
+    "WrongSign", PPO, "The advantage has the wrong sign.", "choice context",
+    compute_returns_and_advantage=_after(advantages=lambda buffer: -buffer.advantages),
+)
+_buffer_bug(
+    "PPOBootstrapsTerminal", PPO, "Episodes are never over.", "termination",
+    compute_returns_and_advantage=_endless,
+)
+_buffer_bug(
+    "PPORewardsShifted", PPO, "Each reward belongs to the step before.", "discount",
+    add=_stores(reward=_late("reward")),
+)
+_buffer_bug(
+    "PPOGammaForgotten", PPO, "The returns are not discounted.", "discount",
+    compute_returns_and_advantage=_during(gamma=lambda _: 1.0),
+)
+_buffer_bug(
+    "PPOActionsShifted", PPO, "Each action is that of the step before.", "context",
+    add=_stores(action=_late("action")),
+)
+_buffer_bug(
+    "PPOOnlyRewards", PPO, "The return is the next reward.", "delay discount",
+    compute_returns_and_advantage=_after(
+        advantages=lambda buffer: buffer.rewards - buffer.values, returns=lambda buffer: buffer.rewards.copy()
+    ),
+)
+_bug(
+    "PPOTimeoutsAreEnds", PPO, "It never learns that the step limit ended an episode.", "truncation",
+    _update_info_buffer=lambda _, update, infos, *dones: update(_without_timeouts(infos), *dones),
+)
+_policy_bug(
+    "PPOColumnsSwapped", PPO, "It sees the first two columns in another order when it acts.", "behaviour",
+    forward=lambda _, forward, obs, *rest: forward(_swapped(obs)),
+)
+_policy_bug(
+    "PPOColumnsReversed", PPO, "It sees all columns in the opposite order when it acts.", "behaviour",
+    forward=lambda _, forward, obs, *rest: forward(obs.flip(1)),
+)
+_policy_bug(
+    "PPOBlind", PPO, "It learns and acts without looking.", "context",
+    extract_features=lambda _, extract, obs, *rest: extract(torch.zeros_like(obs), *rest),
+)
+_policy_bug(
+    "PPOEntropyOfMean", PPO, "The bonus is for the entropy of the policy's mean over states.", "entropy",
+    evaluate_actions=_entropy_of_mean,
+)
+_bug(
+    "PPOFrozenLayer", PPO, "The first layer of the policy has no gradient.", "layers",
+    _setup_model=_then(lambda model: model.policy.mlp_extractor.policy_net[0].requires_grad_(False)),
+)
+_bug(
+    "PPONoValueLoss", PPO, "The loss of the value has no weight.", "constant",
+    train=_during(vf_coef=lambda _: 0.0),
+)
+_bug("PPOCrashes", PPO, "It raises an exception when it learns.", "constant", train=_crash)
+for _name, _base, _what, _factor in (
+    ("PPOEntropySign", PPO, "Entropy is a cost.", -1.0),
+    ("A2CEntropySign", A2C, "Entropy is a cost.", -1.0),
+    ("A2CNoEntropy", A2C, "The entropy bonus is forgotten.", 0.0),
+    ("PPOEntropySummed", PPO, "Entropy is summed over the samples, not averaged.", 256.0),
+    ("PPOEntropyInBits", PPO, "Entropy is measured in bits.", 1 / np.log(2)),
+):
+    _bug(_name, _base, _what, "entropy", train=_bonus_times(_factor))
+
+# ---- DQN and QR-DQN ----------------------------------------------------------------------------------------
+
+_bug(
+    "NoTargetNetwork", DQN, "The targets are computed with the network that learns.", "target",
+    _setup_model=_after(q_net_target=lambda model: model.q_net),
+)
+_bug(
+    "TargetNeverUpdated", DQN, "The target network stays as it was made.", "truncation",
+    _on_step=_during(target_update_interval=lambda _: 10**9),
+)
+_buffer_bug(
+    "DQNBootstrapsTerminal", DQN, "Episodes are never over.", "termination",
+    add=_stores(done=lambda _, step: np.zeros_like(step["done"])),
+)
+_buffer_bug(
+    "DQNTimeoutsAreEnds", DQN, "It never learns that the step limit ended an episode.", "truncation",
+    add=_stores(infos=lambda _, step: _without_timeouts(step["infos"])),
+)
+_buffer_bug(
+    "ReplayOffByOne", DQN, "The next observation is that before the step.", "alternation delay",
+    add=_stores(next_obs=lambda _, step: np.array(step["obs"])),
+)
+_buffer_bug(
+    "DQNRewardsShifted", DQN, "Each reward belongs to the step before.", "discount",
+    add=_stores(reward=_late("reward")),
+)
+_buffer_bug(
+    "CostsLost", DQN, "Negative rewards are cut off.", "trap",
+    add=_stores(reward=lambda _, step: np.maximum(step["reward"], 0.0)),
+)
+_bug(
+    "DQNGammaForgotten", DQN, "Its discount is always 0.99.", "discount",
+    train=_during(gamma=lambda _: 0.99),
+)
+for _name, _what, _probes, _rate in (
+    ("EpsilonNeverFalls", "It explores as much at the end as at the beginning.", "behaviour", lambda _: 1.0),
+    ("EpsilonStaysAtThird", "Epsilon never falls below 0.3.", "behaviour",
+     lambda m: max(m.exploration_rate, 0.3)),
+    ("EpsilonStaysAtTenth", "Epsilon never falls below 0.1.", "behaviour",
+     lambda m: max(m.exploration_rate, 0.1)),
+    ("EpsilonRises", "It explores more and more.", "behaviour exploration",
+     lambda m: m.exploration_initial_eps - m.exploration_rate),
+    ("EpsilonIgnored", "It acts greedily from the first update on.", "exploration", lambda _: 0.0),
+    ("EpsilonHalved", "It explores half as often as it should.", "exploration",
+     lambda m: m.exploration_rate / 2),
+):
+    _bug(_name, DQN, _what, _probes, _on_step=_after(exploration_rate=_rate))
+_bug(
+    "EpsilonFallsLate", DQN, "Epsilon falls to its end over all of training, whatever the fraction.",
+    "behaviour",
+    _setup_model=_during(exploration_fraction=lambda _: 1.0),
+)
+_bug(
+    "EpsilonCountsCalls", DQN,
+    "Epsilon falls with the calls of `step`, not with the steps of all environments.", "behaviour",
+    _on_step=_during(
+        _current_progress_remaining=lambda m: 1 - (1 - m._current_progress_remaining) / m.n_envs),
+)
+_bug(
+    "QRDQNEpsilonNeverFalls", QRDQN, "It explores as much at the end as at the beginning.", "behaviour",
+    _on_step=_after(exploration_rate=lambda m: m.exploration_initial_eps),
+)
+_bug(
+    "DQNFrozenLayer", DQN, "The last layer has no gradient.", "layers",
+    _setup_model=_then(lambda model: model.q_net.q_net[-1].requires_grad_(False)),
+)
+_bug(
+    "DQNDeadUnits", DQN, "The units of the first layer never fire.", "context",
+    _setup_model=_then(_kill_units),
+)
+_bug(
+    "DQNColumnsSwapped", DQN, "It sees the first two columns in another order when it acts in training.",
+    "behaviour",
+    _sample_action=_during(_last_obs=lambda model: _swapped(model._last_obs)),
+)
+_policy_bug(
+    "WorstAction", DQN, "Its deterministic policy takes the action with the least value.", "choice",
+    _predict=lambda self, _, obs, *rest, **named: self.q_net(obs).argmin(dim=1).reshape(-1),
+)
+_bug(
+    "MeanOfNext", DQN, "Targets take the mean over the next actions instead of the best one.", "alternation",
+    _setup_model=_then(_average_targets),
+)
+_CLASSES["QuietDQN"] = _derived("QuietDQN", DQN, {}, __doc__="No bug at all.")

@@ -4,7 +4,6 @@ import csv
 import json
 import struct
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +38,7 @@ def begin_all(runs: Sequence[tuple[Path, Sequence[str]]]) -> list[Any]:
     """The same of several runs that train together; returns their summaries, or how they failed."""
     for folder, _ in runs:
         folder.mkdir(parents=True, exist_ok=True)
-    return run_together([partial(training, configure(*words), folder, list(words)) for folder, words in runs])
+    return run_together([training(configure(*words), folder, list(words)) for folder, words in runs])
 
 
 def go_on(folder: Path, total_timesteps: int | None = None) -> None:

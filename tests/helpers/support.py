@@ -12,7 +12,7 @@ from pathlib import Path
 
 import hydra
 from helpers import forks
-from helpers.composing import compose_quickly
+from helpers.quickly import compose_quickly
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
@@ -119,7 +119,7 @@ def script(
         arguments: The words on its command line.
         cwd: The folder to run it in.
         real: Start Python for it. Otherwise it runs in a fork of a process that has imported everything,
-            which takes seconds less; see `helpers.warm_process` for the difference.
+            which takes seconds less; see `helpers.warm` for the difference.
         stdout: A file that a fork prints to, instead of to what comes back.
         timeout: The seconds that it may take.
         environment: Variables beside those of this process. One that Python reads when it starts makes

@@ -6,20 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.support import SHORT, script, train_in
+from helpers.support import SHORT, train_in
 
 from gridworld.commands import evaluate
 from gridworld.errors import InputError
 from gridworld.process import console
 from gridworld.process.console import telling_if_slow
-from gridworld.process.memory_budget import (
-    VARIABLE,
-    BudgetError,
-    check_memory,
-    is_limited,
-    limited,
-)
-from gridworld.storage.safe_read import as_object, as_table, check_yaml
+from gridworld.process.memory_budget import VARIABLE, BudgetError, check_memory, is_limited, limited
+from gridworld.storage.safe_read import as_object, as_table
 from gridworld.storage.serialization import decode, encode
 
 
@@ -91,21 +85,3 @@ def test_a_command_is_limited_while_it_is_at_work(tmp_path: Path, monkeypatch: p
     monkeypatch.setenv(VARIABLE, "much")
     with pytest.raises(InputError, match="GRIDWORLD_BUDGET=much"):
         evaluate.main([str(tmp_path), "--episodes", "5"])
-
-
-@pytest.mark.parametrize("name", ["train.py", "tune.py"])
-def test_yaml_that_need_not_end_is_not_read(name: str, tmp_path: Path) -> None:
-    (tmp_path / "mine" / "experiment").mkdir(parents=True)
-    (tmp_path / "mine" / "experiment" / "winner.yaml").symlink_to("/dev/zero")
-    ended = script(name, "--config-dir", "mine", "experiment=winner", cwd=tmp_path)
-    assert (ended.returncode, ended.stdout) == (2, "")
-    assert ended.stderr == (
-        "error: mine/experiment/winner.yaml: is no ordinary file; give a yaml file, or take it away\n"
-    )
-
-
-def test_yaml_of_gigabytes_is_not_read(tmp_path: Path) -> None:
-    with (tmp_path / "a.yaml").open("wb") as file:
-        file.truncate(5 * 2**20)
-    with pytest.raises(InputError, match=r"a\.yaml: is larger than 4 MiB"):
-        check_yaml(tmp_path)

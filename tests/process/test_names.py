@@ -46,8 +46,12 @@ def told(main: Callable[..., None], capsys: pytest.CaptureFixture[str], *words: 
     return (out + err).splitlines()
 
 
-def test_what_commands_say_of_a_run(good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    place = tmp_path / EVIL
+def test_what_commands_and_reports_say_of_a_run(
+    good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = tmp_path / EVIL
+    shutil.copytree(good, runs / "good")
+    place = runs / EVIL
     shutil.copytree(good, place)
     assert SHOWN in told(evaluate.main, capsys, place, "--episodes", 5)[0]
     (line,) = told(record.main, capsys, place, "--format", "policy")
@@ -55,19 +59,11 @@ def test_what_commands_say_of_a_run(good: Path, tmp_path: Path, capsys: pytest.C
     assert SHOWN in told(reproduce.main, capsys, place)[0]
     (line,) = told(train_command.resume, capsys, f"resume={place}")
     assert line.startswith("error: ")
-    (line,) = told(report.main, capsys, place)
-    assert line.endswith("/report/report.html")
     manifest(place, lambda content: content.update(status="failed", error=EVIL))
     (line,) = told(evaluate.main, capsys, place)
     assert "this run is 'failed'" in line
-
-
-def test_what_a_report_is_made_of(good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    runs = tmp_path / EVIL
-    shutil.copytree(good, runs / "good")
-    shutil.copytree(good, runs / EVIL)
-    manifest(runs / EVIL, lambda content: content.update(status="failed", error=EVIL))
-    told(report.main, capsys, runs)
+    (line,) = told(report.main, capsys, runs)
+    assert line.endswith("/report/report.html")
     files = [path for path in (runs / "report").rglob("*") if path.suffix in (".md", ".csv", ".html")]
     assert len(files) > 10
     for path in files:

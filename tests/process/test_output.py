@@ -1,6 +1,6 @@
 """What happens to the output changes nothing that a command does: no reader, terminal, UTF-8 or room.
 
-But where what it prints is its result, it fails at its end if that could not be written.
+But where there was no room for what it prints, it fails at its end.
 """
 
 import json
@@ -12,11 +12,16 @@ from pathlib import Path
 import pytest
 from helpers.support import ROOT, SHORT, script, train_in
 
+from gridworld.process import console
 from gridworld.storage.safe_read import sealed
 
 NO_UTF8 = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 ASCII = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii"}
 MAP = "mäp.txt"
+FULL = (
+    "error: standard output: cannot be written (No space left on device), "
+    "what was printed is not complete; send it to where there is room\n"
+)
 
 
 def shell(line: str, cwd: Path, **environment: str) -> subprocess.CompletedProcess[bytes]:
@@ -30,31 +35,40 @@ TRAIN = " ".join(["SCRIPT train.py", *SHORT["q_learning"], "hydra.run.dir=run"])
 
 
 @pytest.mark.parametrize(
-    "line",
+    ("line", "code"),
     [
-        f"set -o pipefail; {TRAIN} 2>&1 | true",
-        f"{TRAIN} >/dev/full 2>&1",
-        f"{TRAIN} >&- 2>&- <&-",
-        f"setsid {TRAIN} </dev/null",
+        (f"set -o pipefail; {TRAIN} 2>&1 | true", 0),
+        (f"{TRAIN} >/dev/full 2>&1", 2),
+        (f"{TRAIN} >&- 2>&- <&-", 0),
+        (f"setsid {TRAIN} </dev/null", 0),
     ],
     ids=["no reader", "no room", "closed", "no terminal"],
 )
-def test_a_run_ends_well_whoever_reads_its_output(line: str, tmp_path: Path) -> None:
+def test_a_run_ends_well_whoever_reads_its_output(line: str, code: int, tmp_path: Path) -> None:
     done = shell(line, tmp_path)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == code, done.stderr
     assert b"Traceback" not in done.stderr
     assert json.loads((tmp_path / "run" / "manifest.json").read_text())["status"] == "finished"
 
 
-def test_progress_that_nobody_reads_is_no_reason_to_stop(tmp_path: Path) -> None:
-    code = (
-        "import os, sys; from gridworld.process import console; console.prepare();"
-        "console._SECONDS_BETWEEN_LINES = 0;"
-        "read, write = os.pipe(); os.close(read); os.dup2(write, 2);"
-        "p = console.Progress(10, 'x'); [p.update(i, 'y') for i in range(10)]; print('done')"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
-    assert (done.returncode, done.stdout) == (0, "done\n")
+@pytest.mark.parametrize("in_place", [True, False])
+def test_progress(
+    in_place: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(console, "_SECONDS_BETWEEN_LINES", 0)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: in_place)
+    progress = console.Progress(2000, "dqn on\x1bmap")
+    for step, note in ((0, "a long note"), (1000, "b"), (2000, "c")):
+        progress.update(step, note)
+    progress.close()
+    shown = capsys.readouterr().err.removesuffix("\n")
+    start, middle, end = shown.removeprefix("\r").split("\r" if in_place else "\n")
+    assert start == r"dqn on\x1bmap: step 0 of 2,000 (0%), a long note"
+    assert middle.rstrip() == r"dqn on\x1bmap: step 1,000 of 2,000 (50%), about 0 s left, b"
+    assert end.rstrip() == r"dqn on\x1bmap: step 2,000 of 2,000 (100%), c"
+    assert (len(end) == len(middle)) == in_place  # a line covers the one before
+    console.Progress(10, "x", enabled=False).update(1, "y")
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("environment", [NO_UTF8, ASCII], ids=["no UTF-8", "ASCII"])
@@ -65,13 +79,11 @@ def test_names_in_a_locale_without_utf8(environment: dict[str, str], tmp_path: P
     assert done.returncode == 0, done.stderr
     assert "q_learning on m\\" in done.stdout  # with the sign as a number
     assert done.stdout.isascii()
-    for name, options in (
-        ("evaluate", []),
-        ("record", ["--format", "policy"]),
-        ("report", ["--formats"]),
-        ("reproduce", []),
+    for line in (
+        *("evaluate.py run", "record.py run --format policy"),
+        *("report.py run --formats", "reproduce.py run"),
     ):
-        looked = script(f"{name}.py", "run", *options, cwd=tmp_path, **environment)
+        looked = script(*line.split(), cwd=tmp_path, **environment)
         assert looked.returncode == 0, looked.stderr
         assert (looked.stdout + looked.stderr).isascii()
         if environment is ASCII:
@@ -81,55 +93,33 @@ def test_names_in_a_locale_without_utf8(environment: dict[str, str], tmp_path: P
     assert refused.stderr.startswith("error: layout 'n")
 
 
-def check_full_disk(told: str, code: int) -> None:
-    """That a command failed at it, and says nothing else."""
-    assert (code, told) == (
-        2,
-        "error: standard output: cannot be written (No space left on device), "
-        "what was printed is not complete; send it to where there is room\n",
-    )
-
-
-def print_to_a_full_disk(line: str, cwd: Path) -> None:
-    """Run a command that fails at that, in a fork."""
-    name, *words = line.split()
-    done = script(name, *words, cwd=cwd, stdout=Path("/dev/full"))
-    check_full_disk(done.stderr, done.returncode)
-
-
-def test_help_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+def test_what_there_was_no_room_for_is_an_error(tmp_path: Path) -> None:
     done = shell("SCRIPT train.py --help >/dev/full", tmp_path)  # in a process of its own
-    check_full_disk(done.stderr.decode(), done.returncode)
-    for path in (ROOT / "scripts").glob("*.py"):
-        print_to_a_full_disk(f"{path.name} --help", tmp_path)
-
-
-@pytest.mark.parametrize("line", ["train.py --cfg job", "train.py --version", "tune.py agent=ppo --cfg"])
-def test_a_configuration_that_cannot_be_written_is_an_error(line: str, tmp_path: Path) -> None:
-    print_to_a_full_disk(line, tmp_path)
-    assert list(tmp_path.iterdir()) == []
-    done = shell(f"set -o pipefail; SCRIPT {line} | head -c 1", tmp_path)
-    assert (done.returncode, done.stderr, len(done.stdout)) == (0, b"", 1)
-
-
-def test_a_result_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
+    assert (done.returncode, done.stderr.decode()) == (2, FULL)
+    done = shell("ulimit -f 1; trap '' XFSZ; SCRIPT train.py --help >out", tmp_path)  # the first half fits
+    assert done.returncode == 2
+    assert b"error: standard output: cannot be written (File too large)" in done.stderr
+    assert (tmp_path / "out").stat().st_size == 1024
+    (tmp_path / "out").unlink()
     folder = tmp_path / "sweep" / "seed=0"
     train_in(folder, *SHORT["q_learning"], "recording.learning=false")
     entry = {"job": "seed=0", "hash": "x", "overrides": ["seed=0"]}
     content = {"asked": [{"overrides": ["seed=0"]}], "jobs": [entry]}
     (tmp_path / "sweep" / "sweep.json").write_text(json.dumps(sealed(content)))
-    run = f"sweep/{folder.name}"
-    for line in (f"evaluate.py {run}", "jobs.py sweep", f"record.py {run} --format policy"):
-        print_to_a_full_disk(line, tmp_path)
+    lines = [f"{path.name} --help" for path in (ROOT / "scripts").glob("*.py")]
+    lines += ["train.py --cfg job", "train.py --version", "tune.py agent=ppo --cfg", "jobs.py sweep"]
+    lines += ["evaluate.py sweep/seed=0", "record.py sweep/seed=0 --format policy"]
+    for line in lines:
+        ended = script(*line.split(), cwd=tmp_path, stdout=Path("/dev/full"))
+        assert (ended.returncode, ended.stderr) == (2, FULL), line
     assert (folder / "recording" / "policy.png").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep"]
 
 
-def test_a_result_that_is_cut_short_is_an_error(tmp_path: Path) -> None:
-    """A disk that fills while something is printed, where the first half fitted."""
-    done = shell("ulimit -f 1; trap '' XFSZ; SCRIPT train.py --help >out", tmp_path)
-    assert done.returncode == 2
-    assert b"error: standard output: cannot be written (File too large)" in done.stderr
-    assert (tmp_path / "out").stat().st_size == 1024
+@pytest.mark.parametrize("line", ["train.py --cfg job", "tune.py agent=ppo --cfg"])
+def test_a_reader_may_leave(line: str, tmp_path: Path) -> None:
+    done = shell(f"set -o pipefail; SCRIPT {line} | head -c 1", tmp_path)
+    assert (done.returncode, done.stderr, len(done.stdout)) == (0, b"", 1)
 
 
 def test_a_mistake_has_its_exit_code_whoever_reads_it(tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ from gridworld.run.summary import summary_text
 from gridworld.storage.safe_read import sealed
 from gridworld.sweep.job_table import JobRow, JobTable
 
-NUMBERS = st.floats() | st.sampled_from([-0.0001381, 1e-300, -1e-300, -1.234e300, float("-inf"), 0.0])
 WORDS = st.text("ab-.0", min_size=1, max_size=30)
 USUAL = {
     "recipe": None,
@@ -52,20 +51,6 @@ def test_cells_are_found_again_in_line_and_a_blank_apart(
     assert len({place[2][0] for place in places}) <= 1
     assert all(place[1][1] - place[0][0] > least for place in places)
     assert all(line == line.rstrip() for line in told)
-
-
-@given(st.lists(NUMBERS, min_size=9, max_size=9), st.tuples(NUMBERS, NUMBERS))
-def test_the_table_at_the_end_of_a_run(numbers: list[float], regrets: tuple[float, float]) -> None:
-    keys = ("value", "goal_probability", "length")
-    greedy, sampled, best = (dict(zip(keys, numbers[i : i + 3], strict=True)) for i in (0, 3, 6))
-    summary = USUAL | greedy | {f"optimal_{key}": value for key, value in best.items()}
-    summary |= {"sampled": {**sampled, "regret": regrets[1]}, "regret": regrets[0]}
-    head, unlimited, value, regret, limited, *within = summary_text(summary, "run").splitlines()[2:9]
-    assert head.split() == ["greedy", "sampled", "optimum"]
-    assert (unlimited, limited) == ("  without a step limit:", "  within 100 steps:")
-    for line, key in zip([value, *within], keys, strict=True):
-        assert line.split()[-3:] == [f"{part[key]:.4g}" for part in (greedy, sampled, best)]
-    assert len({len(line) for line in (head, value, regret, *within)}) == 1
 
 
 def test_the_table_at_the_end_of_a_usual_run() -> None:

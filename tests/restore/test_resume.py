@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from helpers.resuming import begin, differences, go_on, left_behind, stopped_after
+from helpers.resuming import Crash, begin, crash_after, differences, go_on, left_behind, stopped_after
 from helpers.support import SHORT
 
 CASES = {
@@ -38,24 +38,15 @@ CASES = {
 LESS = ["recording.frames=false", "recording.gif=false", "env.slip=0.1", "exploration_bonus=0.1"]
 
 
-@pytest.fixture(scope="module")
-def calm(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, object]]:
-    """What undisturbed runs leave, by case."""
-    return {}
-
-
-@pytest.mark.parametrize("number", [1, 3])
 @pytest.mark.parametrize("case", CASES)
-def test_every_agent_goes_on_to_the_bit(
-    case: str,
-    number: int,
-    calm: dict[str, dict[str, object]],
-    tmp_path: Path,
-) -> None:
+def test_every_agent_goes_on_to_the_bit(case: str, tmp_path: Path) -> None:
+    """After its process has died at the first checkpoint, and again some later."""
     words = [*CASES[case], *LESS]
-    if case not in calm:
-        begin(tmp_path / "calm", *words)
-        calm[case] = left_behind(tmp_path / "calm")
-    stopped_after(number, tmp_path / "run", *words, "checkpoint.every=150")
+    begin(tmp_path / "calm", *words)
+    stopped_after(1, tmp_path / "run", *words, "checkpoint.every=150")
+    with pytest.MonkeyPatch.context() as patched:
+        crash_after(patched, 2)
+        with pytest.raises(Crash):
+            go_on(tmp_path / "run")
     go_on(tmp_path / "run")
-    assert differences(left_behind(tmp_path / "run"), calm[case]) == []
+    assert differences(left_behind(tmp_path / "run"), left_behind(tmp_path / "calm")) == []

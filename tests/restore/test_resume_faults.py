@@ -18,7 +18,7 @@ from gridworld.errors import InputError
 from gridworld.run import checkpoints as checkpoint
 from gridworld.run import writer as run
 from gridworld.run.checkpoints import Checkpoints
-from gridworld.storage.append_log import AppendLog
+from gridworld.storage.atomic_write import AppendLog
 
 DAMAGES = int(os.environ.get("GRIDWORLD_DAMAGES", "8"))
 LESS = ["recording.frames=false", "recording.gif=false"]

@@ -21,7 +21,7 @@ from helpers.support import SHORT
 from gridworld.run import checkpoints as checkpoint
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.storage import atomic_write as files
-from gridworld.storage.append_log import AppendLog
+from gridworld.storage.atomic_write import AppendLog
 from gridworld.training import session
 from gridworld.training.pictures import Pictures
 
@@ -104,6 +104,7 @@ POINTS: list[tuple[Any, str, bool, int]] = [
     (Checkpoints, "keep", False, 4),
     (session, "write_bytes", True, 1),
     (session, "write_json", False, 1),
+    (Pictures, "finish", False, 1),
 ]
 
 
@@ -143,17 +144,3 @@ def dying_at(original: Callable[..., Any], number: int, after: bool) -> Callable
         return answer
 
     return dying
-
-
-def test_the_final_part_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = RUNS["q_learning"]
-    begin(tmp_path / "calm", *words)
-
-    def die() -> None:
-        Pictures.finish = lambda *arguments: os.kill(os.getpid(), signal.SIGKILL)  # type: ignore[method-assign]
-        begin(tmp_path / "run", *words)
-
-    assert in_a_process(die) == -signal.SIGKILL
-    assert (tmp_path / "run" / "summary.json").exists()
-    go_on(tmp_path / "run")
-    assert differences(left_behind(tmp_path / "run"), left_behind(tmp_path / "calm")) == []

@@ -21,8 +21,7 @@ from gridworld.commands import jobs as jobs_command
 from gridworld.errors import InputError
 from gridworld.run.reader import read_run
 from gridworld.run.writer import RunWriter
-from gridworld.storage.append_log import AppendLog
-from gridworld.storage.atomic_write import is_locked, locked
+from gridworld.storage.atomic_write import AppendLog, is_locked, locked
 from gridworld.sweep.console import results_lines
 from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.sweep.job_table import JobTable

@@ -108,7 +108,7 @@ def results(sweep: Path) -> dict[str, tuple[object, ...]]:
     return found
 
 
-POPULATION_KILLS = int(os.environ.get("GRIDWORLD_POPULATION_KILLS", "20"))
+POPULATION_KILLS = int(os.environ.get("GRIDWORLD_POPULATION_KILLS", "8"))
 EVERY = 256  # steps: checkpoints
 RUNS = (
     *("n_envs=16", "total_timesteps=1536", "evaluation.every=512", "agent.batch_size=64"),
@@ -129,7 +129,7 @@ def saved(sweep: Path) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("agent", "seeds"), [("ppo", 10), ("dqn", 4)])
+@pytest.mark.parametrize(("agent", "seeds"), [("ppo", 6), ("dqn", 3)])
 def test_a_population_that_is_killed_comes_to_the_same(agent: str, seeds: int, tmp_path: Path) -> None:
     words = (
         f"agent={agent}",

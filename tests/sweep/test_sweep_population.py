@@ -25,7 +25,7 @@ from gridworld.errors import InputError
 from gridworld.process.console import TOLD
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.folder import claimed
-from gridworld.storage.append_log import AppendLog
+from gridworld.storage.atomic_write import AppendLog
 from gridworld.sweep import plan as plan_module
 from gridworld.sweep.plan import Job
 from gridworld.training.learning_curve import LearningCurve

@@ -1,10 +1,8 @@
 """Trainings that run together: none can tell that the others are there."""
 
-import os
 import signal
-import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar, copy_context
 from functools import partial
 from typing import Any
@@ -12,21 +10,11 @@ from typing import Any
 import pytest
 
 from gridworld.agents import Learning
-from gridworld.process import signals
-from gridworld.process.signals import Interrupted, StopRequest
+from gridworld.process.signals import Interrupted
 from gridworld.process.together import clock
 from gridworld.training.together import Training, run_alone, run_together
 
 NAME: ContextVar[str] = ContextVar("name", default="outside")
-
-
-@pytest.fixture(autouse=True)
-def handlers_are_put_back() -> Iterator[None]:
-    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGALRM)
-    yield
-    assert StopRequest._listening == []
-    assert (signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGALRM)) == before
-    assert signal.getitimer(signal.ITIMER_REAL)[0] == 0
 
 
 class Walker:
@@ -36,11 +24,6 @@ class Walker:
 
     def __init__(self, name: str, at_step: dict[int, Callable[[], Any]] | None = None) -> None:
         self.name, self.at_step = name, at_step or {}
-
-    def learn(self, total: int, on_step: Any, on_safe_point: Any = None, state: Any = None) -> None:
-        (error,) = self.learn_together([Learning(self, total, on_step, on_safe_point, state)])  # type: ignore[arg-type]
-        if error is not None:
-            raise error
 
     def learn_together(self, learnings: Sequence[Learning]) -> list[BaseException | None]:
         Walker.together.append(len(learnings))
@@ -56,7 +39,7 @@ class Walker:
                     agent.at_step.get(step, int)()  # of nobody's own: what it raises ends all
                     if not each.on_step(step) or step >= each.total_timesteps:
                         errors[place] = None
-                except signals.Interrupted:
+                except Interrupted:
                     raise
                 except BaseException as error:
                     errors[place] = error
@@ -108,7 +91,7 @@ def test_each_is_what_it_is_alone() -> None:
         assert copy_context().run(run_alone, walk(alone, name, steps)) == name.upper()
     assert Walker.together == [1, 1]
     log: list[str] = []
-    assert run_together([partial(walk, log, "a", 3), partial(walk, log, "b", 1)]) == ["A", "B"]
+    assert run_together([walk(log, "a", 3), walk(log, "b", 1)]) == ["A", "B"]
     assert log == alone == ["a walked [1, 2, 3]", "b walked [1]"]
     assert Walker.together[2:] == [2]
     assert NAME.get() == "outside"
@@ -128,9 +111,7 @@ def ends_by(error: BaseException, where: str, log: list[str]) -> Training[str]:
 def test_one_that_fails_leaves_the_others_and_all_end_where_it_is_no_exception(where: str) -> None:
     def together(error: BaseException) -> list[Any]:
         log.clear()
-        return run_together(
-            [partial(walk, log, "a"), partial(ends_by, error, where, log), partial(walk, log, "c")]
-        )
+        return run_together([walk(log, "a"), ends_by(error, where, log), walk(log, "c")])
 
     log: list[str] = []
     failure = ZeroDivisionError("by zero")
@@ -146,80 +127,15 @@ def test_one_that_fails_leaves_the_others_and_all_end_where_it_is_no_exception(w
     assert {line for line in log if "ended" in line} == {f"{name} ended by Interrupted" for name in ended}
 
 
-def test_the_clock_counts_a_runs_own_time_and_its_share() -> None:
-    found: dict[str, float] = {}
+def test_the_clock_counts_a_runs_share() -> None:
+    seconds: list[float] = []
 
-    def timed(name: str, seconds: float) -> Training[None]:
+    def timed() -> Training[None]:
         started = clock()
-        shared = {1: partial(time.sleep, 0.2)} if name == "a" else {}  # outside of all hooks
+        yield Learning(Walker("a", {1: partial(time.sleep, 0.2)}), 1, lambda step: 1)  # type: ignore[arg-type]
+        seconds.append(clock() - started)
 
-        def on_step(step: int) -> int:
-            time.sleep(seconds)
-            return 1
-
-        yield Learning(Walker(name, shared), 1, on_step)  # type: ignore[arg-type]
-        found[name] = clock() - started
-
-    run_together([partial(timed, "a", 0.1), partial(timed, "b", 0.3)])
-    assert found["a"] == pytest.approx(0.1 + 0.1, abs=0.08)
-    assert found["b"] == pytest.approx(0.3 + 0.1, abs=0.08)
-
-
-def interruptible(log: list[str], name: str, kills: dict[int, int], patient: bool = True) -> Training[None]:
-    """As a session: it is asked by signals, saves at its safe points, and exits."""
-    request = StopRequest()
-
-    def on_safe_point(step: int) -> None:
-        if request.number is not None:
-            log.append(f"{name} saved at {step}")
-        request.obey()
-
-    def kill(times: int) -> None:
-        for _ in range(times):
-            os.kill(os.getpid(), signal.SIGTERM)
-            time.sleep(0)
-
-    at_step = {step: partial(kill, times) for step, times in kills.items()}
-    hook = on_safe_point if patient else None
-    try:
-        with request.listening():
-            request.patient = patient
-            yield Learning(Walker(name, at_step), 4, lambda step: step + 1, hook)  # type: ignore[arg-type]
-            request.patient = False
-            request.obey()
-    except Interrupted as stop:
-        log.append(f"{name} stopped")
-        sys.exit(stop.exit_code)
-    log.append(f"{name} done")
-
-
-def test_a_second_signal_ends_all_at_once() -> None:
-    log: list[str] = []
-    with pytest.raises(Interrupted):
-        run_together([partial(interruptible, log, name, {2: 2} if name == "b" else {}) for name in "abc"])
-    assert sorted(log) == [f"{name} stopped" for name in "abc"]
-
-
-def test_who_comes_to_no_safe_point_is_stopped_after_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(signals, "_SECONDS_TO_SAFE_POINT", 0.01)
-    log: list[str] = []
-
-    def slow() -> None:
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(5)
-
-    def sleeps(name: str) -> Training[None]:
-        request = StopRequest()
-        try:
-            with request.listening():
-                request.patient = True
-                yield Learning(Walker(name, {1: slow}), 1, lambda step: 1)  # type: ignore[arg-type]
-        except Interrupted:
-            log.append(f"{name} stopped")
-            raise
-
-    started = time.monotonic()
-    with pytest.raises(Interrupted):
-        run_together([partial(sleeps, "a"), partial(sleeps, "b")])
-    assert time.monotonic() - started < 4
-    assert log == ["a stopped", "b stopped"]
+    started = time.perf_counter()
+    run_together([timed(), timed()])
+    assert min(seconds) >= 0.2
+    assert sum(seconds) <= time.perf_counter() - started

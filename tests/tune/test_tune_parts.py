@@ -201,7 +201,7 @@ def test_trials_and_seeds_that_train_together_are_those_that_train_one_by_one(
     whole = [report for report in reports if report.trial == 0]
     assert [report.step for report in whole] == list(range(12))
     assert whole[-1].value == pytest.approx(outcomes[0].value)
-    monkeypatch.setattr(objective_module, "run_together", lambda tasks: [run_alone(task()) for task in tasks])
+    monkeypatch.setattr(objective_module, "run_together", lambda tasks: [run_alone(task) for task in tasks])
     alone = [reported(objective, {number: rate}) for number, rate in enumerate(RATES)]
     assert [outcome for found, _ in alone for outcome in found] == outcomes
     assert [report for _, found in alone for report in found] == reports

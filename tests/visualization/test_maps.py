@@ -225,19 +225,19 @@ def test_a_history_is_short_evenly_spread_and_ends_at_the_end(evaluations: int) 
 def test_a_run_leaves_out_what_cannot_be_drawn_and_says_so(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    (tmp_path / "long.txt").write_text("S" + "." * 65_600 + "G")
-    own = (f"env.layout={tmp_path / 'long.txt'}", "total_timesteps=320", "env.max_episode_steps=5")
+    (tmp_path / "wide.txt").write_text("S.G" + "#" * 65_600)
+    own = (f"env.layout={tmp_path / 'wide.txt'}", "total_timesteps=320", "env.max_episode_steps=5")
     with caplog.at_level(logging.WARNING):
         train_in(tmp_path / "endless", *SHORT["q_learning"], "env.step_reward=0.1", "agent.gamma=1")
         assert "q_error.png is left out, gamma=1 with step_reward=0.1" in caplog.text
         caplog.clear()
-        train_in(tmp_path / "long", *SHORT["q_learning"], *own)
+        train_in(tmp_path / "wide", *SHORT["q_learning"], *own)
     for name in ("policy.png", "q_error.png", "visits.png", "learning.gif", "the episode"):
         assert caplog.text.count(f"{name} is left out") == 1
-        assert "65604 x 3 pixels is too large to draw" in caplog.text
+        assert "65605 x 3 pixels is too large to draw" in caplog.text
     assert not (tmp_path / "endless" / "q_error.png").exists()
     assert (tmp_path / "endless" / "visits.png").exists()
-    assert (tmp_path / "long" / "visits.npy").exists()
+    assert (tmp_path / "wide" / "visits.npy").exists()
 
 
 def test_pictures_can_be_switched_off_and_the_learning_gif_lasts_as_long_as_its_evaluations(

@@ -32,61 +32,52 @@ def outcomes(draw):
 
 
 def rows(table, policy, state):
-    for action, chosen in enumerate(policy[state]):
-        for k, p in enumerate(table.probability[state, action]):
-            if chosen * p > 0:
-                at = state, action, k
-                yield chosen * p, int(table.next_state[at]), float(table.reward[at]), at
+    """All that may happen in a state: (probability, next state, reward, where in the table)."""
+    for action, k in np.ndindex(table.probability[state].shape):
+        at = state, action, k
+        if (p := policy[state, action] * table.probability[at]) > 0:
+            yield p, int(table.next_state[at]), float(table.reward[at]), at
 
 
 def successes(table):
     if table.success is not None:
         return table.success
-    seen, ends, frontier = set(), [], list(np.flatnonzero(table.start))
+    policy = np.ones(table.next_state.shape[:2])
+    seen, ends, frontier = set(), [0], list(np.flatnonzero(table.start))
     while frontier:
         state = int(frontier.pop())
-        if state in seen:
-            continue
-        seen.add(state)
-        for at in np.ndindex(table.probability[state].shape):
-            where = (state, *at)
-            if table.probability[where] > 0 and table.terminated[where]:
-                ends.append(table.reward[where])
-            elif table.probability[where] > 0:
-                frontier.append(table.next_state[where])
-    return table.reward == max(ends, default=0)
+        if state not in seen:
+            seen.add(state)
+            found = list(rows(table, policy, state))
+            ends += [reward for _, _, reward, at in found if table.terminated[at]]
+            frontier += [target for _, target, _, at in found if not table.terminated[at]]
+    return table.reward == max(ends[1:], default=0)
 
 
 def walked(table, policy):
     """(probabilities of success, failure and time-out, return, length) of an episode, by its flags."""
-    at, good = dict(enumerate(table.start)), successes(table)
+    masses, good = dict(enumerate(table.start)), successes(table)
     totals = np.zeros(5)
     for _ in range(HORIZON):
         following = {}
-        for state, mass in at.items():
-            for p, target, reward, where in rows(table, policy, state):
+        for state, mass in masses.items():
+            for p, target, reward, at in rows(table, policy, state):
                 totals[3:] += mass * p * reward, mass * p
-                if table.terminated[where]:
-                    totals[0 if good[where] else 1] += mass * p
+                if table.terminated[at]:
+                    totals[0 if good[at] else 1] += mass * p
                 else:
                     following[target] = following.get(target, 0) + mass * p
-        at = following
-    totals[2] = sum(at.values())
+        masses = following
+    totals[2] = sum(masses.values())
     return totals
 
 
 def valued(table, policy, gamma=0.8):
     values = np.zeros(len(table.start))
+    known = [list(rows(table, policy, state)) for state in range(len(values))]
     for _ in range(120):
-        values = np.array(
-            [
-                sum(
-                    p * (reward + gamma * (0 if table.terminated[where] else values[target]))
-                    for p, target, reward, where in rows(table, policy, state)
-                )
-                for state in range(len(values))
-            ]
-        )
+        going_on = np.where(table.terminated, 0.0, gamma * values[table.next_state])
+        values = np.array([sum(p * (reward + going_on[at]) for p, _, reward, at in row) for row in known])
     return values
 
 
@@ -94,47 +85,29 @@ def valued(table, policy, gamma=0.8):
 def test_a_world_is_worth_what_a_walk_with_flags_is(table, seed):
     policy = np.random.default_rng(seed).dirichlet(np.ones(table.next_state.shape[1]), len(table.start))
     mdp = mdp_from_outcomes("random", table)
-    own = policy[mdp.number]
-    chain = Chain(mdp, own)
+    chain = Chain(mdp, policy[mdp.number])
     found = chain.outcome(HORIZON)
     of_ends = found.goal, found.trap, found.timeout, found.expected_return, found.expected_length
     assert np.allclose(of_ends, walked(table, policy), atol=1e-9)
     assert np.isclose(mdp.start @ chain.value(0.8), table.start @ valued(table, policy), atol=1e-9)
-
-
-@given(outcomes())
-def test_a_state_in_which_an_episode_goes_on_keeps_its_rows(table):
-    mdp = mdp_from_outcomes("random", table)
-    for state in np.flatnonzero(~mdp.terminal):
-        possible = table.probability[state] > 0
+    assert not (mdp.start[mdp.terminal] > 0).any()
+    for state in np.flatnonzero(~mdp.terminal):  # where an episode goes on, the rows are kept
+        possible, leads_to = table.probability[state] > 0, mdp.next_state[state]
         assert np.array_equal(mdp.probability[state], table.probability[state])
         assert np.array_equal(mdp.reward[state][possible], table.reward[state][possible])
-        assert np.array_equal(mdp.number[mdp.next_state[state]][possible], table.next_state[state][possible])
-        ends = mdp.terminal[mdp.next_state[state]]
-        assert (ends | ~table.terminated[state])[possible].all()
-    assert not (mdp.start[mdp.terminal] > 0).any()
+        assert np.array_equal(mdp.number[leads_to][possible], table.next_state[state][possible])
+        assert (mdp.terminal[leads_to] | ~table.terminated[state])[possible].all()
 
 
-def two_states(**changed):
-    table = {
-        "next_state": np.array([[[0], [1]], [[0], [1]]]),
-        "probability": np.ones((2, 2, 1)),
-        "reward": np.zeros((2, 2, 1)),
-        "terminated": np.zeros((2, 2, 1), dtype=np.bool_),
-        "start": np.array([1.0, 0.0]),
-    }
-    return Outcomes(**{**table, **changed})
-
-
-def test_worlds_that_are_too_large_are_refused_with_what_they_would_take():
-    many = np.broadcast_to(np.int64(0), (600_000, 2, 1))
-    with pytest.raises(InputError, match="600,000 states and 2 actions are too many"):
-        mdp_from_outcomes("big", two_states(next_state=many, **as_large(many)))
-    wide = np.broadcast_to(np.int64(0), (100_000, 100, 20))
-    with pytest.raises(InputError, match=r"would take [\d.]+ GiB of memory; at most 4 GiB"):
-        mdp_from_outcomes("wide", two_states(next_state=wide, **as_large(wide)))
-
-
-def as_large(table):
-    zeros = {name: np.broadcast_to(0.0, table.shape) for name in ("probability", "reward")}
-    return {**zeros, "terminated": np.broadcast_to(False, table.shape), "start": np.zeros(len(table))}
+@pytest.mark.parametrize(
+    ("shape", "told"),
+    [
+        ((600_000, 2, 1), "600,000 states and 2 actions are too many"),
+        ((100_000, 100, 20), r"would take [\d.]+ GiB of memory; at most 4 GiB"),
+    ],
+)
+def test_worlds_that_are_too_large_are_refused_with_what_they_would_take(shape, told):
+    tables = {name: np.broadcast_to(0.0, shape) for name in ("probability", "reward")}
+    tables |= {"next_state": np.broadcast_to(np.int64(0), shape), "terminated": np.broadcast_to(False, shape)}
+    with pytest.raises(InputError, match=told):
+        mdp_from_outcomes("big", Outcomes(**tables, start=np.zeros(shape[0])))

@@ -21,16 +21,12 @@ GAMMAS = st.sampled_from([0, 0.9, 0.99])
 UNIFORM = np.full((30, 4), 0.25)
 
 
-def compiled(world):
-    return compile_mdp(parse(world.text, "map"), **world.settings)
-
-
 def made(text, **settings):
     return compile_mdp(parse(text, "map"), **settings)
 
 
-def table(world, policy):
-    return np.array([policy[cell] for cell in world.cells])
+def compiled(world):
+    return made(world.text, **world.settings)
 
 
 @given(worlds(), GAMMAS)
@@ -45,35 +41,23 @@ def test_the_optimum_equals_brute_force(world, gamma):
     assert np.array_equal(solution.optimal, solution.q >= top - 1e-9 * solution.scale[:, None])
 
 
-@given(st.data(), worlds(), GAMMAS)
-def test_the_value_of_a_policy_equals_brute_force(data, world, gamma):
+@given(st.data(), worlds(), GAMMAS, st.integers(1, 12))
+def test_a_policy_is_worth_what_brute_force_finds_in_large_worlds_too(data, world, gamma, max_steps):
     policy = data.draw(policies(world))
-    exact = Chain(compiled(world), table(world, policy)).value(gamma)
     slow = world.policy_values(policy, gamma)
-    assert exact == pytest.approx(np.array([slow[cell] for cell in world.cells]), abs=1e-9)
-
-
-@given(st.data(), worlds(), st.integers(1, 12))
-def test_the_outcome_within_the_limit_equals_brute_force(data, world, max_steps):
-    policy = data.draw(policies(world))
-    result = Chain(compiled(world), table(world, policy)).outcome(max_steps)
-    exact = result.goal, result.trap, result.timeout, result.expected_return, result.expected_length
-    assert exact == pytest.approx(world.episode(policy, max_steps), abs=1e-12)
-    assert result.goal + result.trap + result.timeout == pytest.approx(1, abs=1e-12)
-
-
-@given(st.data(), worlds(), GAMMAS)
-def test_large_worlds_are_solved_as_small_ones(data, world, gamma):
-    mdp, policy = compiled(world), table(world, data.draw(policies(world)))
-    dense = solve.value_iteration(mdp, gamma), Chain(mdp, policy).value(gamma)
-    short = Chain(mdp, policy).outcome(7)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(chain, "DENSE_STATES", 0)
-        sparse = solve.value_iteration(mdp, gamma), Chain(mdp, policy).value(gamma)
-        assert vars(Chain(mdp, policy).outcome(7)) == pytest.approx(vars(short), abs=1e-12)
-    assert sparse[0].q == pytest.approx(dense[0].q, abs=1e-11)
-    assert np.array_equal(sparse[0].optimal, dense[0].optimal)
-    assert sparse[1] == pytest.approx(dense[1], abs=1e-11)
+    mdp, table = compiled(world), np.array([policy[cell] for cell in world.cells])
+    dense, solutions = chain.DENSE_STATES, []
+    for size in (dense, 0):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(chain, "DENSE_STATES", size)
+            exact, result = Chain(mdp, table).value(gamma), Chain(mdp, table).outcome(max_steps)
+            solutions.append(solve.value_iteration(mdp, gamma))
+        assert exact == pytest.approx(np.array([slow[cell] for cell in world.cells]), abs=1e-9)
+        found = result.goal, result.trap, result.timeout, result.expected_return, result.expected_length
+        assert found == pytest.approx(world.episode(policy, max_steps), abs=1e-12)
+        assert sum(found[:3]) == pytest.approx(1, abs=1e-12)
+    assert solutions[0].q == pytest.approx(solutions[1].q, abs=1e-11)
+    assert np.array_equal(solutions[0].optimal, solutions[1].optimal)
 
 
 def test_the_textbook_world_of_russell_and_norvig():
@@ -124,34 +108,26 @@ def test_without_discount_a_chance_of_never_ending_counts():
     ids=["line", "square", "rooms"],
 )
 def test_where_nothing_can_be_won_there_still_is_a_best_action(text, slip, gamma):
-    code = (  # in a process of its own, which can be stopped
-        "from gridworld.world.layout import parse; from gridworld.world.grid import compile_mdp;"
-        "from gridworld.world import solver;"
-        f"solution = solver.value_iteration(compile_mdp(parse({text!r}, 'map'), slip={slip}), {gamma});"
-        "print(solution.optimal.any(axis=1).all(), *solution.v)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=5)
-    always, *values = done.stdout.split()
+    solution = solve.value_iteration(made(text, slip=slip), gamma)
     world = World(text.split(), slip=slip)
     best = world.optimal_values(gamma, tolerance=1e-14)
-    assert list(map(float, values)) == pytest.approx([best[cell] for cell in world.cells], abs=1e-9)
-    assert always == "True"
+    assert solution.v == pytest.approx([best[cell] for cell in world.cells], abs=1e-9)
+    assert solution.optimal.any(axis=1).all()
 
 
 def test_endless_states_of_a_cycle():
-    mdp = made("S..\n...\n..G")
+    def endless(actions, **settings):
+        return Chain(made("S..\n...\n..G", **settings), one_hot_policy(actions, 4)).endless_states().tolist()
+
     cycle = {0: 1, 1: 1, 2: 2, 5: 3, 4: 0}  # right twice, down, left, up and round again
     actions = np.array([cycle.get(state, 1) for state in range(9)])
-    assert Chain(mdp, one_hot_policy(actions, 4)).endless_states().tolist() == [1, 2, 4, 5]
+    assert endless(actions) == [1, 2, 4, 5]
     actions[5] = 2
-    assert Chain(mdp, one_hot_policy(actions, 4)).endless_states().size == 0
-    assert Chain(mdp, one_hot_policy(np.zeros(9, dtype=int), 4)).endless_states().tolist() == [0]
-    assert Chain(mdp, np.full((9, 4), 0.25)).endless_states().size == 0
-    slippery = made(
-        "S..\n...\n..G", slip=0.1
-    )  # "up" never leaves the first row, "right" slips down in the end
-    assert Chain(slippery, one_hot_policy(np.full(9, 0), 4)).endless_states().tolist() == [0, 1, 2]
-    assert Chain(slippery, one_hot_policy(np.full(9, 1), 4)).endless_states().size == 0
+    assert endless(actions) == []
+    assert endless(np.full(9, 0)) == [0]
+    assert Chain(made("S..\n...\n..G"), np.full((9, 4), 0.25)).endless_states().size == 0
+    assert endless(np.full(9, 0), slip=0.1) == [0, 1, 2]  # "up" never leaves the first row
+    assert endless(np.full(9, 1), slip=0.1) == []  # "right" slips down in the end
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="this system tells no peak by itself")
@@ -182,34 +158,17 @@ def test_a_gamma_is_a_number_from_0_to_1(gamma):
         Chain(mdp, UNIFORM).value(gamma)
 
 
-def broken(value):
-    policy = UNIFORM.copy()
-    policy[7] = value
-    return policy
-
-
 @pytest.mark.parametrize(
-    ("policy", "mistake"),
-    [
-        (UNIFORM[:29], r"shape \(29, 4\)"),
-        (UNIFORM[:, :3], r"shape \(30, 3\)"),
-        (0.25, r"shape \(\)"),
-        (broken([1, 0.5, -0.5, 0]), "row 7"),
-        (broken([0.5, 0.5, 0.5, 0]), "row 7"),
-        (broken(0), "row 7"),
-        (broken(np.nan), "row 7"),
-        (broken([np.inf, 0, 0, 0]), "row 7"),
-    ],
+    "row",
+    [[1, 0.5, -0.5, 0], [0.5, 0.5, 0.5, 0], 0, np.nan, [np.inf, 0, 0, 0]],
 )
-def test_what_is_no_policy_is_refused(policy, mistake):
-    mdp = compile_mdp(load("classic"))
-    for use in (
-        lambda: Chain(mdp, policy).value(0.9),
-        lambda: Chain(mdp, policy).outcome(10),
-        lambda: Chain(mdp, policy).endless_states(),
-    ):
+def test_what_is_no_policy_is_refused(row):
+    mdp, broken = compile_mdp(load("classic")), UNIFORM.copy()
+    broken[7] = row
+    wrong = {r"shape \(29, 4\)": UNIFORM[:29], r"shape \(30, 3\)": UNIFORM[:, :3], r"shape \(\)": 0.25}
+    for mistake, policy in (wrong | {"row 7": broken}).items():
         with pytest.raises(InputError, match=mistake):
-            use()
+            Chain(mdp, policy)
 
 
 def test_a_value_may_fade_to_nothing_on_the_way() -> None:

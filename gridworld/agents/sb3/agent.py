@@ -3,41 +3,29 @@
 from __future__ import annotations
 
 import io
-import time
 import traceback
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.save_util import recursive_getattr
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from torch import nn
 
-from gridworld.agents import Learning, PolicySnapshot, TrainingContext, WriteScalars
-from gridworld.agents.sb3.callbacks import RunCallback, check_finite, class_without_state, diverged
-from gridworld.agents.sb3.factory import (
-    Arguments,
-    UnfitError,
-    algorithm_and_arguments,
-    make_callbacks,
-    make_model,
-    unfit,
-)
-from gridworld.agents.sb3.features import FIXED, LEARNED
-from gridworld.agents.sb3.model_file import check_weights, flat, read_parameters, reason
+from gridworld.agents import Hook, Learning, PolicySnapshot, SafePoint, TrainingContext, WriteScalars, misfit
+from gridworld.agents.sb3.callbacks import RunCallback, check_finite, class_without_state
+from gridworld.agents.sb3.factory import algorithm_and_arguments, failed, make_callbacks, make_model, unfit
+from gridworld.agents.sb3.features import AgentByColour, FourierFeatures, PixelCNN
+from gridworld.agents.sb3.model_file import read_model
 from gridworld.agents.sb3.policy_outputs import explored, read_table, why_no_table
 from gridworld.agents.sb3.replay_counts import ReplayCounts
-from gridworld.agents.sb3.settings import SB3ClassConfig, SB3Config
+from gridworld.agents.sb3.settings import SB3Config
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.bounds import Bounds
-from gridworld.engine.networks import Kind
 from gridworld.engine.optimizer import ELEMENTWISE
 from gridworld.engine.population import Population, train
 from gridworld.engine.sb3_format import algorithm_of, make_run, model_file, put_weights
@@ -47,23 +35,20 @@ from gridworld.storage.serialization import State, StateError
 from gridworld.world.chain import one_hot_policy
 from gridworld.world.mdp import FloatArray
 
-# A model file holds the optimiser's numbers beside every weight, and what SB3 pickles: the last
-# observations, say.
-_BYTES_A_BYTE = 16
-_SPARE_BYTES = 64 * 2**20
-_FIRST_YEAR = 1980  # of the zip format
+# A model file holds the optimiser's numbers beside every weight, and what SB3 pickles.
+_BYTES_A_BYTE, _SPARE_BYTES = 16, 64 * 2**20
 # Of torch.nn, what maps every number by itself, in training as in evaluation, and never draws at random.
 ACTIVATIONS = (
     *(nn.CELU, nn.ELU, nn.GELU, nn.Hardshrink, nn.Hardsigmoid, nn.Hardswish, nn.Hardtanh, nn.Identity),
     *(nn.LeakyReLU, nn.LogSigmoid, nn.Mish, nn.PReLU, nn.ReLU, nn.ReLU6, nn.SELU, nn.SiLU, nn.Sigmoid),
     *(nn.Softplus, nn.Softshrink, nn.Softsign, nn.Tanh, nn.Tanhshrink),
 )
-# Of a policy's classes: those that are known to fit, and why another one need not.
-_CLASSES: tuple[tuple[str, tuple[type, ...], str], ...] = (
-    ("activation_fn", ACTIVATIONS, "is not known to give the same for the same number always"),
-    ("features_extractor_class", (*FIXED, *LEARNED), "may keep more than a function of the state"),
-    ("optimizer_class", ELEMENTWISE, "may look at more than a weight at a time"),
-)
+# Of `policy_kwargs`, classes with which outputs at a state follow from the parameters and that state alone.
+_KNOWN_CLASSES: Mapping[str, Sequence[type]] = {
+    "activation_fn": ACTIVATIONS,
+    "features_extractor_class": (FourierFeatures, AgentByColour, PixelCNN),
+    "optimizer_class": ELEMENTWISE,  # of which each step looks at a weight at a time
+}
 
 
 def build(config: SB3Config, context: TrainingContext) -> SB3Agent:
@@ -74,69 +59,55 @@ def build(config: SB3Config, context: TrainingContext) -> SB3Agent:
     algorithm, arguments = algorithm_and_arguments(config, context.features)
     ours = algorithm_of(algorithm) if config.engine == "tabulated" else None
     if ours is not None:
-        reason = why_not_in_engine(config, algorithm, arguments)
-        if context.callbacks:
-            reason = "callbacks read and change what only SB3's own loop has"
-        if reason is None:
-            return EngineAgent(config, context, algorithm, arguments, ours)
-        if not context.only_asked:
-            tell(f"engine: stock, since {reason}")
-    agent = SB3Agent(config, context, algorithm, arguments, not context.only_asked)
+        unknown = "callbacks" if context.callbacks else unknown_to_engine(config, algorithm, arguments)
+        if unknown is not None:
+            ours = None
+            if not context.only_asked:
+                tell(f"engine: stock, since the tabulated one does not cover {unknown}")
+    keeps = ours is None and not context.only_asked
+    model = make_model(config, context, algorithm, arguments, with_buffers=keeps)
+    if ours is not None:
+        return EngineAgent(config, context, model, ours)
+    agent = SB3Agent(config, context, model)
     agent.check_table()
     return agent
 
 
-def why_not_in_engine(
+def unknown_to_engine(
     config: SB3Config, algorithm: type[BaseAlgorithm], arguments: Mapping[str, Any]
 ) -> str | None:
-    """Why these settings need SB3's own loop, or None where the engine gives the same.
-
-    It does where the network's outputs at a state follow from the parameters and that state alone: whatever
-    the mode, the other states of the batch and the passes before. That is known of the classes listed alone.
-    """
-    where = "agent.arguments" if isinstance(config, SB3ClassConfig) else "agent"
-    classes = arguments.get("policy_kwargs", {})
+    """The first setting with which the engine need not give what SB3's own loop does; None: there is none."""
+    known: dict[str, Sequence[Any]] = {
+        "replay_buffer_class": [None, ReplayCounts] if issubclass(algorithm, DQN) else [None],
+        "rollout_buffer_class": [None],
+        "replay_buffer_kwargs": [None, {}],
+        "rollout_buffer_kwargs": [None, {}],
+        "optimize_memory_usage": [False],
+        "n_steps": [1] if issubclass(algorithm, OffPolicyAlgorithm) else [arguments.get("n_steps")],
+    }
+    for name, values in known.items():
+        if name in arguments and arguments[name] not in values:
+            return f"{config.where}.{name}={config.given[name]}"
     if arguments["policy"] not in (algorithm.policy_aliases[name] for name in ("MlpPolicy", "CnnPolicy")):
-        return f"agent.policy={config.policy} may compute more than a function of the state"
-    for name, known, why in _CLASSES:
-        if name in classes and classes[name] not in known:
-            own = config.policy_kwargs_given.get(name)
-            chosen = f"{where}.policy_kwargs.{name}={own}"
-            return f"{chosen if own else f'observation.features={classes[name].__name__}'} {why}"
-    counts = arguments.get("replay_buffer_class") is ReplayCounts and issubclass(algorithm, DQN)
-    for name in ("replay_buffer", "rollout_buffer"):
-        is_known = arguments.get(f"{name}_class") is None or (counts and name == "replay_buffer")
-        if not is_known or arguments.get(f"{name}_kwargs"):
-            return f"{where}.{name}_class is not the plain {name.replace('_', ' ')}"
-    if arguments.get("optimize_memory_usage"):
-        return f"{where}.optimize_memory_usage changes what the replay buffer samples"
-    if issubclass(algorithm, OffPolicyAlgorithm) and arguments.get("n_steps", 1) > 1:
-        return f"{where}.n_steps above 1 needs SB3's n-step replay buffer"
+        return f"agent.policy={config.policy}"
+    kwargs, own = arguments.get("policy_kwargs", {}), config.policy_kwargs_given
+    for name, classes in _KNOWN_CLASSES.items():
+        if name in kwargs and kwargs[name] not in classes:
+            is_own = name in own
+            key = f"{config.where}.policy_kwargs.{name}" if is_own else "observation.features"
+            return f"{key}={own[name] if is_own else kwargs[name].__name__}"
     return None
 
 
 class SB3Agent:
     """One SB3 model, which learns in SB3's own loop."""
 
-    def __init__(
-        self,
-        config: SB3Config,
-        context: TrainingContext,
-        algorithm: type[BaseAlgorithm],
-        arguments: Arguments,
-        with_buffers: bool,
-    ) -> None:
-        if (today := time.localtime()).tm_year < _FIRST_YEAR:
-            raise InputError(
-                f"the clock says {time.strftime('%Y-%m-%d', today)}, and SB3's model.zip can have no date "
-                f"before {_FIRST_YEAR}; set the clock"
-            )
-        torch.set_num_threads(context.threads)
+    def __init__(self, config: SB3Config, context: TrainingContext, model: BaseAlgorithm) -> None:
         self.config = config
         self.observation = context.observation
         self._envs = context.envs
         self._loaded = False
-        self._model = make_model(config, context, algorithm, arguments, with_buffers)
+        self._model = model
         self._callbacks = make_callbacks(context.callbacks)
         writers = [] if context.write_scalars is None else [_ScalarsOnly(context.write_scalars)]
         self._model.set_logger(Logger(folder=None, output_formats=list(writers)))
@@ -148,12 +119,9 @@ class SB3Agent:
                 warnings.simplefilter("ignore")  # which come again while it learns
                 why = why_no_table(self._model.policy, self.observation)
         except Exception as error:  # the class may be anybody's
-            raise self._cannot_update(error) from error
+            raise failed(self.config, "cannot be asked", error) from error
         if why is not None:
-            raise UnfitError(self.config, why)
-
-    def _cannot_update(self, error: Exception) -> UnfitError:
-        return unfit(self.config, "cannot make its first update", error)
+            raise unfit(self.config, why)
 
     @property
     def model(self) -> BaseAlgorithm:
@@ -161,29 +129,23 @@ class SB3Agent:
         return self._model
 
     def learn(
-        self,
-        total_timesteps: int,
-        on_step: Callable[[int], int],
-        on_safe_point: Callable[[int], None] | None = None,
-        state: State | None = None,
+        self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
     ) -> None:
         """See `gridworld.agents.Agent.learn`."""
         interval, falling = self.config.log_interval, self.config.falling()
         self._callback = RunCallback(on_step, on_safe_point, state, interval, self._callbacks, falling)
         try:
             self._model.learn(total_timesteps, callback=self._callback, log_interval=interval)
-        except FloatingPointError as error:
-            raise diverged(self._model, str(error)) from None
         except (InputError, OSError, StateError):
             raise
         except Exception as error:
             if isinstance(error, ValueError):  # torch's distributions refuse NaN, which SB3 lets through
                 check_finite(self._model)
             is_update = any(frame.name == "train" for frame in traceback.extract_tb(error.__traceback__))
-            library = type(self._model).__module__.partition(".")[0]
-            is_known = library in ("stable_baselines3", "sb3_contrib")  # a custom class may have a bug
+            # a custom class may have a bug, of which the traceback is wanted
+            is_known = type(self._model).__module__.startswith(("stable_baselines3.", "sb3_contrib."))
             if is_update and is_known and not self._model._n_updates:
-                raise self._cannot_update(error) from error
+                raise failed(self.config, "cannot make its first update", error) from error
             raise
 
     def class_without_state(self) -> str | None:
@@ -222,21 +184,23 @@ class SB3Agent:
 
     def load(self, path: Path) -> None:
         """See `gridworld.agents.Agent.load`: nothing in the file is unpickled as SB3 would, or run."""
-        own = self._model.get_parameters()
-        modules = [name for name in own if isinstance(recursive_getattr(self._model, name), nn.Module)]
-        expected = flat({name: own[name] for name in modules})
-        most = _SPARE_BYTES + _BYTES_A_BYTE * sum(weights.nbytes for weights in expected.values())
-        try:
-            parameters, rate = read_parameters(path, most)
-            found = {name: parameters.get(name, {}) for name in modules}
-            check_weights(flat(found), expected)
-            self._model.set_parameters(found, exact_match=False, device=self._model.device)
-        except InputError:
-            raise
-        except Exception as error:  # zipfile, torch and SB3, each in their way
-            raise InputError(
-                f"{path}: not a model of {self.config.name} for this world and observation ({reason(error)})"
-            ) from None
+        own = {
+            module: state
+            for module, state in self._model.get_parameters().items()
+            if "param_groups" not in state  # of an optimiser, which stays as it is
+        }
+        size = sum(weights.nbytes for state in own.values() for weights in state.values())
+        kind = f"a model of {self.config.name}"
+        found, rate = read_model(path, _SPARE_BYTES + _BYTES_A_BYTE * size, kind)
+        for module in own:
+            arrays, expected = (
+                {name: tensor.cpu().numpy() for name, tensor in of_all.get(module, {}).items()}
+                for of_all in (found, own)
+            )
+            if (reason := misfit(arrays, expected)) is not None:
+                raise InputError(f"{path}: not {kind} for this world and observation ({module}.{reason})")
+        taken: Any = {module: found[module] for module in own}
+        self._model.set_parameters(taken, exact_match=False, device=self._model.device)
         self._loaded = True
         if rate is not None:
             Bounds(0, 1).check(f"{path}: exploration_rate", rate)
@@ -247,26 +211,18 @@ class EngineAgent(SB3Agent):
     """One SB3 model, which learns in the engine."""
 
     def __init__(
-        self,
-        config: SB3Config,
-        context: TrainingContext,
-        algorithm: type[BaseAlgorithm],
-        arguments: Arguments,
-        ours: type[Population],
+        self, config: SB3Config, context: TrainingContext, model: BaseAlgorithm, ours: type[Population]
     ) -> None:
-        super().__init__(config, context, algorithm, arguments, with_buffers=False)
+        super().__init__(config, context, model)
         self._algorithm, self._is_only_asked = ours, context.only_asked
         self.run = make_run(
-            self._model,
-            context.observation,
-            context.envs,
-            context.seed,
-            extractors_kind(self._model),
-            config.reward_factor,
-            config.falling(),
-            config.log_interval,
+            *(self._model, context.observation, context.envs, context.seed),
+            reward_scale=config.reward_factor,
+            falling=config.falling(),
+            log_interval=config.log_interval,
+            counts_transitions=config.counts_transitions,
+            shape=config.shape,
         )
-        self.run.counts_transitions = config.counts_transitions
         self._algorithm([self.run], [None])
 
     @property
@@ -280,11 +236,7 @@ class EngineAgent(SB3Agent):
         return type(self._model).load(file, env=envs, device=self._model.device)
 
     def learn(
-        self,
-        total_timesteps: int,
-        on_step: Callable[[int], int],
-        on_safe_point: Callable[[int], None] | None = None,
-        state: State | None = None,
+        self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
     ) -> None:
         """See `gridworld.agents.Agent.learn`."""
         (error,) = self.learn_together([Learning(self, total_timesteps, on_step, on_safe_point, state)])
@@ -300,7 +252,8 @@ class EngineAgent(SB3Agent):
         train([agent.run for agent in agents], [learning.state for learning in learnings])
         for agent in agents:
             if agent.run.failed_update is not None and not agent.run.model._n_updates:
-                agent.run.error = agent._cannot_update(agent.run.failed_update)
+                error = agent.run.failed_update
+                agent.run.error = failed(agent.config, "cannot make its first update", error)
         return [agent.run.error for agent in agents]
 
     def class_without_state(self) -> None:
@@ -322,16 +275,6 @@ class EngineAgent(SB3Agent):
         """See `gridworld.agents.Agent.load`."""
         super().load(path)
         self._algorithm([self.run], [None])
-
-
-def extractors_kind(model: Any) -> Kind:
-    """Of a model's features extractors, see `engine.networks.Inputs`."""
-    kinds = {type(each) for each in model.policy.modules() if isinstance(each, BaseFeaturesExtractor)}
-    if kinds == {FlattenExtractor}:
-        return "flat"
-    if kinds <= {FlattenExtractor, *FIXED}:
-        return "fixed"
-    return "patches" if kinds <= set(LEARNED) else "any"
 
 
 class _ScalarsOnly(KVWriter):

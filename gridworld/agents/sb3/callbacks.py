@@ -1,6 +1,6 @@
 """SB3's own loop: the hooks of a run, settings that fall over training, and the state between two rollouts.
 
-SB3 calls `on_step` before it has stored the transition. A rollout's start is where nothing is half done: the
+SB3 calls `on_step` before it has stored the transition. Nothing is half done at a rollout's start: the
 transitions are stored, the update is made. What was saved is put back when training starts, after SB3 has
 reset everything that it resets then.
 
@@ -16,25 +16,26 @@ buffer or callback says everything. With a custom class that does not define the
 
 from __future__ import annotations
 
+import io
 import math
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from stable_baselines3.common import callbacks as sb3_callbacks
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import BaseBuffer
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import FloatSchedule
-from torch import Tensor
 
-from gridworld.agents.sb3.factory import first_line
+from gridworld.agents import Hook, SafePoint
+from gridworld.agents.sb3.model_file import load_tensors
 from gridworld.agents.sb3.settings import SCHEDULES
 from gridworld.config.fields import Decay
-from gridworld.errors import InputError
+from gridworld.engine.population import diverged, log_state, set_log_state
 from gridworld.process.console import tell
 from gridworld.storage.serialization import (
     State,
@@ -47,7 +48,7 @@ from gridworld.storage.serialization import (
     set_global_state,
 )
 
-_LIBRARIES = ("stable_baselines3", "sb3_contrib", "torch", "gridworld")
+_LIBRARIES = ("stable_baselines3", "sb3_contrib", "torch", "gridworld", "builtins")  # None is no part
 _NUMBERS = (
     *("num_timesteps", "_n_updates", "_episode_num", "_n_calls"),
     *("exploration_rate", "_current_progress_remaining"),
@@ -60,7 +61,7 @@ _OF_CALLBACKS: dict[type[BaseCallback], tuple[str, ...]] = {  # SB3's own, and w
 }
 
 
-class RunCallback(BaseCallback):
+class RunCallback(CallbackList):
     """Calls `on_step` after every step and `on_safe_point` at rollouts' starts, as `Agent.learn` has them.
 
     Settings that are `falling` without a schedule of SB3's are set before the user's callbacks are called.
@@ -68,56 +69,39 @@ class RunCallback(BaseCallback):
 
     def __init__(
         self,
-        on_step: Callable[[int], int],
-        on_safe_point: Callable[[int], None] | None,
+        on_step: Hook,
+        on_safe_point: SafePoint,
         state: State | None,
         log_interval: int,
         others: Sequence[BaseCallback],
         falling: dict[str, Decay],
     ) -> None:
-        super().__init__()
-        self._hook, self._on_safe_point, self._state = on_step, on_safe_point, state
-        self._log_interval, self._others = log_interval, others
-        self._schedules = [
+        schedules = [
             FallingSetting(name, decay.initial, decay.power)
             for name, decay in falling.items()
             if not (name in SCHEDULES and decay.power == 1)
         ]
+        super().__init__([*schedules, *others])
+        self._hook, self._on_safe_point, self._state = on_step, on_safe_point, state
+        self._log_interval, self._others = log_interval, others
         self._continues = True
-
-    def _init_callback(self) -> None:
-        for schedule in self._schedules:
-            schedule.init_callback(self.model)
-        self._begin("init_callback", self.model)
-
-    def _begin(self, name: str, *arguments: Any) -> None:
-        for index, other in enumerate(self._others):
-            try:
-                getattr(other, name)(*arguments)
-            except InputError:
-                raise
-            except Exception as error:  # the class may be anybody's
-                raise InputError(f"{_name(index, other)} cannot begin: {first_line(error)}") from error
 
     def _on_step(self) -> bool:
         self._continues = self._hook(self.num_timesteps) > 0
         for index, other in enumerate(self._others):
             if not other.on_step():
                 self._continues = False
-                tell(f"{_name(index, other)} stopped training after {self.num_timesteps:,} steps")
+                tell(
+                    f"callbacks[{index}]: {_path(other)} stopped training after {self.num_timesteps:,} steps"
+                )
         return self._continues
 
-    def update_child_locals(self, locals_: dict[str, Any]) -> None:
-        """See `BaseCallback.update_child_locals`."""
-        for other in self._others:
-            other.update_locals(locals_)
-
     def _on_training_start(self) -> None:
-        self._begin("on_training_start", self.locals, self.globals)
+        super()._on_training_start()
         if self._state is not None:
-            state, self._state = self._state, None
             with fitting():
-                set_state(self.model, self._others, state)
+                set_state(self.model, self._others, self._state)
+            self._state = None
             self.num_timesteps = self.model.num_timesteps
 
     def _on_rollout_start(self) -> None:
@@ -128,12 +112,7 @@ class RunCallback(BaseCallback):
         # SB3 counts rollouts from its `learn` on: only here would it log again as it does from the start.
         if self._on_safe_point is not None and rollouts % self._log_interval == 0:
             self._on_safe_point(self.model.num_timesteps)
-        for other in (*self._schedules, *self._others):
-            other.on_rollout_start()
-
-    def _on_rollout_end(self) -> None:
-        for other in (*self._schedules, *self._others):
-            other.on_rollout_end()
+        super()._on_rollout_start()
 
     def _on_training_end(self) -> None:
         if self._continues:
@@ -143,8 +122,7 @@ class RunCallback(BaseCallback):
             check_finite(self.model)
             if self._on_safe_point is not None:
                 self._on_safe_point(self.model.num_timesteps)
-        for other in self._others:
-            other.on_training_end()
+        super()._on_training_end()
 
     def get_state(self) -> State:
         """The model's state while it waits at a rollout's start."""
@@ -152,7 +130,7 @@ class RunCallback(BaseCallback):
 
 
 class FallingSetting(BaseCallback):
-    """Sets a number of a model of SB3's as training goes on; usable in SB3's own `learn()`.
+    """Lets a number of a model of SB3's fall to 0 over training; usable in SB3's own `learn()`.
 
     An entropy bonus that is large enough to keep a policy trying aims at a policy that goes on trying.
     Falling to 0, it ends at the world's own optimum. Generalised advantages with a λ near 1 are close to
@@ -160,7 +138,7 @@ class FallingSetting(BaseCallback):
 
     Args:
         name: `ent_coef` or `learning_rate`, set before each update, or `gae_lambda`, set before each rollout.
-        initial: what it falls from, to 0 at the end of training.
+        initial: what it falls from.
         power: 1 lets it fall linearly, 2 with the square of what is left of training.
     """
 
@@ -191,31 +169,17 @@ class FallingSetting(BaseCallback):
         model.logger.record(f"train/{self._name}", value)
 
 
-def _name(index: int, other: BaseCallback) -> str:
-    return f"callbacks[{index}]: {_path(other)}"
-
-
 def _path(thing: object) -> str:
     return f"{type(thing).__module__}.{type(thing).__qualname__}"
 
 
 def check_finite(model: BaseAlgorithm) -> None:
     """Check that the last update left finite weights and losses."""
-    # A sum takes one pass, and is finite only where all are; of very large weights it need not be.
-    weights = model.policy.parameters()
-    if not all(math.isfinite(each.sum().item()) or bool(torch.isfinite(each).all()) for each in weights):
-        raise diverged(model, "the network's weights are no finite number")
+    if not all(bool(torch.isfinite(each).all()) for each in model.policy.parameters()):
+        raise diverged(model, "a weight")
     losses = [value for name, value in model.logger.name_to_value.items() if "loss" in name]
     if not all(math.isfinite(loss) for loss in losses):
-        raise diverged(model, "a loss is no finite number")
-
-
-def diverged(model: BaseAlgorithm, what: str) -> InputError:
-    """The error to raise where numbers are not finite; `what` says which."""
-    return InputError(
-        f"training diverged at update {model._n_updates:,}, after {model.num_timesteps:,} steps: {what}; "
-        "try a smaller learning rate"
-    )
+        raise diverged(model, "a loss")
 
 
 @runtime_checkable
@@ -231,18 +195,15 @@ class HasState(Protocol):
 
 def class_without_state(model: BaseAlgorithm, callbacks: Sequence[BaseCallback]) -> str | None:
     """The path of a class of which nobody knows what it keeps; None: all are known."""
-    for each in (*_custom_parts(model), *_flat(callbacks)):
-        if type(each) not in _OF_CALLBACKS and not isinstance(each, HasState):
-            return _path(each)
-    return None
+    unknown = [each for each in _parts(model) if type(each).__module__.partition(".")[0] not in _LIBRARIES]
+    unknown += [each for each in _flat(callbacks) if type(each) not in _OF_CALLBACKS]
+    return next((_path(each) for each in unknown if not isinstance(each, HasState)), None)
 
 
-def _custom_parts(model: Any) -> list[Any]:
-    """The model and those of its parts whose classes come from no library."""
+def _parts(model: Any) -> list[Any]:
+    """The model and all of which somebody may write a class."""
     buffers = [getattr(model, f"{kind}_buffer", None) for kind in ("replay", "rollout")]
-    parts = [model, *model.policy.modules(), model.policy.optimizer, *buffers]
-    libraries = (*_LIBRARIES, "builtins")  # None is no part
-    return [part for part in parts if type(part).__module__.partition(".")[0] not in libraries]
+    return [model, *model.policy.modules(), model.policy.optimizer, *buffers]
 
 
 def _flat(callbacks: Sequence[BaseCallback]) -> Iterator[BaseCallback]:
@@ -253,27 +214,24 @@ def _flat(callbacks: Sequence[BaseCallback]) -> Iterator[BaseCallback]:
         yield from _flat([each for each in held if isinstance(each, BaseCallback)])
 
 
+def _with_state(model: Any, callbacks: Sequence[BaseCallback]) -> list[HasState]:
+    return [each for each in (*_parts(model), *_flat(callbacks)) if isinstance(each, HasState)]
+
+
 def get_state(model: Any, callbacks: Sequence[BaseCallback]) -> State:
     """The state of a model that waits between a rollout and the next, and of its callbacks."""
-    logger, buffer = model.logger, getattr(model, "replay_buffer", None)
     return {
         **{name: getattr(model, name) for name in _NUMBERS if hasattr(model, name)},
-        "parameters": _plain(model.get_parameters()),
-        "replay": None if buffer is None else _replay_state(buffer),
+        "parameters": {name: _saved(each) for name, each in model.get_parameters().items()},
+        "replay": _replay(model),
         "environments": model.env.envs.get_state(),
         "last_episode_starts": model._last_episode_starts,
-        "recent_episodes": [[each["r"], each["l"]] for each in model.ep_info_buffer],
-        "logged": [
-            [name, float(value), logger.name_to_count[name], "tensorboard" in (excluded or ())]
-            for name, value in logger.name_to_value.items()
-            for excluded in [logger.name_to_excluded[name]]
-        ],
-        "seconds": (time.time_ns() - model.start_time) / 1e9,
+        **log_state(model),
         "global_generators": global_state(),
         "torch_generators": _torch_state(),
         "action_generator": generator_state(model.action_space.np_random),
-        "custom_parts": [part.get_state() for part in _custom_parts(model)],
-        "callbacks": [_callback_state(each) for each in _flat(callbacks)],
+        "own": [each.get_state() for each in _with_state(model, callbacks)],
+        "callbacks": [{name: getattr(each, name) for name in _counts(each)} for each in _flat(callbacks)],
     }
 
 
@@ -282,37 +240,37 @@ def set_state(model: Any, callbacks: Sequence[BaseCallback], state: State) -> No
     for name in _NUMBERS:
         if hasattr(model, name):
             setattr(model, name, type(getattr(model, name))(state[name]))
-    expected, parameters = _plain(model.get_parameters()), _tensors(state["parameters"])
-    if parameters.keys() != expected.keys():
-        raise StateError(f"the model's parameters must be {', '.join(expected)}")
-    for name, found in parameters.items():
-        if "param_groups" in found:  # of an optimiser: its numbers of each weight, which are counted
-            found["state"] = {int(number): values for number, values in found["state"].items()}
-            continue
-        for key, array in expected[name].items():
-            fill(array, state["parameters"][name].get(key), f"{name}.{key}")
+    parameters = {name: load_tensors(each.tobytes()) for name, each in state["parameters"].items()}
     model.set_parameters(parameters, exact_match=True, device=model.device)
-    if getattr(model, "replay_buffer", None) is not None:
-        _set_replay_state(model.replay_buffer, state["replay"])
+    if _replay(model):
+        buffer, pos = model.replay_buffer, int(state["replay"]["pos"])
+        if not 0 <= pos < buffer.buffer_size:
+            raise StateError(f"the replay's pos must be from 0 to {buffer.buffer_size - 1}")
+        buffer.pos, buffer.full = pos, bool(state["replay"]["full"])
+        for name, rows in _replay(model).items():
+            if isinstance(rows, np.ndarray):
+                fill(rows, state["replay"][name], f"the replay's {name}")
     model.env.envs.set_state(state["environments"])
     model._last_obs = model.env.observation.rows(model.env.states)
     if model._last_episode_starts is not None:
         fill(model._last_episode_starts, state["last_episode_starts"], "last_episode_starts")
-    model.ep_info_buffer.clear()
-    model.ep_info_buffer.extend({"r": each, "l": size, "t": 0.0} for each, size in state["recent_episodes"])
-    for name, value, count, is_excluded in state["logged"]:
-        model.logger.record(name, float(value), exclude="tensorboard" if is_excluded else None)
-        model.logger.name_to_count[name] = int(count)
-    model.start_time = time.time_ns() - int(state["seconds"] * 1e9)
-    for part, own in zip(_custom_parts(model), state["custom_parts"], strict=True):
-        part.set_state(own)
-    for callback, own in zip(_flat(callbacks), state["callbacks"], strict=True):
-        _set_callback_state(callback, own)
+    set_log_state(model, state)
+    for callback, counts in zip(_flat(callbacks), state["callbacks"], strict=True):
+        for name in _counts(callback):
+            setattr(callback, name, int(counts[name]))
+    for each, own in zip(_with_state(model, callbacks), state["own"], strict=True):
+        each.set_state(own)
     set_generator_state(model.action_space.np_random, state["action_generator"])
     set_global_state(state["global_generators"])
     torch.set_rng_state(torch.from_numpy(state["torch_generators"]["cpu"]))
     if "cuda" in state["torch_generators"]:
         torch.cuda.set_rng_state_all([torch.from_numpy(each) for each in state["torch_generators"]["cuda"]])
+
+
+def _saved(tensors: dict[str, Any]) -> NDArray[np.uint8]:
+    content = io.BytesIO()
+    torch.save(tensors, content)
+    return np.frombuffer(content.getvalue(), dtype=np.uint8)
 
 
 def _torch_state() -> State:
@@ -322,56 +280,16 @@ def _torch_state() -> State:
     return state
 
 
-def _replay_state(buffer: Any) -> State:
-    if isinstance(buffer, HasState):
-        return buffer.get_state()
-    return {**_rows(buffer), "pos": int(buffer.pos), "full": bool(buffer.full)}
-
-
-def _set_replay_state(buffer: Any, state: State) -> None:
-    if isinstance(buffer, HasState):
-        buffer.set_state(state)
-        return
-    if not 0 <= state["pos"] < buffer.buffer_size:
-        raise StateError(f"the replay's pos must be from 0 to {buffer.buffer_size - 1}")
-    buffer.pos, buffer.full = int(state["pos"]), bool(state["full"])
-    for name, rows in _rows(buffer).items():
-        fill(rows, state[name], f"the replay's {name}")
-
-
-def _rows(buffer: Any) -> dict[str, Any]:
-    """Views of a replay buffer's arrays, of the steps that it holds."""
+def _replay(model: Any) -> State:
+    """Views of the steps in a replay buffer of SB3's, and where it is; {} where there is none."""
+    buffer = getattr(model, "replay_buffer", None)
+    if buffer is None or isinstance(buffer, HasState):
+        return {}
     count = buffer.buffer_size if buffer.full else buffer.pos
     arrays = {name: each for name, each in vars(buffer).items() if isinstance(each, np.ndarray)}
-    return {name: each[:count] for name, each in arrays.items() if len(each) == buffer.buffer_size}
+    rows = {name: each[:count] for name, each in arrays.items() if len(each) == buffer.buffer_size}
+    return {**rows, "pos": int(buffer.pos), "full": bool(buffer.full)}
 
 
-def _callback_state(callback: BaseCallback) -> State:
-    counted = {name: getattr(callback, name) for name in _OF_CALLBACKS.get(type(callback), ())}
-    own = callback.get_state() if isinstance(callback, HasState) else None
-    return {"n_calls": callback.n_calls, "num_timesteps": callback.num_timesteps, **counted, "own": own}
-
-
-def _set_callback_state(callback: BaseCallback, state: State) -> None:
-    for name in ("n_calls", "num_timesteps", *_OF_CALLBACKS.get(type(callback), ())):
-        setattr(callback, name, int(state[name]))
-    if isinstance(callback, HasState):
-        callback.set_state(state["own"])
-
-
-def _plain(node: Any) -> Any:
-    """Tensors as arrays, keys as text."""
-    if isinstance(node, dict):
-        return {str(key): _plain(value) for key, value in node.items()}
-    if isinstance(node, list | tuple):
-        return [_plain(value) for value in node]
-    return node.detach().cpu().numpy().copy() if isinstance(node, Tensor) else node
-
-
-def _tensors(node: Any) -> Any:
-    """Mirrors `_plain`, but for the keys."""
-    if isinstance(node, dict):
-        return {key: _tensors(value) for key, value in node.items()}
-    if isinstance(node, list):
-        return [_tensors(value) for value in node]
-    return torch.from_numpy(node.copy()) if isinstance(node, np.ndarray) else node
+def _counts(callback: BaseCallback) -> tuple[str, ...]:
+    return ("n_calls", "num_timesteps", *_OF_CALLBACKS.get(type(callback), ()))

@@ -17,7 +17,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped, sync_envs_normalization
 
-from gridworld.agents.sb3.policy_outputs import CHUNK, explored, read_table, why_no_table, why_unreadable
+from gridworld.agents.sb3.policy_outputs import (
+    CHUNK,
+    NO_TABLE,
+    explored,
+    read_table,
+    why_no_table,
+    why_unreadable,
+)
 from gridworld.bounds import Bounds, discount
 from gridworld.envs.inspection import Task, observation_like, tabulated, task_of
 from gridworld.envs.observations import KINDS, ObservationTable
@@ -40,7 +47,7 @@ _KINDS: dict[str, type] = {"step": np.int64, "certified": np.bool_}
 
 
 class Tables(NamedTuple):
-    """A model's policies, and what they are of; (S, A), float64, each."""
+    """A model's policies, and what they follow from; (S, A), float64, each."""
 
     greedy: FloatArray  # action probabilities
     sampled: FloatArray | None  # the same; None: a custom `predict` decides, which shows no probabilities
@@ -95,9 +102,7 @@ class ForeignPolicy:
             return tabulated(wanted, seen.table().transpose(0, 3, 1, 2), seen.num_states)
         if seen is not None and seen.space == wanted:
             if isinstance(seen.stored, dict):
-                raise InputError(
-                    "env: its observations are a Dict; take one entry, as VecExtractDictObs does"
-                )
+                raise InputError("env: observes a Dict; take one entry, as VecExtractDictObs does")
             return seen
         if seen is not None and seen.kind not in KINDS:
             raise InputError(
@@ -118,8 +123,8 @@ class ForeignPolicy:
             shown = None if task.seen is None else task.seen()
         except InputError as error:
             raise InputError(
-                "the model: what it was shown in training is not known, so it cannot be scored on an "
-                f"environment that shows something else; give one that shows the same ({error})"
+                f"the model: what it was shown in training is not known ({error}); give an environment that "
+                "shows the same"
             ) from None
         alike = shown is not None and shown.space == guess.space and same(shown.table(), guess.table())
         if not alike and (shown is None or shown.kind not in KINDS):
@@ -144,10 +149,7 @@ class ForeignPolicy:
         except Exception as error:  # it may be anybody's own
             raise InputError(f"the model: its predict() raised {in_short(error)}") from error
         if state is not None:
-            raise InputError(
-                "the model: its predict() gives a state to give back, so what it does is not a function of "
-                "the observation, and no table of it can be evaluated exactly"
-            )
+            raise InputError(f"the model: its predict() keeps a state from step to step, {NO_TABLE}")
         fits = actions.shape == np.shape(states) and actions.dtype.kind in "iu"
         if not fits or not np.isin(actions, np.arange(self._task.mdp.num_actions)).all():
             raise InputError(
@@ -165,25 +167,19 @@ class ForeignPolicy:
         reason = why_no_table(self._policy, observation)
         self._policy.set_training_mode(was_training)
         if reason is None and random_states() != before:
-            reason = "draws random numbers for its best action, so no table of it can be evaluated exactly"
+            reason = f"draws random numbers for its best action, {NO_TABLE}"
         if reason is None and any((each != together).any() for each in rounds):
-            reason = (
-                "does not always take the same action in the same state, asked alone and with others, so no "
-                "table of it can be evaluated exactly"
-            )
+            reason = f"takes different actions in one state, asked alone, again and with others, {NO_TABLE}"
         if reason is not None:
             raise InputError(f"the model {reason}")
 
 
 def _is_of_a_library(model: Any, policy: BasePolicy) -> bool:
     """Whether no custom layer or `predict` decides on an action."""
-    modules = [type(each).__module__ for each in policy.modules()]
-    for thing in (model, policy):
-        for name in _PREDICTS:
-            method = getattr(type(thing), name, None)
-            modules += [] if method is None else [method.__module__]
-            modules += ["custom"] if name in vars(thing) else []
-    return all(module.startswith(_LIBRARIES) for module in modules)
+    methods = [getattr(type(thing), name, None) for thing in (model, policy) for name in _PREDICTS]
+    modules = [each.__module__ for each in (*map(type, policy.modules()), *filter(None, methods))]
+    is_replaced = any(name in vars(thing) for thing in (model, policy) for name in _PREDICTS)
+    return not is_replaced and all(module.startswith(_LIBRARIES) for module in modules)
 
 
 def _is_transposed(shown: Any, wanted: Any) -> bool:
@@ -316,13 +312,16 @@ class ExactEvalCallback(BaseCallback):
         self.logger.dump(step)
         if score.shortfall < self.best_regret:
             self.best_regret = score.shortfall
-            if self.verbose >= 1:
-                print(f"step {step:,}: new best model, exact regret {self.best_regret:.3g}")
-            if self._best_path is not None:
-                self._best_path.mkdir(parents=True, exist_ok=True)
-                with replacing(self._best_path / BEST_MODEL) as part, part.open("wb") as file:
-                    self.model.save(file)
+            self._keep_best()
         if self._log_path is not None:
             table = self.evaluations
             self._log_path.mkdir(parents=True, exist_ok=True)
             write_evaluations(self._log_path / EVALUATIONS, table, **table)
+
+    def _keep_best(self) -> None:
+        if self.verbose >= 1:
+            print(f"step {self.num_timesteps:,}: new best model, exact regret {self.best_regret:.3g}")
+        if self._best_path is not None:
+            self._best_path.mkdir(parents=True, exist_ok=True)
+            with replacing(self._best_path / BEST_MODEL) as part, part.open("wb") as file:
+                self.model.save(file)

@@ -1,15 +1,11 @@
-"""From settings to an SB3 model and its callbacks: classes imported by their paths, schedules made.
-
-What cannot work is refused in a sentence.
-"""
+"""From settings to an SB3 model and its callbacks: classes imported by their paths, schedules made."""
 
 from __future__ import annotations
 
 import inspect
-import itertools
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, cast
 
@@ -25,24 +21,15 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from gridworld.agents import TrainingContext
 from gridworld.agents.sb3.policy_outputs import CHUNK, why_unreadable
-from gridworld.agents.sb3.settings import (
-    FALLING,
-    SCHEDULES,
-    SB3CheckedConfig,
-    SB3ClassConfig,
-    SB3Config,
-    as_dict,
-)
+from gridworld.agents.sb3.settings import FALLING, SCHEDULES, SB3ClassConfig, SB3Config
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.config.fields import falls, parse_schedule
-from gridworld.errors import InputError
+from gridworld.errors import InputError, in_short
 from gridworld.process.memory_budget import check_memory, is_limited
 from gridworld.process.user_input import imported
 
 Arguments = dict[str, Any]
 
-# Fields of the config that are ours, not arguments of the algorithm's class.
-_OWN_FIELDS = {"name", "family", "algorithm", "engine", "log_interval", "reward_scale"}
 _EXTRACTOR, _ITS_KWARGS = "features_extractor_class", "features_extractor_kwargs"
 _KINDS: dict[str, type] = {
     "activation_fn": torch.nn.Module,
@@ -52,39 +39,22 @@ _KINDS: dict[str, type] = {
     "rollout_buffer_class": BaseBuffer,
 }
 _MOST_LAYERS, _WIDEST_LAYER = 16, 4096  # what a processor's memory holds, whoever asks for them
-_SMALLEST_IMAGE = 36  # pixels that SB3's NatureCNN needs on each side
-_CNN_FEATURES = 512  # of its last layer
-_COPIES = 4  # of a weight: its gradient and what the optimiser keeps, or a file, its member and a tensor
-_NUMBER = 4  # bytes of a weight, and of an activation
-# A pass makes of each byte of an observation: numbers of 4 bytes, scaled, and the first layer's answer.
-_PIXEL_PASS, _NUMBER_PASS = 24, 2
+_PIXEL_PASS, _NUMBER_PASS = 24, 8  # bytes of a pass for a pixel, which becomes a scaled number, or a number
 _TARGET = "_target_"
 
 
-class UnfitError(InputError):
-    """The class itself refuses its settings, or fails at them."""
-
-    def __init__(self, config: SB3Config, reason: str) -> None:
-        super().__init__(f"agent={config.name}: {config.algorithm} {reason}")
+def unfit(config: SB3Config, why: str) -> InputError:
+    """The error to raise where the class cannot be used."""
+    return InputError(f"agent={config.name}: {config.algorithm} {why}")
 
 
-def unfit(config: SB3Config, what: str, error: Exception) -> UnfitError:
+def failed(config: SB3Config, what: str, error: Exception) -> InputError:
     """The error to raise where the class fails, with the settings that only it can judge."""
-    is_any = isinstance(config, SB3ClassConfig)
-    where = "agent.arguments" if is_any else "agent"
-    kwargs = config.policy_kwargs_given
-    suspects = [f"{where}.policy_kwargs.{name}={value}" for name, value in kwargs.items() if value]
-    if is_any:
-        given = config.given.items()
-        suspects += [f"{where}.{name}={value}" for name, value in given if name != "policy_kwargs"]
-    why = f"; look at {', '.join(suspects)}" if suspects else ""
-    return UnfitError(config, f"{what}: {first_line(error)}{why}")
-
-
-def first_line(error: Exception) -> str:
-    """The message of a library's exception in one line."""
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
+    given = {f"policy_kwargs.{name}": value for name, value in config.policy_kwargs_given.items()}
+    if isinstance(config, SB3ClassConfig):
+        given |= {name: value for name, value in config.arguments.items() if name != "policy_kwargs"}
+    suspects = ", ".join(f"{config.where}.{name}={value}" for name, value in given.items())
+    return unfit(config, f"{what}: {in_short(error)}" + (f"; look at {suspects}" if suspects else ""))
 
 
 def algorithm_and_arguments(
@@ -94,22 +64,25 @@ def algorithm_and_arguments(
 
     `features` is what the observation adds to the settings of an `MlpPolicy`.
     """
-    if isinstance(config, SB3ClassConfig):
-        algorithm = algorithm_class("agent.algorithm", config.algorithm)
-        _check_types(config.arguments, algorithm)
-        arguments = _convert(config.arguments, "agent.arguments.")
-    else:
-        assert isinstance(config, SB3CheckedConfig)
-        algorithm = getattr(stable_baselines3, config.algorithm)
-        given = {name: value for name, value in vars(config).items() if name not in _OWN_FIELDS}
-        arguments = _convert(given, "agent.")
-    arguments["policy"] = _policy(config, algorithm)
-    own = arguments.get("policy_kwargs", {})
-    if features and config.policy == "MlpPolicy" and _EXTRACTOR not in own:
+    is_any = isinstance(config, SB3ClassConfig)
+    path = config.algorithm if is_any else f"{stable_baselines3.__name__}.{config.algorithm}"
+    algorithm = algorithm_class("agent.algorithm", path)
+    arguments = {
+        name: _converted(f"{config.where}.{name}", name, each) for name, each in config.given.items()
+    }
+    kwargs = {
+        name: _converted(f"{config.where}.policy_kwargs.{name}", name, each)
+        for name, each in config.policy_kwargs_given.items()
+    }
+    if features and config.policy == "MlpPolicy" and _EXTRACTOR not in kwargs:
         extractor = import_class("observation.features", features[_EXTRACTOR], BaseFeaturesExtractor)
-        kwargs = features[_ITS_KWARGS] | own.get(_ITS_KWARGS, {})
-        arguments["policy_kwargs"] = own | {_EXTRACTOR: extractor, _ITS_KWARGS: kwargs}
-    return algorithm, arguments
+        kwargs |= {_EXTRACTOR: extractor, _ITS_KWARGS: features[_ITS_KWARGS] | kwargs.get(_ITS_KWARGS, {})}
+    arguments.pop("policy_kwargs", None)
+    return algorithm, {
+        **arguments,
+        "policy": _policy(config, algorithm),
+        **({"policy_kwargs": kwargs} if kwargs else {}),
+    }
 
 
 def algorithm_class(where: str, path: Any) -> type[BaseAlgorithm]:
@@ -127,16 +100,6 @@ def import_class(where: str, path: Any, kind: type) -> Any:
     return found
 
 
-def _check_types(arguments: Arguments, algorithm: type[BaseAlgorithm]) -> None:
-    """Types where the class says plainly what it wants; SB3 itself looks at none."""
-    parameters = inspect.signature(algorithm).parameters
-    for name, value in arguments.items():
-        wanted: Any = parameters[name].annotation if name in parameters else None
-        fitting = {float: (int, float), int: (int,), bool: (bool,), str: (str,)}.get(wanted)
-        if fitting and type(value) not in fitting and not (name in FALLING and falls(value)):
-            raise InputError(f"agent.arguments.{name}={value}: must be {wanted.__name__}")
-
-
 def _policy(config: SB3Config, algorithm: type[BaseAlgorithm]) -> type[BasePolicy]:
     if config.policy in algorithm.policy_aliases:
         return algorithm.policy_aliases[config.policy]
@@ -147,25 +110,19 @@ def _policy(config: SB3Config, algorithm: type[BaseAlgorithm]) -> type[BasePolic
     raise InputError(f"agent.policy={config.policy}: {config.algorithm} has {known}")
 
 
-def _convert(given: Arguments, where: str) -> Arguments:
-    """Yaml's plain values as what SB3 takes; `where` names them in messages."""
-    converted = {}
-    for name, value in given.items():
-        if (name in SCHEDULES and isinstance(value, str)) or (name in FALLING and falls(value)):
-            decay = parse_schedule(where + name, value, linear_only=name not in FALLING)
-            linear = name in SCHEDULES and decay.power == 1
-            value = LinearSchedule(decay.initial, 0.0, 1.0) if linear else decay.initial
-        elif name == "train_freq" and isinstance(value, list):
-            value = tuple(value)
-        elif name.endswith(("_class", "_fn")) and value is not None:
-            value = import_class(where + name, value, _KINDS.get(name, object))
-        elif name == "policy_kwargs":
-            own = {key: each for key, each in as_dict(value).items() if each is not None and each != {}}
-            value = _convert(own, f"{where}policy_kwargs.")
-        elif name == "net_arch":
-            _check_widths(where + name, value)
-        converted[name] = value
-    return converted
+def _converted(key: str, name: str, value: Any) -> Any:
+    """A plain value of yaml as what SB3 takes; `key` names it in messages."""
+    if (name in SCHEDULES and isinstance(value, str)) or (name in FALLING and falls(value)):
+        decay = parse_schedule(key, value, linear_only=name not in FALLING)
+        is_sb3s = name in SCHEDULES and decay.power == 1
+        return LinearSchedule(decay.initial, 0.0, 1.0) if is_sb3s else decay.initial
+    if name == "train_freq" and isinstance(value, list):
+        return tuple(value)
+    if name.endswith(("_class", "_fn")) and value is not None:
+        return import_class(key, value, _KINDS.get(name, object))
+    if name == "net_arch":
+        _check_widths(key, value)
+    return value
 
 
 def _check_widths(key: str, value: Any) -> None:
@@ -180,7 +137,7 @@ def _check_widths(key: str, value: Any) -> None:
 
 
 class NoBuffer(BaseBuffer):
-    """The buffer of a model that is only asked, which keeps nothing of what it meets."""
+    """The buffer of a model that does not learn in SB3's own loop, which keeps nothing of what it meets."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         pass
@@ -198,16 +155,9 @@ def make_model(
 ) -> BaseAlgorithm:
     """Build a model on the context's environments; `with_buffers`: whether it keeps what it meets."""
     keep_compiler_out()
-    kwargs, shape = arguments.get("policy_kwargs", {}), context.observation.space.shape or ()
-    is_cnn = arguments["policy"].__name__.endswith("CnnPolicy") and "features_extractor_class" not in kwargs
-    if is_cnn and min(shape[1:], default=0) < _SMALLEST_IMAGE:
-        height, width = shape[1:] or (0, 0)
-        raise InputError(
-            f"observation=image: frames of {width} x {height} pixels are too small for CnnPolicy, "
-            f"whose convolutions need {_SMALLEST_IMAGE}; take a larger observation.cell_size"
-        )
+    torch.set_num_threads(context.threads)
     if is_limited():
-        check_memory(f"agent={config.name}: its network", _network_bytes(kwargs, context, is_cnn))
+        _check_network(config, context)
     device = _device(context.device)
     envs = GridWorldVecEnv(context.envs, context.observation, config.reward_factor)
     if not with_buffers:
@@ -219,48 +169,28 @@ def make_model(
             if context.only_asked:
                 warnings.simplefilter("ignore")  # of rollouts that there will not be
             model = algorithm(env=envs, seed=context.seed, device=device, **arguments)
+        reason = why_unreadable(model.policy)
     except InputError:
         raise
-    except MemoryError:
-        raise InputError(
-            f"agent={config.name}: its buffers do not fit into memory; take a smaller agent.buffer_size, "
-            "agent.n_steps or n_envs, or another observation"
-        ) from None
     except Exception as error:  # the class may be anybody's
-        raise unfit(config, "cannot be built", error) from error
-    if not isinstance(getattr(model, "policy", None), BasePolicy):
-        raise UnfitError(config, "cannot be built: it makes no policy")
+        raise failed(config, "cannot be built", error) from error
     if model.observation_space._np_random is not None:
         # A network for images is shown a random one to see its size; SB3 seeds the actions' space only.
         model.observation_space.seed(context.seed)
-    if (reason := why_unreadable(model.policy)) is not None:
-        raise UnfitError(config, reason)
+    if reason is not None:
+        raise unfit(config, reason)
     return model
 
 
-def _network_bytes(policy_kwargs: Arguments, context: TrainingContext, is_cnn: bool) -> int:
-    """About the memory of a network, where every whole number of its settings is the width of a layer."""
+def _check_network(config: SB3Config, context: TrainingContext) -> None:
+    """Refuse a network that would take more than the memory budget, alone or in a pass over the states."""
     observation, space = context.observation, cast(Any, context.observation.space)
-    shape: tuple[int, ...] = space.shape or ()
-    size = math.prod(shape) if shape else int(space.n)
-    widths = [size, *_whole_numbers(policy_kwargs), context.envs.mdp.num_actions]
-    widths[-1] *= int(policy_kwargs.get("n_quantiles", 1))
-    if is_cnn:  # an eighth of the image's sides, in 64 channels
-        widths[:1] = [size // shape[0], _CNN_FEATURES]
-    weights = 2 * sum(above * below for above, below in itertools.pairwise(widths))  # of two networks
-    per_byte = _PIXEL_PASS if space.dtype == np.uint8 else _NUMBER_PASS
-    row: int = per_byte * math.prod(shape) * np.dtype(space.dtype).itemsize + 3 * _NUMBER * max(widths[1:])
-    table: int = 0 if observation.stored is None else observation.stored.nbytes
-    return table + _COPIES * _NUMBER * weights + min(observation.num_states, CHUNK) * row
-
-
-def _whole_numbers(node: Any) -> Iterator[int]:
-    """Those in nested settings, in their order."""
-    if isinstance(node, dict | list | tuple):
-        for each in node.values() if isinstance(node, dict) else node:
-            yield from _whole_numbers(each)
-    elif type(node) is int and node > 0:
-        yield node
+    size = math.prod(space.shape) if space.shape else int(space.n)
+    per_number = _PIXEL_PASS if space.dtype == np.uint8 else _NUMBER_PASS
+    table = 0 if observation.stored is None else observation.stored.nbytes
+    needed = config.memory(size, context.envs.num_envs, 0) + table
+    needed += min(observation.num_states, CHUNK) * per_number * size
+    check_memory(f"agent={config.name}: its network", needed)
 
 
 def _device(name: str) -> str:
@@ -298,10 +228,9 @@ def _make(where: str, value: Any, kind: type = object) -> Any:
         return [_make(f"{where}[{index}]", item) for index, item in enumerate(value)]
     if not (isinstance(value, dict) and _TARGET in value):
         return value
-    path = value[_TARGET]
-    found = import_class(f"{where}.{_TARGET}", path, kind)
+    found = import_class(f"{where}.{_TARGET}", value[_TARGET], kind)
     arguments = {name: _make(f"{where}.{name}", each) for name, each in value.items() if name != _TARGET}
     try:
         return found(**arguments)
     except Exception as error:  # the class may be anybody's
-        raise InputError(f"{where}: {path} cannot be built: {first_line(error)}") from error
+        raise InputError(f"{where}: {value[_TARGET]} cannot be built: {in_short(error)}") from error

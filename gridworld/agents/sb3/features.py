@@ -1,8 +1,7 @@
-"""Features extractors: functions of what an agent sees, which a network learns from; all but one are fixed.
+"""Features extractors, which make of each observation a vector that a small network can tell apart.
 
-Two numbers, or thousands of pixels of which few differ, are hard to tell apart for a small network. Here each
-observation becomes a vector of length 1, and those of different cells are at right angles, or nearly, as the
-unit vectors of `one_hot` are. They work in any model of Stable-Baselines3:
+Those of different cells are at right angles, or nearly, as the unit vectors of `one_hot` are. They work in
+any model of Stable-Baselines3:
 
     DQN("MlpPolicy", env, policy_kwargs={"features_extractor_class": FourierFeatures})
 """
@@ -11,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from gymnasium import spaces
@@ -19,6 +18,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 from torch.nn.functional import embedding, layer_norm, max_pool2d, normalize, pad, relu
 
+from gridworld.engine.networks import Kind
 from gridworld.envs.observations import IMAGE_CELL_SIZE
 from gridworld.errors import InputError
 
@@ -27,6 +27,8 @@ _FEATURES, _MOST_FEATURES = 144, 4096
 
 class _Extractor(BaseFeaturesExtractor):
     """One that is printed with its settings, by which networks are told apart."""
+
+    kind: ClassVar[Kind] = "fixed"
 
     def extra_repr(self) -> str:
         """See `torch.nn.Module.extra_repr`."""
@@ -39,9 +41,9 @@ class FourierFeatures(_Extractor):
 
     The features are the products of cos(pi c_i x_i), c_i = 0, ..., n_i, divided by the length of all. Factors
     with c_i = 0 or n_i are multiplied by the root of 1/2, as in the discrete cosine transform of type I. With
-    orders of rows - 1 and columns - 1 the features of a grid's cells are orthonormal. With these or larger
-    ones, linear functions of them are all functions of the cell. A state without a place, whose coordinates
-    are negative, has zeros.
+    orders of rows - 1 and columns - 1 the features of a grid's cells are orthonormal; with these or larger
+    ones any function of the cell is linear in them. A state without a place, whose coordinates are negative,
+    has zeros.
 
     G. Konidaris, S. Osentoski, P. Thomas: Value Function Approximation in Reinforcement Learning using the
     Fourier Basis, AAAI 2011. R. Sutton, A. Barto: Reinforcement Learning, section 9.5.2.
@@ -54,25 +56,16 @@ class FourierFeatures(_Extractor):
 
     def __init__(self, observation_space: spaces.Space[Any], orders: Sequence[int] | None = None) -> None:
         if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
-            raise InputError(
-                "FourierFeatures: the observation must be coordinates, a Box of shape (d,); it is "
-                f"{observation_space}"
-            )
+            raise InputError(f"FourierFeatures: must see coordinates, a Box (d,); {observation_space} is not")
         (dimensions,) = observation_space.shape
         largest = max(int(_FEATURES ** (1 / dimensions) + 1e-9) - 1, 1)
         given = orders if isinstance(orders, Iterable) else [orders]
         self.orders: Any = [largest] * dimensions if orders is None else list(given)
         if len(self.orders) != dimensions or any(type(each) is not int or each < 0 for each in self.orders):
-            raise InputError(
-                f"FourierFeatures: orders={orders}: must be {dimensions} whole numbers, one for each "
-                "coordinate"
-            )
+            raise InputError(f"FourierFeatures: orders={orders}: must be {dimensions} whole numbers")
         size = math.prod(order + 1 for order in self.orders)
         if size > _MOST_FEATURES:
-            raise InputError(
-                f"FourierFeatures: {dimensions} coordinates of these orders make {size} features, more than "
-                f"{_MOST_FEATURES}"
-            )
+            raise InputError(f"FourierFeatures: orders={orders}: {size} features; at most {_MOST_FEATURES}")
         super().__init__(observation_space, size)
 
     def forward(self, observations: Tensor) -> Tensor:
@@ -88,8 +81,8 @@ class FourierFeatures(_Extractor):
 class AgentByColour(_Extractor):
     """The brightest colours of an image's squares, nearly where the agent stands: nothing is learned.
 
-    What counts of a pixel is by how much red, green or blue exceeds the other two: white and greys are 0. The
-    features are the largest of each colour in each square of pixels, divided by the length of all.
+    The features are by how much red, green or blue exceeds the other two, the most in each square of pixels,
+    divided by the length of all.
 
     Args:
         observation_space: of images, (3, height, width), channels first.
@@ -112,12 +105,11 @@ class PixelCNN(_Extractor):
     """A small convolutional network that learns from an image's pixels.
 
     Two convolutions, of squares of pixels side by side and of one square's channels. Each channel of each is
-    scaled to mean 0 and variance 1 over the image's squares, image by image, and rectified. So the sizes of
-    the weights do not matter, and no optimiser's step is too long for them. The third power lets what stands
-    out in an image, as the agent does, weigh more than what fills it. The features are scaled to one length.
+    scaled to mean 0 and variance 1 over the image's squares, image by image, and rectified, so that the sizes
+    of the weights do not matter. The third power lets what stands out in an image, as the agent does, weigh
+    more than what fills it. The features are scaled to one length.
 
-    The first convolution is computed as a product of matrices, since squares do not overlap. What depends on
-    no parameter (`patches`) is apart from what is learned (`learn`), so that it can be computed once.
+    What depends on no parameter (`patches`) is apart from what is learned (`learn`): it is computed once.
 
     D. Ulyanov, A. Vedaldi, V. Lempitsky: Instance Normalization, 2016.
 
@@ -127,6 +119,8 @@ class PixelCNN(_Extractor):
         channels: of the two convolutions.
         length: of a feature vector. With 1, values as large as -100 are learned too slowly.
     """
+
+    kind: ClassVar[Kind] = "patches"
 
     def __init__(
         self,
@@ -172,15 +166,9 @@ def _standing_out(channels: Tensor) -> Tensor:
 def _image_shape(name: str, space: spaces.Space[Any], cell_size: int) -> tuple[int, int, int]:
     shape = space.shape or ()
     if len(shape) != 3:
-        raise InputError(
-            f"{name}: the observation must be an image of shape (channels, height, width); it is {space}"
-        )
+        raise InputError(f"{name}: must see images, (channels, height, width); {space} is none")
     if not (type(cell_size) is int and 0 < cell_size <= min(shape[1:])):
         raise InputError(
             f"{name}: cell_size={cell_size}: must be from 1 to the image's {min(shape[1:])} pixels"
         )
     return shape[0], shape[1], shape[2]
-
-
-FIXED = (FourierFeatures, AgentByColour)  # functions of an observation alone, which never change
-LEARNED = (PixelCNN,)  # functions of an observation and of parameters, of nothing else

@@ -40,16 +40,13 @@ def oracle_fit(
         fresh: whether to begin with new weights, not those that the model has learnt.
     """
     fit = _Fit(agent, best, states, advantages=True)
-    elsewhere = np.argmax(best.q, axis=1)
+    actions = np.argmax(best.q, axis=1)
 
     def is_done(found: IntArray) -> bool:
-        actions = elsewhere.copy()
         actions[states] = found
         return is_optimal(actions)
 
-    if fit.steps < _FEWEST:
-        return None
-    return fit.run(lambda found: fit.error(found, slice(None)), is_done, fresh)
+    return fit.run(lambda found: fit.error(found, slice(None)), is_done, fresh) if fit.is_fast else None
 
 
 class OneState(NamedTuple):
@@ -62,7 +59,7 @@ class OneState(NamedTuple):
 def one_state_fit(agent: Agent, best: Solution, states: IntArray, state: int) -> OneState | None:
     """Fit a copy of a model's network, with its own weights, to the optimum in one state; see above."""
     fit = _Fit(agent, best, states, advantages=False)
-    if fit.steps < _FEWEST:
+    if not fit.is_fast:
         return None
     here, rows, right = int(np.flatnonzero(states == state)[0]), np.arange(len(states)), best.optimal[states]
     with torch.no_grad():
@@ -85,14 +82,14 @@ def one_state_fit(agent: Agent, best: Solution, states: IntArray, state: int) ->
 
 def narrowest_layer(agent: Agent) -> int:
     """The units of the narrowest layer between a network's features and its actions; 0: there is none."""
-    assert isinstance(agent, SB3Agent)
     policy = agent.model.policy
-    extractor = getattr(policy, "mlp_extractor", None)
-    network = getattr(policy, "q_net", None) or getattr(policy, "quantile_net", None)
-    whole = network if extractor is None else extractor.policy_net
-    layers = [each for each in whole.modules() if isinstance(each, torch.nn.Linear)] if whole else []
-    hidden = layers if extractor is not None else layers[:-1]
-    return min((each.out_features for each in hidden), default=0)
+    if hasattr(policy, "mlp_extractor"):
+        layers = list(policy.mlp_extractor.policy_net.modules())
+    else:
+        network = getattr(policy, "q_net", None) or getattr(policy, "quantile_net", None)
+        linear = [each for each in network.modules() if isinstance(each, torch.nn.Linear)] if network else []
+        layers = linear[:-1]
+    return min((each.out_features for each in layers if isinstance(each, torch.nn.Linear)), default=0)
 
 
 class _Fit:
@@ -105,7 +102,8 @@ class _Fit:
         assert isinstance(agent, SB3Agent)
         self.policy = agent.model.policy
         weights = sum(each.numel() for each in self.policy.parameters())
-        self.steps = int(min(_STEPS, _WORK / (weights * len(states))))
+        self._steps = int(min(_STEPS, _WORK / (weights * len(states))))
+        self.is_fast = self._steps >= _FEWEST
         self.observations, _ = self.policy.obs_to_tensor(agent.observation.rows(states))
         q = best.q[states] - (best.v[states][:, None] if advantages else 0.0)
         q = np.where(np.isfinite(q), q, 0.0)
@@ -130,14 +128,12 @@ class _Fit:
         try:
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(0)
-                policy = copy.deepcopy(self.policy)
+                policy = copy.deepcopy(self.policy).requires_grad_(True)
                 for module in policy.modules() if fresh else ():
                     if callable(reset := getattr(module, "reset_parameters", None)):
                         reset()
-                for weights in policy.parameters():
-                    weights.requires_grad_(True)
                 optimizer = torch.optim.Adam(policy.parameters(), lr=_RATE)
-                for step in range(self.steps + 1):
+                for step in range(self._steps + 1):
                     found = read(policy, self.observations)
                     if step % _EVERY == 0 and is_done(_greedy(found)):
                         return True

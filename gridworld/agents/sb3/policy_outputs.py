@@ -19,6 +19,7 @@ from gridworld.world.mdp import BoolArray, FloatArray
 CHUNK = 4096  # states a forward pass
 _ASKED = 512  # states
 _PART = 3
+NO_TABLE = "so no table of it can be evaluated exactly"
 
 
 class Reading(NamedTuple):
@@ -36,15 +37,11 @@ def why_unreadable(policy: BasePolicy) -> str | None:
     """Why a policy's outputs cannot be read as a table over states; None: they can."""
     for module in policy.modules():
         if isinstance(module, nn.RNNBase):
-            return (
-                f"keeps a memory from step to step ({type(module).__name__}), so what it does is not a "
-                "function of the state, and no table of it can be evaluated exactly; take one without"
-            )
+            return f"keeps a memory from step to step ({type(module).__name__}), {NO_TABLE}"
     if _is_actor_critic(policy) or hasattr(policy, "q_net") or hasattr(policy, "quantile_net"):
         return None
     return (
-        f"has a policy ({type(policy).__name__}) that tells neither probabilities and values nor Q values "
-        "of a state, so it cannot be evaluated exactly"
+        f"has neither probabilities and values nor Q values of a state ({type(policy).__name__}), {NO_TABLE}"
     )
 
 
@@ -61,10 +58,7 @@ def why_no_table(policy: BasePolicy, observation: ObservationTable) -> str | Non
             continue
         same = torch.allclose(one, other, rtol=0, atol=0, equal_nan=True)
         if not same or not torch.allclose(one[::_PART], fewer, rtol=1e-3, atol=1e-4, equal_nan=True):
-            return (
-                "does not always give the same answer in the same state, so no table of it can be evaluated "
-                "exactly"
-            )
+            return f"does not always give the same answer in the same state, {NO_TABLE}"
     return None
 
 

@@ -1,7 +1,6 @@
-"""A replay buffer for finite worlds: how often each transition was met.
+"""A replay buffer for finite worlds: each transition once, with how often it was met.
 
-A finite world has few transitions, and a buffer holds each again and again. Here each is there once, with a
-count, so nothing is forgotten, in little memory. A minibatch is drawn by systematic sampling, see
+So nothing is forgotten, in little memory. A minibatch is drawn by systematic sampling, see
 `engine.replay.systematic_sample`: the mean is that of uniform sampling, the noise far smaller. It works in
 any model of Stable-Baselines3 that replays single steps:
 
@@ -44,8 +43,7 @@ class ReplayCounts(ReplayBuffer):
     ) -> None:
         if options.get("optimize_memory_usage"):
             raise InputError(
-                "optimize_memory_usage=true: ReplayCounts stores each transition once; set it to false, or "
-                "replay_buffer_class to null"
+                "optimize_memory_usage=true: ReplayCounts has each transition once; set it to false"
             )
         super().__init__(_ROOM, observation_space, action_space, device, 1, **options)
         self.counts: IntArray = np.zeros(self.buffer_size, dtype=np.int64)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, is_dataclass
 from typing import Any, Optional
 
@@ -25,7 +24,7 @@ from gridworld.config.fields import (
     parse_schedule,
     rate,
 )
-from gridworld.config.train import AgentConfig, ObservationConfig, TrainConfig
+from gridworld.config.train import AgentConfig, TrainConfig
 from gridworld.errors import InputError
 
 # OmegaConf reads these annotations at run time and knows no `X | None`.
@@ -35,14 +34,16 @@ FALLING = ("ent_coef", "gae_lambda", "learning_rate")  # see `agents.sb3.callbac
 REPLAY_COUNTS = "gridworld.agents.sb3.replay_counts.ReplayCounts"  # a replay buffer that counts transitions
 # Arguments of SB3's classes that are a number to compute with: runs of one population may differ in them.
 _NUMBERS = {
-    *("learning_rate", "gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm", "clip_range", "tau"),
-    *("clip_range_vf", "target_kl", "exploration_fraction", "exploration_initial_eps", "name", "buffer_size"),
-    *("exploration_final_eps", "learning_starts", "target_update_interval", "reward_scale", "log_interval"),
-    "stats_window_size",
+    *("learning_rate", "gamma", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm", "clip_range", "name"),
+    *("clip_range_vf", "target_kl", "exploration_fraction", "exploration_initial_eps", "log_interval"),
+    *("exploration_final_eps", "reward_scale", "stats_window_size", "line_search_shrinking_factor"),
 }
-_COPIES, _NUMBER = 6, 4  # of each weight: its gradient, the optimiser's, a model file; bytes
+# Fields that are ours, not arguments of the algorithm's class.
+_OWN_FIELDS = {"name", "family", "algorithm", "engine", "log_interval", "reward_scale", "policy"}
+_BYTES_OF_A_WEIGHT = 24  # with its gradient, the optimiser's numbers and a model file
 _BYTES_OF_A_STEP = 64  # in a buffer, and while it is summed up
-_MOST_RETURN = 1e15  # of an episode: its square must be a number of 32 bits
+_CNN_FEATURES = 512  # of the last layer of SB3's NatureCNN
+_MOST_RETURN = 1e15  # of an episode
 _LEAST_REWARD = 1e-30  # in networks' 32 bits
 _COUNT, _SHARE, _POSITIVE = bounds(1), bounds(0, 1), bounds(0, above=True)
 
@@ -77,9 +78,13 @@ class ActorCriticPolicyKwargs(PolicyKwargs):
     share_features_extractor: Optional[bool] = None  # noqa: UP045
 
 
-def as_dict(group: Any) -> dict[str, Any]:
-    """The settings of a group, which is a dict or has a schema of its own."""
-    return group if isinstance(group, dict) else vars(group)
+def _whole_numbers(node: Any) -> Iterator[int]:
+    """Those in nested settings, in their order."""
+    if isinstance(node, dict | list | tuple):
+        for each in node.values() if isinstance(node, dict) else node:
+            yield from _whole_numbers(each)
+    elif type(node) is int and node > 0:
+        yield node
 
 
 @dataclass
@@ -98,14 +103,25 @@ class SB3Config(AgentConfig):
         return ("stable-baselines3", "sb3-contrib", "torch")
 
     @property
+    def where(self) -> str:
+        """The key of its class's arguments."""
+        return "agent"
+
+    @property
     def given(self) -> Mapping[str, Any]:
         """The arguments of its class, by their names."""
-        return vars(self)
+        return {name: value for name, value in vars(self).items() if name not in _OWN_FIELDS}
 
     @property
     def policy_kwargs_given(self) -> dict[str, Any]:
-        """Its `policy_kwargs`; {} where there are none."""
-        return as_dict(self.given.get("policy_kwargs") or {})
+        """Its `policy_kwargs` that say something."""
+        given = self.given.get("policy_kwargs") or {}
+        found = vars(given) if is_dataclass(given) else given
+        if not isinstance(found, dict):
+            raise InputError(
+                f"{self.where}.policy_kwargs={found}: must be settings, e.g. {{net_arch:[64,64]}}"
+            )
+        return {name: value for name, value in found.items() if value is not None and value != {}}
 
     @property
     def counts_transitions(self) -> bool:
@@ -121,22 +137,22 @@ class SB3Config(AgentConfig):
     @property
     def shape(self) -> str | None:
         # all that says how large arrays are, and what is done with them
+        if self.engine != "tabulated":
+            return None
         settings = asdict(self)
         settings |= settings.pop("arguments", {})
-        if settings.get("engine") != "tabulated":
-            return None
         return repr({key: value for key, value in settings.items() if key not in _NUMBERS})
 
     def memory(self, num_states: int, num_envs: int, total_timesteps: int) -> int:
-        # its networks with their copies, and what it keeps of its steps
-        nets = self.policy_kwargs_given.get("net_arch") or [64, 64]
-        widths = [num_states, *(nets if isinstance(nets, list) else max(nets.values(), key=sum)), 1]
-        weights = 2 * sum(above * below for above, below in itertools.pairwise(widths))
+        # its networks with their copies, where any whole number may be a layer's width, and its steps
+        widths = list(_whole_numbers(self.policy_kwargs_given)) or [64, 64]
+        widths += [_CNN_FEATURES] if self.policy == "CnnPolicy" else []
+        weights = 2 * (num_states + sum(widths)) * max(widths)
         rollout = self.given.get("n_steps", 2048) * num_envs
         kept = min(self.given.get("buffer_size", rollout), total_timesteps)
-        if self.counts_transitions:
-            kept = num_envs
-        return int(_COPIES * _NUMBER * weights + _BYTES_OF_A_STEP * kept)
+        return _BYTES_OF_A_WEIGHT * weights + _BYTES_OF_A_STEP * (
+            num_envs if self.counts_transitions else kept
+        )
 
     def falling(self) -> dict[str, Decay]:
         """Its settings that fall over training."""
@@ -152,6 +168,10 @@ class SB3ClassConfig(SB3Config):
     arguments: Arguments = field(  # of the class; it keeps its defaults
         default_factory=dict, metadata=affects(Effect.LEARNING, stats_window_size=Effect.LABELS)
     )
+
+    @property
+    def where(self) -> str:
+        return "agent.arguments"
 
     @property
     def given(self) -> Mapping[str, Any]:
@@ -231,23 +251,11 @@ class PPOConfig(SB3CheckedConfig):
 
 SCHEMAS: dict[str, type[AgentConfig]] = {"dqn": DQNConfig, "ppo": PPOConfig, "sb3": SB3ClassConfig}
 
-# By their names in SB3 and sb3-contrib: counts that neither DQN nor PPO has, and what these two have.
-_BOUNDS: dict[str, Bounds] = dict.fromkeys(
-    ("sub_sampling_factor", "n_critic_updates", "cg_max_steps", "n_quantiles"), Bounds(1)
-) | {
+_BOUNDS: dict[str, Bounds] = {  # of numbers by their names in SB3 and sb3-contrib
     name: metadata[BOUNDS]
     for schema in (DQNConfig, PPOConfig)
     for name, metadata in declared(schema).items()
     if BOUNDS in metadata
-}
-# Arguments of an SB3 class that are settings of the run, and where they are set.
-_ELSEWHERE = {
-    "policy": "agent.policy",
-    "env": "env",
-    "seed": "seed",
-    "device": "device",
-    "tensorboard_log": "logging.tensorboard",
-    "verbose": "logging.progress",
 }
 
 
@@ -262,105 +270,46 @@ def check(config: TrainConfig) -> None:
         if not isinstance(path, str) or "." not in path:
             raise InputError(
                 f"callbacks[{index}]={entry}: must be a mapping of _target_, the import path of a callback's "
-                "class, and its arguments, e.g. {_target_: "
-                "stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes, max_episodes: 500}"
+                "class, and its arguments"
             )
-    _check_observation(agent, config.observation)
     # An episode's return and its square must be numbers of 32 bits.
-    steps = config.env.max_episode_steps or 1
-    for name, times in (("step_reward", steps), ("goal_reward", 1), ("trap_reward", 1)):
-        most = _MOST_RETURN / times
+    for name, times in (
+        ("step_reward", config.env.max_episode_steps or 1),
+        ("goal_reward", 1),
+        ("trap_reward", 1),
+    ):
         reward = vars(config.env).get(name, 0.0)
-        Bounds(-most, most, least=_LEAST_REWARD).check(f"env.{name}", reward)
+        Bounds(-_MOST_RETURN / times, _MOST_RETURN / times, least=_LEAST_REWARD).check(f"env.{name}", reward)
     if isinstance(agent, SB3ClassConfig):
-        for name in _ELSEWHERE.keys() & agent.arguments.keys():
-            raise InputError(f"agent.arguments.{name}: is not set here but by {_ELSEWHERE[name]}=...")
-        _check_numbers("agent.arguments", agent.arguments)
-        if "train_freq" in agent.arguments:
-            _check_train_freq("agent.arguments.train_freq", agent.arguments["train_freq"], config.n_envs)
-    elif isinstance(agent, DQNConfig):
-        _check_dqn(agent, config)
-    elif isinstance(agent, PPOConfig):
-        _check_ppo(agent, config.n_envs)
-
-
-def _check_observation(agent: SB3Config, observation: ObservationConfig) -> None:
-    given = agent.given.get("policy_kwargs", {})
-    if not (isinstance(given, dict) or is_dataclass(given)):
-        raise InputError(f"{agent.key('policy_kwargs')}={given}: must be settings, e.g. {{net_arch:[64,64]}}")
-    extractor = as_dict(given).get("features_extractor_class") or observation.features
-    if observation.kind == "image" and agent.policy == "MlpPolicy" and extractor is None:
-        raise InputError(
-            "observation=image: agent.policy=MlpPolicy cannot see images without observation.features; leave "
-            "that out, or set agent.policy=CnnPolicy"
-        )
-    if observation.kind != "image" and agent.policy == "CnnPolicy":
-        raise InputError(
-            f"observation={observation.kind}: agent.policy=CnnPolicy sees images only; "
-            "set observation=image or agent.policy=MlpPolicy"
-        )
-
-
-def _check_numbers(where: str, content: dict[str, Any]) -> None:
-    """What no algorithm can use, however its class is written."""
-    for name, value in content.items():
-        key, number = f"{where}.{name}", value
-        if isinstance(value, dict):
-            _check_numbers(key, value)
-        if name in FALLING and falls(value):
-            number = parse_schedule(key, value).initial
-        if isinstance(number, int | float) and not isinstance(number, bool):
-            _BOUNDS.get(name, Bounds()).check(key, number, value)
-
-
-def _check_train_freq(key: str, value: Any, n_envs: int) -> None:
-    count, unit = value if isinstance(value, list | tuple) and len(value) == 2 else (value, "step")
-    if type(count) is not int or count < 1 or unit not in ("step", "episode"):
-        raise InputError(f"{key}={value}: must be a whole number of at least 1, or [N,step] or [N,episode]")
-    Bounds(1, MOST_STEPS).check(key, count, value)
-    if unit == "episode" and n_envs > 1:
-        raise InputError(
-            f"{key}={value}: SB3 counts episodes with one environment only; "
-            f"set n_envs=1 (it is {n_envs}) or count steps"
-        )
-
-
-def _check_dqn(agent: DQNConfig, config: TrainConfig) -> None:
-    if agent.buffer_size < agent.batch_size and not agent.counts_transitions:
-        raise InputError(
-            f"agent.buffer_size={agent.buffer_size}: smaller than a batch; "
-            f"must be at least agent.batch_size={agent.batch_size}"
-        )
-    if agent.counts_transitions and agent.n_steps > 1:
-        raise InputError(
-            f"agent.n_steps={agent.n_steps}: agent.replay_buffer_class={agent.replay_buffer_class} counts "
-            "single steps; must be 1, or set agent.replay_buffer_class=null"
-        )
-    if agent.learning_starts >= config.total_timesteps:
+        _check_arguments(agent.arguments)
+    if isinstance(agent, DQNConfig) and agent.counts_transitions and agent.n_steps > 1:
+        raise InputError(f"agent.n_steps={agent.n_steps}: ReplayCounts counts single steps; must be 1")
+    if isinstance(agent, DQNConfig) and agent.learning_starts >= config.total_timesteps:
         raise InputError(
             f"agent.learning_starts={agent.learning_starts}: nothing would be learned; "
             f"must be below total_timesteps={config.total_timesteps}"
         )
-    if isinstance(agent.policy_kwargs.net_arch, dict):
-        raise InputError(
-            "agent.policy_kwargs.net_arch: DQN has one network; must be layer widths, e.g. [64,64]"
-        )
-    _check_train_freq("agent.train_freq", agent.train_freq, config.n_envs)
+    if (frequency := agent.given.get("train_freq")) is not None:
+        _check_train_freq(agent.key("train_freq"), frequency, config.n_envs)
 
 
-def _check_ppo(agent: PPOConfig, n_envs: int) -> None:
-    rollout = agent.n_steps * n_envs
-    if rollout % agent.batch_size:
-        raise InputError(
-            f"agent.batch_size={agent.batch_size}: must divide the rollout, "
-            f"agent.n_steps={agent.n_steps} x n_envs={n_envs} = {rollout} steps"
-        )
-    if agent.normalize_advantage and agent.batch_size < 2:
-        raise InputError(
-            "agent.batch_size=1: an advantage cannot be normalised alone; "
-            "must be at least 2 and divide the rollout, or set agent.normalize_advantage=false"
-        )
-    if agent.use_sde:
-        raise InputError(
-            "agent.use_sde=true: gSDE explores continuous actions; GridWorld's are four, set it to false"
-        )
+def _check_arguments(arguments: Mapping[str, Any]) -> None:
+    for name, value in arguments.items():
+        key, number = f"agent.arguments.{name}", value
+        if name in ("policy", "env", "seed", "device"):
+            raise InputError(f"{key}: is a setting of the run; must not be among the class's arguments")
+        if name in (*FALLING, *SCHEDULES) and falls(value):
+            number = parse_schedule(key, value).initial
+        if name in _BOUNDS and value is not None:
+            if isinstance(number, bool) or not isinstance(number, int | float):
+                raise InputError(f"{key}={value}: must be a number")
+            _BOUNDS[name].check(key, number, value)
+
+
+def _check_train_freq(key: str, value: Any, n_envs: int) -> None:
+    count, unit = value if isinstance(value, list | tuple) and len(value) == 2 else (value, "step")
+    if type(count) is not int or unit not in ("step", "episode"):
+        raise InputError(f"{key}={value}: must be a whole number, or [N,step] or [N,episode]")
+    Bounds(1, MOST_STEPS).check(key, count, value)
+    if unit == "episode" and n_envs > 1:
+        raise InputError(f"{key}={value}: SB3 counts episodes of one environment only; must be with n_envs=1")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import time
 from collections.abc import Sequence
 from os import PathLike
@@ -21,14 +20,10 @@ from gridworld.storage.serialization import independent_generator
 from gridworld.world.layout import CLASSIC, Layout
 
 _MASKS = "action_masks"  # asked for by agents that respect them; here nothing is ever forbidden
-_NOT_OF_THE_WORLD = {"self", "num_envs", "layout", "autoreset_mode", "cell_size"}
 
 
 class GridWorldVecEnv(VecEnv):
-    """Observations looked up in a table, episodes reported in `infos` as SB3's Monitor would.
-
-    At an episode's end, its info has `terminal_observation`, `TimeLimit.truncated` and
-    `episode` = {"r": return, "l": length, "t": seconds since the start}; the other infos are empty.
+    """Observations looked up in a table; infos at an episode's end as of SB3's Monitor and DummyVecEnv.
 
     Args:
         envs: the batch. It must reset in the same step, which is how SB3 sees episodes.
@@ -57,9 +52,6 @@ class GridWorldVecEnv(VecEnv):
 
         SB3 seeds the action space, from which DQN explores, with the same number as the environments. These
         take an independent generator instead, so that slips and starts do not depend on the actions.
-
-        Returns:
-            (num_envs, *shape), the observations.
         """
         if self._seeds[0] is not None:
             self.envs.np_random = independent_generator(self._seeds[0])
@@ -117,7 +109,7 @@ class GridWorldVecEnv(VecEnv):
         raise InputError(f"{method_name}: the environments of a native batch have no methods of their own")
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """True for Monitor, whose `episode` entries are written here."""
+        """True for Monitor, whose `episode` entries the infos have."""
         return [wrapper_class is Monitor] * len(list(self._get_indices(indices)))
 
 
@@ -138,8 +130,7 @@ def make_vec_env(
         seed: of the starts and slips, unless the model has a seed, which SB3 gives to its environments; None:
             another one at every call.
         cell_size: pixels a cell, of the images.
-        world: other arguments of `GridWorldVectorEnv`: `slip`, `step_reward`, `goal_reward`, `trap_reward`,
-            `max_episode_steps`, `num_rows`, `num_cols`, `mdp`, `render_mode`, `stratified`.
+        world: other arguments of `GridWorldVectorEnv`: `slip`, `step_reward`, `max_episode_steps`, ...
 
     Returns:
         An SB3 `VecEnv`, which reports episodes as SB3's `Monitor` does.
@@ -151,11 +142,6 @@ def make_vec_env(
         >>> from stable_baselines3 import PPO
         >>> model = PPO("MlpPolicy", make_vec_env("four_rooms", n_envs=8, slip=0.1))
     """
-    names = inspect.signature(GridWorldVectorEnv.__init__).parameters
-    known = [name for name in names if name not in _NOT_OF_THE_WORLD]
-    for name, value in world.items():
-        if name not in known:
-            raise InputError(f"{name}={value!r}: is no argument of a world; there are {', '.join(known)}")
     envs = GridWorldVectorEnv(n_envs, layout=layout, autoreset_mode=AutoresetMode.SAME_STEP, **world)
     batch = GridWorldVecEnv(envs, make_observation(envs.mdp, observation, cell_size))
     batch.seed(seed)

@@ -7,14 +7,13 @@ Reference: R. Sutton and A. Barto, Reinforcement Learning, 2nd ed., 2018, sectio
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gridworld.agents import PolicySnapshot, TrainingContext
+from gridworld.agents import Hook, PolicySnapshot, SafePoint, TrainingContext
 from gridworld.agents.tabular.td_control import (
     TabularConfig,
     TabularControl,
@@ -141,11 +140,7 @@ class ValueIteration:
         return self.q
 
     def learn(
-        self,
-        total_timesteps: int,
-        on_step: Callable[[int], int],
-        on_safe_point: Callable[[int], None] | None = None,
-        state: State | None = None,
+        self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
     ) -> None:
         """See `gridworld.agents.Agent.learn`. Nothing is left to learn: 0 steps."""
         on_step(0)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import PolicySnapshot, TrainingContext
+from gridworld.agents import Hook, PolicySnapshot, SafePoint, TrainingContext, misfit
 from gridworld.bounds import Bounds
 from gridworld.config.fields import MOST_KEPT, Effect, Schedule, Word, affects, bounds, parse_schedule, rate
 from gridworld.config.train import AgentConfig
@@ -119,11 +119,7 @@ class TabularControl(ABC):
         return self._act(states)
 
     def learn(
-        self,
-        total_timesteps: int,
-        on_step: Callable[[int], int],
-        on_safe_point: Callable[[int], None] | None = None,
-        state: State | None = None,
+        self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
     ) -> None:
         """See `gridworld.agents.Agent.learn`."""
         envs, config = self._context.envs, self.config
@@ -190,32 +186,23 @@ class TabularControl(ABC):
             "random": generator_state(self._random),
             "q": self.q.copy(),
             "visits": self.visits.copy(),
-            "exploration_rate": self.exploration_rate,
-            "steps": self._steps,
             "actions": self._actions.copy(),
-            "log": {
-                "finished": self._episodes,
-                "last": [list(episode) for episode in self._last],
-                "next": self._next_log,
-                "error": self._error,
-                "updates": self._updates,
-            },
+            "exploration_rate": self.exploration_rate,
+            "error": self._error,
+            "counts": [self._steps, self._episodes, self._next_log, self._updates],
+            "last": [list(episode) for episode in self._last],
         }
 
     def _set_state(self, state: State) -> None:
         """Mirrors `get_state`, once learning has begun."""
         self._context.envs.set_state(state["envs"])
         set_generator_state(self._random, state["random"])
-        fill(self.q, state["q"], "q")
-        fill(self.visits, state["visits"], "visits")
-        self.exploration_rate = float(state["exploration_rate"])
-        self._steps = int(state["steps"])
-        fill(self._actions, state["actions"], "actions")
-        log = state["log"]
-        self._episodes, self._next_log = int(log["finished"]), int(log["next"])
-        self._error, self._updates = float(log["error"]), int(log["updates"])
+        for name, array in (("q", self.q), ("visits", self.visits), ("actions", self._actions)):
+            fill(array, state[name], name)
+        self.exploration_rate, self._error = float(state["exploration_rate"]), float(state["error"])
+        self._steps, self._episodes, self._next_log, self._updates = map(int, state["counts"])
         self._last.clear()
-        self._last.extend((float(total), int(length)) for total, length in log["last"])
+        self._last.extend((float(total), int(length)) for total, length in state["last"])
 
     def _act(self, states: IntArray) -> IntArray:
         return draw_actions(self.q, self.exploration_rate, states, self._random.random(len(states)))
@@ -256,10 +243,8 @@ def update(
 
         Q(s, a) ← Q(s, a) + Σ_j w_j [y_j - Q(s, a)],    w_j = α_j Π_(l > j) (1 - α_l)
 
-    with Q on the right as it was before: a sum over the batch. So α is a step per transition, whatever the
-    number of environments. Plain addition of the errors would overshoot as soon as k α > 2, and their mean
-    make k transitions count as one. Targets may be a batch old: J. N. Tsitsiklis, Asynchronous stochastic
-    approximation and Q-learning, 1994, allows for outdated values.
+    with Q on the right as it was before. Plain addition of the errors would overshoot as soon as k α > 2.
+    Targets may be a batch old: J. N. Tsitsiklis, Asynchronous stochastic approximation and Q-learning, 1994.
 
     `q` and `visits`, which counts updates, are (S * A,); `pairs`, s * A + a, and `targets` y are (n,).
     """
@@ -317,23 +302,11 @@ def read_model(path: Path, algorithm: str, like: Mapping[str, NDArray[Any]]) -> 
     """Read an algorithm's model file; its arrays must have the names, types and shapes of `like`."""
     most = _SPARE_BYTES + sum(array.nbytes for array in like.values())
     found = read_arrays(path, most, algorithm)
-    if found.keys() != {"algorithm", *like}:
-        raise InputError(
-            f"{path}: not a model of {algorithm}: must hold {sorted(['algorithm', *like])}, "
-            f"holds {sorted(found)[:8]}"
-        )
-    written_by = str(found.pop("algorithm"))
+    written_by = str(found.pop("algorithm", "something else"))
     if written_by != algorithm:
         raise InputError(f"{path}: not a model of {algorithm} but of {written_by[:50]}")
-    for name, expected in like.items():
-        array = found[name]
-        if (array.dtype, array.shape) != (expected.dtype, expected.shape):
-            raise InputError(
-                f"{path}: {name} is {array.dtype} {array.shape}; "
-                f"{algorithm} in this world has {expected.dtype} {expected.shape}"
-            )
-        if not np.isfinite(array).all():
-            raise InputError(f"{path}: {name} holds numbers that are not finite")
+    if (reason := misfit(found, like)) is not None:
+        raise InputError(f"{path}: not a model of {algorithm} for this world ({reason})")
     return found
 
 

@@ -13,7 +13,7 @@ from ray.exceptions import RayError, TaskCancelledError
 
 from gridworld.errors import InputError
 from gridworld.process.processes import LostError
-from gridworld.process.signals import keeping
+from gridworld.process.signals import handling
 from gridworld.sweep.job import StopSweep, SweepJob, Worker
 from gridworld.sweep.launchers import Group, Launch, Task, collect
 
@@ -82,7 +82,8 @@ def _connect(arguments: dict[str, Any]) -> None:
     if ray.is_initialized():
         return
     try:
-        with keeping(signal.SIGTERM):  # Ray puts its own handler in its place
+        own = signal.getsignal(signal.SIGTERM)  # in whose place Ray puts another
+        with handling({signal.SIGTERM: own}):
             ray.init(**{"logging_level": logging.WARNING, "log_to_driver": False, **arguments})
     except (ConnectionError, RuntimeError, ValueError, TypeError) as error:
         first = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")

@@ -23,7 +23,7 @@ import submitit
 from gridworld.errors import InputError
 from gridworld.process.console import printable
 from gridworld.process.processes import LostError
-from gridworld.storage.atomic_write import make_inside, remove_inside
+from gridworld.storage.atomic_write import inside, remove_path
 from gridworld.sweep.launchers import Group, Launch, Task, collect
 
 _FOLDER = ".slurm"  # in the sweep's: what submitit writes
@@ -75,7 +75,8 @@ def run(launch: Launch, settings: Mapping[str, Any]) -> None:
     """Run populations. Raises as `launchers.local.run`, and `InputError` where Slurm takes no jobs."""
     chunks = _chunks(launch.groups, settings["jobs_per_task"])
     _refuse_too_many(len(chunks), sum(map(len, launch.groups)))
-    folder = make_inside(launch.worker.sweep, _FOLDER)
+    folder = inside(launch.worker.sweep, _FOLDER)
+    folder.mkdir(exist_ok=True)
     jobs = _submit(folder, settings, launch, chunks)
     of_task = [[job for group in chunk for job in group] for chunk in chunks]
     tasks: dict[Task, Group] = dict(zip(map(SlurmTask, jobs), of_task, strict=True))
@@ -86,7 +87,7 @@ def run(launch: Launch, settings: Mapping[str, Any]) -> None:
         raise
     if all(job.paths.result_pickle.exists() for job in jobs):
         with contextlib.suppress(OSError):
-            remove_inside(folder.parent, folder.name)  # of a lost task the logs are kept
+            remove_path(folder)  # of a lost task the logs are kept
 
 
 def _chunks(groups: Sequence[Group], most: int) -> list[list[Group]]:

@@ -61,16 +61,18 @@ def load_world(path: str | PathLike[str]) -> Mdp:
 
 def mdp_from_arrays(name: str, arrays: Mapping[str, Any], where: str) -> Mdp:
     """Compile the arrays of a custom world, or what numpy makes arrays of, by name; see the module."""
-    _check_names(where, arrays)
+    for key in _NEEDED:
+        if key not in arrays:
+            raise InputError(f"{where}: has no {key}, must hold {', '.join(_NEEDED)}")
+    if unknown := [key for key in arrays if key not in _NEEDED + _OPTIONAL]:
+        raise InputError(
+            f"{where}: {str(unknown[0])[:50]} is no array of a world; beside what is needed it may hold "
+            f"{', '.join(_OPTIONAL)}"
+        )
     given = {key: _array(where, key, value) for key, value in arrays.items()}
-    shape = given["next_state"].shape
-    if len(shape) == 2:
-        for key in [key for key in _TABLES if key in given]:
-            if given[key].ndim != 2:
-                raise InputError(
-                    f"{where}: {key} has shape {given[key].shape}, next_state has {shape}; give one shape"
-                )
-            given[key] = given[key][:, :, None]
+    if given["next_state"].ndim == 2:
+        flat = [key for key in _TABLES if key in given and given[key].ndim == 2]
+        given |= {key: given[key][:, :, None] for key in flat}
         given.setdefault("probability", np.ones(given["next_state"].shape))
     elif "probability" not in given:
         raise InputError(f"{where}: has no probability; without it, next_state must be (states, actions)")
@@ -137,18 +139,6 @@ def _name_of(function: Any) -> str:
     return str(getattr(function, "__name__", type(function).__name__))
 
 
-def _check_names(where: str, arrays: Mapping[str, Any]) -> None:
-    for key in _NEEDED:
-        if key not in arrays:
-            raise InputError(f"{where}: has no {key}, must hold {', '.join(_NEEDED)}")
-    for key in arrays:
-        if key not in _NEEDED + _OPTIONAL:
-            raise InputError(
-                f"{where}: {str(key)[:50]} is no array of a world; beside what is needed it may hold "
-                f"{', '.join(_OPTIONAL)}"
-            )
-
-
 def _array(where: str, key: str, value: Any) -> NDArray[Any]:
     try:
         array = np.asarray(value)
@@ -176,10 +166,7 @@ def _whole(where: str, key: str, given: NDArray[Any] | None) -> int | None:
 
 
 def _read(path: str | PathLike[str]) -> bytes:
-    try:
-        given = fspath(path)
-    except TypeError:
-        given = None
+    given = fspath(path) if isinstance(path, str | PathLike) else None
     if not isinstance(given, str) or not given:
         raise InputError(f"env.path={path!r}: must be the path of an .npz file")
     try:
@@ -207,11 +194,8 @@ def world_bytes(mdp: Mdp) -> bytes:
     arrays = {"format": _FORMAT}
     for field in dataclasses.fields(Mdp):
         value = getattr(mdp, field.name)
-        if value is not None:
+        if value is not None and not (field.name in _LISTS and not value):
             arrays[field.name] = np.ascontiguousarray(value) if np.ndim(value) else np.array(value)
-    for key in _LISTS:
-        if not getattr(mdp, key):
-            del arrays[key]
     return npz_bytes(arrays)
 
 

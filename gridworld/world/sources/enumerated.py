@@ -3,26 +3,24 @@
     search    the states and what each action does there; everything that changes is state, the time included
     replay    the environment itself beside the table, thousands of steps: any difference is refused
 
-An enumeration may have missed randomness that no generator of the environment shows, state outside of its
-attributes or in those that it was told to leave out, or a wrapper. Whatever changes the walks of an agent
-shows up in the replay, if it is met. Attributes that a user names are no part of a state; the claim then
-rests on that, and `truth` says so.
+The replay is for what an enumeration may miss: randomness that no generator of the environment shows, state
+outside of its attributes or in those that it was told to leave out, or a wrapper. With attributes that a user
+names as no part of a state, the claim rests on that, and `truth` says so.
 
 The step limit is that of the id or the one at which the environment truncates by itself. A state at the limit
 is not terminal, since the environment does not say so, but every action stays there and pays nothing.
 
 Its own observation is a table where the observation space is a Box or Discrete, or a Dict with a Box
-`image`, of which this entry is taken, as minigrid's `ImgObsWrapper` does. Elsewhere there is none.
-
-An end is a success if it pays more than 0, and if none does, if it pays best.
+`image`, of which this entry is taken, as minigrid's `ImgObsWrapper` does. An end is a success if it pays more
+than 0, and if none does, if it pays best.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import EnumType
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -32,17 +30,16 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order
 
 from gridworld.errors import InputError
-from gridworld.process.console import ProgressLine, printable, telling_if_slow
+from gridworld.process.console import telling_if_slow
 from gridworld.process.memory_budget import check_memory
-from gridworld.world.mdp import Mdp
+from gridworld.world.mdp import BoolArray, Mdp
 from gridworld.world.outcomes import MOST_ACTIONS, MOST_STATES, Outcomes, mdp_from_outcomes
-from gridworld.world.snapshots import Snapshots, key_of, random_states
+from gridworld.world.snapshots import Snapshots, digest, random_states
 from gridworld.world.sources.gymnasium_table import make_env
 from gridworld.world.wrappers import refuse_transformed
 
 _BEYOND = 1_000  # states further than a step limit that are found too, so that a small world is whole
 _DEEPEST = 10_000  # steps from the start
-_MANY_STATES = 20_000  # from which on their number is shown
 _MOST_BYTES = 2**31  # of all copies and observations together
 _SAMPLED = 16  # of so many states the copy of one is kept, to name what keeps changing
 _FACING = ("right", "down", "left", "up")  # minigrid's directions
@@ -79,8 +76,7 @@ def enumerate_env(
             limit = None if env.spec is None else env.spec.max_episode_steps
             limit = limit if limit is not None and limit > 0 else None  # -1 is "none" to `gymnasium.make`
             search.explore(limit)
-            limits = [each for each in (search.own_limit(), limit) if each is not None]
-            mdp = search.compiled(min(limits, default=None))
+            mdp = search.compiled(limit)
             found_limit = _Replay(search, mdp).check(make_env(env_id, kwargs))
             refuse_transformed(f"env.id={env_id}", env)
         finally:
@@ -88,19 +84,37 @@ def enumerate_env(
     return replace(mdp, max_episode_steps=found_limit)
 
 
+class _Step(NamedTuple):
+    """What an action does: the number of the state that follows, and what the environment returns."""
+
+    following: int
+    reward: float
+    terminated: bool
+    truncated: bool
+
+
+@dataclass
+class _State:
+    number: int
+    key: bytes
+    seen: bytes  # a digest of its observation
+    depth: int  # steps from the start
+    copy: bytes  # b"" where it is no longer needed
+    name: str
+    observation: NDArray[Any] | None
+    is_open: bool = False  # an episode goes on in it
+    steps: Sequence[_Step] = ()  # of each action; empty where none was tried
+
+
 class _Search:
-    """The N states of an environment, the start first, found breadth first.
+    """Finds the states of an environment, the start first, breadth first.
 
     It is one object, into which copies of its states are put; `ignore` are attributes that are no state.
-
-    Attributes:
-        keys: N digests of states.
-        seen: N digests of observations.
-        next_state, reward, terminated, truncated: (N, A); a state that was not tried leads to itself.
     """
 
     def __init__(self, name: str, env: gym.Env[Any, Any], ignore: Sequence[str], most_states: int) -> None:
         self.name, self.ignore, self._most_states = name, tuple(ignore), most_states
+        self.states: list[_State] = []
         self._env = env.unwrapped
         self._snapshots = Snapshots(self._env)
         actions = env.action_space
@@ -109,19 +123,10 @@ class _Search:
                 f"its actions are {actions}, must be Discrete(n), from 0 to {MOST_ACTIONS} - 1"
             )
         self._num_actions = int(actions.n)
-        self.seen: list[bytes] = []
-        self._depth: list[int] = []
-        self._names: list[str] = []
-        self._observations: list[NDArray[Any]] = []
-        self._copies: list[bytes] = []
+        self._by_key: dict[bytes, _State] = {}
+        self._by_copy: dict[bytes, _State] = {}  # by a digest of a copy, of which a state may have several
         self._num_bytes = 0
-        self._rows: dict[int, list[tuple[int, float, bool, bool]]] = {}
-        self._state_of_copy: dict[bytes, int] = {}  # by a digest of a copy, of which a state may have several
-        self._state: dict[bytes, int] = {}  # by its key
         self._check_start()
-        observation, _ = self._env.reset(seed=0)
-        self._pending = [self._state_after(self._copy(), observation, 0)]  # still to be tried
-        self._goes_on = set(self._pending)
 
     def refusal(self, reason: str) -> InputError:
         """An error that says why there is no table of it."""
@@ -134,11 +139,12 @@ class _Search:
                 f"env.ignore={list(self.ignore)}: {self.name} has no attribute {unknown[0]}; it has "
                 f"{', '.join(vars(self._env))}"
             )
-        key, before = self._key(), self._keys()
+        key, before = self._key(), self._snapshots.keys(self.ignore)
         for seed in range(_RESETS):
             self._env.reset(seed=seed)
             if self._key() != key:
-                changed = _listed(name for name, each in self._keys().items() if each != before.get(name))
+                now = self._snapshots.keys(self.ignore)
+                changed = _listed(name for name, each in now.items() if each != before.get(name))
                 remedy = self._remedy or (
                     "; take an environment with a fixed layout and start, or name in env.ignore what nothing "
                     "depends on"
@@ -152,92 +158,74 @@ class _Search:
     def _remedy(self) -> str:
         return "; it has a transition table, so take env=gymnasium" if hasattr(self._env, "P") else ""
 
-    def _keys(self) -> dict[str, bytes]:
-        return {name: key for name, key in self._snapshots.keys().items() if name not in self.ignore}
-
     def _key(self) -> bytes:
         try:
             return self._snapshots.key(self.ignore)
         except (TypeError, ValueError, RecursionError) as error:
             raise self.refusal(f"its state cannot be compared: {error}") from error
 
-    def _copy(self) -> bytes:
-        try:
-            return self._snapshots.take()
-        except Exception as error:  # whatever the classes in it raise
-            raise self.refusal(f"its state cannot be copied: {error}") from error
-
     def explore(self, limit: int | None) -> None:
         """Find all states that can be reached, and what every action does there.
 
-        Episodes are over at the step limit. What lies beyond it is found too if it is little.
+        Episodes are over at the step limit. What lies beyond it is kept too if it is little.
         """
-        self._go_on(limit or _DEEPEST)
-        if self._pending and limit is None:
-            raise self.refusal(
-                f"after {_DEEPEST:,} steps there are still new states, since its {self._what_changes()}"
-            )
-        inside, tried = len(self._depth), set(self._rows)
-        if self._pending:
-            self._most_states = min(self._most_states, inside + _BEYOND)
+        observation, _ = self._env.reset(seed=0)
+        start = self._state_after(observation, 0)
+        start.is_open = True
+        waiting, size = [start], 0
+        beyond: int | None = None  # where in `waiting` the limit is, with `size` states before it
+        for place, state in enumerate(waiting):  # which grows
+            if beyond is None and state.depth >= (limit or _DEEPEST):
+                if limit is None:
+                    still = f"after {_DEEPEST:,} steps there are still new states"
+                    raise self.refusal(f"{still}, since its {self._what_changes()}")
+                beyond, size = place, len(self.states)
+                self._most_states = min(self._most_states, size + _BEYOND)
             try:
-                self._go_on(None)
-                inside, tried = len(self._depth), set(self._rows)
+                state.steps = self._tried(state)
             except InputError:
-                pass
-        self._make_tables(inside, tried)
+                if beyond is None:
+                    raise
+                for late in waiting[beyond:]:
+                    late.steps = ()
+                del self.states[size:]
+                break
+            for step in state.steps:
+                following = self.states[step.following]
+                if not (step.terminated or step.truncated or following.is_open):
+                    following.is_open = True
+                    waiting.append(following)
 
-    def _go_on(self, deepest: int | None) -> None:
-        """Try what is pending, and what is found by that; states at the depth `deepest` are left pending."""
-        left = []
-        line = ProgressLine(True)
-        for state in self._pending:  # which grows
-            if self._depth[state] == deepest:
-                left.append(state)
-                continue
-            self._rows[state] = self._tried(state)
-            for following, _, terminated, truncated in self._rows[state]:
-                if not (terminated or truncated or following in self._goes_on):
-                    self._goes_on.add(following)
-                    self._pending.append(following)
-            if state % _SAMPLED:
-                self._num_bytes -= len(self._copies[state])
-                self._copies[state] = b""
-            if len(self._depth) > _MANY_STATES and state % 500 == 0:
-                line.show(
-                    lambda: (
-                        f"enumerating {printable(self.name)}: {len(self._depth):,} states so far, at most "
-                        f"{self._most_states:,}; Ctrl-C ends it"
-                    )
-                )
-        line.clear()
-        self._pending = left
-
-    def _tried(self, state: int) -> list[tuple[int, float, bool, bool]]:
-        """Of each action in a copy of a state: the state that follows, the reward, terminated, truncated."""
-        row = []
-        copy, before = self._copies[state], random_states(self._env)
+    def _tried(self, state: _State) -> list[_Step]:
+        """What each action does in a copy of a state."""
+        steps, before = [], random_states(self._env)
         for action in range(self._num_actions):
-            self._snapshots.put_back(copy)
+            self._snapshots.put_back(state.copy)
             try:
                 observation, reward, terminated, truncated, _ = self._env.step(action)
             except Exception as error:  # whatever it raises
                 raise self.refusal(f"a step with action {action} fails: {error}") from error
-            following = self._state_after(self._copy(), observation, self._depth[state] + 1)
-            row.append((following, float(reward), bool(terminated), bool(truncated)))
+            following = self._state_after(observation, state.depth + 1)
+            steps.append(_Step(following.number, float(reward), bool(terminated), bool(truncated)))
         if random_states(self._env) != before:
             raise self.refusal(f"a step draws a random number, so it is not deterministic{self._remedy}")
-        return row
+        if state.number % _SAMPLED:
+            self._num_bytes -= len(state.copy)
+            state.copy = b""
+        return steps
 
-    def _state_after(self, copy: bytes, observation: Any, depth: int) -> int:
-        """The number of the state that the environment is in, of which `copy` is one."""
-        short, seen = key_of(copy), key_of(observation)
-        state = self._state_of_copy.get(short)
-        if state is None:
-            state = self._state_of_copy[short] = self._state.setdefault(self._key(), len(self._state))
-        if state == len(self._depth):
-            self._add(copy, seen, observation, depth)
-        elif self.seen[state] != seen:
+    def _state_after(self, observation: Any, depth: int) -> _State:
+        """The state that the environment is in."""
+        try:
+            copy = self._snapshots.take()
+        except Exception as error:  # whatever the classes in it raise
+            raise self.refusal(f"its state cannot be copied: {error}") from error
+        short, seen = digest(copy), digest(observation)
+        if (state := self._by_copy.get(short)) is None:
+            key = self._key()
+            state = self._by_key.get(key) or self._added(key, seen, depth, copy, observation)
+            self._by_copy[short] = state
+        if state.seen != seen:
             left_out = ", ".join(self.ignore)
             without = f" without {left_out}, which env.ignore leaves out" if left_out else ""
             raise self.refusal(
@@ -246,16 +234,12 @@ class _Search:
             )
         return state
 
-    def _add(self, copy: bytes, seen: bytes, observation: Any, depth: int) -> None:
-        self._depth.append(depth)
-        self._copies.append(copy)
-        self.seen.append(seen)
-        self._names.append(self._state_name())
-        self._num_bytes += len(copy)
-        if (array := self._as_array(observation)) is not None:
-            self._observations.append(array)
-            self._num_bytes += array.nbytes
-        size = len(self._depth)
+    def _added(self, key: bytes, seen: bytes, depth: int, copy: bytes, observation: Any) -> _State:
+        array, size = self._as_array(observation), 1 + len(self.states)
+        state = _State(size - 1, key, seen, depth, copy, self._state_name(), array)
+        self._by_key[key] = state
+        self.states.append(state)
+        self._num_bytes += len(copy) + (0 if array is None else array.nbytes)
         if size > self._most_states:
             raise self.refusal(
                 f"more than {self._most_states:,} states can be reached, and more than that cannot be solved "
@@ -266,6 +250,7 @@ class _Search:
                 f"copies of the first {size:,} states take more than {_MOST_BYTES / 2**30:.0f} GiB"
             )
         check_memory(f"env.id={self.name}", self._num_bytes)
+        return state
 
     def _state_name(self) -> str:
         """What a reader calls its state, by the attributes that minigrid's environments have; else ""."""
@@ -282,12 +267,12 @@ class _Search:
     def _as_array(self, observation: Any) -> NDArray[Any] | None:
         """An observation as an array, of a Dict the `image`; None where there is none."""
         space = self._env.observation_space
-        of_image = isinstance(space, spaces.Dict)
-        part = space.spaces.get("image") if isinstance(space, spaces.Dict) else space
-        if not isinstance(part, spaces.Box if of_image else spaces.Box | spaces.Discrete):
+        image = space.spaces.get("image") if isinstance(space, spaces.Dict) else None
+        part = image if isinstance(image, spaces.Box) else space
+        if not isinstance(part, spaces.Box | spaces.Discrete):
             return None
         try:
-            array = np.array(observation["image"]) if of_image else np.array(observation, dtype=space.dtype)
+            array = np.array(observation, part.dtype) if part is space else np.array(observation["image"])
             fits = array.shape == part.shape and array.dtype.kind in "biuf"
             if isinstance(part, spaces.Discrete):
                 fits = fits and bool(part.start <= array < part.start + part.n)
@@ -303,9 +288,9 @@ class _Search:
     def _what_changes(self) -> str:
         """What has most values, the elapsed time among them, and a remedy, as the rest of a sentence."""
         values: dict[str, set[bytes]] = {}
-        for copy in [each for each in self._copies[::_SAMPLED] if each][-1000:]:
+        for copy in [each.copy for each in self.states[::_SAMPLED] if each.copy][-1000:]:
             self._snapshots.put_back(copy)
-            for name, key in self._keys().items():
+            for name, key in self._snapshots.keys(self.ignore).items():
                 values.setdefault(name, set()).add(key)
         most = max(map(len, values.values()))
         names = _listed(name for name, found in values.items() if len(found) == most)
@@ -314,59 +299,47 @@ class _Search:
             f"leave out what nothing depends on, e.g. env.ignore=[{names.split(',')[0]}]"
         )
 
-    def _make_tables(self, size: int, tried: set[int]) -> None:
-        """Of the first `size` states, of which all that were not tried stay where they are."""
-        for each in (self._depth, self.seen, self._names, self._observations):
-            del each[size:]
-        self.keys = list(self._state)[:size]
-        self._was_tried = np.isin(np.arange(size), list(tried))
-        still = [[(state, 0.0, False, False)] * self._num_actions for state in range(size)]
-        rows = [self._rows[state] if state in tried else still[state] for state in range(size)]
-        columns = np.array(rows, dtype=np.float64).reshape(size, self._num_actions, 4)
-        self.next_state, self.reward = columns[:, :, 0].astype(np.int64), columns[:, :, 1]
-        self.terminated, self.truncated = columns[:, :, 2] > 0, columns[:, :, 3] > 0
+    def compiled(self, limit: int | None) -> Mdp:
+        """The world of what was found; a state in which nothing was tried stays as it is."""
+        stay = [[_Step(each.number, 0.0, False, False)] * self._num_actions for each in self.states]
+        rows = [each.steps or still for each, still in zip(self.states, stay, strict=True)]
+        columns = np.array(rows, dtype=np.float64)  # (N, A, 4)
+        reward, terminated, truncated = columns[:, :, 1], columns[:, :, 2] > 0, columns[:, :, 3] > 0
+        limits = [each for each in (self._own_limit(terminated, truncated), limit) if each is not None]
+        paid = terminated & (reward > 0)
+        observations = [each.observation for each in self.states if each.observation is not None]
+        check_memory(f"env.id={self.name}: its own observations", sum(each.nbytes for each in observations))
+        mdp = mdp_from_outcomes(
+            self.name,
+            Outcomes(
+                next_state=columns[:, :, 0].astype(np.int64)[:, :, None],
+                probability=np.ones((*reward.shape, 1)),
+                reward=reward[:, :, None],
+                terminated=terminated[:, :, None],
+                start=np.eye(1, len(rows))[0],
+                success=paid[:, :, None] if paid.any() else None,
+            ),
+            action_names=self._action_names(),
+            max_episode_steps=min(limits, default=None),
+            own_observation=np.stack(observations) if observations else None,
+        )
+        names = tuple(each.name for each in self.states)
+        without = f" without {', '.join(self.ignore)} as told" if self.ignore else ""
+        truth = f"enumerated, {mdp.num_states:,} states{without}"
+        return replace(mdp, state_names=names if names[0] else (), truth=truth)
 
-    def own_limit(self) -> int | None:
+    def _own_limit(self, terminated: BoolArray, truncated: BoolArray) -> int | None:
         """The time at which the environment itself truncates all episodes, if any."""
-        times = np.broadcast_to(np.array(self._depth)[:, None] + 1, self.truncated.shape)
-        truncating = self.truncated & ~self.terminated
-        if not truncating.any():
+        time = np.array([[each.depth + 1] * self._num_actions for each in self.states])
+        tried = np.array([[bool(each.steps)] for each in self.states])
+        if not (truncated & ~terminated).any():
             return None
-        limit = int(times[truncating].min())
-        if (self.truncated != (times >= limit))[self._was_tried[:, None] & ~self.terminated].any():
+        limit = int(time[truncated & ~terminated].min())
+        if ((truncated != (time >= limit)) & tried & ~terminated).any():
             raise self.refusal(
                 "it truncates some episodes earlier than others, which no step limit of the world says"
             )
         return limit
-
-    def compiled(self, limit: int | None) -> Mdp:
-        """The world of the tables."""
-        observations = None
-        if self._observations:
-            size = len(self.keys) * self._observations[0].nbytes
-            check_memory(f"env.id={self.name}: its own observations", size)
-            observations = np.stack(self._observations)
-        paid = self.terminated & (self.reward > 0)
-        mdp = mdp_from_outcomes(
-            self.name,
-            Outcomes(
-                next_state=self.next_state[:, :, None],
-                probability=np.ones((*self.next_state.shape, 1)),
-                reward=self.reward[:, :, None],
-                terminated=self.terminated[:, :, None],
-                start=np.eye(1, len(self.next_state))[0],
-                success=paid[:, :, None] if paid.any() else None,
-            ),
-            action_names=self._action_names(),
-            max_episode_steps=limit,
-            own_observation=observations,
-        )
-        without = f" without {', '.join(self.ignore)} as told" if self.ignore else ""
-        return replace(
-            mdp,
-            state_names=tuple(self._names) if self._names[0] else (),
-            truth=f"enumerated, {mdp.num_states:,} states{without}",
-        )
 
     def _action_names(self) -> list[str] | None:
         """The names in an enumeration `actions`, if the environment has one that fits."""
@@ -378,7 +351,7 @@ class _Search:
         return [names[number] for number in numbers] if names.keys() >= set(numbers) else None
 
 
-def _listed(names: Any) -> str:
+def _listed(names: Iterable[str]) -> str:
     return ", ".join(sorted(names)) or "nothing"
 
 
@@ -386,9 +359,9 @@ class _Replay:
     """Walks through an environment that must be those of its table."""
 
     def __init__(self, search: _Search, mdp: Mdp) -> None:
-        self._search, self._mdp = search, mdp
+        self._search, self._mdp, self._limit = search, mdp, mdp.max_episode_steps
         self._random = np.random.default_rng(_SEED)
-        self._limit = mdp.max_episode_steps
+        self._steps = 0  # of this episode
         origins = np.repeat(np.arange(mdp.num_states), mdp.num_actions)
         leads = np.ones(len(origins)), (origins, mdp.next_state.ravel())
         self._moves = csr_array(leads, shape=(mdp.num_states, mdp.num_states))
@@ -398,42 +371,38 @@ class _Replay:
 
         Returns the step limit: the table's, or what the walks found.
         """
-        snapshots = Snapshots(env.unwrapped)
         steps = episodes = 0
         try:
             while steps < _STEPS or episodes < _EPISODES:
                 most = _LONGEST if self._search.ignore and not episodes else _LONG
-                steps += self._episode(env, snapshots, most, episodes % 3 * _AT_RANDOM)
-                episodes += 1
+                self._walk(env, most, episodes % 3 * _AT_RANDOM)
+                steps, episodes = steps + self._steps, episodes + 1
         finally:
             env.close()
         return self._limit
 
-    def _episode(self, env: gym.Env[Any, Any], snapshots: Snapshots, most: int, at_random: int) -> int:
-        """Walk to one state after the other, with random steps between, until it ends; the steps."""
-        mdp, state, steps = self._mdp, int(self._mdp.start_states[0]), 0
+    def _walk(self, env: gym.Env[Any, Any], most: int, at_random: int) -> None:
+        """Walk to one state after the other, with random steps between, until the episode ends."""
+        mdp, state, actions = self._mdp, int(self._mdp.start_states[0]), list[int]()
         observation, _ = env.reset(seed=int(self._random.integers(2**31)))
-        self._compare_state(snapshots, steps, observation, state)
-        actions: list[int] = []
-        while steps < most and not mdp.terminal[state]:
+        self._steps, truncated = 0, False
+        self._compare_state(env, observation, state)
+        while self._steps < most and not mdp.terminal[state] and not truncated:
             if not actions:
                 actions = self._way_from(state)
                 actions += self._random.integers(mdp.num_actions, size=at_random).tolist()
             action = actions.pop(0)
             observation, reward, terminated, truncated, _ = env.step(action)
-            steps += 1
-            self._compare("reward", steps, float(reward), float(mdp.reward[state, action, 0]))
+            self._steps += 1
+            self._compare("reward", float(reward), float(mdp.reward[state, action, 0]))
             state = int(mdp.next_state[state, action, 0])
-            cut = bool(truncated and not terminated)
-            if cut and self._limit is None and self._search.ignore:
-                self._limit = steps
-            over = bool(mdp.terminal[state])
-            expected = [over, steps >= (self._limit or np.inf) and not over]
-            self._compare("end (terminated, truncated)", steps, [bool(terminated), cut], expected)
-            self._compare_state(snapshots, steps, observation, state)
-            if cut:
-                break
-        return steps
+            truncated = bool(truncated and not terminated)
+            if truncated and self._limit is None and self._search.ignore:
+                self._limit = self._steps
+            is_end = bool(mdp.terminal[state])
+            is_cut = not is_end and self._limit is not None and self._steps >= self._limit
+            self._compare("end (terminated, truncated)", [bool(terminated), truncated], [is_end, is_cut])
+            self._compare_state(env, observation, state)
 
     def _way_from(self, state: int) -> list[int]:
         """The actions by which to come to a state drawn at random, first to one where it goes on."""
@@ -448,17 +417,17 @@ class _Replay:
             target = origin
         return way[::-1] or [int(self._random.integers(mdp.num_actions))]
 
-    def _compare_state(self, snapshots: Snapshots, steps: int, observation: Any, state: int) -> None:
-        number = self._mdp.number[state]
-        found = snapshots.key(self._search.ignore), key_of(observation)
-        self._compare("state", steps, found, (self._search.keys[number], self._search.seen[number]))
+    def _compare_state(self, env: gym.Env[Any, Any], observation: Any, state: int) -> None:
+        expected = self._search.states[self._mdp.number[state]]
+        found = Snapshots(env.unwrapped).key(self._search.ignore), digest(observation)
+        self._compare("state", found, (expected.key, expected.seen))
 
-    def _compare(self, what: str, steps: int, found: Any, expected: Any) -> None:
+    def _compare(self, what: str, found: Any, expected: Any) -> None:
         if found != expected:
             shown = f" ({found}, enumerated as {expected})" if what != "state" else ""
             left_out = ", ".join(self._search.ignore)
             depends = f"depends on {left_out}, which env.ignore leaves out, " if left_out else ""
             raise self._search.refusal(
-                f"after {steps} steps of an episode its {what} is not the enumerated one{shown}, so it "
+                f"after {self._steps} steps of an episode its {what} is not the enumerated one{shown}, so it "
                 f"{depends}is random, has state outside of its attributes, or a wrapper that changes it"
             )

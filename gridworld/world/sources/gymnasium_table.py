@@ -14,15 +14,15 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError, in_short, install_command
-from gridworld.world.mdp import IntArray, Mdp, grid_places
+from gridworld.world.mdp import Mdp, grid_places
 from gridworld.world.outcomes import Outcomes, check_size, mdp_from_outcomes
 from gridworld.world.sources.table_walk import walk
 from gridworld.world.wrappers import copied, refuse_transformed, step_limit
@@ -36,32 +36,30 @@ def compile_gymnasium(env_id: str, kwargs: Mapping[str, Any] | None = None) -> M
 
     `kwargs` are arguments of `gymnasium.make`. The world has the id as its name, and its step limit.
     """
-    arguments = dict(kwargs or {})
-    env = make_env(env_id, arguments)
+    env, again = make_env(env_id, kwargs), make_env(env_id, kwargs)
     refuse_transformed(env_id, env)
-    mdp, table = _compiled(env.unwrapped, env_id, step_limit(env))
-    # Only now: a large environment takes long, and may be refused. Its own step limit may be set otherwise.
-    again = make_env(env_id, {**arguments, "max_episode_steps": -1})
-    if _differ(table, _table(mdp.name, again.unwrapped)):
+    if _differ(_table(env_id, env.unwrapped), _table(env_id, again.unwrapped)):
         raise InputError(
             f"env.id={env_id}: has another table each time that it is made, so no exact truth is known; "
             "give what it draws as env.kwargs, e.g. desc of a FrozenLake"
         )
-    truth = _check_steps(mdp, table, again)
+    mdp = compile_table(again.unwrapped, step_limit(env), env_id)
     env.close()
     again.close()
-    return replace(mdp, truth=truth)
+    return mdp
 
 
-def compile_table(real: gym.Env[Any, Any], limit: int | None = None) -> Mdp:
+def compile_table(real: gym.Env[Any, Any], limit: int | None = None, name: str | None = None) -> Mdp:
     """Compile the table of an environment without wrappers, which is left as it is; a copy is stepped.
 
-    `limit` is the step limit of its wrappers. The world has the environment's id, or else its class, as name.
+    `limit` is the step limit of its wrappers. Without a name the world is called by its id or class.
     """
-    mdp, table = _compiled(real, real.spec.id if real.spec is not None else type(real).__name__, limit)
+    called = name or (real.spec.id if real.spec is not None else type(real).__name__)
+    mdp, table = _compiled(real, called, limit)
     if own := {"step", "reset"} & vars(real).keys():
-        raise InputError(f"{mdp.name}: its {own.pop()}() was replaced, so nothing exact is known of it")
-    key = (type(real), mdp.text()) if type(real).__module__.startswith("gymnasium.envs.") else None
+        raise InputError(f"{called}: its {own.pop()}() was replaced, so nothing exact is known of it")
+    is_gymnasiums = type(real).__module__.startswith("gymnasium.envs.")
+    key = (type(real), mdp.text()) if is_gymnasiums and name is None else None
     truth = _WALKED.get(key) or _check_steps(mdp, table, copied(real))
     if key is not None:
         _WALKED[key] = truth
@@ -75,19 +73,18 @@ def has_table(env: Any) -> bool:
 
 def _compiled(real: gym.Env[Any, Any], name: str, limit: int | None) -> tuple[Mdp, Outcomes]:
     table = _table(name, real)
-    known = known_env(real)
-    num_states, num_actions = table.next_state.shape[:2]
-    names = known.action_names if known is not None and len(known.action_names) == num_actions else None
-    places = known.places(real) if known is not None else None
+    known = known_env(real) or _KnownEnv((), lambda env: np.zeros((0, 3), np.int64))
+    (num_states, num_actions), places = table.next_state.shape[:2], known.places(real)
     mdp = mdp_from_outcomes(
         name,
         table,
-        action_names=names,
-        places=places if places is not None and len(places) == num_states else None,
-        panel_names=known.panel_names if known is not None else (),
+        action_names=known.action_names if len(known.action_names) == num_actions else None,
+        places=places if len(places) == num_states else None,
+        panel_names=known.panel_names,
         max_episode_steps=limit,
     )
-    if known and getattr(real, "fickle_passenger", False) and getattr(real, "fickle_probability", 1) > 0:
+    is_fickle = known.panel_names and getattr(real, "fickle_passenger", False)
+    if is_fickle and getattr(real, "fickle_probability", 1) > 0:
         raise InputError(
             f"{name}: fickle_passenger=True changes the destination in a way that its table P does not have, "
             "so no exact truth is known; leave it out"
@@ -109,11 +106,7 @@ def _table(name: str, real: Any) -> Outcomes:
             raise InputError(f"{name}: its {what} space is {space}, must be Discrete(n) that starts at 0")
         sizes.append(int(space.n))
     states, actions = sizes
-    check_size(name, states, actions, 1)
-    rows, counts = _rows(name, real.P, states, actions)
-    longest = int(counts.max())
-    check_size(name, states, actions, longest)
-
+    rows = _rows(name, real.P, states, actions)
     try:
         start = np.array(getattr(real, "initial_state_distrib", None), dtype=np.float64)
     except (TypeError, ValueError):
@@ -122,33 +115,33 @@ def _table(name: str, real: Any) -> Outcomes:
         raise InputError(
             f"{name}: initial_state_distrib must be the {states} probabilities of starting in each state"
         )
-
-    ends = np.cumsum(counts)
-    pair = np.repeat(np.arange(states * actions), counts)
-    column = np.arange(len(rows)) - np.repeat(ends - counts, counts)
-    # What fills up a short row leads where its first outcome leads, so that it adds no predecessor.
-    padded = np.repeat(rows[ends - counts][:, None], longest, axis=1)
-    padded[:, :, 0] = 0.0
-    padded[pair, column] = rows
-    padded = padded.reshape(states, actions, longest, 4)
     return Outcomes(
-        next_state=padded[..., 1].astype(np.int64),
-        probability=padded[..., 0].copy(),
-        reward=padded[..., 2].copy(),
-        terminated=padded[..., 3] == 1,
+        next_state=rows[..., 1].astype(np.int64),
+        probability=rows[..., 0].copy(),
+        reward=rows[..., 2].copy(),
+        terminated=rows[..., 3] == 1,
         start=start,
     )
 
 
-def _rows(name: str, table: Any, states: int, actions: int) -> tuple[NDArray[np.float64], IntArray]:
-    """All outcomes (M, 4) in the order of states and actions, and how many each of these has (S * A,)."""
+def _rows(name: str, table: Any, states: int, actions: int) -> NDArray[np.float64]:
+    """All outcomes (N, A, K, 4); what fills up a short row leads to where its first outcome leads."""
+    check_size(name, states, actions, 1)
+    errors = (KeyError, IndexError, TypeError, ValueError, OverflowError)
     try:
-        of_pairs = [table[state][action] for state in range(states) for action in range(actions)]
-        rows = np.array([outcome for row in of_pairs for outcome in row], dtype=np.float64)
-        counts = np.array([len(row) for row in of_pairs])
-        if (counts > 0).all() and _are_outcomes(rows, states):
-            return rows, counts
-    except (KeyError, IndexError, TypeError, ValueError, OverflowError):
+        rows = [table[state][action] for state in range(states) for action in range(actions)]
+        longest = max(map(len, rows))
+    except errors:
+        rows, longest = [], 1
+    check_size(name, states, actions, longest)
+    try:
+        filled = [[*row, *[(0.0, *row[0][1:])] * (longest - len(row))] for row in rows]
+        found = np.array(filled, dtype=np.float64).reshape(states, actions, longest, 4)
+        following = found[..., 1]
+        fits = (following >= 0) & (following < states) & (np.floor(following) == following)
+        if (fits & np.isin(found[..., 3], (0, 1))).all():
+            return found
+    except errors:
         pass
     raise InputError(
         f"{name}: its table P must have for each of {states} states and {actions} actions a list of "
@@ -156,24 +149,17 @@ def _rows(name: str, table: Any, states: int, actions: int) -> tuple[NDArray[np.
     )
 
 
-def _are_outcomes(rows: NDArray[np.float64], states: int) -> bool:
-    """Whether all rows (M, 4) lead to states and end, or not."""
-    if rows.ndim != 2 or rows.shape[1] != 4:
-        return False
-    are_states = (rows[:, 1] >= 0) & (rows[:, 1] < states) & (np.floor(rows[:, 1]) == rows[:, 1])
-    return bool(are_states.all() and np.isin(rows[:, 3], (0, 1)).all())
-
-
 def _differ(table: Outcomes, other: Outcomes) -> bool:
     names = ("next_state", "probability", "reward", "terminated", "start")
-    return not all(np.array_equal(getattr(table, name), getattr(other, name)) for name in names)
+    tables = ((getattr(table, name), getattr(other, name)) for name in names)
+    return not all(np.array_equal(one, two, equal_nan=True) for one, two in tables)
 
 
 def _check_steps(mdp: Mdp, table: Outcomes, env: gym.Env[Any, Any]) -> str:
     """What `walk` says."""
     real, mistake, found = env.unwrapped, None, ""
     try:
-        found = walk(mdp, table, env, known_env(real) is not None)
+        found = walk(mdp, table, env)
     except InputError as error:
         mistake = error
     except Exception as error:  # an environment of the user's own may raise anything
@@ -188,8 +174,7 @@ def _check_steps(mdp: Mdp, table: Outcomes, env: gym.Env[Any, Any]) -> str:
     return found
 
 
-@dataclass(frozen=True)
-class _KnownEnv:
+class _KnownEnv(NamedTuple):
     """What is known of a class of environments beside its table; see `Mdp`."""
 
     action_names: tuple[str, ...]
@@ -222,9 +207,6 @@ def known_env(real: Any) -> _KnownEnv | None:
     return None
 
 
-_PACKAGES = {"MiniGrid-": "minigrid", "BabyAI-": "minigrid"}  # which register ids that begin so
-
-
 def make_env(
     env_id: str, kwargs: Mapping[str, Any] | None = None, render_mode: str | None = None
 ) -> gym.Env[Any, Any]:
@@ -236,14 +218,20 @@ def make_env(
         )
     module, _, registered = str(env_id).rpartition(":")
     if module:
-        _import_module(env_id, module)
-    for beginning, package in _PACKAGES.items():
-        if registered.startswith(beginning):
-            try:
-                importlib.import_module(package)
-            except ImportError:
-                needed = f"needs the package {package}; install it with {install_command(package)}"
-                raise InputError(f"env.id={env_id}: {needed}") from None
+        try:
+            importlib.import_module(module)
+        except (Exception, SystemExit) as error:  # it may raise anything
+            reason = f"the module {module} cannot be imported ({short_reason(error)})"
+            missing = error.name if isinstance(error, ModuleNotFoundError) else None
+            if missing and f"{module}.".startswith(f"{missing}."):
+                reason = f"there is no module {missing}; install it, or name its folder in PYTHONPATH"
+            raise InputError(f"env.id={str(env_id)[:80]}: {reason}") from None
+    if registered.startswith(("MiniGrid-", "BabyAI-")):
+        try:
+            importlib.import_module("minigrid")  # registers them
+        except ImportError:
+            needed = f"needs the package minigrid; install it with {install_command('minigrid')}"
+            raise InputError(f"env.id={env_id}: {needed}") from None
     try:
         gym.spec(registered)
     except Exception as error:  # an id may name a module, which may raise anything
@@ -263,15 +251,3 @@ def make_env(
 def short_reason(error: BaseException) -> str:
     """What an exception says, in short."""
     return in_short(error).split(" was raised from the environment creator")[0].rstrip(" .")
-
-
-def _import_module(env_id: str, module: str) -> None:
-    """Import what an id "module:id" names, which registers the environment."""
-    try:
-        importlib.import_module(module)
-    except (Exception, SystemExit) as error:  # it may raise anything
-        reason = f"the module {module} cannot be imported ({short_reason(error)})"
-        missing = error.name if isinstance(error, ModuleNotFoundError) else None
-        if missing and f"{module}.".startswith(f"{missing}."):
-            reason = f"there is no module {missing}; install it, or name its folder in PYTHONPATH"
-        raise InputError(f"env.id={str(env_id)[:80]}: {reason}") from None

@@ -9,7 +9,6 @@ Reference: J. Ville, Étude critique de la notion de collectif, 1939.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +18,6 @@ from scipy.special import gammaln, logsumexp
 from gridworld.errors import InputError
 from gridworld.world.mdp import FloatArray, IntArray, Mdp
 from gridworld.world.outcomes import Outcomes
-from gridworld.world.snapshots import Snapshots
 from gridworld.world.solver import backup
 
 if TYPE_CHECKING:
@@ -27,6 +25,7 @@ if TYPE_CHECKING:
 
 SEED = 20_240_501  # of the walk
 _FALSE_ALARM = 1e-9  # probability that a true table is refused
+_JUDGED = 5  # kinds of counts
 _CONCENTRATIONS = np.array([1.0, 10.0, 100.0, 1000.0])  # of the Dirichlet priors around a row
 _VAGUE = 0.5  # what cannot be told nearer than that is not told
 _GAMMA = 0.99
@@ -42,15 +41,11 @@ _SEEDED = 11  # so often with a seed
 _BLOCKS = 8  # of starts that follow each other
 _MOST_KINDS = 10_000  # numbers in different rows, up to which what came before an outcome is counted too
 _PROBES = 12
-_WATCHED = 5  # episodes after which it is seen which attributes change
 
 
-def walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any], is_known: bool) -> str:
-    """Compare steps of the real environment with its table; says what was compared, and how exactly.
-
-    `is_known`: whether it is one of Gymnasium's own classes.
-    """
-    walker = _Walker(mdp, table, real, is_known)
+def walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> str:
+    """Compare steps of the real environment with its table; says what was compared, and how exactly."""
+    walker = _Walker(mdp, table, real)
     walker.along_policies(_WALK)
     while walker.episodes < _RESETS:
         walker.reset()
@@ -64,7 +59,7 @@ def walk(mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any], is_known: bool) -> 
 class _Walker:
     """Steps an environment, and counts what its R = N * A rows did."""
 
-    def __init__(self, mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any], is_known: bool) -> None:
+    def __init__(self, mdp: Mdp, table: Outcomes, real: gym.Env[Any, Any]) -> None:
         self.mdp, self.table, self.real = mdp, table, real
         self.episodes = 0
         self._rng = np.random.default_rng(SEED)
@@ -80,13 +75,10 @@ class _Walker:
         self._open = np.flatnonzero(np.repeat(mdp.acting[: len(table.start)], mdp.num_actions))
         self._met: list[tuple[int, int, float, bool]] = []  # row, next state, reward, terminated
         self._state = self._elapsed = 0
-        self._shows_state = True  # as the attribute `s`, so far
-        self._is_known = is_known
-        self._changed: set[str] = set()
 
     def reset(self) -> None:
         seed = None if self.episodes % _SEEDED else SEED + self.episodes  # never one twice
-        self._state = _number(self.mdp, self.real.reset(seed=seed)[0])
+        self._state = self._shown(self.real.reset(seed=seed)[0])
         self._elapsed = 0
         self.episodes += 1
         self._started[self._state] += 1
@@ -100,7 +92,7 @@ class _Walker:
         """Take an action; whether the episode is over."""
         observation, reward, terminated, truncated, _ = self.real.step(action)
         row = self._state * self.mdp.num_actions + action
-        self._state = _number(self.mdp, observation)
+        self._state = self._shown(observation)
         self._met.append((row, self._state, float(reward), bool(terminated)))
         self._elapsed += 1
         if truncated and self._elapsed < (self.mdp.max_episode_steps or np.inf):
@@ -111,28 +103,35 @@ class _Walker:
             )
         return bool(terminated or truncated) or self._elapsed >= self._limit
 
+    def _shown(self, observation: Any) -> int:
+        """The number of the state that is shown."""
+        try:
+            number = int(observation)
+            if number == observation and 0 <= number < self.mdp.num_numbers:
+                return number
+        except (TypeError, ValueError, OverflowError):
+            pass
+        raise InputError(
+            f"{self.mdp.name}: shows {str(observation)[:80]!r}, must show the number of a state of its "
+            f"table, 0 to {self.mdp.num_numbers - 1}"
+        )
+
     def along_policies(self, most: int) -> None:
         """Take steps that are good, that live long, that lead to what is new, and random ones."""
-        mdp, inner, steps = self.mdp, self.real.unwrapped, 0
-        reward = backup(mdp, np.zeros(mdp.num_states), 1.0)
-        good, living = self._policy(reward), self._policy(~mdp.absorbing[:, None] * np.ones(mdp.num_actions))
+        mdp, steps = self.mdp, 0
+        good = self._policy(backup(mdp, np.zeros(mdp.num_states), 1.0))
+        living = self._policy(~mdp.absorbing[:, None] * np.ones(mdp.num_actions))
         new, more = good, _WORK // (_SWEEPS * mdp.probability.size)
-        snapshots = Snapshots(inner)
         for episode in range(most):
             if episode % 5 == 3 and more > 0:
                 new, more = self._policy(self._newness()), more - 1
             policy, share = [(good, 0.0), (good, 0.1), (living, 0.02), (new, 0.05), (good, 1.0)][episode % 5]
             self.reset()
-            watched = episode < _WATCHED and not self._is_known
-            before = _keys(snapshots) if watched else {}
             over = False
             while not over:
-                self._shows_state = self._shows_state and getattr(inner, "s", None) == self._state
                 random = self._rng.random() < share
                 over = self._step(int(self._rng.integers(mdp.num_actions) if random else policy[self._state]))
                 steps += 1
-            if watched:
-                self._changed |= {name for name, key in _keys(snapshots).items() if key != before.get(name)}
             if steps >= most:
                 break
         self.check()
@@ -155,22 +154,18 @@ class _Walker:
         return np.where(self.mdp.absorbing[:, None], 0.0, found)
 
     def is_settable(self) -> bool:
-        """Whether the attribute `s` is its state: it is what is shown, and setting it leads there.
-
-        Nothing else may change, but in Gymnasium's own classes; and steps that only the state set can make,
-        not the one it is in, must be made.
-        """
-        if not (self._shows_state and len(self._open) and (self._is_known or self._changed <= {"s"})):
-            return False
+        """Whether its attribute `s` is what it shows, and it makes steps that only the state set can make."""
         proven = 0
-        for row in self._rng.choice(self._open, size=20 * _PROBES).tolist():
+        for row in self._rng.choice(self._open, size=20 * _PROBES if self._open.size else 0).tolist():
             self.reset()
+            if getattr(self.real.unwrapped, "s", None) != self._state:
+                return False
             state, action = divmod(row, self.mdp.num_actions)
             if self._possible(state, action) & self._possible(self._state, action):
                 continue
             self._set(state)
             observation, reward, terminated, *_ = self.real.step(action)
-            found = _number(self.mdp, observation), float(reward), bool(terminated)
+            found = self._shown(observation), float(reward), bool(terminated)
             if found not in self._possible(state, action):
                 return False
             proven += 1
@@ -211,39 +206,38 @@ class _Walker:
         if self._met:
             self._count()
         seen = np.flatnonzero(self._counts.any(axis=1))
+        firsts = np.unique(self._kind, return_index=True)[1]
+        kinds = [f"all rows like {self._name(row)}" for row in firsts]
         contexts, columns = self._after.shape[1:]
         start = self.table.start
         block = (_BLOCKS * (np.cumsum(start) - start / 2)).astype(np.int64).clip(0, _BLOCKS - 1)
         in_blocks = [np.bincount(block, each, _BLOCKS).astype(np.float64) for each in (self._started, start)]
-        each_context = np.repeat(self._chances, contexts, axis=0)
+        of_contexts = [f"{kind} after outcome {last - 1}" for kind in kinds for last in range(contexts)]
+        self._judge(["the start in state"], self._started[None], start[None])
+        self._judge([f"of {_BLOCKS} parts of the starts, part"], in_blocks[0][None], in_blocks[1][None])
+        self._judge([f"{self._name(row)}, outcome" for row in seen], self._counts[seen], self._chance[seen])
+        self._judge([f"{kind}, outcome" for kind in kinds], self._after.sum(axis=1), self._chances)
+        self._judge(
+            [f"{each}, outcome" for each in of_contexts],
+            self._after.reshape(-1, columns),
+            np.repeat(self._chances, contexts, axis=0),
+        )
 
-        def like(kind: int) -> str:
-            return f"all rows like {self._name(np.flatnonzero(self._kind == kind)[0])}"
+    def _judge(self, names: list[str], counts: NDArray[Any], chance: FloatArray) -> None:
+        """Refuse counts (n, K) that cannot come from these probabilities (n, K)."""
+        evidence = _evidence(counts, chance)
+        if evidence.max(initial=0) <= np.log(_JUDGED * max(1, len(evidence)) / _FALSE_ALARM):
+            return
+        row = int(evidence.argmax())
+        size = int(counts[row].sum())
+        which = int(np.abs(counts[row] - size * chance[row]).argmax())
+        raise InputError(
+            f"{self.mdp.name}: leaves its own table: {names[row]} {which}, came {counts[row, which]:,.0f} "
+            f"times of {size:,}, its probability there is {chance[row, which]:.3g}, so no exact truth is "
+            "known; must start by initial_state_distrib and step by P alone"
+        )
 
-        def in_context(row: int) -> str:
-            return f"{like(row // contexts)} after outcome {row % contexts - 1}, outcome"
-
-        judged: list[tuple[NDArray[Any], FloatArray, Callable[[int], str]]] = [
-            (self._started[None], start[None], lambda row: "the start in state"),
-            (in_blocks[0][None], in_blocks[1][None], lambda row: f"of {_BLOCKS} parts of the starts, part"),
-            (self._counts[seen], self._chance[seen], lambda row: f"{self._name(seen[row])}, outcome"),
-            (self._after.sum(axis=1), self._chances, lambda row: f"{like(row)}, outcome"),
-            (self._after.reshape(-1, columns), each_context, in_context),
-        ]
-        for counts, chance, name in judged:
-            evidence = _evidence(counts, chance)
-            if evidence.max(initial=0) <= np.log(len(judged) * max(1, len(evidence)) / _FALSE_ALARM):
-                continue
-            row = int(evidence.argmax())
-            size = int(counts[row].sum())
-            which = int(np.abs(counts[row] - size * chance[row]).argmax())
-            raise InputError(
-                f"{self.mdp.name}: leaves its own table: {name(row)} {which}, came {counts[row, which]:,} "
-                f"times of {size:,}, its probability there is {chance[row, which]:.3g}, so no exact truth is "
-                "known; must start by initial_state_distrib and step by P alone"
-            )
-
-    def _name(self, row: int) -> str:
+    def _name(self, row: Any) -> str:
         state, action = divmod(int(row), self.mdp.num_actions)
         return f"P[{state}][{action}]"
 
@@ -293,15 +287,12 @@ def _merged(table: Outcomes) -> tuple[IntArray, FloatArray]:
     count = table.probability.shape[-1]
     parts = (table.next_state, table.reward, table.terminated, table.probability > 0)
     flat = [each.reshape(-1, count) for each in parts]
-    rows = np.repeat(np.arange(len(flat[0])), count)
-    column = np.tile(np.arange(count), len(flat[0]))
-    order = np.lexsort((column, *(each.ravel() for each in flat), rows))
-    changes = np.any([np.diff(each.ravel()[order]) != 0 for each in (*flat, rows)], axis=0)
-    first = order[np.concatenate([[0], 1 + np.flatnonzero(changes)])]
-    leader = np.empty(len(order), dtype=np.int64)
-    leader[order] = first[np.concatenate([[0], np.cumsum(changes)])]
-    chance = np.bincount(leader, weights=table.probability.ravel(), minlength=len(order))
-    return column[leader].reshape(-1, count), np.asarray(chance.reshape(-1, count))
+    column = np.zeros(flat[0].shape, dtype=np.int64)
+    for k in reversed(range(count)):
+        column[np.all([each == each[:, k : k + 1] for each in flat], axis=0)] = k
+    first = (np.arange(len(column))[:, None] * count + column).ravel()
+    chance = np.bincount(first, weights=table.probability.ravel(), minlength=first.size)
+    return column, np.asarray(chance.reshape(-1, count))
 
 
 def _evidence(counts: NDArray[Any], chance: FloatArray) -> FloatArray:
@@ -322,23 +313,3 @@ def _resolved(size: IntArray, chance: FloatArray) -> FloatArray:
     """(R,), by how much a probability must be off in a row to be found out nearly always."""
     spread = (chance * (1 - chance)).max(axis=1)
     return np.asarray(np.minimum(1.0, 6 * np.sqrt(spread / size) + 4 / size))
-
-
-def _keys(snapshots: Snapshots) -> dict[str, bytes]:
-    try:
-        return snapshots.keys()
-    except (TypeError, ValueError, RecursionError) as error:  # what cannot be compared may have changed
-        return {"": repr((error, np.random.default_rng().random())).encode()}
-
-
-def _number(mdp: Mdp, observation: Any) -> int:
-    try:
-        number = int(observation)
-        if number == observation and 0 <= number < mdp.num_numbers:
-            return number
-    except (TypeError, ValueError, OverflowError):
-        pass
-    raise InputError(
-        f"{mdp.name}: shows {str(observation)[:80]!r}, must show the number of a state of its table, 0 to "
-        f"{mdp.num_numbers - 1}"
-    )

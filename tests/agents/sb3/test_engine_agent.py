@@ -1,32 +1,32 @@
-"""Which settings the engine learns with; what it leaves is what Stable-Baselines3's own loop leaves."""
+"""Which settings the engine learns with, SB3's own model that it leaves, and settings that fall."""
 
 import contextlib
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from helpers.own_class import importable
 from helpers.support import SHORT, configure
 from sb3_contrib import QRDQN, TRPO
 from stable_baselines3 import A2C, DQN, PPO
 
+import gridworld
 from gridworld.agents import Agent, TrainingContext, family
 from gridworld.agents.sb3 import check
 from gridworld.agents.sb3.agent import ACTIVATIONS, EngineAgent, SB3Agent
-from gridworld.agents.sb3.factory import UnfitError
+from gridworld.agents.sb3.callbacks import FallingSetting
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.training.setup import make_context
 
 
-def built(*words: str, **changes: Any) -> Agent:
+def built(*words: str, log: Any = None) -> Agent:
     config = configure(*words)
     mdp = config.env.compile()
     observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
-    context: TrainingContext = make_context(config, mdp, observation)
+    context: TrainingContext = make_context(config, mdp, observation, log)
     return family(config.agent).build(config.agent, context)
 
 
@@ -53,102 +53,53 @@ def test_the_model_is_sb3s_own_and_learns_on(agent: str, tmp_path: Path) -> None
         assert each.num_timesteps >= before + 100
 
 
-OWN_MODULES = """
-import torch
-from stable_baselines3.dqn.policies import DQNPolicy
-from torch import nn
-
-class Calm(nn.Module):  # draws at random, in either mode
-    def forward(self, x):
-        return x.relu() + 0.1 * torch.randn_like(x)
-
-class Centred(nn.Module):  # looks at the other rows
-    def forward(self, x):
-        return x - x.mean(dim=0)
-
-class ReLU(nn.ReLU):  # is not what it is called
-    def forward(self, x):
-        return super().forward(x) + self.training
-
-class Policy(DQNPolicy):
-    pass
-
-class Adam(torch.optim.Adam):
-    pass
-"""
+UNKNOWN = [
+    "agent.n_steps=3",
+    *(f"agent.policy_kwargs.activation_fn=torch.nn.{name}" for name in ("RReLU", "Dropout", "Softmax")),
+    *(f"agent.policy_kwargs.activation_fn=own_modules.{name}" for name in ("Drawn", "Among", "ReLU")),
+    "agent.policy=own_modules.Policy",
+    "agent.policy_kwargs.optimizer_class=own_modules.Adam",
+    "agent.policy_kwargs.optimizer_class=torch.optim.Rprop",
+    "agent.replay_buffer_class=stable_baselines3.common.buffers.ReplayBuffer",
+]
 
 
-@pytest.fixture
-def own_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Makes `own_modules` importable."""
-    (tmp_path / "modules").mkdir()
-    (tmp_path / "modules" / "own_modules.py").write_text(OWN_MODULES)
-    monkeypatch.syspath_prepend(str(tmp_path / "modules"))
-    yield
-    sys.modules.pop("own_modules", None)
-
-
-REASONS = {
-    "agent.n_steps=3": "agent.n_steps above 1",
-    **{
-        f"agent.policy_kwargs.activation_fn={name}": f"agent.policy_kwargs.activation_fn={name} is not known"
-        for name in (
-            *("torch.nn.RReLU", "torch.nn.Dropout", "torch.nn.Softmax", "own_modules.Calm"),
-            *("own_modules.Centred", "own_modules.ReLU"),
-        )
-    },
-    "agent.policy=own_modules.Policy": "agent.policy=own_modules.Policy may compute more",
-    "agent.policy_kwargs.optimizer_class=own_modules.Adam": "agent.policy_kwargs.optimizer_class=own_mo",
-    "agent.policy_kwargs.optimizer_class=torch.optim.Rprop": "agent.policy_kwargs.optimizer_class=torch",
-    "agent.replay_buffer_class=stable_baselines3.common.buffers.ReplayBuffer": (
-        "agent.replay_buffer_class is not the plain replay buffer"
-    ),
-}
-
-
-@pytest.mark.parametrize(("setting", "reason"), REASONS.items())
-@pytest.mark.usefixtures("own_modules")
-def test_what_it_does_not_cover_falls_back_and_says_why(
-    setting: str, reason: str, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("setting", UNKNOWN)
+def test_what_it_does_not_know_learns_in_sb3s_loop_and_a_line_says_why(
+    setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with contextlib.suppress(UnfitError):  # some cannot learn there either
+    importable(tmp_path, monkeypatch)
+    with contextlib.suppress(InputError):  # some cannot learn there either
         agent = built("agent=dqn", setting)
         assert type(agent) is SB3Agent
         assert type(agent.model) is DQN
-    assert f"engine: stock, since {reason}" in capsys.readouterr().err
+    assert f"engine: stock, since the tabulated one does not cover {setting}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    "settings",
+    "words",
     [
-        [],
-        ["agent.policy_kwargs.activation_fn=torch.nn.modules.activation.GELU"],
-        ["agent.policy_kwargs.optimizer_class=torch.optim.adamw.AdamW", "agent.policy_kwargs.net_arch=[]"],
-        ["agent.policy=stable_baselines3.POLICY"],
+        ["agent=ppo"],
+        ["agent=dqn", "agent.policy_kwargs.activation_fn=torch.nn.modules.activation.GELU"],
+        ["agent=ppo", "agent.policy_kwargs.optimizer_class=torch.optim.adamw.AdamW"],
+        ["agent=dqn", "agent.policy=stable_baselines3.dqn.policies.DQNPolicy"],
     ],
 )
-@pytest.mark.parametrize(
-    ("agent", "policy"), [("dqn", "dqn.policies.DQNPolicy"), ("ppo", "common.policies.ActorCriticPolicy")]
-)
-def test_what_is_known_is_covered(agent: str, policy: str, settings: list[str]) -> None:
-    words = [each.replace("POLICY", policy) for each in settings]
-    assert type(built(f"agent={agent}", *words)) is EngineAgent
+def test_what_it_knows(words: list[str]) -> None:
+    assert type(built(*words)) is EngineAgent
 
 
 @pytest.mark.parametrize("agent", ["a2c", "qrdqn", "trpo"])
-def test_a_class_with_its_arguments_is_covered_as_well(
-    agent: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_class_with_its_arguments(agent: str, capsys: pytest.CaptureFixture[str]) -> None:
     without = [f"~agent.arguments.{name}" for name in vars(configure(f"agent={agent}").agent)["arguments"]]
     assert type(built(f"agent={agent}")) is EngineAgent
     assert type(built(f"agent={agent}", "agent.engine=stock")) is SB3Agent
     other = built(f"agent={agent}", "agent.algorithm=sb3_contrib.MaskablePPO", *without)
     assert type(other) is SB3Agent
     assert capsys.readouterr().err == ""
-    refused = built(f"agent={agent}", "+agent.arguments.policy_kwargs.activation_fn=torch.nn.RReLU")
-    assert type(refused) is SB3Agent
-    reason = "agent.arguments.policy_kwargs.activation_fn=torch.nn.RReLU is not known to give"
-    assert f"engine: stock, since {reason}" in capsys.readouterr().err
+    unknown = "agent.arguments.policy_kwargs.activation_fn=torch.nn.RReLU"
+    assert type(built(f"agent={agent}", f"+{unknown}")) is SB3Agent
+    assert f"engine: stock, since the tabulated one does not cover {unknown}" in capsys.readouterr().err
     with pytest.raises(InputError, match=r"agent\.engine=fast: must be tabulated or stock"):
         check(configure(f"agent={agent}", "agent.engine=fast"))
 
@@ -166,3 +117,33 @@ def test_an_activation_that_is_covered_is_a_function_of_each_number(kind: type[t
     assert torch.allclose(torch.stack([module(row) for row in x]), expected, atol=1e-6)
     assert torch.equal(torch.get_rng_state(), chance)
     assert not list(module.buffers())
+
+
+@pytest.mark.parametrize(("name", "last"), [("ent_coef", 0), ("gae_lambda", 0.4 * (1 - 256 / 300))])
+def test_it_falls_to_nothing_in_plain_sb3(name: str, last: float) -> None:
+    envs, arguments = gridworld.make_vec_env("classic", n_envs=4), {name: 0.4}
+    model: Any = A2C("MlpPolicy", envs, n_steps=16, **arguments)
+    model.learn(300, callback=FallingSetting(name, 0.4))  # the last rollout ends beyond the end
+    assert getattr(model, name) == pytest.approx(last)
+    assert model.rollout_buffer.gae_lambda == model.gae_lambda
+
+
+@pytest.mark.parametrize("engine", ["tabulated", "stock"])
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [
+        ("ent_coef", "lin_0.5", [0.4, 0.3, 0.2, 0.1, 0]),
+        ("ent_coef", "quad_0.5", [0.32, 0.18, 0.08, 0.02, 0]),
+        ("gae_lambda", "lin_0.5", [0.5, 0.4, 0.3, 0.2, 0.1]),
+        ("learning_rate", "lin_0.5", [0.4, 0.3, 0.2, 0.1]),
+        ("learning_rate", "sqrt_0.5", [0.5 * left**0.5 for left in (0.8, 0.6, 0.4, 0.2)]),
+    ],
+)
+def test_a_run_has_it_by_its_setting(engine: str, name: str, value: str, expected: list[float]) -> None:
+    words = ("total_timesteps=320", "n_envs=4", "agent.n_steps=16", "agent.batch_size=16")
+    logged: list[Any] = []
+    words = (*words, f"agent.engine={engine}", f"agent.{name}={value}")
+    agent = built("agent=ppo", *words, log=lambda values, _: logged.append(dict(values)))
+    agent.learn(320, lambda steps: steps + 1)
+    found = [values[f"train/{name}"] for values in logged if f"train/{name}" in values]
+    assert found == pytest.approx(expected)

@@ -1,4 +1,4 @@
-"""Worlds in files: what one writes oneself, and what a run keeps of its world."""
+"""Worlds in files and from functions: what one writes oneself, and what a run keeps of its world."""
 
 import contextlib
 import dataclasses
@@ -16,7 +16,7 @@ from gridworld.process.user_input import npz_bytes
 from gridworld.world.mdp import Mdp
 from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 from gridworld.world.solver import value_iteration
-from gridworld.world.sources.arrays import load_world, world_bytes, world_from_bytes
+from gridworld.world.sources.arrays import build, load_world, world_bytes, world_from_bytes
 from gridworld.world.sources.classics import river_swim
 
 TWO_ROOMS = {
@@ -48,7 +48,7 @@ def test_a_deterministic_world_needs_five_lines(tmp_path, save):
 
 def test_everything_optional(tmp_path):
     table = {
-        key: np.array(value)[:, :, None].repeat(2, 2) for key, value in TWO_ROOMS.items() if key != "start"
+        key: np.array(value)[..., None].repeat(2, 2) for key, value in TWO_ROOMS.items() if key != "start"
     }
     path = written(
         tmp_path,
@@ -71,9 +71,9 @@ def test_everything_optional(tmp_path):
     [
         ({"start": None}, "has no start, must hold next_state, reward, terminated, start"),
         ({"nonsense": [1.0]}, "nonsense is no array of a world; beside what is needed it may hold"),
-        ({"reward": [0.0, 1.0]}, r"reward has shape \(2,\), next_state has \(2, 2\)"),
-        ({"reward": [["a", "b"], ["a", "b"]]}, "reward is <U1, must be an array of numbers"),
-        ({"terminated": [[0, 0], [0, 1]]}, "terminated is int64, must be an array of booleans"),
+        ({"reward": [0.0, 1.0]}, r"reward has shape \(2,\), next_state has \(2, 2, 1\)"),
+        ({"reward": [["a", "b"], ["a", "b"]]}, "reward is <U1 .* must be an array of numbers"),
+        ({"terminated": [[0, 0], [0, 1]]}, "terminated is int64 .* must be an array of booleans"),
         ({"next_state": [[0, 2], [0, 1]]}, "next_state of state 0, action 1 is 2"),
         ({"next_state": [[0.0, 1.0], [0.0, 1.0]]}, "next_state is float64"),
         ({"next_state": [[[0], [1]], [[0], [1]]]}, "has no probability; without it"),
@@ -96,23 +96,23 @@ def test_arrays_that_make_no_world_are_refused(tmp_path, changed, told):
 
 
 def test_no_file_of_arrays(tmp_path, monkeypatch):
-    def refused(path, told):
+    (tmp_path / "text.npz").write_text("no zip")
+    np.save(tmp_path / "one.npy", np.zeros(3))
+    os.mkfifo(tmp_path / "pipe.npz")
+    np.savez_compressed(tmp_path / "bomb.npz", **{**TWO_ROOMS, "reward": np.zeros(2**20)})
+    monkeypatch.setattr("gridworld.world.sources.arrays._MOST_BYTES", 2**20)
+    for path, told in (
+        (tmp_path / "none.npz", "env.path=.*none.npz: cannot be read .No such file"),
+        (tmp_path, "env.path=.*: is a folder; give an .npz file"),
+        (3, "env.path=3: must be the path"),
+        (tmp_path / "text.npz", "text.npz: not an .npz file of arrays that can be read"),
+        (tmp_path / "one.npy", "not an .npz file of arrays"),
+        (tmp_path / "pipe.npz", "is no ordinary file"),
+        (written(tmp_path, name=np.array([{}], dtype=object)), "cannot be loaded when allow_pickle=False"),
+        (tmp_path / "bomb.npz", "its arrays have 8 MiB, more than 1"),
+    ):
         with pytest.raises(InputError, match=told):
             load_world(path)
-
-    refused(tmp_path / "none.npz", "env.path=.*none.npz: cannot be read .No such file")
-    refused(tmp_path, "env.path=.*: is a folder; give an .npz file")
-    refused(3, "env.path=3: must be the path")
-    (tmp_path / "text.npz").write_text("no zip")
-    refused(tmp_path / "text.npz", "text.npz: not an .npz file of arrays that can be read")
-    np.save(tmp_path / "one.npy", np.zeros(3))
-    refused(tmp_path / "one.npy", "not an .npz file of arrays")
-    os.mkfifo(tmp_path / "pipe.npz")
-    refused(tmp_path / "pipe.npz", "is no ordinary file")
-    refused(written(tmp_path, name=np.array([{}], dtype=object)), "cannot be loaded when allow_pickle=False")
-    monkeypatch.setattr("gridworld.world.sources.arrays._MOST_BYTES", 2**20)
-    np.savez_compressed(tmp_path / "bomb.npz", **{**TWO_ROOMS, "reward": np.zeros(2**20)})
-    refused(tmp_path / "bomb.npz", "its arrays have 8 MiB, more than 1")
 
 
 @st.composite
@@ -137,28 +137,27 @@ def worlds(draw):
     )
 
 
-def assert_same(one, other):
+def assert_comes_back(mdp):
+    content = world_bytes(mdp)
+    again = world_from_bytes(content, "world.npz")
     for field in dataclasses.fields(Mdp):
-        mine, theirs = getattr(one, field.name), getattr(other, field.name)
+        mine, theirs = getattr(mdp, field.name), getattr(again, field.name)
         if isinstance(mine, np.ndarray):
             assert (mine.dtype, mine.shape, mine.tobytes()) == (theirs.dtype, theirs.shape, theirs.tobytes())
             assert not theirs.flags.writeable
         else:
             assert (type(mine), mine) == (type(theirs), theirs)
+    assert world_bytes(again) == content == world_bytes(mdp)
+    assert again.digest() == mdp.digest()
 
 
 @given(worlds())
 def test_a_world_comes_back_bit_for_bit(mdp):
-    content = world_bytes(mdp)
-    again = world_from_bytes(content, "world.npz")
-    assert_same(mdp, again)
-    assert world_bytes(again) == content == world_bytes(mdp)
-    assert again.text() == mdp.text()
+    assert_comes_back(mdp)
 
 
 def test_the_tables_of_a_map_come_back_too():
-    mdp = compile_mdp(load("four_rooms"), slip=0.3)
-    assert_same(mdp, world_from_bytes(world_bytes(mdp), "world.npz"))
+    assert_comes_back(compile_mdp(load("four_rooms"), slip=0.3))
 
 
 BASE = river_swim(3)
@@ -169,18 +168,16 @@ def changed_world(**changed):
     with np.load(io.BytesIO(world_bytes(BASE))) as file:
         arrays = dict(file)
     for name, value in changed.items():
-        if callable(value):
-            arrays[name] = arrays[name].copy()
-            value(arrays[name])
-        elif value is None:
-            del arrays[name]
-        else:
-            arrays[name] = value
-    return npz_bytes(arrays)
+        arrays[name] = value(arrays[name].copy()) if callable(value) else value
+    return npz_bytes({name: value for name, value in arrays.items() if value is not None})
 
 
 def at(where, value):
-    return lambda table: table.__setitem__(where, value)
+    def changed(table):
+        table[where] = value
+        return table
+
+    return changed
 
 
 @pytest.mark.parametrize(
@@ -260,3 +257,75 @@ def test_what_is_impossible_may_lead_anywhere(tmp_path):
     assert found.next_state.min() >= 0
     assert np.isfinite(found.reward).all()
     assert np.array_equal(world_from_bytes(world_bytes(found), "here").next_state, found.next_state)
+
+
+# what a function returns
+
+ARRAYS = {"next_state": [[0]], "reward": [[1.0]], "terminated": [[True]], "start": [1.0]}
+
+
+def outcomes(**changed):
+    tables = {key: np.array(value)[..., None] for key, value in ARRAYS.items()}
+    return Outcomes(**{**tables, "probability": np.ones((1, 1, 1)), "start": np.ones(1), **changed})
+
+
+def arrays(**more):
+    return {**ARRAYS, **more}
+
+
+def slippery_map(slip=0.2):
+    return compile_mdp(load("classic"), slip=slip)
+
+
+def broken():
+    return dataclasses.replace(river_swim(), number=np.arange(6) + 1)
+
+
+def raising(text="no power"):
+    raise RuntimeError(text)
+
+
+def drawn(length=4, seed=None):
+    return arrays(reward=[[float(np.random.default_rng(seed).integers(1, 10**9)) / length]])
+
+
+def test_a_function_that_draws_its_world_needs_a_seed():
+    with pytest.raises(InputError, match=r"^env.builder=drawn: makes another world each time .* env.kwargs"):
+        build(drawn)
+    assert build(drawn, {"seed": 3}).text() == build(drawn, {"seed": 3}).text()
+
+
+def test_the_three_things_that_a_function_may_return():
+    assert build("gridworld.world.sources.classics.river_swim", {"length": 4}).num_states == 4
+    assert (build(arrays).name, build(arrays, {"name": "mine"}).name) == ("arrays", "mine")
+    assert build(outcomes).name == "outcomes"
+    a_map = build(slippery_map, {"slip": 0.4})
+    assert type(a_map) is Mdp
+    assert a_map.probability[0, 0].tolist() == [0.6, 0.2, 0.2]
+
+
+@pytest.mark.parametrize(
+    ("builder", "kwargs", "told"),
+    [
+        ("make", None, "env.builder=make: must be the import path of a function"),
+        ("no_such_module.make", None, "env.builder=no_such_module.make: there is no module no_such_module"),
+        ("gridworld.world.nothing", None, "env.builder=gridworld.world.nothing: must be the import path"),
+        ("gridworld.ENV_ID", None, "env.builder=gridworld.ENV_ID: must be the import path"),
+        (3, None, "env.builder=3: must be"),
+        (
+            "os.getcwd",
+            None,
+            "env.builder=os.getcwd: returned str, must return an Mdp, Outcomes, or a mapping",
+        ),
+        (raising, None, "env.builder=raising: raised RuntimeError: no power"),
+        (raising, {"txt": 1}, "env.builder=raising: raised TypeError: .*unexpected keyword argument 'txt'"),
+        (raising, {"text": "one\ntwo"}, "env.builder=raising: raised RuntimeError: one$"),
+        (river_swim, {"length": 1}, "env.builder=river_swim: length=1: must be a whole number from 2"),
+        (broken, None, "env.builder=broken: state 5 has a number"),
+        (arrays, {"start": [0.5]}, "env.builder=arrays: start is"),
+        (outcomes, {"start": [1.0]}, "env.builder=outcomes: start is list"),
+    ],
+)
+def test_what_makes_no_world_is_refused(builder, kwargs, told):
+    with pytest.raises(InputError, match=f"^{told}"):
+        build(builder, kwargs)

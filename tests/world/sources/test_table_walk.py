@@ -55,60 +55,10 @@ class Sticky(Lake):
         return int(self.s), reward, terminated, False, {}
 
 
-class RareSlip(Lake):
-    def step(self, action: int) -> tuple[Any, ...]:
-        return super().step((action + 1) % 4 if self.np_random.random() < 0.01 else action)
-
-
-class FarReward(TaxiEnv):
-    """One of 400 states in which a passenger may get out pays another fare."""
-
-    def step(self, a: Any) -> tuple[Any, ...]:
-        was = self.s
-        state, reward, *others = super().step(a)
-        return state, reward + (was == 479 and a == 5), *others
-
-
 class FarStarts(TaxiEnv):
     def reset(self, **kwargs: Any) -> tuple[Any, Any]:
         state, info = super().reset(**kwargs)
         return (state, info) if state < 400 else super().reset(**kwargs | {"seed": None})
-
-
-class Tired(CliffWalkingEnv):
-    """Each step of a long episode costs more."""
-
-    def reset(self, **kwargs: Any) -> tuple[Any, Any]:
-        self.steps = 0
-        return super().reset(**kwargs)
-
-    def step(self, action: Any) -> tuple[Any, ...]:
-        self.steps += 1
-        state, reward, *others = super().step(action)
-        return state, reward - (self.steps > 90), *others
-
-
-class WornOut(CliffWalkingEnv):
-    """After thousands of steps it turns left instead of right."""
-
-    steps = 0
-
-    def step(self, action: Any) -> tuple[Any, ...]:
-        self.steps += 1
-        return super().step(3 if action == 1 and self.steps > 8_000 else action)
-
-
-class Learned(TaxiEnv):
-    """After hundreds of episodes it knows a shortcut."""
-
-    episodes = 0
-
-    def reset(self, **kwargs: Any) -> tuple[Any, Any]:
-        self.episodes += 1
-        return super().reset(**kwargs)
-
-    def step(self, a: Any) -> tuple[Any, ...]:
-        return super().step(0 if a == 1 and self.episodes > 450 else a)
 
 
 class Seeded(Lake):
@@ -122,14 +72,6 @@ class Seeded(Lake):
         return super().step((action + 2) % 4 if self.seed_given % 4 == 2 else action)
 
 
-class Every97th(TaxiEnv):
-    calls = 0
-
-    def step(self, a: Any) -> tuple[Any, ...]:
-        self.calls += 1
-        return super().step(4 if self.calls % 97 == 0 else a)
-
-
 class Chain(gym.Env[int, int]):
     """Forty rooms; its state has another name, so that it cannot be set."""
 
@@ -138,17 +80,14 @@ class Chain(gym.Env[int, int]):
     def __init__(self) -> None:
         self.observation_space, self.action_space = spaces.Discrete(self.rooms), spaces.Discrete(2)
         self.initial_state_distrib = np.eye(self.rooms)[0]
-        last = self.rooms - 1
         self.P = {
-            room: {
-                0: [(1.0, max(room - 1, 0), 0.0, False)],
-                1: [
-                    (0.8, min(room + 1, last), float(room == last - 1), room == last - 1),
-                    (0.2, room, 0, False),
-                ],
-            }
+            room: {0: [(1.0, max(room - 1, 0), 0.0, False)], 1: self.onward(room)}
             for room in range(self.rooms)
         }
+
+    def onward(self, room: int) -> list[tuple[float, int, float, bool]]:
+        ends = room == self.rooms - 2
+        return [(0.8, min(room + 1, self.rooms - 1), float(ends), ends), (0.2, room, 0.0, False)]
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[int, dict[str, Any]]:
         super().reset(seed=seed)
@@ -161,10 +100,23 @@ class Chain(gym.Env[int, int]):
         return self.room, reward, terminated, False, {}
 
 
-class LastRoom(Chain):
-    def step(self, action: int) -> tuple[Any, ...]:
-        room, reward, *others = super().step(action)
-        return room, reward * 2, *others
+def liar(base: Any, turned: Any = lambda env, a: a, paid: Any = lambda env, was, a: 0.0) -> Any:
+    """A class whose steps take another action than the one given, or pay more."""
+
+    class Liar(base):  # type: ignore[misc]
+        calls = elapsed = 0
+
+        def reset(self, **kwargs: Any) -> Any:
+            self.elapsed = 0
+            return super().reset(**kwargs)
+
+        def step(self, action: Any) -> Any:
+            self.calls, self.elapsed = self.calls + 1, self.elapsed + 1
+            was = getattr(self, "s", None)
+            state, reward, *others = super().step(turned(self, action))
+            return state, reward + paid(self, was, action), *others
+
+    return Liar
 
 
 class Heavy(Chain):
@@ -200,30 +152,38 @@ class Remembered(Chain):
 
 
 LIES = {
-    AllRows: "all rows like P",
-    OneRow: r"P\[27\]\[1\], outcome 0, came",
-    Sticky: "outcome [0-2], came",
-    RareSlip: "in state .* led to state",
-    FarReward: r"in state 479, action 5 led to state .* with reward 21 and ended",
-    FarStarts: "(the start in state|of 8 parts of the starts, part) [0-9]*, came",
-    Tired: "with reward -2, which P",
-    WornOut: "action 1 led to",
-    Learned: "action 1 led to",
-    Seeded: "led to state",
-    Every97th: "led to state",
-    LastRoom: r"in state 38, action 1 led to state 39 with reward 2 and ended",
-    Heavy: "outcome [01], came",
+    "all rows": (AllRows, "all rows like P"),
+    "one row": (OneRow, r"P\[27\]\[1\], outcome 0, came"),
+    "sticky": (Sticky, "outcome [0-2], came"),
+    "starts": (FarStarts, "(the start in state|of 8 parts of the starts, part) [0-9]*, came"),
+    "seeded": (Seeded, "led to state"),
+    "rare slips": (
+        liar(Lake, lambda env, a: (a + 1) % 4 if env.np_random.random() < 0.01 else a),
+        "in state .* led to state",
+    ),
+    "one of 400 fares": (
+        liar(TaxiEnv, paid=lambda env, was, a: (was, a) == (479, 5)),
+        r"in state 479, action 5 led to state .* with reward 21 and ended",
+    ),
+    "tired": (liar(CliffWalkingEnv, paid=lambda env, was, a: -(env.elapsed > 90)), "with reward -2, which P"),
+    "worn out": (
+        liar(CliffWalkingEnv, lambda env, a: 3 if a == 1 and env.calls > 8000 else a),
+        "action 1 led to",
+    ),
+    "every 97th step": (liar(TaxiEnv, lambda env, a: 4 if env.calls % 97 == 0 else a), "led to state"),
+    "the last room": (
+        liar(Chain, paid=lambda env, was, a: env.room == 39),
+        r"in state 38, action 1 led to state 39 with reward 2 and ended",
+    ),
+    "heavy": (Heavy, "outcome [01], came"),
 }
 
 
 @pytest.mark.parametrize("kind", LIES)
-@pytest.mark.parametrize("seed", range(2))
-def test_what_is_not_the_table_is_found(
-    kind: type[gym.Env[Any, Any]], seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(table_walk, "SEED", seed)
-    with pytest.raises(InputError, match=f"^{kind.__name__}: leaves its own table: .*{LIES[kind]}"):
-        compile_table(kind(), 150)
+def test_what_is_not_the_table_is_found(kind: str) -> None:
+    made, told = LIES[kind]
+    with pytest.raises(InputError, match=f"^{made.__name__}: leaves its own table: .*{told}"):
+        compile_table(made(), 150)
 
 
 @pytest.mark.parametrize("kind", [Lake, Shadowed, Chain, Remembered])
@@ -231,7 +191,6 @@ def test_a_true_table_is_not_refused_however_it_is_stepped(kind: type[gym.Env[An
     assert compile_table(kind()).num_actions in (2, 4)
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
     ("env_id", "kwargs"),
     [
@@ -242,9 +201,8 @@ def test_a_true_table_is_not_refused_however_it_is_stepped(kind: type[gym.Env[An
     ],
 )
 def test_gymnasium_s_own_are_far_from_being_refused(
-    env_id: str, kwargs: dict[str, Any], seed: int, monkeypatch: pytest.MonkeyPatch
+    env_id: str, kwargs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(table_walk, "SEED", seed)
     monkeypatch.setattr(table_walk, "_FALSE_ALARM", 0.01)
     assert compile_gymnasium(env_id, kwargs).truth.startswith("table P, checked by ")
 
@@ -252,10 +210,8 @@ def test_gymnasium_s_own_are_far_from_being_refused(
 class Swamp(Chain):
     """Hardly anybody comes far."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        for room, rows in self.P.items():
-            rows[1] = [(0.02, *rows[1][0][1:]), (0.98, room, 0.0, False)]
+    def onward(self, room: int) -> list[tuple[float, int, float, bool]]:
+        return [(0.02, *super().onward(room)[0][1:]), (0.98, room, 0.0, False)]
 
 
 def test_what_could_not_be_told_is_said() -> None:

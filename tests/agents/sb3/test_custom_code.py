@@ -1,0 +1,278 @@
+"""Custom algorithms, layers, optimisers, buffers and callbacks in SB3's own loop.
+
+Those that say what they keep go on to the bit; with others a run trains without checkpoints.
+"""
+
+import importlib
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.own_class import any_class
+from helpers.resuming import begin, differences, go_on, left_behind, rows, stopped_after
+from helpers.support import SHORT, configure
+
+from gridworld.agents.sb3.model_file import read_weights
+from gridworld.agents.tabular import check as check_tabular
+from gridworld.config.recipe_file import overrides
+from gridworld.errors import InputError
+from gridworld.restore.resume import open_unfinished
+from gridworld.restore.saved_run import SavedRun, settings_of
+from gridworld.run.checkpoints import Checkpoints
+from gridworld.run.reader import check_free, read_run
+
+MODULE = """
+import gridworld
+import numpy as np
+import torch
+from stable_baselines3 import A2C, DQN
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from torch import nn
+
+CALLS = []
+
+class Stirring(BaseCallback):  # changes learning by what it has counted
+    def __init__(self, every):
+        super().__init__()
+        self.every, self.rollouts, self.rates = every, 0, []
+
+    def get_state(self):
+        return {"rollouts": self.rollouts, "rates": self.rates}
+
+    def set_state(self, state):
+        self.rollouts, self.rates = state["rollouts"], list(state["rates"])
+        if self.rates:
+            self.model.gamma = self.model.ent_coef = self.rates[-1]
+
+    def _on_rollout_start(self):
+        self.rollouts += 1
+
+    def _on_step(self):
+        if self.n_calls % self.every == 0:
+            self.rates.append(1e-3 * (1 + 3.5 * self.rollouts % 3))
+            self.model.gamma = self.model.ent_coef = self.rates[-1]
+            self.logger.record("mine/rate", self.rates[-1])
+        return True
+
+class Recording(BaseCallback):
+    def _init_callback(self):
+        CALLS.append("init")
+    def _on_training_start(self):
+        CALLS.append("start")
+    def _on_rollout_start(self):
+        CALLS.append("rollout start")
+    def _on_step(self):
+        CALLS.append("new_obs" in self.locals)
+        return self.num_timesteps < 300
+    def _on_training_end(self):
+        CALLS.append("end")
+
+class Sampling(EvalCallback):
+    def __init__(self, **settings):
+        super().__init__(gridworld.make_vec_env("classic", n_envs=1), verbose=0, **settings)
+
+class Failing(Recording):
+    def __init__(self):
+        raise RuntimeError("no server")
+
+class Counting:  # changes learning by what it has counted, and draws numbers of its own
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        self.count, self.numbers = 0, np.random.default_rng(5)
+
+    def train(self, *arguments, **options):
+        self.count += 1
+        self.gamma = 0.9 + 0.01 * (self.count % 7) + 0.01 * self.numbers.random()
+        super().train(*arguments, **options)
+
+class WithState:
+    def get_state(self):
+        return {"count": self.count, "numbers": self.numbers.bit_generator.state}
+
+    def set_state(self, state):
+        self.count, self.numbers.bit_generator.state = state["count"], state["numbers"]
+
+class SilentA2C(Counting, A2C): pass
+class CountingA2C(WithState, Counting, A2C): pass
+class CountingDQN(WithState, Counting, DQN): pass
+
+class Shifting(nn.Module):  # by a number that it keeps outside of its parameters
+    def __init__(self):
+        super().__init__()
+        self.shift = 0.1
+
+    def forward(self, x):
+        return torch.tanh(x + self.shift)
+
+class SavedShifting(Shifting):
+    def get_state(self):
+        return {"shift": self.shift}
+
+    def set_state(self, state):
+        self.shift = state["shift"]
+
+class Adam(torch.optim.Adam): pass
+class Remembering(ReplayBuffer): pass
+"""
+LESS = ["recording.frames=false", "recording.gif=false"]
+STIRRING = "callbacks=[{_target_: own_code.Stirring, every: 3}]"
+LAYER = "+agent.arguments.policy_kwargs.activation_fn="
+STATEFUL = {
+    "an algorithm on policy": ["own_code.CountingA2C"],
+    "an algorithm with a replay": ["own_code.CountingDQN", "+agent.arguments.learning_starts=50"],
+    "a layer": ["stable_baselines3.A2C", f"{LAYER}own_code.SavedShifting"],
+    "one that asks for masks": ["sb3_contrib.MaskablePPO", "+agent.arguments.n_steps=16"],
+}
+EVERY = "{_target_: stable_baselines3.common.callbacks.EveryNTimesteps, n_steps: 9, callback: "
+SILENT = {
+    "SilentA2C": ["own_code.SilentA2C"],
+    "Shifting": ["stable_baselines3.A2C", f"{LAYER}own_code.Shifting"],
+    "Adam": ["stable_baselines3.A2C", "+agent.arguments.policy_kwargs.optimizer_class=own_code.Adam"],
+    "Remembering": ["stable_baselines3.DQN", "+agent.arguments.replay_buffer_class=own_code.Remembering"],
+    "Sampling": [
+        "stable_baselines3.A2C",
+        "callbacks=[{_target_: own_code.Sampling, eval_freq: 50, n_eval_episodes: 2}]",
+    ],
+    "Recording": ["stable_baselines3.A2C", f"callbacks=[{EVERY}{{_target_: own_code.Recording}}}}]"],
+}
+
+
+@pytest.fixture(autouse=True)
+def _module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_code.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    sys.modules.pop("own_code", None)
+    monkeypatch.setitem(sys.modules, "own_code", importlib.import_module("own_code"))  # taken out at the end
+
+
+def calls() -> list[Any]:
+    return sys.modules["own_code"].CALLS  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize("name", STATEFUL)
+def test_what_says_its_state_goes_on_to_the_bit(name: str, tmp_path: Path) -> None:
+    words = [*any_class(*STATEFUL[name]), *LESS, "checkpoint.every=100"]
+    begin(tmp_path / "calm", *words)
+    stopped_after(2, tmp_path / "run", *words)
+    go_on(tmp_path / "run")
+    assert differences(left_behind(tmp_path / "run"), left_behind(tmp_path / "calm")) == []
+
+
+@pytest.mark.parametrize("name", SILENT)
+def test_what_does_not_trains_without_checkpoints(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [*any_class(*SILENT[name]), *LESS]
+    begin(tmp_path / "run", *words, "checkpoint.every=100")
+    line = f"checkpoints: none, since own_code.{name} does not define get_state and set_state\n"
+    assert capsys.readouterr().err.count(line) == 1
+    assert line in (tmp_path / "run" / "train.log").read_text()
+    assert Checkpoints(tmp_path / "run").files() == []
+    assert read_run(tmp_path / "run").is_finished
+    if name == "SilentA2C":
+        with pytest.raises(InputError, match="checkpoint"):
+            open_unfinished(tmp_path / "run", trust=True).resume(1000)
+        capsys.readouterr()
+        begin(tmp_path / "none", *words, "checkpoint.every=null")
+        assert "checkpoints" not in capsys.readouterr().err
+
+
+def test_a_callback_goes_on_to_the_bit(tmp_path: Path) -> None:
+    words = [*SHORT["a2c"], *LESS, "logging.policy_map_every=0"]
+    begin(tmp_path / "calm", *words, STIRRING)
+    begin(tmp_path / "without", *words)
+    stopped_after(2, tmp_path / "run", *words, STIRRING, "checkpoint.every=150")
+    with pytest.raises(InputError, match=r"_target_=own_code\.Stirring is called with .* add trust=true"):
+        open_unfinished(tmp_path / "run")
+    go_on(tmp_path / "run")
+    calm, run = left_behind(tmp_path / "calm"), left_behind(tmp_path / "run")
+    assert differences(run, calm) == []
+    assert "mine/rate" in {tag for tag, _, _ in calm["points"]}
+    assert len(calm["state"]["agent"]["own"][-1]["rates"]) > 3
+    mine, others = (read_weights(tmp_path / name / "model.zip", 10**8) for name in ("run", "without"))
+    weights = [name for name in mine if name.startswith("policy.") and name.endswith(".weight")]
+    assert weights
+    for name in weights:
+        assert not np.array_equal(mine[name], others[name]), name
+    assert SavedRun(tmp_path / "run").snapshot().greedy.shape == (30,)  # which calls no callback
+
+
+def test_it_is_called_as_sb3_calls_it_and_may_end_training(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    begin(tmp_path / "run", *SHORT["ppo"], *LESS, "callbacks=[{_target_: own_code.Recording}]")
+    found = calls()
+    assert found[:3] == ["init", "start", "rollout start"]
+    assert found[3:] == [True] * 19 + ["end"]  # 304 steps of 16 environments; the rollout is not over
+    assert rows(tmp_path / "run")[-1]["step"] == "304"
+    assert read_run(tmp_path / "run").is_finished
+    told = "callbacks[0]: own_code.Recording stopped training after 304 steps\n"
+    assert told in capsys.readouterr().err
+    assert told in (tmp_path / "run" / "train.log").read_text()
+    with pytest.raises(InputError, match=r"holds a run already; choose another folder$"):
+        check_free(tmp_path / "run")  # it has no checkpoint to go on from
+
+
+def test_callbacks_of_sb3_may_hold_others(tmp_path: Path) -> None:
+    path, words = "stable_baselines3.common.callbacks", [*SHORT["a2c"], *LESS]
+    held = f"{{_target_: {path}.EveryNTimesteps, n_steps: 200, callback: {{_target_: own_code.Recording}}}}"
+    begin(tmp_path / "run", *words, f"callbacks=[{held}]")
+    assert [call for call in calls() if isinstance(call, bool)] == [True, True]
+    begin(tmp_path / "list", *words, f"callbacks=[{{_target_: {path}.CallbackList, callbacks: [{held}]}}]")
+    assert calls().count("init") == 2
+    wrong = f"callbacks=[{held.replace('own_code.Recording', 'torch.nn.ReLU')}]"
+    with pytest.raises(AttributeError, match="'ReLU' object"):
+        begin(tmp_path / "wrong", *words, wrong)
+    limit = f"callbacks=[{{_target_: {path}.StopTrainingOnMaxEpisodes, max_episodes: 1}}]"
+    stopped_after(1, tmp_path / "limit", *words, limit, "checkpoint.every=20")
+    open_unfinished(tmp_path / "limit", trust=True).resume()
+
+
+def test_callbacks_of_a_strangers_run_write_nothing_without_trust(tmp_path: Path) -> None:
+    """Stable-Baselines3's own write files where they are told to, and make what they hold."""
+    made = tmp_path / "made.json"
+    held = {"_target_": "stable_baselines3.common.logger.JSONOutputFormat", "filename": str(made)}
+    begin(tmp_path / "run", *SHORT["a2c"], *LESS)
+    run = read_run(tmp_path / "run")
+    run.manifest["config"]["callbacks"] = [held]
+    with pytest.raises(InputError, match="may write files; add "):
+        settings_of(run)
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text(f"callbacks: {json.dumps([held])}")
+    with pytest.raises(InputError, match="may write files; add trust=true"):
+        overrides(recipe)
+    assert not made.exists()
+
+
+OWN = "{_target_: own_code."
+
+
+@pytest.mark.parametrize(
+    ("callbacks", "told"),
+    [
+        ("[3]", r"callbacks\[0\]=3: must be a mapping of _target_"),
+        ("[{every: 3}]", r"callbacks\[0\]={'every': 3}: must be a mapping of _target_"),
+        ("[{_target_: Stirring}]", "must be a mapping of _target_, the import path"),
+        (f"[{OWN}Stiring}}]", r"callbacks\[0\]\._target_=own_code\.Stiring: must be the import path of"),
+        ("[{_target_: torch.nn.ReLU}]", "must be the import path of a BaseCallback class"),
+        ("[{_target_: nowhere.Stirring}]", "there is no module nowhere; is the folder"),
+        (f"[{OWN}Stirring, every: 3, evry: 3}}]", "got an unexpected keyword argument 'evry'"),
+        (f"[{OWN}Failing}}]", r"callbacks\[0\]: own_code\.Failing cannot be built: .*no server"),
+    ],
+)
+def test_mistakes_are_found_before_training(callbacks: str, told: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=told):
+        begin(tmp_path / "run", *SHORT["a2c"], f"callbacks={callbacks}")
+    assert not list((tmp_path / "run").iterdir())
+
+
+def test_a_tabular_agent_has_none() -> None:
+    told = (
+        r"^callbacks: are Stable-Baselines3's, agent=sarsa calls none; leave them out, or choose an agent of"
+    )
+    with pytest.raises(InputError, match=told):
+        check_tabular(configure("agent=sarsa", STIRRING))

@@ -1,0 +1,105 @@
+"""A method that could remember something, wherever it keeps that, is no function of its argument alone."""
+
+import itertools
+import threading
+from typing import Any
+
+import gymnasium as gym
+import pytest
+
+from gridworld.errors import InputError
+from gridworld.world.snapshots import alike, asked
+
+TOTAL = [0]
+TICKS, GENERATOR = itertools.count(), (number for number in range(10**6))
+LOCK, CART = threading.Lock(), gym.make("CartPole-v1")
+
+
+class Counter:
+    """Hides its count from pickle."""
+
+    count = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {}
+
+    def __call__(self, reward: Any) -> float:
+        self.count += 1
+        return float(reward) + (self.count > 10**9)
+
+
+class Shared:
+    calls = 0
+
+    @classmethod
+    def paid(cls, reward: Any) -> float:
+        cls.calls += 1
+        return float(reward)
+
+
+def counted(reward: Any) -> float:
+    TOTAL[0] += 1
+    return float(reward)
+
+
+def by_default(reward: Any, seen: list[Any] = []) -> float:  # noqa: B006
+    seen.append(reward)
+    return float(reward)
+
+
+def by_closure() -> Any:
+    count = 0
+
+    def paid(reward: Any) -> float:
+        nonlocal count
+        count += 1
+        return float(reward)
+
+    return paid
+
+
+class Sampling(gym.RewardWrapper[Any, Any]):
+    def reward(self, reward: Any) -> float:
+        self.action_space.sample()
+        return float(reward)
+
+
+def asked_of(function: Any) -> list[Any]:
+    env = gym.make("FrozenLake-v1")
+    wrapper = Sampling(env) if function is Sampling else gym.wrappers.TransformReward(env, function)
+    return asked("env", wrapper, "reward", [0.0, 1.0], [wrapper, env, env.unwrapped])
+
+
+@pytest.mark.parametrize(
+    ("function", "told"),
+    [
+        (Counter(), "keeps a memory"),
+        (Counter().__call__, "keeps a memory"),
+        (Shared.paid, "keeps a memory"),
+        (counted, "keeps a memory"),
+        (Sampling, "draws random numbers"),
+        (lambda reward: counted(reward), "keeps a memory"),
+        (by_default, "keeps a memory"),
+        (by_closure(), "keeps a memory"),
+        (lambda reward: float(reward) + 0 * next(TICKS), "keeps a memory"),
+        (lambda reward: float(reward) + 0 * next(GENERATOR), "cannot be read"),
+        (lambda reward: float(reward) + LOCK.locked(), "cannot be read"),
+        (lambda reward: float(reward) + (CART.render_mode is None), "looks into an environment"),
+    ],
+)
+def test_a_memory_is_found_wherever_it_is_kept(function: Any, told: str) -> None:
+    with pytest.raises(InputError, match=f"^env: .*reward.. of .* .*{told}"):
+        asked_of(function)
+
+
+def test_a_function_of_its_argument_is_asked() -> None:
+    assert asked_of(lambda reward: 2 * reward - len(TOTAL)) == [-1.0, 1.0]
+
+
+def test_what_is_made_alike() -> None:
+    def made(factor: float) -> Any:
+        return gym.wrappers.TransformReward(gym.make("FrozenLake-v1"), lambda reward: factor * reward)
+
+    assert alike(made(2.0), made(2.0), ("env",))
+    assert not alike(made(2.0), made(3.0), ("env",))
+    assert not alike(made(2.0), made(2.0).env)
