@@ -26,7 +26,7 @@ from gridworld.errors import InputError
 from gridworld.process.console import command
 from gridworld.restore.saved_run import SavedRun
 from gridworld.visualization.canvas import Canvas, directions, greedy_paths
-from gridworld.visualization.sheet import ORANGES, PAPER, UNREACHABLE, linear, short
+from gridworld.visualization.sheet import ORANGES, PAPER, UNREACHABLE, linear
 from gridworld.visualization.state_table import StateTable, table_states
 from gridworld.world.evaluation import score_of_optimum
 from gridworld.world.mdp import IntArray, Mdp
@@ -198,7 +198,7 @@ def draw_diagnosis(found: Diagnosis, cell_size: int | None = None) -> Frame:
         table, scale = StateTable(mdp, states, ["regret"]), linear(ORANGES, cost[states], low=0.0)
         table.paint(np.where(cost > 0, cost, np.nan)[:, None], scale)
         table.caption(caption)
-        table.legend(scale, "regret 0", short(scale.high))
+        table.legend(scale, "regret")
         return table.frame()
     canvas = Canvas(mdp, cell_size)
     scale = linear(ORANGES, cost[canvas.board.floor], low=0.0)
@@ -218,5 +218,5 @@ def draw_diagnosis(found: Diagnosis, cell_size: int | None = None) -> Frame:
     )
     canvas.caption(caption)
     swatches = [*([canvas.path_swatch] if paths else []), *([UNREACHABLE] if canvas.hidden else [])]
-    canvas.legend(scale, "regret 0", short(scale.high), swatches)
+    canvas.legend(scale, "regret", swatches)
     return canvas.frame()

@@ -109,12 +109,10 @@ class Canvas(Sheet):
             box = (left, top, panel.cols * self.cell + 2, panel.rows * self.cell + 2)
             drawing.import_pygame().draw.rect(self.world, INK, box, 1)
 
-    def draw_numbers(
-        self, numbers: FloatArray, scale: Scale, low: str, high: str, missing: str, caption: str
-    ) -> Frame:
+    def draw_numbers(self, numbers: FloatArray, scale: Scale, name: str, missing: str, caption: str) -> Frame:
         """The finished picture of numbers (S, 1), or (S, 4) in the order of `MOVES`, a triangle for each.
 
-        NaN is left white, which the legend calls `missing`; `low` and `high` name the scale's ends.
+        NaN is left white, which the legend calls `missing`.
         """
         playable, known, by_move = self.board.floor, np.isfinite(numbers), numbers.shape[1] > 1
         colours = scale.colours(np.where(known, numbers, scale.low))
@@ -135,7 +133,7 @@ class Canvas(Sheet):
         self.write_numbers(numbers, known, colours, scale.high, size, middle)
         self.caption(caption)
         unknown = [] if known[playable].all() else [Swatch(missing)]
-        self.legend(scale, low, high, [*unknown, *([UNREACHABLE] if self.hidden else [])])
+        self.legend(scale, name, [*unknown, *([UNREACHABLE] if self.hidden else [])])
         return self.frame()
 
     def _triangles(self) -> NDArray[np.intp]:

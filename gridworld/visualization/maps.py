@@ -42,7 +42,6 @@ from gridworld.visualization.sheet import (
     counting,
     is_dark,
     linear,
-    short,
 )
 from gridworld.visualization.state_table import StateTable, table_states
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
@@ -114,10 +113,9 @@ def q_error(subject: Subject) -> Draw:
     caption = f"{name} after {subject.steps:,} steps, at the agent's gamma {gamma:g}"
     if board_of(mdp).panels:
         return lambda cell_size: draw_error_map(mdp, error, caption, cell_size)
-    states = table_states(mdp, visits_of(subject))
-    scale = linear(ORANGES, error[states], low=0.0)
-    table = StateTable(mdp, states, ["V"] if snapshot.q is None else mdp.action_names)
-    picture = table.draw_numbers(error, scale, "error 0", short(scale.high), _NO_OPTIMUM, caption)
+    columns = ["V"] if snapshot.q is None else mdp.action_names
+    table = StateTable(mdp, table_states(mdp, visits_of(subject)), columns)
+    picture = table.draw_numbers(error, _error_scale(error[table.states]), "error", _NO_OPTIMUM, caption)
     return lambda cell_size: picture
 
 
@@ -127,12 +125,14 @@ def visits(subject: Subject) -> Draw:
     caption = f"where {counts.sum():,} training steps were taken"
     if board_of(mdp).panels:
         return lambda cell_size: draw_visit_map(mdp, counts, caption, cell_size)
-    states = table_states(mdp, counts)
-    scale = counting(BLUES, counts[states])
-    table = StateTable(mdp, states, mdp.action_names)
-    numbers = np.where(counts > 0, counts, np.nan)
-    picture = table.draw_numbers(numbers, scale, *_visit_ends(scale), "never", caption)
+    table = StateTable(mdp, table_states(mdp, counts), mdp.action_names)
+    scale, numbers = counting(BLUES, counts[table.states]), np.where(counts > 0, counts, np.nan)
+    picture = table.draw_numbers(numbers, scale, "visits", "never", caption)
     return lambda cell_size: picture
+
+
+def _error_scale(error: FloatArray) -> Scale:
+    return linear(ORANGES, error, low=0.0)
 
 
 def explored(mdp: Mdp, visits: NDArray[np.int64] | None) -> BoolArray:
@@ -201,7 +201,7 @@ def draw_policy_map(
     swatches = [canvas.path_swatch] if paths else []
     swatches.append(Swatch("not optimal in this cell", frame=DISAGREES, thick=2))
     swatches += [] if known[playable].all() and not canvas.hidden else [NEVER_VISITED]
-    canvas.legend(ends, f"value {short(ends.low, ends.high)}", short(ends.high), swatches)
+    canvas.legend(ends, "value", swatches)
     return canvas
 
 
@@ -233,7 +233,7 @@ def _finish_policy_table(
     swatches = [Swatch("greedy action", frame=AGENT, thick=2)]
     swatches.append(Swatch("greedy, not optimal", frame=DISAGREES, thick=2))
     swatches += [] if known[states].all() else [NEVER_VISITED]
-    table.legend(scale, f"{name} {short(scale.low, scale.high)}", short(scale.high), swatches)
+    table.legend(scale, name, swatches)
     return table
 
 
@@ -248,8 +248,8 @@ def draw_error_map(mdp: Mdp, error: FloatArray, caption: str = "", cell_size: in
     canvas = Canvas(mdp, cell_size)
     moves = moving_actions(mdp) if error.shape[1] > 1 and canvas.has_grid else None
     error = error.max(axis=1, keepdims=True) if moves is None else error[:, moves]
-    scale = linear(ORANGES, error[canvas.board.floor], low=0.0)
-    return canvas.draw_numbers(error, scale, "error 0", short(scale.high), _NO_OPTIMUM, caption)
+    scale = _error_scale(error[canvas.board.floor])
+    return canvas.draw_numbers(error, scale, "error", _NO_OPTIMUM, caption)
 
 
 def draw_visit_map(
@@ -259,8 +259,4 @@ def draw_visit_map(
     counts = visits.sum(axis=1, keepdims=True)
     scale = counting(BLUES, counts[board_of(mdp).floor])
     numbers = np.where(counts > 0, counts, np.nan)
-    return Canvas(mdp, cell_size).draw_numbers(numbers, scale, *_visit_ends(scale), "never", caption)
-
-
-def _visit_ends(scale: Scale) -> tuple[str, str]:
-    return f"visits {short(scale.low)}", short(scale.high) + (", log scale" if scale.logarithmic else "")
+    return Canvas(mdp, cell_size).draw_numbers(numbers, scale, "visits", "never", caption)

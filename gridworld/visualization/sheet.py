@@ -185,8 +185,10 @@ class Sheet:
             size = text_size(text, size, width - left - 6) or SMALLEST_TEXT
             write(self._surface, text, left, middle, size)
 
-    def legend(self, scale: Scale, low: str, high: str, swatches: Sequence[Swatch] = ()) -> None:
-        """Draw the colour bar between the names of its ends, and the swatches, in the second row if any."""
+    def legend(self, scale: Scale, name: str, swatches: Sequence[Swatch] = ()) -> None:
+        """Draw the colour bar between its ends, and the swatches, in the second row if any."""
+        low = f"{name} {short(scale.low, scale.high)}"
+        high = short(scale.high) + (", log scale" if scale.logarithmic else "")
         total, bottom = self._surface.get_width(), self._bottom()
         edge = self.world.get_offset()[0] + self.cell
         rows = (0.5,) if self._legend_rows == 1 else (0.32, 0.74)  # heights within what is below the grid

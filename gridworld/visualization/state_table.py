@@ -50,7 +50,7 @@ class StateTable(Sheet):
         hidden = int((mdp.reachable & ~mdp.terminal).sum()) - len(states)
         self._label = max((text_width(name, _TEXT) for name in names), default=0) + _ROW // 2
         self._column = max(_NARROWEST, min(_WIDEST, _WIDTH // len(columns)))
-        self._states = states
+        self.states = states
         width = self._label + len(columns) * self._column
         super().__init__(width + 2 * _ROW, (3 + len(states) + (hidden > 0)) * _ROW, _ROW, legend_rows)
         for row, name in enumerate(names):
@@ -77,8 +77,8 @@ class StateTable(Sheet):
         self, table: FloatArray, scale: Scale, known: BoolArray | None = None, written: bool = True
     ) -> None:
         """Fill the cells with numbers (S, columns); NaN is white, rows that are not `known` (S,) grey."""
-        values = table[self._states]
-        rows = np.ones(len(values), dtype=np.bool_) if known is None else known[self._states]
+        values = table[self.states]
+        rows = np.ones(len(values), dtype=np.bool_) if known is None else known[self.states]
         there = np.isfinite(values) & rows[:, None]
         colours = scale.colours(np.where(there, values, scale.low))
         colours[~there] = PAPER
@@ -101,11 +101,9 @@ class StateTable(Sheet):
         rect(self.world, PAPER, (left + 1, top + 1, width - 2, height - 2), 3)
         rect(self.world, colour, (left + 1, top + 1, width - 2, height - 2), 2)
 
-    def draw_numbers(
-        self, table: FloatArray, scale: Scale, low: str, high: str, missing: str, caption: str
-    ) -> Frame:
+    def draw_numbers(self, table: FloatArray, scale: Scale, name: str, missing: str, caption: str) -> Frame:
         """The finished picture of numbers (S, columns); see `Canvas.draw_numbers`."""
         self.paint(table, scale)
         self.caption(caption)
-        self.legend(scale, low, high, [] if np.isfinite(table[self._states]).all() else [Swatch(missing)])
+        self.legend(scale, name, [] if np.isfinite(table[self.states]).all() else [Swatch(missing)])
         return self.frame()
