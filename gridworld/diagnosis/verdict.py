@@ -48,27 +48,18 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Why a run is not optimal.
+    """Why a run is not optimal."""
 
-    Attributes:
-        mdp: its world.
-        greedy: (S,), its greedy actions.
-        split: its regret by state.
-        findings: the causes that explain some of it, the largest share first; none for a certified run.
-        shares: the share of the regret that each of them explains; they sum to 1.
-        cause_of: (S,), the number in `findings` of each state's cause, -1 where there is none.
-        offers: the words of at most three command lines to try.
-        tried: those that were tried, up to the first that is certified.
-    """
-
-    mdp: Mdp
-    greedy: IntArray
-    split: RegretSplit
-    findings: tuple[Finding, ...]
-    shares: tuple[float, ...]
-    cause_of: IntArray
-    offers: tuple[tuple[str, ...], ...]
-    tried: tuple[Trial, ...] = ()
+    mdp: Mdp  # its world
+    greedy: IntArray  # (S,), its greedy actions
+    split: RegretSplit  # its regret by state
+    findings: tuple[
+        Finding, ...
+    ]  # what explains some of it, the largest share first; none if it is certified
+    shares: tuple[float, ...]  # the share of the regret that each of them explains; they sum to 1
+    cause_of: IntArray  # (S,), the number in `findings` of each state's cause, -1 where there is none
+    offers: tuple[tuple[str, ...], ...]  # the words of at most three command lines to try
+    tried: tuple[Trial, ...] = ()  # those that were tried, up to the first that is certified
 
     @property
     def commands(self) -> tuple[str, ...]:

@@ -115,7 +115,9 @@ def q_error(subject: Subject) -> Draw:
         return lambda cell_size: draw_error_map(mdp, error, caption, cell_size)
     columns = ["V"] if snapshot.q is None else mdp.action_names
     table = StateTable(mdp, table_states(mdp, visits_of(subject)), columns)
-    picture = table.draw_numbers(error, _error_scale(error[table.states]), "error", _NO_OPTIMUM, caption)
+    picture = table.draw_numbers(
+        error, linear(ORANGES, error[table.states], low=0.0), "error", _NO_OPTIMUM, caption
+    )
     return lambda cell_size: picture
 
 
@@ -129,10 +131,6 @@ def visits(subject: Subject) -> Draw:
     scale, numbers = counting(BLUES, counts[table.states]), np.where(counts > 0, counts, np.nan)
     picture = table.draw_numbers(numbers, scale, "visits", "never", caption)
     return lambda cell_size: picture
-
-
-def _error_scale(error: FloatArray) -> Scale:
-    return linear(ORANGES, error, low=0.0)
 
 
 def explored(mdp: Mdp, visits: NDArray[np.int64] | None) -> BoolArray:
@@ -248,7 +246,7 @@ def draw_error_map(mdp: Mdp, error: FloatArray, caption: str = "", cell_size: in
     canvas = Canvas(mdp, cell_size)
     moves = moving_actions(mdp) if error.shape[1] > 1 and canvas.has_grid else None
     error = error.max(axis=1, keepdims=True) if moves is None else error[:, moves]
-    scale = _error_scale(error[canvas.board.floor])
+    scale = linear(ORANGES, error[canvas.board.floor], low=0.0)
     return canvas.draw_numbers(error, scale, "error", _NO_OPTIMUM, caption)
 
 
