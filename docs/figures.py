@@ -1,4 +1,4 @@
-"""Makes the pictures in docs/images again: `python docs/figures.py`, a minute."""
+"""Makes the pictures in docs/images again: `python docs/figures.py`, some minutes."""
 
 import shlex
 import shutil
@@ -14,12 +14,17 @@ COMMANDS = """\
 python scripts/train.py agent=dqn hydra.run.dir=one
 python scripts/train.py -m agent=dqn,ppo 'seed=range(5)' evaluation.every=2000 hydra.sweep.dir=five
 python scripts/report.py five --out report
+python scripts/train.py agent=ppo_sb3_defaults total_timesteps=20000 hydra.run.dir=defaults
+python scripts/train.py -m env=four_rooms agent=q_learning,sarsa 'seed=range(20)' hydra.sweep.dir=rooms
+python scripts/report.py rooms --out rooms_report
 """
 # By the name in docs/images: what is copied there.
 SOURCES = {
     "policy.png": "one/policy.png",
     "learning.gif": "one/learning.gif",
     "curve.png": "report/figures/classic_regret.png",
+    "four_rooms.png": "rooms_report/figures/four_rooms_regret.png",
+    "standing_still.png": "defaults/policy.png",
 }
 
 

@@ -16,7 +16,7 @@ from gridworld.config.settings import flat
 
 CLAIMS: dict[str, tuple[str, list[str]]] = {  # by a part of a command: what it prints, and words to add
     "classic_ppo_sb3_defaults": ("not optimal", []),
-    "evaluate.py runs/defaults": ("it loops until the step limit (probability 1)", []),
+    "diagnose.py runs/defaults": ("exploration", []),
     "observation=coordinates": ("certified optimal since step", ["evaluation.stop_after=1"]),
     "observation=image": ("certified optimal since step", ["evaluation.stop_after=1"]),
     "train.py --help": ("Choices:", []),

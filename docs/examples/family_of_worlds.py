@@ -5,7 +5,7 @@
 Draws worlds and seeds: maps of 4x4 to 12x12 cells, half of them `classic`, half with random walls and one to
 three traps; slip 0, 0.05, 0.1 or 0.2; a step reward of 0, -0.01, -0.04 or -0.1; an observation. Each is
 trained on once, with `agent=...` and nothing else. `--seed 2` draws the held-out ones of the documentation.
-With `--samples 9.6e6` nothing is trained: in the agent's place stands the optimum of a world that is
+With `--samples 9.6e6` nothing is trained: the agent is replaced by the optimum of a world that is
 estimated from so many transitions, as many of each state and action.
 """
 

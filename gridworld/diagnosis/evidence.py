@@ -234,14 +234,14 @@ def faster(run: Evidence) -> tuple[str, ...]:
     return *adam, *((run.multiplied("learning_rate", by),) if by > 2 else ()), longer(run, 4)
 
 
-def longer(run: Evidence, times: int) -> str:
-    """The words for a run so many times as long or more, with a usual learning rate if its own is small."""
+def longer(run: Evidence, times: int, keep_rate: bool = False) -> str:
+    """The words for a run so many times as long or more; a small rate changes too, unless `keep_rate`."""
     total = run.config.total_timesteps
     updates = 1.0 if run.is_tabular else _ENOUGH[run.is_actor_critic] / max(run.updates, 1.0)
     goals = _MEETINGS * run.steps_to_goal / total if np.isfinite(run.steps_to_goal) else 1.0
     word = f"total_timesteps={total * max(times, math.ceil(min(max(updates, goals), _MOST)))}"
     by = run.usual_rate / max(run.setting("learning_rate", 1.0), 1e-300)
-    return f"{word} {run.multiplied('learning_rate', by)}" if by > _FAR else word
+    return f"{word} {run.multiplied('learning_rate', by)}" if by > _FAR and not keep_rate else word
 
 
 def best_of_what_was_tried(evaluator: Evaluator, tried: BoolArray) -> FloatArray:

@@ -16,7 +16,7 @@ from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import RunReader, find_run
 from gridworld.storage.atomic_write import is_locked, write_text
 from gridworld.storage.csv_text import csv_rows, csv_text
-from gridworld.storage.safe_read import LARGEST_CSV, LARGEST_JSON, as_table, read_bytes
+from gridworld.storage.safe_read import LARGEST_JSON, read_bytes, read_table
 from gridworld.sweep.folder import JobEntry
 
 JOBS_CSV = "jobs.csv"
@@ -55,7 +55,7 @@ class JobTable:
     def read(self) -> dict[str, JobRow]:
         """The rows of the file; one that cannot be read counts as empty, since it can be made again."""
         try:
-            lines = list(csv_rows(as_table(read_bytes(self.file, LARGEST_CSV), self.file)))
+            lines = list(csv_rows(read_table(self.file)))
         except (InputError, csv.Error):
             return {}
         if not lines or lines[0] != _COLUMNS:

@@ -1,6 +1,8 @@
 """The pages of the documentation: their blocks of code, run or read in one folder."""
 
+import contextlib
 import importlib
+import io
 import re
 import shlex
 import subprocess
@@ -31,11 +33,7 @@ _SEEDS = re.compile(r"seed=(?:range\(\d+\)|[\d,]+,\d+)$")
 _FEW_STEPS = ["total_timesteps=1000", "evaluation.every=500"]
 NO_PICTURES = [f"recording.{picture.setting}=false" for picture in PICTURES]
 _FEW_TRIALS = [
-    "tune.trials=2",
-    "tune.seeds=1",
-    "tune.final_seeds=1",
-    "tune.confirm_seeds=2",
-    "tune.workers=1",
+    *("tune.trials=2", "tune.seeds=1", "tune.final_seeds=1", "tune.confirm_seeds=2", "tune.workers=1"),
 ]
 
 
@@ -102,9 +100,18 @@ class Reader:
         self._ran: set[str] = set()
 
     def read(self, page: Path) -> None:
-        """Run a page's commands and Python, write its files, and read what else looks like a command."""
+        """Run a page's commands and Python, write its files, and read what else looks like a command.
+
+        A block of text after one of Python is what that prints.
+        """
         names: dict[str, object] = {}
+        printed = ""
         for block in blocks(page):
+            if block.language == "text" and printed:
+                assert block.text.split() == printed.split(), page
+                printed = ""
+                continue
+            printed = ""
             if block.file:
                 (self.folder / block.file).parent.mkdir(parents=True, exist_ok=True)
                 (self.folder / block.file).write_text(block.text)
@@ -112,7 +119,9 @@ class Reader:
                 for line in block.lines:
                     self._run_once(line)
             elif block.language == "python":
-                exec(compile(block.text, page.name, "exec"), names)
+                with contextlib.redirect_stdout(io.StringIO()) as output:
+                    exec(compile(block.text, page.name, "exec"), names)
+                printed = output.getvalue()
             elif block.language == "yaml":
                 yaml.safe_load(block.text)
             else:
@@ -137,11 +146,8 @@ class Reader:
         variables = dict(word.split("=", 1) for word in words if word.startswith("PYTHONPATH="))
         program, *words = words[len(variables) :]
         if program == "tensorboard":
-            command = [
-                str(Path(sys.executable).with_name(program)),
-                *words,
-                "--inspect",
-            ]  # reads the same, and ends
+            reads = str(Path(sys.executable).with_name(program))
+            command = [reads, *words, "--inspect"]  # reads the same, and ends
             return subprocess.run(command, cwd=self.folder, capture_output=True, text=True, timeout=300)
         assert program == "python"
         words[0] = words[0].removeprefix("scripts/")

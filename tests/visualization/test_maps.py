@@ -229,7 +229,7 @@ def test_a_run_leaves_out_what_cannot_be_drawn_and_says_so(
     own = (f"env.layout={tmp_path / 'wide.txt'}", "total_timesteps=320", "env.max_episode_steps=5")
     with caplog.at_level(logging.WARNING):
         train_in(tmp_path / "endless", *SHORT["q_learning"], "env.step_reward=0.1", "agent.gamma=1")
-        assert "q_error.png is left out, gamma=1 with step_reward=0.1" in caplog.text
+        assert "q_error.png is left out, gamma=1 in " in caplog.text
         caplog.clear()
         train_in(tmp_path / "wide", *SHORT["q_learning"], *own)
     for name in ("policy.png", "q_error.png", "visits.png", "learning.gif", "the episode"):

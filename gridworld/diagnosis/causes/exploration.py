@@ -62,7 +62,9 @@ def _exploration(run: Evidence, states: BoolArray, why: str) -> Finding:
         changes = (longer(run, 10), *_explore(run)[:2])
         return Finding("budget", states, f"{why}{told}, and it had {total:,}", changes)
     spent = "" if run.is_actor_critic else f", and {random * total:,.0f} of its {total:,} were random"
-    return Finding("exploration", states, f"{why}{told}{spent}", (*_explore(run), longer(run, 10))[:3])
+    is_paid = run.is_actor_critic and not run.config.exploration_bonus
+    more = f"{longer(run, 10, keep_rate=True)} exploration_bonus={_BONUS}" if is_paid else longer(run, 10)
+    return Finding("exploration", states, f"{why}{told}{spent}", (*_explore(run), more)[:3])
 
 
 def _random(run: Evidence) -> float:

@@ -1,0 +1,46 @@
+"""The site builds without a warning, and no page is wider than the window."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers.browser import chromium
+from helpers.support import ROOT
+
+WIDTHS = (390, 1280, 1440, 1600)
+PAGES = (  # by what may be too wide: a picture, tables, long commands, the tables of options, signatures
+    "index",
+    "how-to/agents",
+    "how-to/speed",
+    "reference/results",
+    "reference/options",
+    "reference/api",
+)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("sphinx")
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", str(ROOT / "docs"), str(folder)]
+    subprocess.run(command, check=True, timeout=300)
+    return folder
+
+
+@pytest.mark.slow
+def test_no_page_is_wider_than_the_window(site: Path, tmp_path: Path) -> None:
+    with chromium(tmp_path) as browser:
+        too_wide = []
+        for width in WIDTHS:
+            size = {"width": width, "height": 1000, "deviceScaleFactor": 1, "mobile": False}
+            browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+            for page in PAGES:
+                browser.get((site / f"{page}.html").as_uri())
+                wide, window = browser.execute_script(
+                    "return [document.documentElement.scrollWidth, window.innerWidth]"
+                )
+                assert window == width
+                if wide > window:
+                    too_wide.append((page, width, wide))
+    assert not too_wide
