@@ -72,7 +72,7 @@ __all__ = ["ENV_ID", "register_envs", *sorted(_HOME)]
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *_HOME]
+    return __all__
 
 
 def __getattr__(name: str) -> object:

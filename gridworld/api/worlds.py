@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from gymnasium.spaces import Discrete
 from numpy.typing import ArrayLike
 
 from gridworld.bounds import discount
+from gridworld.config.compose import named_world
 from gridworld.envs.inspection import Task, task_of, world_of
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.errors import InputError
@@ -21,7 +23,7 @@ from gridworld.world.mdp import FloatArray, Mdp
 def evaluate(
     model_or_table: Any = None,
     env: Any = None,
-    gamma: float = 0.99,
+    gamma: float | None = None,
     *,
     q: ArrayLike | None = None,
     deterministic: bool = True,
@@ -35,12 +37,13 @@ def evaluate(
             takes them; or a table: actions (S,), whole numbers from 0, or their probabilities (S, A);
             by observations where the environment shows whole numbers.
         env: an environment or a batch of Gymnasium or SB3: a GridWorld, or one with a transition table; a
-            compiled world (`compile_mdp`, `compile_env`); or the name of a map. The task is that of the
+            compiled world (`compile_mdp`, `compile_env`); a finished run; what `env=NAME` means on a command
+            line, or an id of Gymnasium; or a map, its file or a `Layout`. The task is that of the
             environment with its wrappers, which must be neutral or functions; see
             `gridworld.world.wrappers`. A model sees states as this environment shows them; where that
             is the world's own observation of another kind, by the kind that has the model's observation
             space. None: the environment that the model was trained on.
-        gamma: discount of value and regret.
+        gamma: discount of value and regret; None: 0.99, or a run's own `evaluation.gamma`.
         q: in place of `model_or_table`: Q values (S, A), of which the first of the best actions is taken.
         deterministic: whether to score a model's best action in every state, or the distribution that it
             explores with, as SB3's `evaluate_policy` does.
@@ -61,13 +64,19 @@ def evaluate(
         >>> round(evaluate([1] * 16, gymnasium.make("FrozenLake-v1")).outcome.goal, 3)  # always down
         0.049
     """
-    discount("gamma", gamma)
     if (model_or_table is None) == (q is None):
         raise InputError("evaluate: give one of a model or table, as the first argument, and q=...")
     is_model = hasattr(model_or_table, "observation_space")
     place = model_or_table.get_env() if env is None and hasattr(model_or_table, "get_env") else env
     if place is None:
-        raise InputError("env: is needed; give an environment, a compiled world or the name of a map")
+        raise InputError("env: is needed; give an environment, a compiled world or the name of a world")
+    if isinstance(place, str):
+        place = named_world(place)
+    elif isinstance(evaluator := getattr(place, "evaluator", None), Evaluator):  # a run
+        gamma = evaluator.solution.gamma if gamma is None else gamma
+        place = replace(evaluator.mdp, max_episode_steps=evaluator.max_episode_steps)
+    gamma = 0.99 if gamma is None else gamma
+    discount("gamma", gamma)
     task = task_of(place, max_episode_steps)
     mdp, limit = task.mdp, task.max_episode_steps
     if is_model:
@@ -138,7 +147,8 @@ def compile_env(env: Any) -> Mdp:
     Args:
         env: an environment of Gymnasium with a transition table (`P` and `initial_state_distrib`: FrozenLake,
             CliffWalking, Taxi and their like), a GridWorld, or a batch of them, of Gymnasium or SB3. Wrappers
-            that transform rewards or actions by a function are compiled into the tables.
+            that transform rewards or actions by a function are compiled into the tables. Or a name: what
+            `env=NAME` means on a command line, or an id of Gymnasium.
 
     Returns:
         The world, with the environment's step limit as `max_episode_steps`; a GridWorld's own world.
@@ -153,7 +163,7 @@ def compile_env(env: Any) -> Mdp:
         >>> mdp.name, mdp.num_states, mdp.action_names, mdp.max_episode_steps
         ('FrozenLake-v1', 16, ('left', 'down', 'right', 'up'), 100)
     """
-    return world_of(env)
+    return named_world(env) if isinstance(env, str) else world_of(env)
 
 
 def make_vec(mdp: Mdp, num_envs: int = 1, **kwargs: Any) -> GridWorldVectorEnv:
@@ -179,6 +189,6 @@ def make_vec(mdp: Mdp, num_envs: int = 1, **kwargs: Any) -> GridWorldVectorEnv:
     """
     if not isinstance(mdp, Mdp):
         raise InputError(f"mdp={str(mdp)[:50]}: must be a compiled world, as `compile_env` makes one")
-    if not isinstance(mdp, GridMdp):
+    if not isinstance(mdp, GridMdp) or mdp.max_episode_steps is not None:
         kwargs.setdefault("max_episode_steps", mdp.max_episode_steps)
     return GridWorldVectorEnv(num_envs, mdp=mdp, **kwargs)

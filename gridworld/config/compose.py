@@ -10,7 +10,7 @@ import secrets
 import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -27,8 +27,11 @@ from gridworld.config.settings import agent_schemas
 from gridworld.config.sweep import LAUNCHER_SCHEMAS, SearchConfig, SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import conf_folder, is_override, meant, own_conf_folders, prepared, sentence
-from gridworld.config.worlds import SOURCES, EnvConfig
+from gridworld.config.worlds import SOURCES, EnvConfig, GymnasiumConfig, MapConfig
 from gridworld.errors import InputError
+
+if TYPE_CHECKING:  # importing numpy takes longer than `--help` does
+    from gridworld.world.mdp import Mdp
 
 VERSION_BASE = "1.3"
 _LONGEST_NAME = 100  # characters of a job's folder
@@ -51,6 +54,31 @@ def compose(words: Sequence[str]) -> TrainConfig:
             return to_config(compose_whole(conf_folder(), "train", words)[0])
     except (HydraException, OmegaConfBaseException, YAMLError, OSError, ValueError) as error:
         raise InputError(sentence(error)) from None
+
+
+def named_world(name: str, **settings: Any) -> Mdp:
+    """Compile the world that `env=NAME` means on a command line, an id of Gymnasium's, or a map's file.
+
+    `settings` change keys of `env`. The world has the step limit of the settings as `max_episode_steps`.
+    """
+    names = sorted(path.stem for path in (conf_folder() / "env").glob("*.yaml"))
+    if name in names:
+        env = compose([f"env={name}"]).env
+    elif re.search(r"-v\d+$", name):
+        env = GymnasiumConfig(id=name)
+    elif name.endswith(".txt"):
+        env = MapConfig(layout=name)
+    else:
+        all_of_them = (
+            f"; give an id of Gymnasium, as FrozenLake-v1, a map's file, or one of {', '.join(names)}"
+        )
+        raise InputError(f"env={name}: there is no such world{meant(name, names) or all_of_them}")
+    known = {field.name for field in dataclasses.fields(env)}
+    if wrong := sorted(set(settings) - known):
+        raise InputError(f"{wrong[0]}: is not a setting of env={name}{meant(wrong[0], sorted(known))}")
+    env = dataclasses.replace(env, **settings)
+    mdp = env.compile()
+    return dataclasses.replace(mdp, max_episode_steps=env.step_limit(mdp))
 
 
 def compose_whole(conf: Path, name: str, overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:

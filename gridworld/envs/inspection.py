@@ -87,12 +87,11 @@ def task_of(env: Any, max_episode_steps: int | None = None) -> Task:
     """Find out which task an environment is; refuses what has no world in it or may change it unseen.
 
     `env` is an environment or a batch of Gymnasium or SB3, wrapped or not, of a GridWorld or with a
-    transition table; a compiled world; or what `load` takes. Without a limit it is the
-    environment's own, or else 100.
+    transition table; a compiled world; or a map. Without a limit it is the environment's own, or else 100.
     """
     if isinstance(env, Mdp):
         task = Task(env, env.max_episode_steps)
-    elif isinstance(env, str | PathLike | Layout):
+    elif isinstance(env, PathLike | Layout):
         task = Task(compile_mdp(load(env)))
     else:
         task = _task(env)
@@ -121,7 +120,7 @@ def _task(env: Any) -> Task:
 def _no_world(env: Any) -> InputError:
     return InputError(
         f"env: {type(env).__name__} has no GridWorld in it and no transition table; must be a GridWorld "
-        "environment, one of Gymnasium with a table P, a compiled world, or the name of a map"
+        "environment, one of Gymnasium with a table P, a compiled world, or the name of a world"
     )
 
 

@@ -67,6 +67,10 @@ def compile_mdp(
     Raises:
         InputError: a setting that makes no world.
     """
+    if not isinstance(layout, Layout):
+        raise InputError(
+            f"layout={layout!r:.50}: must be a map, as `load` reads one; `compile_env` takes names"
+        )
     slip = finite("slip", slip)
     if not 0 <= slip <= 1:
         raise InputError(f"slip={slip}: must be a probability, from 0 to 1")

@@ -364,7 +364,7 @@ REFUSED: dict[str, tuple[Callable[[], Any], str]] = {  # what makes an environme
     "an object with a step": (grid_with_a_step, _STEP),
     "a batch that mixes": (lambda: Mixing(DummyVecEnv([lake])), _BATCH),
     "our batch that mixes":
-        (lambda: VecCheckNan(Mixing(gridworld.make_vec_env("frozen_lake_4x4", n_envs=2))), _BATCH),
+        (lambda: VecCheckNan(Mixing(gridworld.make_vec_env(layout="frozen_lake_4x4", n_envs=2))), _BATCH),
     "a batch that pays": (lambda: wrappers.vector.TransformReward(native(), lambda r: -r), _BATCH),
     "a batch that scales": (lambda: wrappers.vector.NormalizeReward(SyncVectorEnv([lake])), _BATCH),
     "a batch that shows otherwise": (lambda: Saving([lake]), _ENV),
@@ -483,7 +483,7 @@ SEEN: dict[str, Callable[[], Any]] = {
         VecNormalize(VecExtractDictObs(DummyVecEnv([as_dict] * 2), "place"))
     ),
     "grid coordinates": lambda: gridworld.CoordinateObservation(grid()),
-    "our batch": lambda: VecCheckNan(gridworld.make_vec_env("frozen_lake_4x4", n_envs=3)),
+    "our batch": lambda: VecCheckNan(gridworld.make_vec_env(layout="frozen_lake_4x4", n_envs=3)),
 }
 
 
@@ -744,11 +744,11 @@ def test_an_encoding_of_ones_own_is_not_taken_for_ours_by_its_space() -> None:
         return wrappers.TransformObservation(grid(), lambda s: np.eye(16, dtype=np.float32)[15 - s], space)
 
     model = held(BEST, reversed_rows())
-    for other in (grid(), "frozen_lake_4x4", gridworld.compile_env(reversed_rows())):
+    for other in (grid(), gridworld.load("frozen_lake_4x4"), gridworld.compile_env(reversed_rows())):
         with pytest.raises(InputError, match="only has the same space"):
             gridworld.evaluate(model, other)
     ours = held(BEST, gridworld.OneHotObservation(grid()))
-    assert gridworld.evaluate(ours, "frozen_lake_4x4") == gridworld.evaluate(ours)
+    assert gridworld.evaluate(ours, gridworld.load("frozen_lake_4x4")) == gridworld.evaluate(ours)
 
 
 # ---- what changes on the way -------------------------------------------------------------------------------

@@ -132,7 +132,7 @@ def test_the_batch_is_one_for_sb3() -> None:
     assert gridworld.make_vec_env(observation="image", cell_size=7).observation_space.shape == (3, 49, 56)
 
     def walk(seed: int) -> list[float]:
-        batch = gridworld.make_vec_env("frozen_lake_8x8", n_envs=4, slip=2 / 3, seed=seed)
+        batch = gridworld.make_vec_env(layout="frozen_lake_8x8", n_envs=4, slip=2 / 3, seed=seed)
         batch.reset()
         return [float(batch.step(np.full(4, 1))[0].argmax()) for _ in range(30)]
 

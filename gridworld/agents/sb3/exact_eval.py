@@ -26,6 +26,7 @@ from gridworld.agents.sb3.policy_outputs import (
     why_unreadable,
 )
 from gridworld.bounds import Bounds, discount
+from gridworld.config.compose import named_world
 from gridworld.envs.inspection import Task, observation_like, tabulated, task_of
 from gridworld.envs.observations import KINDS, ObservationTable
 from gridworld.errors import InputError, in_short
@@ -265,7 +266,7 @@ class ExactEvalCallback(BaseCallback):
         return table | {name: table[name].astype(kind) for name, kind in _KINDS.items() if name in table}
 
     def _evaluate_on(self, env: Any) -> Task:
-        task = task_of(env, self._limit)
+        task = task_of(named_world(env) if isinstance(env, str) else env, self._limit)
         self.evaluator = Evaluator(task.mdp, self._gamma, task.max_episode_steps)
         return task
 

@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
+from gridworld.config.compose import named_world
 from gridworld.envs.observations import IMAGE_CELL_SIZE, ObservationTable, make_observation
 from gridworld.envs.vector_env import GridWorldVectorEnv, StateArray
 from gridworld.errors import InputError
 from gridworld.storage.serialization import independent_generator
 from gridworld.world.layout import CLASSIC, Layout
+from gridworld.world.mdp import Mdp
 
+_OF_A_BATCH = {"max_episode_steps", "stratified", "render_mode"}  # arguments that no world has
 _MASKS = "action_masks"  # asked for by agents that respect them; here nothing is ever forbidden
 
 
@@ -113,7 +116,7 @@ class GridWorldVecEnv(VecEnv):
 
 
 def make_vec_env(
-    layout: str | PathLike[str] | Layout = CLASSIC,
+    env: str | Mdp | Layout | PathLike[str] = CLASSIC,
     n_envs: int = 64,
     observation: str = "one_hot",
     seed: int | None = 0,
@@ -123,13 +126,15 @@ def make_vec_env(
     """Make a batch of GridWorlds for a model of SB3: one native batch, not `n_envs` environments.
 
     Args:
-        layout: the name of a map, its file, or a `Layout`.
+        env: what `env=NAME` means on a command line (`classic`, `cliff`, `taxi_v4`, ...) or an id of
+            Gymnasium; a compiled world; or a map, its file or a `Layout`. `layout=NAME` is the bare map.
         n_envs: how many environments step together.
         observation: `one_hot`, `coordinates`, `image` (for CnnPolicy), `own` or `none` (the state's number).
         seed: of the starts and slips, unless the model has a seed, which SB3 gives to its environments; None:
             another one at every call.
         cell_size: pixels a cell, of the images.
-        world: other arguments of `GridWorldVectorEnv`: `slip`, `step_reward`, `max_episode_steps`, ...
+        world: settings of the world in place of its own (`slip`, `step_reward`, ...), and other arguments of
+            `GridWorldVectorEnv`: `max_episode_steps`, `stratified`, `render_mode`.
 
     Returns:
         An SB3 `VecEnv`, which reports episodes as SB3's `Monitor` does.
@@ -141,7 +146,15 @@ def make_vec_env(
         >>> from stable_baselines3 import PPO
         >>> model = PPO("MlpPolicy", make_vec_env("four_rooms", n_envs=8, slip=0.1))
     """
-    envs = GridWorldVectorEnv(n_envs, layout=layout, autoreset_mode=AutoresetMode.SAME_STEP, **world)
+    if not {"layout", "mdp"} & set(world):
+        if isinstance(env, str):
+            settings = {name: world.pop(name) for name in set(world) - _OF_A_BATCH}
+            world["mdp"] = named_world(env, **settings)
+        else:
+            world["mdp" if isinstance(env, Mdp) else "layout"] = env
+    if (mdp := world.get("mdp")) is not None:
+        world.setdefault("max_episode_steps", mdp.max_episode_steps)
+    envs = GridWorldVectorEnv(n_envs, autoreset_mode=AutoresetMode.SAME_STEP, **world)
     batch = GridWorldVecEnv(envs, make_observation(envs.mdp, observation, cell_size))
     batch.seed(seed)
     return batch
