@@ -61,9 +61,7 @@ def test_an_enumerated_environment_takes_the_same_walk():
 
 
 def test_large_frames_are_made_smaller():
-    frame, *_ = frames_of(
-        "CliffWalking-v1", GymnasiumConfig(id="CliffWalking-v1").compile(), [36], most_pixels=30_000
-    )
+    frame, *_ = frames_of("CliffWalking-v1", [36], most_pixels=30_000)
     assert frame.shape == (100, 300, 3)
 
 
