@@ -62,8 +62,9 @@ def test_what_commands_and_reports_say_of_a_run(
     manifest(place, lambda content: content.update(status="failed", error=EVIL))
     (line,) = told(evaluate.main, capsys, place)
     assert "this run is 'failed'" in line
-    (line,) = told(report.main, capsys, runs)
+    line, warning = told(report.main, capsys, runs)
     assert line.endswith("/report/report.html")
+    assert "this run is 'failed'" in warning
     files = [path for path in (runs / "report").rglob("*") if path.suffix in (".md", ".csv", ".html")]
     assert len(files) > 10
     for path in files:

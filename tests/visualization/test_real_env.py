@@ -16,9 +16,9 @@ from gridworld.world.sources.enumerated import enumerate_env
 FROZEN_LAKE = GymnasiumConfig(id="FrozenLake-v1").compile()
 
 
-def frames_of(env_id: str, states: list[int], mdp: Mdp | None = None, **options: int):
-    config = GymnasiumConfig(id=env_id)
-    return rendered_frames(config, mdp or config.compile(), [states], **options)
+def frames_of(env_id: str, states: list[int], mdp: Mdp | None = None, most_pixels: int = 512 * 512, **kwargs):
+    config = GymnasiumConfig(id=env_id, kwargs=kwargs)
+    return rendered_frames(config, mdp or config.compile(), [states], most_pixels)
 
 
 @pytest.mark.parametrize(
@@ -43,8 +43,9 @@ def test_an_environment_with_a_table_is_put_into_each_state(env_id, states, size
 
 
 def test_an_enumerated_environment_takes_the_same_walk():
-    mdp = enumerate_env("MiniGrid-Empty-5x5-v0")
-    env = gym.make("MiniGrid-Empty-5x5-v0", render_mode="rgb_array")
+    name, short = "MiniGrid-Empty-5x5-v0", {"max_steps": 12}
+    mdp = enumerate_env(name, short)
+    env = gym.make(name, render_mode="rgb_array", **short)
     env.reset(seed=5)
     states, expected = [int(mdp.start_states[0])], [env.render()]
     for action in (2, 1, 5, 2, 0, 0, 1, 2, 2):
@@ -52,18 +53,15 @@ def test_an_enumerated_environment_takes_the_same_walk():
         states.append(int(mdp.next_state[states[-1], action, 0]))
         expected.append(env.render())
     env.close()
-    frames = frames_of("MiniGrid-Empty-5x5-v0", states, mdp)
-    assert np.array_equal(frames, expected)
+    assert np.array_equal(frames_of(name, states, mdp, **short), expected)
     with pytest.raises(
         InputError, match="no action leads from row 2, column 2, facing right, step 0 to row 2, column 2"
     ):
-        frames_of("MiniGrid-Empty-5x5-v0", [0, 0], mdp)
+        frames_of(name, [0, 0], mdp, **short)
 
 
 def test_large_frames_are_made_smaller():
-    frame, *_ = frames_of(
-        "CliffWalking-v1", GymnasiumConfig(id="CliffWalking-v1").compile(), [36], most_pixels=30_000
-    )
+    frame, *_ = frames_of("CliffWalking-v1", [36], most_pixels=30_000)
     assert frame.shape == (100, 300, 3)
 
 
