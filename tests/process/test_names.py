@@ -62,8 +62,7 @@ def test_what_commands_and_reports_say_of_a_run(
     manifest(place, lambda content: content.update(status="failed", error=EVIL))
     (line,) = told(evaluate.main, capsys, place)
     assert "this run is 'failed'" in line
-    (line,) = told(report.main, capsys, runs)
-    assert line.endswith("/report/report.html")
+    assert any(line.endswith("/report/report.html") for line in told(report.main, capsys, runs))
     files = [path for path in (runs / "report").rglob("*") if path.suffix in (".md", ".csv", ".html")]
     assert len(files) > 10
     for path in files:
