@@ -17,7 +17,7 @@ from gridworld.report.evidence import Unusable
 from gridworld.report.grouping import Study, differing, learning_key
 from gridworld.report.statistics import Interval, Share
 from gridworld.report.tuning_study import TuningStudy
-from gridworld.storage.csv_text import csv_text
+from gridworld.storage.safe_read import csv_text
 
 NOTHING = "\N{EN DASH}"
 _MINUS = "\N{MINUS SIGN}"

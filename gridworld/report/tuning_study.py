@@ -13,8 +13,7 @@ from typing import Any
 from gridworld.errors import InputError
 from gridworld.process.console import plain
 from gridworld.process.user_input import check_memory
-from gridworld.storage.csv_text import csv_rows
-from gridworld.storage.safe_read import LARGEST_CSV, as_table, read_bytes, read_sealed, sha256
+from gridworld.storage.safe_read import LARGEST_CSV, as_table, csv_rows, read_bytes, read_sealed, sha256
 
 STUDY_JSON, TRIALS_CSV = "study.json", "trials.csv"
 TRIALS_SUM = "trials_sha256"  # in the former, of the latter

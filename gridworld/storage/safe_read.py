@@ -6,24 +6,28 @@ and its numbers fit into 64 bits. Nothing is resolved, imported or unpickled. Ev
 `InputError`, with a sentence that names the file, and `BudgetError` where it would take too much memory.
 
 JSON may have a seal, which is a checksum over all of its content. A seal finds damage and changes. It finds
-no forgery: whoever writes a file can seal it.
+no forgery: whoever writes a file can seal it. In CSV no cell is a formula to a spreadsheet: a text that
+begins as one, and is no number, is written behind an apostrophe, as spreadsheets do it themselves.
 """
 
 from __future__ import annotations
 
+import csv
 import errno
 import hashlib
 import io
 import json
 import math
 import os
+import re
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
 from gridworld.bounds import LARGEST_INTEGER
 from gridworld.errors import InputError
+from gridworld.process.console import plain
 from gridworld.process.user_input import check_memory
 
 LARGEST_JSON = 4 * 2**20  # bytes
@@ -32,6 +36,7 @@ FORMAT = 2  # of sealed JSON
 _DEEPEST = 100  # levels of JSON; what reads it further may call itself for each
 # Bytes of memory that a byte of text may come to as Python's objects: short strings in short lists.
 _AS_CSV, AS_JSON = 64, 48
+_FORMULA = re.compile(r"'*[=+\-@\uff1d\uff0b\uff0d\uff20]")  # the last four are as wide as Chinese signs
 
 
 def open_ordinary(path: Path, mode: str = "rb", most: float = math.inf) -> BinaryIO:
@@ -166,3 +171,27 @@ def file_sha256(path: Path, most: int) -> str:
     """SHA-256 of a file of at most `most` bytes, which is not held in memory."""
     with open_ordinary(path, most=most) as file:
         return hashlib.file_digest(cast("io.BufferedReader", file), "sha256").hexdigest()
+
+
+def csv_text(rows: Iterable[Iterable[object]]) -> str:
+    """Rows of cells as the text of a file, a line each."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(map(_cell, row) for row in rows)
+    return text.getvalue()
+
+
+def csv_rows(text: str) -> Iterator[list[str]]:
+    """The rows that `csv_text` was given. Raises `csv.Error`."""
+    for row in csv.reader(io.StringIO(text)):
+        yield [cell[cell.startswith("'") and _FORMULA.match(cell) is not None :] for cell in row]
+
+
+def _cell(value: object) -> object:
+    if not isinstance(value, str):
+        return value
+    text = plain(value)
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}" if _FORMULA.match(text) else text
+    return text

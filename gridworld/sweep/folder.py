@@ -34,8 +34,7 @@ from gridworld.storage.atomic_write import (
     write_json,
     write_text,
 )
-from gridworld.storage.csv_text import csv_text
-from gridworld.storage.safe_read import LARGEST_JSON, read_bytes, read_sealed, sealed
+from gridworld.storage.safe_read import LARGEST_JSON, csv_text, read_bytes, read_sealed, sealed
 from gridworld.sweep.plan import Job
 
 JOBS_CSV = "jobs.csv"

@@ -24,7 +24,7 @@ from gridworld.envs.statistics_env import NO_EPISODES, Returns, StatisticsVector
 from gridworld.errors import InputError
 from gridworld.run.writer import NEEDED
 from gridworld.storage.atomic_write import AppendLog
-from gridworld.storage.csv_text import csv_text
+from gridworld.storage.safe_read import csv_text
 from gridworld.storage.serialization import State
 from gridworld.world.evaluation import Evaluator, Score
 from gridworld.world.metrics import METRICS, TRAINING_METRICS, Metric, numbers, optimal_score

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import gridworld
 from gridworld.process.console import plain
 from gridworld.report.tables import Table, to_csv
-from gridworld.storage.csv_text import csv_rows, csv_text
+from gridworld.storage.safe_read import csv_rows, csv_text
 from gridworld.sweep.folder import JobRow, SweepFolder
 
 FORMULA = re.compile(r"[=+\-@\t\r\n]")
@@ -55,4 +55,4 @@ def test_tables_of_reports_and_of_sweeps_have_no_formulas(tmp_path: Path) -> Non
 def test_only_one_module_writes_csv() -> None:
     writes = re.compile(r"csv\.(writer|DictWriter)\(")
     package = Path(gridworld.__file__).parent
-    assert [p.name for p in package.rglob("*.py") if writes.search(p.read_text())] == ["csv_text.py"]
+    assert [p.name for p in package.rglob("*.py") if writes.search(p.read_text())] == ["safe_read.py"]
