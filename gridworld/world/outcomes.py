@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError
-from gridworld.process.memory_budget import check_memory
+from gridworld.process.user_input import check_memory
 from gridworld.world.layout import positive_int
 from gridworld.world.mdp import (
     LEAST_REWARD,

@@ -33,6 +33,7 @@ import gymnasium as gym
 import numpy as np
 
 from gridworld.errors import InputError, in_short
+from gridworld.workarounds import generator_of
 
 _GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
 _KEPT = (
@@ -186,9 +187,10 @@ def random_states(env: gym.Env[Any, Any] | None = None) -> list[Any]:
     """The states of all generators that a step may draw from: the environment's, and those that all share."""
     torch = sys.modules.get("torch")
     shared = [] if torch is None else [torch.get_rng_state().numpy().tobytes()]
-    shared += [random.getstate(), _generator_state(np.random.mtrand._rand)]
+    numpys = np.random.get_state(legacy=False)["state"]
+    shared += [random.getstate(), (numpys["key"].tobytes(), numpys["pos"])]
     held = [] if env is None else [env, *vars(env).values()]
-    found = [getattr(each, "_np_random", each) for each in held]
+    found = [generator_of(each) or each for each in held]
     return shared + [_generator_state(each) for each in found if isinstance(each, _GENERATORS)]
 
 
