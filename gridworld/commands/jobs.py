@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gridworld.process.console import aligned, printable, program, telling_if_slow
-from gridworld.process.memory_budget import limited
+from gridworld.process.user_input import limited
 from gridworld.sweep.console import counts_text
 from gridworld.sweep.folder import STATUSES, JobRow, open_sweep
 from gridworld.world.metrics import regret_text

@@ -21,9 +21,10 @@ from omegaconf import DictConfig, OmegaConf
 from gridworld.agents import family
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.errors import FolderLostError, InputError, MachineError, reason
-from gridworld.process.console import called_from, prepare
+from gridworld.process.console import prepare
 from gridworld.process.signals import Interrupted, exiting, handling, send_sigterm
 from gridworld.process.together import mixing
+from gridworld.process.user_input import called_from
 from gridworld.restore.resume import unfinished_of
 from gridworld.run.folder import ERROR_FILE, LOCK, MANIFEST
 from gridworld.run.reader import find_run, is_started

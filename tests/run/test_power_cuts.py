@@ -138,27 +138,3 @@ def test_a_short_run_waits_for_the_disk_at_its_end_only(tmp_path: Path) -> None:
     names = [Path(path).name.split(".")[0] for path in disk.syncs if "source" not in path]
     assert names[-1] == "run"
     assert len(names) == len(set(names)) + 1 == 14  # the run's folder with its results, and with its end
-
-
-DAMAGES: dict[str, Callable[[bytes], bytes]] = {
-    "empty": lambda _: b"",
-    "zeros": lambda content: bytes(len(content)),
-    "cut": lambda content: content[:300],
-    "changed": lambda content: content.replace(b'"slip": 0.0', b'"slip": 0.9'),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_manifest_is_refused_and_nothing_is_lost(damage: str, tmp_path: Path) -> None:
-    begin(tmp_path, *SAVED)
-    file = tmp_path / "manifest.json"
-    whole, results = file.read_bytes(), read_run(tmp_path).results()
-    before = [path.read_bytes() for path in results]
-    file.write_bytes(DAMAGES[damage](whole))
-    for act in (lambda: go_on(tmp_path, 3000), lambda: begin_or_go_on(tmp_path, *SAVED)):
-        with pytest.raises(InputError, match=r"manifest\.json: (is no JSON|was changed or damaged)"):
-            act()
-    assert [path.read_bytes() for path in results] == before
-    file.write_bytes(whole)
-    go_on(tmp_path, 3000)
-    assert is_whole(tmp_path)

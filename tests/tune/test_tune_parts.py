@@ -252,8 +252,13 @@ def test_a_trial_that_is_worse_than_the_median_is_pruned(tmp_path: Path) -> None
     assert all(len(trial.intermediate_values) == 10 for trial in study.trials)
 
 
-@pytest.mark.parametrize("words", [["tune.sampler=tpe"], ["tune.sampler=random"], ["tune.pruner=hyperband"]])
-def test_a_search_of_one_worker_is_the_same_however_it_was_stopped(words: list[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("word", "killed"),
+    [("tune.sampler=tpe", (0, 1, 1)), ("tune.sampler=random", (3, 11)), ("tune.pruner=hyperband", (3, 11))],
+)
+def test_a_search_of_one_worker_is_the_same_however_it_was_stopped(
+    word: str, killed: tuple[int, ...], tmp_path: Path
+) -> None:
     def searched(name: str, kills: Sequence[int]) -> list[tuple[Any, ...]]:
         calls = itertools.count()
 
@@ -266,7 +271,7 @@ def test_a_search_of_one_worker_is_the_same_however_it_was_stopped(words: list[s
             return outcome(error="too large") if rate > 0.9 else outcome(rate)
 
         for _ in range(len(kills) + 1):
-            spec, study = asked(tmp_path / name, "tune.trials=14", *words)
+            spec, study = asked(tmp_path / name, "tune.trials=14", word)
             with contextlib.suppress(KeyboardInterrupt):
                 search(spec, study, Inline(function))
         return [told(trial) for trial in study.trials]
@@ -274,7 +279,7 @@ def test_a_search_of_one_worker_is_the_same_however_it_was_stopped(words: list[s
     calm = searched("calm", ())
     assert len(calm) == 14
     assert len({str(trial[1]) for trial in calm}) == 14
-    assert searched("killed", (0, 1, 1, 3, 11)) == calm
+    assert searched("killed", killed) == calm
 
 
 def told(trial: FrozenTrial) -> tuple[Any, ...]:

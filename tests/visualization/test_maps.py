@@ -233,7 +233,7 @@ def test_a_run_leaves_out_what_cannot_be_drawn_and_says_so(
     overrides = ["env.step_reward=0.1", "agent.gamma=1", "total_timesteps=500"]
     with caplog.at_level(logging.WARNING):
         train_in(tmp_path, *SHORT["dqn"], *overrides)
-    assert "q_error.png is left out, gamma=1 with step_reward=0.1" in caplog.text
+    assert "q_error.png is left out, gamma=1 in " in caplog.text
     assert not (tmp_path / "q_error.png").exists()
     assert (tmp_path / "visits.png").exists()
 
