@@ -1,12 +1,19 @@
 """What commands print: columns in line, whatever numbers are in them, and nothing that acts on a terminal."""
 
+import json
 import re
+from pathlib import Path
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gridworld.commands import jobs as jobs_command
 from gridworld.process.console import aligned, printable
 from gridworld.run.summary import summary_text
+from gridworld.storage.safe_read import sealed
+from gridworld.sweep import folder
+from gridworld.sweep.folder import JobRow
 
 WORDS = st.text("ab-.0", min_size=1, max_size=30)
 USUAL = {
@@ -64,6 +71,27 @@ def test_a_goal_that_is_reached_more_often_for_less_is_explained() -> None:
     summary |= {"timeout_probability": 0.0, "optimal_goal_probability": 0.9863}
     [line] = [line for line in summary_text(summary, "x").splitlines() if "goal probability" in line]
     assert line.endswith("0.9863   more often than the optimum, for less value")
+
+
+def test_the_list_of_a_sweeps_jobs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [
+        JobRow("seed=0", "", "interrupted", "12345678.90", "", "it was stopped"),
+        JobRow("seed=1,agent=dqn", "", "done", "0.10", "-1e-300", ""),  # rounding
+        JobRow("seed=2", "", "pending", "", "", ""),
+    ]
+    jobs = [{"job": row.job, "hash": row.job, "overrides": []} for row in rows]
+    (tmp_path / "sweep.json").write_text(json.dumps(sealed({"asked": [{"overrides": []}], "jobs": jobs})))
+    told = {row.job: row for row in rows}
+    monkeypatch.setattr(folder, "job_row", lambda path, entry: told[path.name])
+    jobs_command.main([str(tmp_path)])
+    assert capsys.readouterr().out.splitlines() == [
+        "seed=0            interrupted 12345678.90 s  it was stopped",
+        "seed=1,agent=dqn  done               0.10 s  regret 0",
+        "seed=2            pending",
+        "3 jobs: 1 pending, 1 done, 1 interrupted",
+    ]
 
 
 def test_what_is_printed_cannot_act_on_the_terminal() -> None:
