@@ -16,6 +16,7 @@ from helpers.quickly import collapse_memory, compose_quickly
 from hypothesis import settings
 
 from gridworld.process import console
+from gridworld.workarounds import keep_compiler_out
 
 # The package and the tests are compiled once, not in every process.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -92,8 +93,7 @@ def pytest_collection_finish() -> None:
     """What was imported stays, and need not be looked through each time that garbage is collected."""
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)  # networks this small take longer with more
-    if "gridworld.agents.sb3.factory" in sys.modules:
-        sys.modules["gridworld.agents.sb3.factory"].keep_compiler_out()
+        keep_compiler_out()
     compose_quickly()
     gc.freeze()
     gc.set_threshold(50_000)

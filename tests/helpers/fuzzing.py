@@ -31,7 +31,7 @@ from gridworld.report.tuning_study import TRIALS_SUM, find_tunings
 from gridworld.restore.saved_run import SavedRun
 from gridworld.storage.safe_read import sealed
 from gridworld.training.setup import check_settings, make_context
-from gridworld.tune.study_folder import is_claimed
+from gridworld.tune.study import is_claimed
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load

@@ -83,7 +83,7 @@ def _prepare() -> None:
     console._SECONDS_BETWEEN_LINES = 600.0
     tune_search._SECONDS_BETWEEN_TABLES = 0.3
     if launcher := sys.modules.get("gridworld.sweep.launchers.slurm"):  # it runs here: files are not late
-        vars(launcher).update(_POLL_SECONDS=0.2, _SECONDS_BETWEEN_QUESTIONS=1.0, _FILES_ARRIVE_WITHIN=1.0)
+        vars(launcher).update(_SECONDS_BETWEEN_QUESTIONS=1.0, _FILES_ARRIVE_WITHIN=1.0)
     compose_quickly()
     compose([])
     for file in _CONF.rglob("*.yaml"):
@@ -102,7 +102,7 @@ def _prepare() -> None:
 def run(words: list[str], cwd: str, environment: dict[str, str], watched: tuple[str, str] | None) -> NoReturn:
     """Run a script in this fork; `words` are its command line."""
     vars(process).update(_current_process=_MAIN, _parent_process=None)
-    if "tune.py" in words[0] or any(word.endswith("launcher=joblib") for word in words):
+    if any(word.endswith("launcher=joblib") for word in words):
         _keep_workers()
 
     def program() -> None:
