@@ -15,7 +15,7 @@ import gridworld
 from gridworld.config.settings import flat
 
 CLAIMS: dict[str, tuple[str, list[str]]] = {  # by a part of a command: what it prints, and words to add
-    "classic_ppo_sb3_defaults": ("not optimal", []),
+    "hydra.run.dir=runs/defaults": ("not optimal", []),
     "diagnose.py runs/defaults": ("exploration", []),
     "observation=coordinates": ("certified optimal since step", ["evaluation.stop_after=1"]),
     "observation=image": ("certified optimal since step", ["evaluation.stop_after=1"]),
@@ -26,6 +26,11 @@ CLAIMS: dict[str, tuple[str, list[str]]] = {  # by a part of a command: what it 
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory: pytest.TempPathFactory) -> Reader:
     return Reader(tmp_path_factory.mktemp("clone"), CLAIMS)
+
+
+def test_every_claim_is_of_a_command_on_a_page() -> None:
+    text = "\n".join(page.read_text("utf-8") for page in PAGES)
+    assert [part for part in CLAIMS if part not in text] == []
 
 
 @pytest.mark.slow

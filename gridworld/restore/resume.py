@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 
 from gridworld.config.fields import falls
-from gridworld.config.settings import flat
+from gridworld.config.settings import flat, foreign
 from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import MapConfig
 from gridworld.errors import InputError
@@ -164,7 +164,8 @@ class Unfinished:
 
     def _tell_if_map_changed(self) -> None:
         env = self.config.env
-        if not isinstance(env, MapConfig):
+        is_foreign = not self.is_trusted and any(foreign({"env": dataclasses.asdict(env)}))
+        if is_foreign or not isinstance(env, MapConfig):  # a stranger's may be any file
             return
         try:
             changed = env.compile().text() != self.mdp.text()
