@@ -32,7 +32,8 @@ from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig, TuneConfig
 from gridworld.config.train import AgentConfig, TrainConfig
 from gridworld.config.worlds import SOURCES, EnvConfig, schema_of
 from gridworld.errors import InputError
-from gridworld.process.console import printable, users_folder
+from gridworld.process.console import printable
+from gridworld.process.user_input import users_folder
 
 # Where one of these is missing or empty, a run is as those that were made before there was such a setting.
 NEWER = frozenset(

@@ -9,9 +9,5 @@ So one pass over the states gives the loss and the gradient of any number of sam
 stand still, the outputs are a table and acting is looking up.
 
 All arrays have a leading axis P. A run has its own random generators and its own row, and no number of it
-depends on the other rows. An algorithm is one file: `ppo`, `a2c` and `trpo` alternate between a rollout and
-an update (`on_policy`), `dqn` and `qrdqn` between steps into a `replay` and an update. They share `run` (what
-a run has to itself), `population` (the runs, their hooks, their state), `environments`, `networks` and
-`optimizer`. `sb3_format` is the border to Stable-Baselines3, whose own classes make the first network and
-whose files are written.
+depends on the other rows. docs/reference/how-a-run-works.md says what is in each file.
 """

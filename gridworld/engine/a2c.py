@@ -15,10 +15,7 @@ from gridworld.world.mdp import IntArray
 
 
 class A2C(OnPolicy):
-    """P runs of A2C."""
-
     def update(self, old: tuple[Array, Array], pairs: IntArray, advantages: Array, returns: Array) -> None:
-        """See `OnPolicy.update`."""
         ((states, sums),) = self.summed_up(pairs[:, None], advantages[:, None], returns[:, None])
         logits, values = self.networks.run(states)
         new = log_softmax(logits), values[..., 0]

@@ -28,8 +28,6 @@ _DRAWN_AT_ONCE = 2**13  # transitions of a run
 
 
 class DQN(Population):
-    """P runs of DQN."""
-
     def __init__(self, runs: Sequence[Run], states: Sequence[State | None]) -> None:
         self._outputs: Array | None = None  # of the networks as they are, of all states
         self._greedy: IntArray | None = None  # (P, S), by these
@@ -228,16 +226,13 @@ class DQN(Population):
         return loss.sum(axis=1) / count, slopes
 
     def snapshot(self, run: Run) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
-        """See `Population.snapshot`."""
         q = self.q_of(self.outputs)[run.row].astype(np.float64)
         return q.max(axis=-1), None, q
 
     def weights(self, run: Run) -> dict[str, tuple[Networks, Sequence[torch.Tensor]]]:
-        """See `Population.weights`."""
         return {**super().weights(run), "target_weights": (self.target, run.target_parameters)}
 
     def get_state(self, run: Run) -> State:
-        """See `Population.get_state`."""
         return {
             **super().get_state(run),
             "exploration_rate": float(run.model.exploration_rate),
@@ -245,7 +240,6 @@ class DQN(Population):
         }
 
     def set_state(self, run: Run, state: State) -> None:
-        """Mirrors `get_state`."""
         super().set_state(run, state)
         run.model.exploration_rate = float(state["exploration_rate"])
         self.replay.set_state(run.row, state["replay"])

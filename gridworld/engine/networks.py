@@ -205,14 +205,12 @@ class ModuleNetworks:
         self._pulled: list[tuple[Tensor, Sequence[Tensor]]] = []  # of each output, slopes and gradients
 
     def run(self, states: IntArray | None = None) -> tuple[Array, ...]:
-        """See `DenseNetworks.run`."""
         self._outputs, self._pulled = (), []
         with torch.enable_grad():
             self._outputs = self._forward(states)
         return tuple(output.detach().cpu().numpy()[None] for output in self._outputs)
 
     def backward(self, *slopes: Array) -> None:
-        """See `DenseNetworks.backward`."""
         self.gradients.zero_()
         given = [
             torch.as_tensor(slope, dtype=output.dtype, device=output.device).view_as(output)

@@ -64,7 +64,6 @@ class OnPolicy(Population):
         return log_softmax(logits), values
 
     def snapshot(self, run: Run) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
-        """See `Population.snapshot`."""
         logits, values = self.outputs
         probabilities = torch.as_tensor(logits[run.row]).softmax(dim=-1).numpy()
         return values[run.row].astype(np.float64), probabilities.astype(np.float64), None
@@ -127,11 +126,10 @@ class OnPolicy(Population):
             yield from ((None, sums.of(number)) for number in range(pairs.shape[1]))
             return
         for number in range(pairs.shape[1]):
-            which, pair = self.distinct(pairs[0, number])
-            yield (
-                which,
-                sum_up(pair[None], advantages[:, number], returns[:, number], (len(which), self.num_actions)),
-            )
+            states, actions = np.divmod(pairs[0, number], self.num_actions)
+            which, index = np.unique(states, return_inverse=True)
+            pair, shape = (index * self.num_actions + actions)[None], (len(which), self.num_actions)
+            yield which, sum_up(pair, advantages[:, number], returns[:, number], shape)
 
     def _count(self, run: Run, rollout: Rollout) -> None:
         """Count a run's steps, and call what wants to be called after one of them."""

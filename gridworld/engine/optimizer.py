@@ -78,7 +78,6 @@ class Optimizer:
         return {name: value.cpu().numpy().copy() for name, value in state.items()}
 
     def set_state(self, run: int, state: dict[str, Any]) -> None:
-        """Mirrors `get_state`."""
         if not state:
             return
         row = self._rows[run]

@@ -81,7 +81,6 @@ class Run:
         return float(value(1 - progress) if callable(value) else value)
 
     def record(self, name: str, value: float, for_tensorboard: bool = True) -> None:
-        """Log a number under SB3's name."""
         self.model.logger.record(name, value, exclude=None if for_tensorboard else "tensorboard")
 
     def keep_episodes(self, returns: FloatArray, lengths: IntArray) -> None:
@@ -132,7 +131,6 @@ class Run:
         }
 
     def set_state(self, state: State) -> None:
-        """Mirrors `get_state`."""
         model = self.model
         if state["num_timesteps"] < 0 or state["num_updates"] < 0 or state["num_episodes"] < 0:
             raise StateError("counters must be at least 0")
@@ -160,7 +158,6 @@ def log_state(model: Any) -> State:
 
 
 def set_log_state(model: Any, state: State) -> None:
-    """Mirrors `log_state`."""
     model.ep_info_buffer.clear()
     model.ep_info_buffer.extend(
         {"r": float(each), "l": int(length), "t": 0.0} for each, length in state["recent_episodes"]
@@ -235,7 +232,6 @@ class Population:
         return [run.setting(name, self.progress(run)) for run in self.runs]
 
     def progress(self, run: Run) -> float:
-        """The share of a run's training that is done."""
         return self.num_timesteps / run.total_timesteps
 
     def learn(self, total_timesteps: int) -> None:
@@ -252,12 +248,6 @@ class Population:
     def going(self, chosen: BoolArray | bool = True) -> list[Run]:
         """The runs that have not ended, of those that are chosen (P,)."""
         return list(itertools.compress(self.runs, (self.active & chosen).tolist()))
-
-    def distinct(self, pairs: IntArray) -> tuple[IntArray, IntArray]:
-        """The states (U,) that occur in a batch of pairs (B,), and the pairs with these numbered in turn."""
-        states, actions = np.divmod(pairs, self.num_actions)
-        which, index = np.unique(states, return_inverse=True)
-        return which, index * self.num_actions + actions
 
     def end(self, run: Run) -> None:
         """Let a run take no further part."""
@@ -317,7 +307,6 @@ class Population:
         }
 
     def set_state(self, run: Run, state: State) -> None:
-        """Mirrors `get_state`."""
         run.set_state(state)
         for name, (networks, _) in self.weights(run).items():
             own = networks.weights[run.row].cpu().numpy()

@@ -22,8 +22,6 @@ from gridworld.world.mdp import BoolArray, IntArray
 
 
 class PPO(OnPolicy):
-    """P runs of PPO."""
-
     def __init__(self, runs: Sequence[Run], states: Sequence[State | None]) -> None:
         super().__init__(runs, states)
         model = runs[0].model
@@ -38,7 +36,6 @@ class PPO(OnPolicy):
         return super().kind(run), run.model.clip_range_vf is None
 
     def update(self, old: tuple[Array, Array], pairs: IntArray, advantages: Array, returns: Array) -> None:
-        """See `OnPolicy.update`."""
         coefficients = Coefficients(
             self.column("clip_range"),
             self.column("clip_range_vf") if self.clips_values else None,

@@ -23,15 +23,12 @@ from gridworld.world.mdp import FloatArray, IntArray
 
 
 class QRDQN(DQN):
-    """P runs of QR-DQN."""
-
     def _shaped(self, outputs: Array) -> Array:
         """The quantiles, (P, U, N, A)."""
         return outputs.reshape(*outputs.shape[:2], -1, self.num_actions)
 
     @staticmethod
     def q_of(outputs: Array) -> Array:
-        """See `DQN.q_of`."""
         q: Array = torch.as_tensor(outputs).mean(dim=-2).numpy()
         return q
 
@@ -43,7 +40,6 @@ class QRDQN(DQN):
         return np.ascontiguousarray(chosen.swapaxes(1, 2))
 
     def _targets(self, drawn: Transitions, best: Array, gamma: Array) -> Array:
-        """(n, P, N, B)."""
         following = np.stack(
             [of_run.take(drawn.following[:, run], axis=-1) for run, of_run in enumerate(best)]
         )

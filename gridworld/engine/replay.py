@@ -88,7 +88,6 @@ class UniformReplay:
         return {**columns, "position": self._position, "is_full": self._is_full}
 
     def set_state(self, run: int, state: State) -> None:
-        """Mirrors `get_state`."""
         self._position, self._is_full = int(state["position"]), bool(state["is_full"])
         if not 0 <= self._position < self._rows:
             raise StateError(f"the replay's position must be from 0 to {self._rows - 1}")
@@ -114,7 +113,6 @@ class CountedReplay:
     def store(
         self, states: IntArray, actions: IntArray, following: IntArray, rewards: FloatArray, ends: BoolArray
     ) -> None:
-        """See `UniformReplay.store`."""
         numbers = ((states * self._num_actions + actions) * self._num_states + following) * 2 + ends
         for run, met in enumerate(numbers + 1j * rewards.astype(np.float32)):
             known, counts = self._met[run], self._counts[run]
@@ -150,7 +148,6 @@ class CountedReplay:
         return Transitions(*found)
 
     def get_state(self, run: int) -> State:
-        """See `UniformReplay.get_state`."""
         met = self._met[run]
         return {
             "transitions": met.real.copy(),
@@ -159,7 +156,6 @@ class CountedReplay:
         }
 
     def set_state(self, run: int, state: State) -> None:
-        """See `UniformReplay.set_state`."""
         count = len(state["counts"])
         met, counts = np.empty(count, dtype=np.complex128), np.empty(count, dtype=np.int64)
         for name, column in (("transitions", met.real), ("rewards", met.imag), ("counts", counts)):

@@ -108,7 +108,6 @@ def put_weights(run: Run) -> None:
 
 
 def model_file(run: Run) -> bytes:
-    """The content of SB3's model file."""
     put_weights(run)
     content = io.BytesIO()
     run.model.save(content, exclude=["rollout_buffer_class", "replay_buffer_class", "replay_buffer_kwargs"])

@@ -39,8 +39,6 @@ _RESIDUAL = 1e-10  # squared, below which conjugate gradients end
 
 
 class TRPO(OnPolicy):
-    """P runs of TRPO."""
-
     pushes: ClassVar[bool] = True
 
     @classmethod
@@ -55,23 +53,19 @@ class TRPO(OnPolicy):
         return Optimizer(own, self.critic.weights, self.critic.gradients, [math.inf] * len(own))
 
     def fitted(self, run: Run) -> Sequence[Tensor]:
-        """See `Population.fitted`."""
         return value_parameters(run)
 
     def weights(self, run: Run) -> dict[str, tuple[Networks, Sequence[Tensor]]]:
-        """See `Population.weights`."""
         values = self.critic, value_parameters(run)
         return {"weights": (self.networks, policy_parameters(run)), "value_weights": values}
 
     @property
     def outputs(self) -> tuple[Array, Array]:
-        """See `OnPolicy.outputs`."""
         if self._outputs is None:
             self._outputs = self.networks.run()[0], self.critic.run()[0][..., 0]
         return self._outputs
 
     def update(self, old: tuple[Array, Array], pairs: IntArray, advantages: Array, returns: Array) -> None:
-        """See `OnPolicy.update`."""
         samples = pairs, advantages, returns
         order = self.orders(pairs.shape[1], self.active)
         part = order[:, None, :: self.runs[0].model.sub_sampling_factor]
@@ -167,13 +161,11 @@ class TRPO(OnPolicy):
 
 
 def policy_parameters(run: Run) -> list[nn.Parameter]:
-    """The parameters that the policy depends on."""
     named = run.model.policy.named_parameters()
     return [each for name, each in named if not name.startswith(_OF_VALUES)]
 
 
 def value_parameters(run: Run) -> list[nn.Parameter]:
-    """The parameters that only the values depend on."""
     named = run.model.policy.named_parameters()
     return [each for name, each in named if name.startswith(_OF_VALUES)]
 

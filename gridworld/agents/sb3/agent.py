@@ -125,13 +125,11 @@ class SB3Agent:
 
     @property
     def model(self) -> BaseAlgorithm:
-        """SB3's."""
         return self._model
 
     def learn(
         self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
     ) -> None:
-        """See `gridworld.agents.Agent.learn`."""
         interval, falling = self.config.log_interval, self.config.falling()
         self._callback = RunCallback(on_step, on_safe_point, state, interval, self._callbacks, falling)
         try:
@@ -149,7 +147,6 @@ class SB3Agent:
             raise
 
     def class_without_state(self) -> str | None:
-        """See `gridworld.agents.Agent.class_without_state`."""
         return class_without_state(self._model, self._callbacks)
 
     def get_state(self) -> State:
@@ -157,7 +154,6 @@ class SB3Agent:
         return self._callback.get_state()
 
     def snapshot(self) -> PolicySnapshot:
-        """See `gridworld.agents.Agent.snapshot`."""
         return self._snapshot(*read_table(self._model.policy, self.observation))
 
     def _snapshot(
@@ -177,7 +173,6 @@ class SB3Agent:
         return PolicySnapshot(greedy, explored(one_hot_policy(greedy, q.shape[1]), epsilon), values, q)
 
     def model_file(self) -> bytes:
-        """See `gridworld.agents.Agent.model_file`."""
         content = io.BytesIO()
         self._model.save(content)
         return content.getvalue()
@@ -238,13 +233,11 @@ class EngineAgent(SB3Agent):
     def learn(
         self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
     ) -> None:
-        """See `gridworld.agents.Agent.learn`."""
         (error,) = self.learn_together([Learning(self, total_timesteps, on_step, on_safe_point, state)])
         if error is not None:
             raise error
 
     def learn_together(self, learnings: Sequence[Learning]) -> list[BaseException | None]:
-        """See `gridworld.agents.learn_together`."""
         agents = [learning.agent for learning in learnings if isinstance(learning.agent, EngineAgent)]
         for agent, learning in zip(agents, learnings, strict=True):
             agent.run.begin(learning.total_timesteps)
@@ -260,19 +253,15 @@ class EngineAgent(SB3Agent):
         """See `gridworld.agents.Agent.class_without_state`: the engine takes known classes alone."""
 
     def get_state(self) -> State:
-        """See `gridworld.agents.Agent.get_state`."""
         return self.run.population.get_state(self.run)
 
     def snapshot(self) -> PolicySnapshot:
-        """See `gridworld.agents.Agent.snapshot`."""
         return self._snapshot(*self.run.population.snapshot(self.run))
 
     def model_file(self) -> bytes:
-        """See `gridworld.agents.Agent.model_file`."""
         return model_file(self.run)
 
     def load(self, path: Path) -> None:
-        """See `gridworld.agents.Agent.load`."""
         super().load(path)
         self._algorithm([self.run], [None])
 

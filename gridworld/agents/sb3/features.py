@@ -31,7 +31,6 @@ class _Extractor(BaseFeaturesExtractor):
     kind: ClassVar[Kind] = "fixed"
 
     def extra_repr(self) -> str:
-        """See `torch.nn.Module.extra_repr`."""
         given = {name: vars(self).get(name) for name in ("orders", "cell_size", "length")}
         return ", ".join(f"{name}={value}" for name, value in given.items() if value is not None)
 

@@ -30,9 +30,6 @@ class Reading(NamedTuple):
     q: Tensor | None  # (n, A), of a value-based agent
 
 
-Tables = tuple[FloatArray, FloatArray | None, FloatArray | None]  # a `Reading` of all S states, float64
-
-
 def why_unreadable(policy: BasePolicy) -> str | None:
     """Why a policy's outputs cannot be read as a table over states; None: they can."""
     for module in policy.modules():
@@ -77,8 +74,10 @@ def read(policy: BasePolicy, observations: Any, masks: BoolArray | None = None) 
     return Reading(torch.max(q, dim=1).values, None, q)
 
 
-def read_table(policy: BasePolicy, observation: ObservationTable, masks: BoolArray | None = None) -> Tables:
-    """Ask a policy about all states, in batches and without gradients; `masks`: allowed actions (S, A)."""
+def read_table(
+    policy: BasePolicy, observation: ObservationTable, masks: BoolArray | None = None
+) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
+    """A `Reading` of all states in float64, made in batches; `masks`: allowed actions (S, A)."""
     parts = []
     with torch.no_grad():
         for start in range(0, observation.num_states, CHUNK):

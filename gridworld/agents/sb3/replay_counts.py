@@ -50,13 +50,11 @@ class ReplayCounts(ReplayBuffer):
         self._rows: dict[bytes, int] = {}
 
     def reset(self) -> None:
-        """Forget all transitions."""
         super().reset()
         self.counts[:] = 0
         self._rows = {}
 
     def add(self, obs: Any, next_obs: Any, action: Any, reward: Any, done: Any, infos: Any) -> None:
-        """See SB3's `ReplayBuffer.add`."""
         for index, info in enumerate(infos):
             if self.pos == self.buffer_size:
                 self.buffer_size *= 2
@@ -75,11 +73,9 @@ class ReplayCounts(ReplayBuffer):
         return b"".join(getattr(self, name)[row].tobytes() for name in _COLUMNS[:-1])
 
     def get_state(self) -> State:
-        """What was met, for a checkpoint."""
         return {name: getattr(self, name)[: self.pos] for name in _COLUMNS}
 
     def set_state(self, state: State) -> None:
-        """Mirrors `get_state`."""
         count = len(state["counts"])
         for name in _COLUMNS:
             now = getattr(self, name)

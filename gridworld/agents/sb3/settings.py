@@ -155,7 +155,6 @@ class SB3Config(AgentConfig):
         )
 
     def falling(self) -> dict[str, Decay]:
-        """Its settings that fall over training."""
         return {
             name: parse_schedule(name, self.given[name]) for name in FALLING if falls(self.given.get(name))
         }
@@ -288,6 +287,11 @@ def check(config: TrainConfig) -> None:
         raise InputError(
             f"agent.learning_starts={agent.learning_starts}: nothing would be learned; "
             f"must be below total_timesteps={config.total_timesteps}"
+        )
+    if isinstance(agent, PPOConfig) and (rollout := agent.n_steps * config.n_envs) % agent.batch_size:
+        raise InputError(
+            f"agent.batch_size={agent.batch_size}: must divide the rollout, "
+            f"agent.n_steps={agent.n_steps} x n_envs={config.n_envs} = {rollout} steps"
         )
     if (frequency := agent.given.get("train_freq")) is not None:
         _check_train_freq(agent.key("train_freq"), frequency, config.n_envs)

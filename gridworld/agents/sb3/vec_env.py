@@ -44,7 +44,6 @@ class GridWorldVecEnv(VecEnv):
 
     @property
     def states(self) -> StateArray:
-        """(num_envs,) current states."""
         return self.envs.states
 
     def reset(self) -> VecEnvObs:

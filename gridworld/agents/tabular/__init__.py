@@ -25,18 +25,12 @@ def schemas() -> dict[str, type[AgentConfig]]:
 
 
 def check(config: TrainConfig) -> None:
-    """See `gridworld.agents.Family.check`."""
     agent = config.agent
     if config.observation.kind != "none":
-        raise InputError(
-            f"observation={config.observation.kind}: agent={agent.name} keeps a table over the states "
-            "themselves and would never look at it; must be none"
-        )
+        what = f"observation={config.observation.kind}"
+        raise InputError(f"{what}: agent={agent.name} keeps a table over the states themselves; must be none")
     if config.callbacks:
-        raise InputError(
-            f"callbacks: are Stable-Baselines3's, agent={agent.name} calls none; leave them out, or choose "
-            "an agent of Stable-Baselines3, e.g. agent=dqn"
-        )
+        raise InputError(f"callbacks: are Stable-Baselines3's, agent={agent.name} calls none; leave them out")
     if config.device not in ("cpu", "auto"):
         raise InputError(f"device={config.device}: agent={agent.name} runs on the processor; must be cpu")
 
@@ -46,12 +40,10 @@ def import_for(config: AgentConfig) -> None:
 
 
 def on_processor(device: str) -> bool:
-    """See `gridworld.agents.Family.on_processor`."""
     return True
 
 
 def build(config: AgentConfig, context: TrainingContext) -> Agent:
-    """See `gridworld.agents.Family.build`."""
     from gridworld.agents.tabular.algorithms import ALGORITHMS
 
     agent: Agent = ALGORITHMS[config.algorithm][1](config, context)
@@ -59,7 +51,6 @@ def build(config: AgentConfig, context: TrainingContext) -> Agent:
 
 
 def weights(path: Path, most: int) -> dict[str, NDArray[Any]]:
-    """See `gridworld.agents.Family.weights`."""
     from gridworld.agents.tabular.td_control import read_arrays
 
     return read_arrays(path, most)

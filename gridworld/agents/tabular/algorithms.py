@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 
 @dataclass
 class QLearningConfig(TabularControlConfig):
-    """Settings of Q-learning."""
-
     name: Word = "q_learning"
     algorithm: Word = "q_learning"
 
@@ -54,8 +52,6 @@ class QLearning(TabularControl):
 
 @dataclass
 class ExpectedSarsaConfig(TabularControlConfig):
-    """Settings of expected SARSA."""
-
     name: Word = "expected_sarsa"
     algorithm: Word = "expected_sarsa"
 
@@ -75,8 +71,6 @@ class ExpectedSarsa(TabularControl):
 
 @dataclass
 class SarsaConfig(TabularControlConfig):
-    """Settings of SARSA."""
-
     name: Word = "sarsa"
     algorithm: Word = "sarsa"
 
@@ -136,7 +130,6 @@ class ValueIteration:
 
     @property
     def model(self) -> FloatArray:
-        """Q*."""
         return self.q
 
     def learn(
@@ -162,11 +155,9 @@ class ValueIteration:
         )
 
     def model_file(self) -> bytes:
-        """See `gridworld.agents.Agent.model_file`."""
         return model_bytes(self._algorithm, {"q": self.q, "optimal": self.optimal})
 
     def load(self, path: Path) -> None:
-        """See `gridworld.agents.Agent.load`."""
         arrays = read_model(path, self._algorithm, {"q": self.q, "optimal": self.optimal})
         if not arrays["optimal"].any(axis=1).all():
             raise InputError(f"{path}: optimal names no action in some states")

@@ -48,8 +48,6 @@ _SPARE_BYTES = 2**20  # of a model file, for the frames around its arrays
 
 @dataclass
 class TabularConfig(AgentConfig):
-    """An agent that keeps a table over the states."""
-
     family: Word = "tabular"
     gamma: float = field(default=0.99, metadata=bounds(0, 1))  # the discount it learns with
 
@@ -102,7 +100,6 @@ class TabularControl(ABC):
 
     @property
     def model(self) -> FloatArray:
-        """The table."""
         return self.q
 
     @abstractmethod
@@ -121,7 +118,6 @@ class TabularControl(ABC):
     def learn(
         self, total_timesteps: int, on_step: Hook, on_safe_point: SafePoint = None, state: State | None = None
     ) -> None:
-        """See `gridworld.agents.Agent.learn`."""
         envs, config = self._context.envs, self.config
         q, visits = self.q.reshape(-1), self.visits.reshape(-1)  # flat views
         states, _ = envs.reset(seed=self._context.seed)
@@ -176,11 +172,9 @@ class TabularControl(ABC):
         self._error, self._updates = 0.0, 0
 
     def class_without_state(self) -> None:
-        """See `gridworld.agents.Agent.class_without_state`."""
         return
 
     def get_state(self) -> State:
-        """See `gridworld.agents.Agent.get_state`."""
         return {
             "envs": self._context.envs.get_state(),
             "random": generator_state(self._random),
@@ -220,11 +214,9 @@ class TabularControl(ABC):
         return {"q": self.q, "visits": self.visits, "exploration_rate": np.array(self.exploration_rate)}
 
     def model_file(self) -> bytes:
-        """See `gridworld.agents.Agent.model_file`."""
         return model_bytes(self.config.algorithm, self._arrays())
 
     def load(self, path: Path) -> None:
-        """See `gridworld.agents.Agent.load`."""
         arrays = read_model(path, self.config.algorithm, self._arrays())
         epsilon = float(arrays["exploration_rate"])
         Bounds(0, 1).check(f"{path}: exploration_rate", epsilon)

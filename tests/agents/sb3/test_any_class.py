@@ -28,7 +28,7 @@ agent:
 """
 
 
-A2C = "stable_baselines3.A2C"
+A2C, KWARGS = "stable_baselines3.A2C", "+agent.arguments.policy_kwargs"
 
 
 @pytest.mark.parametrize(
@@ -100,35 +100,6 @@ def outcome(folder: Path, *words: str) -> str:
     return ""
 
 
-CLASSES = {  # of torch: whether a policy can be made of it
-    ("dqn", "agent.policy_kwargs.activation_fn=torch.nn.{}"): {
-        **dict.fromkeys(("GLU", "Module", "LSTM", "ModuleList"), False),
-        **dict.fromkeys(("PReLU", "RReLU", "Dropout", "Softmax", "Flatten"), True),
-    },
-    ("a2c", "+agent.arguments.policy_kwargs={{optimizer_class: torch.optim.{}}}"): {
-        **dict.fromkeys(("LBFGS", "SparseAdam", "Optimizer"), False),
-        **dict.fromkeys(("SGD", "Rprop", "Adafactor"), True),
-    },
-}
-
-
-@pytest.mark.parametrize(
-    ("agent", "word", "fits"),
-    [
-        (agent, word.format(name), fits)
-        for (agent, word), names in CLASSES.items()
-        for name, fits in names.items()
-    ],
-)
-def test_classes_of_torch_are_taken_or_refused_in_a_sentence(
-    agent: str, word: str, fits: bool, tmp_path: Path
-) -> None:
-    told = outcome(tmp_path, *SHORT[agent], word)
-    assert bool(told) != fits
-    assert fits or word.rpartition("torch.")[2].rstrip("}") in told
-    assert "\n" not in told
-
-
 @pytest.mark.parametrize(
     ("agent", "word", "sentence"),
     [
@@ -139,13 +110,17 @@ def test_classes_of_torch_are_taken_or_refused_in_a_sentence(
             "agent=dqn: DQN cannot be asked: NotImplementedError: Module [Module] is missing the required "
             '"forward" function; look at agent.policy_kwargs.activation_fn=torch.nn.Module',
         ),
+        ("dqn", "agent.policy_kwargs.activation_fn=torch.nn.ModuleList", "torch.nn.ModuleList"),
+        ("dqn", "agent.policy_kwargs.activation_fn=torch.nn.Dropout", ""),
+        ("a2c", f"{KWARGS}.optimizer_class=torch.optim.LBFGS", "torch.optim.LBFGS"),
+        ("a2c", f"{KWARGS}.optimizer_class=torch.optim.Adafactor", ""),
         ("ppo", "agent.ent_coef=1e307", "training diverged at update 0"),
         ("ppo", "agent.learning_rate=1e307", "training diverged at update"),
         ("a2c", "+agent.arguments.vf_coef=1e307", "training diverged at update"),
         ("dqn", "agent.policy_kwargs.activation_fn=own_modules.Drawn", "DQN does not always give the same"),
         (
             "a2c",
-            "+agent.arguments.policy_kwargs.activation_fn=own_modules.Among",
+            f"{KWARGS}.activation_fn=own_modules.Among",
             "agent=a2c: stable_baselines3.A2C does not always give the same",
         ),
     ],
@@ -156,4 +131,7 @@ def test_what_only_the_class_can_judge_is_refused_in_a_sentence(
 ) -> None:
     importable(tmp_path / "modules", monkeypatch)
     (tmp_path / "run").mkdir()
-    assert sentence in outcome(tmp_path / "run", *SHORT[agent], word)
+    told = outcome(tmp_path / "run", *SHORT[agent], word)
+    assert sentence in told
+    assert bool(sentence) == bool(told)
+    assert "\n" not in told

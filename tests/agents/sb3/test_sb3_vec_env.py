@@ -4,7 +4,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import DQN, PPO
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -55,16 +54,6 @@ def test_spaces_attributes_and_monitoring() -> None:
         envs.env_method("reset")
     with pytest.raises(InputError, match="SameStep"):
         GridWorldVecEnv(GridWorldVectorEnv(2), make_observation(envs.envs.mdp, "one_hot"))
-
-
-@pytest.mark.parametrize(("kind", "policy"), [("none", "MlpPolicy"), ("image", "CnnPolicy")])
-def test_sb3_learns_on_it_as_it_is(kind: str, policy: str) -> None:
-    envs = GridWorldVectorEnv(2, autoreset_mode="SameStep")
-    vec_env = GridWorldVecEnv(envs, make_observation(envs.mdp, kind))
-    model = PPO(policy, vec_env, seed=0, device="cpu", n_steps=8, batch_size=16).learn(32)
-    assert model.num_timesteps == 32
-    mean, _ = evaluate_policy(model, vec_env, n_eval_episodes=2)
-    assert -1 <= mean <= 1
 
 
 @pytest.mark.parametrize("algorithm", [DQN, PPO])
