@@ -33,7 +33,7 @@ CHOSEN = [  # (command line, recipe, preset)
     ("env.slip=0.1 total_timesteps=1000", None, "auto"),
     ("env.slip=0.1 n_envs=8", None, "auto"),
     ("env.slip=0.1 agent.engine=stock", None, "auto"),
-    ("env.slip=0.1 callbacks=[{_target_: mine.Own}]", None, "auto"),
+    ("env.slip=0.1 callbacks=[{_target_:mine.Own}]", None, "auto"),
     # By name.
     ("env.slip=0.1 preset=none", None, "none"),
     ("preset=stochastic", None, "stochastic"),
