@@ -207,10 +207,9 @@ def _device(name: str) -> str:
 
 
 def keep_compiler_out() -> None:
-    """Spare a run the import of torch's compiler, which takes as long as half of SB3's own.
+    """Spare a run the 1.2 seconds in which optimisers import torch's compiler.
 
-    Optimisers import it to exempt some methods from compilation. Nothing here is compiled, so these are
-    marked as exempt beforehand; a torch that is built otherwise imports what it wants.
+    They do so to exempt some methods from compilation, which are marked as exempt beforehand here.
     """
     for name in ("add_param_group", "state_dict", "load_state_dict"):
         method = getattr(getattr(torch.optim.Optimizer, name), "__wrapped__", None)
