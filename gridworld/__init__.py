@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import importlib
 
-from gridworld.envs.registration import ENV_ID, register_envs, register_when_gymnasium_is_imported
+from gridworld.envs.registration import ENV_ID, register_envs
+from gridworld.workarounds import when_gymnasium_is_imported
 
 TYPE_CHECKING = False  # what type checkers take for True; `typing` itself would double the import's cost
 if TYPE_CHECKING:
@@ -80,4 +81,4 @@ def __getattr__(name: str) -> object:
     return getattr(importlib.import_module(f"gridworld.{_HOME[name]}"), name)
 
 
-register_when_gymnasium_is_imported()
+when_gymnasium_is_imported(register_envs)

@@ -16,6 +16,7 @@ from helpers.quickly import collapse_memory, compose_quickly
 from hypothesis import settings
 
 from gridworld.process import console
+from gridworld.workarounds import keep_compiler_out
 
 # The package and the tests are compiled once, not in every process.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -38,33 +39,31 @@ def _environment() -> Iterator[None]:
     os.environ.update(before)
 
 
-# One after the other: clusters, browsers and kills at random moments, which want a machine for themselves.
-IN_TURN = (
-    *("sweep/test_sweep_cluster.py", "sweep/test_sweep_kills.py"),
-    *("training/test_tensorboard.py", "report/test_report_page.py"),
-)
-# What takes more than five seconds of a processor, the longest first.
+# One after the other: clusters and kills at random moments; and browsers.
+IN_TURN = {
+    "clusters": ("sweep/test_sweep_cluster.py", "sweep/test_sweep_kills.py"),
+    "browsers": ("training/test_tensorboard.py", "report/test_report_page.py"),
+}
+# What takes more than ten seconds of a processor, the longest first.
 LONG = (
-    *("in turn", "tests/test_docs.py", "commands/test_hostile_runs.py", "sweep/test_sweep_population.py"),
-    *("commands/test_commands.py", "sweep/test_sweep.py", "restore/test_resume_kills.py"),
-    *("commands/test_bad_input.py", "tune/test_tune.py", "process/test_output.py", "report/test_report.py"),
-    *("tune/test_tune_parts.py", "engine/test_populations.py", "diagnosis/test_sabotage.py"),
-    *("engine/test_updates.py", "restore/test_resume_states.py", "config/test_experiments.py"),
-    *("restore/test_reproduce.py", "checking/test_check.py", "training/test_training.py"),
-    *("training/test_certified.py", "restore/test_resume.py", "restore/test_resume_commands.py"),
-    *("storage/test_other_systems.py", "docs/test_examples.py", "commands/test_console.py"),
-    *("agents/sb3/test_custom_code.py", "export/test_export.py", "agents/tabular/test_tabular.py"),
-    *("world/test_evaluation.py", "process/test_forks.py", "tune/test_tune_together.py"),
-    *("api/test_scores.py", "api/test_runs.py", "run/test_power_cuts.py", "visualization/test_maps.py"),
-    *("commands/test_fuzz.py", "run/test_lost_folders.py", "agents/sb3/test_any_class.py"),
-    "config/test_config.py",
+    *("clusters", "tests/test_docs.py", "sweep/test_sweep_population.py", "sweep/test_sweep.py"),
+    *("tune/test_tune.py", "browsers", "config/test_recipes.py", "tune/test_tune_parts.py"),
+    *("commands/test_hostile_runs.py", "commands/test_bad_input.py", "config/test_config.py"),
+    *("engine/test_populations.py", "api/test_certificates.py", "report/test_report.py"),
+    *("commands/test_commands.py", "process/test_output.py", "restore/test_resume_kills.py"),
+    *("diagnosis/test_sabotage.py", "restore/test_reproduce.py", "restore/test_resume.py"),
+    *("checking/test_check.py", "restore/test_resume_commands.py", "commands/test_train_on_worlds.py"),
+    *("commands/test_benchmark.py", "export/test_export.py", "training/test_training.py"),
+    *("agents/sb3/test_custom_code.py", "engine/test_updates.py", "restore/test_resume_states.py"),
+    *("commands/test_console.py", "docs/test_examples.py", "config/test_presets.py"),
+    *("agents/tabular/test_tabular.py", "process/test_forks.py", "api/test_runs.py"),
 )
 
 
 def scope(nodeid: str) -> str:
     """Tests of one scope run in one process, in order: many of a file share a run that was trained once."""
     file = nodeid.partition("::")[0]
-    return "in turn" if file.endswith(IN_TURN) else file
+    return next((name for name, files in IN_TURN.items() if file.endswith(files)), file)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -94,8 +93,7 @@ def pytest_collection_finish() -> None:
     """What was imported stays, and need not be looked through each time that garbage is collected."""
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)  # networks this small take longer with more
-    if "gridworld.agents.sb3.factory" in sys.modules:
-        sys.modules["gridworld.agents.sb3.factory"].keep_compiler_out()
+        keep_compiler_out()
     compose_quickly()
     gc.freeze()
     gc.set_threshold(50_000)

@@ -24,8 +24,8 @@ from gridworld.config.train import TrainConfig
 from gridworld.diagnosis import verdict
 from gridworld.diagnosis.evidence import Evidence
 from gridworld.errors import InputError, failure
-from gridworld.process.memory_budget import limited
 from gridworld.process.signals import Interrupted
+from gridworld.process.user_input import limited
 from gridworld.report.evidence import read_columns
 from gridworld.restore.resume import unfinished_of
 from gridworld.restore.saved_run import SavedRun, read_visits

@@ -81,36 +81,13 @@ def evaluate(
             )
         policy = tables.greedy if deterministic or tables.sampled is None else tables.sampled
     else:
-        policy = _greedy(task, q) if q is not None else _policy(task, model_or_table)
+        policy = _policy(task, model_or_table if q is None else q, is_q=q is not None)
     return Evaluator(mdp, gamma, limit).score(policy)
 
 
-def _policy(task: Task, table: Any) -> FloatArray:
-    mdp, numbers = task.mdp, _numbers("the table", task, table)
-    if numbers.shape == (mdp.num_states,):
-        wrong = ~np.isin(numbers, np.arange(mdp.num_actions))
-        if wrong.any():
-            state = int(np.argmax(wrong))
-            raise InputError(
-                f"the table: state {state} has the action {numbers[state]:g}; must be {mdp.action_choices()}"
-            )
-        return one_hot_policy(numbers.astype(np.int64), mdp.num_actions)
-    _check_shape("the table", mdp, numbers)
-    if (numbers < 0).any() or (np.abs(numbers.sum(axis=1) - 1) > 1e-4).any():
-        raise InputError(
-            "the table: its rows are not probabilities, at least 0 with sum 1; give Q values as q=..."
-        )
-    return numbers
-
-
-def _greedy(task: Task, q: ArrayLike) -> FloatArray:
-    values = _numbers("q", task, q)
-    _check_shape("q", task.mdp, values)
-    return one_hot_policy(values.argmax(axis=1), task.mdp.num_actions)
-
-
-def _numbers(name: str, task: Task, table: Any) -> FloatArray:
-    """A table by states; where it is by what is shown, two states may look alike, or be renumbered."""
+def _policy(task: Task, table: Any, is_q: bool) -> FloatArray:
+    """A table as probabilities (S, A) by states."""
+    mdp, name = task.mdp, "q" if is_q else "the table"
     try:
         numbers: FloatArray = np.asarray(table, dtype=np.float64)
     except (TypeError, ValueError, RuntimeError):  # torch's, for a tensor with a gradient
@@ -118,6 +95,32 @@ def _numbers(name: str, task: Task, table: Any) -> FloatArray:
         raise InputError(f"{name}: {kind} is neither a model nor a table of numbers") from None
     if np.isnan(numbers).any():
         raise InputError(f"{name}: has NaN")
+    numbers, size = _by_states(task, numbers), mdp.num_states
+    if numbers.shape == (size,) and not is_q:
+        wrong = ~np.isin(numbers, np.arange(mdp.num_actions))
+        if wrong.any():
+            state = int(np.argmax(wrong))
+            raise InputError(
+                f"{name}: state {state} has the action {numbers[state]:g}; must be {mdp.action_choices()}"
+            )
+        return one_hot_policy(numbers.astype(np.int64), mdp.num_actions)
+    if numbers.shape != (size, mdp.num_actions):
+        either = "" if is_q else f"({size},) actions or "
+        raise InputError(
+            f"{name}: has shape {numbers.shape}; this world has {size} states and "
+            f"{mdp.num_actions} actions, so it must be {either}({size}, {mdp.num_actions})"
+        )
+    if is_q:
+        return one_hot_policy(numbers.argmax(axis=1), mdp.num_actions)
+    if (numbers < 0).any() or (np.abs(numbers.sum(axis=1) - 1) > 1e-4).any():
+        raise InputError(
+            f"{name}: its rows are not probabilities, at least 0 with sum 1; give Q values as q=..."
+        )
+    return numbers
+
+
+def _by_states(task: Task, numbers: FloatArray) -> FloatArray:
+    """The rows of a table that may be by what is shown: two states may look alike, or be renumbered."""
     mdp = task.mdp
     if not numbers.ndim:
         return numbers
@@ -127,16 +130,6 @@ def _numbers(name: str, task: Task, table: Any) -> FloatArray:
             return np.asarray(numbers[seen.table() - seen.space.start])
     is_by_number = len(numbers) == mdp.num_numbers < mdp.num_states
     return np.asarray(numbers[mdp.number]) if is_by_number else numbers
-
-
-def _check_shape(name: str, mdp: Mdp, table: FloatArray) -> None:
-    size = mdp.num_states
-    if table.shape != (size, mdp.num_actions):
-        either = "" if name == "q" else f"({size},) actions or "
-        raise InputError(
-            f"{name}: has shape {table.shape}; this world has {size} states and "
-            f"{mdp.num_actions} actions, so it must be {either}({size}, {mdp.num_actions})"
-        )
 
 
 def compile_env(env: Any) -> Mdp:

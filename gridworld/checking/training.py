@@ -61,10 +61,7 @@ KINDS = (  # the first that fits: DQN and QR-DQN, TRPO, PPO, A2C, tables, others
 
 
 def settings(config: AgentConfig, probe: Probe, given: Mapping[str, Any]) -> tuple[AgentConfig, Kind] | None:
-    """The settings of an algorithm on a probe, whose own arguments go before the user's, and its kind.
-
-    None where it does not take what the probe needs.
-    """
+    """The settings of an algorithm on a probe, and its kind; None: it does not take what the probe needs."""
     algorithm: Any = None
     if isinstance(config, SB3ClassConfig):
         from gridworld.agents.sb3.factory import algorithm_class  # imports torch
@@ -114,11 +111,7 @@ def _arguments_of(kind: type) -> list[str]:
 
 
 def subject(algorithm: Any) -> AgentConfig:
-    """Name an implementation by its settings.
-
-    It is a class with SB3's interface or its import path, which trains in its own loop, or the name of a
-    shipped agent.
-    """
+    """The settings that name a class with SB3's interface, its import path, or a shipped agent."""
     if inspect.isclass(algorithm):
         algorithm = f"{algorithm.__module__}.{algorithm.__qualname__}"
     name = str(algorithm)

@@ -18,7 +18,7 @@ from gridworld.diagnosis.verdict import (
 )
 from gridworld.errors import InputError
 from gridworld.process.console import aligned, printable, tell, telling_if_slow
-from gridworld.process.memory_budget import limited
+from gridworld.process.user_input import limited
 from gridworld.restore.saved_run import SavedRun
 from gridworld.run.folder import shown
 from gridworld.storage.safe_read import check_no_link

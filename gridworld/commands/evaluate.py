@@ -11,7 +11,7 @@ from gridworld.envs.rendering import has_display
 from gridworld.envs.rollout import SampledScores, play, sample_episodes
 from gridworld.errors import InputError
 from gridworld.process.console import aligned, printable, program, telling_if_slow
-from gridworld.process.memory_budget import limited
+from gridworld.process.user_input import limited
 from gridworld.restore.saved_run import SavedRun, choose_policy
 from gridworld.run.summary import MOST_NAMED, circles_text
 from gridworld.world.evaluation import Evaluator, Score

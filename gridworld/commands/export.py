@@ -19,7 +19,7 @@ from gridworld.errors import InputError, reason
 from gridworld.export.exported_run import read
 from gridworld.export.targets import TARGETS, check_installed
 from gridworld.process.console import printable, telling_if_slow
-from gridworld.process.memory_budget import limited
+from gridworld.process.user_input import limited
 from gridworld.report.evidence import find_runs
 from gridworld.run.folder import check_inside, check_writable
 from gridworld.storage.safe_read import check_no_link

@@ -21,7 +21,7 @@ from gridworld.envs.env import GridWorldEnv
 from gridworld.envs.rendering import Frame
 from gridworld.errors import InputError
 from gridworld.process.console import printable, program, telling_if_slow
-from gridworld.process.memory_budget import limited
+from gridworld.process.user_input import limited
 from gridworld.restore.saved_run import SavedRun
 from gridworld.storage.serialization import independent_generator
 from gridworld.visualization.canvas import Canvas

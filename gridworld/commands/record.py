@@ -15,7 +15,7 @@ from gridworld.config.train import PICTURES
 from gridworld.envs.rendering import frame_size
 from gridworld.envs.rollout import play
 from gridworld.process.console import printable, telling_if_slow
-from gridworld.process.memory_budget import limited
+from gridworld.process.user_input import limited
 from gridworld.restore.saved_run import SavedRun, choose_policy, read_visits
 from gridworld.run.folder import check_inside, check_writable
 from gridworld.storage.safe_read import check_no_link

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from gridworld.commands import parser_of, whole
 from gridworld.process.console import printable, telling_if_slow
-from gridworld.process.memory_budget import limited
+from gridworld.process.user_input import limited
 from gridworld.report.analysis import MOST_SHOWN, Reason, gather, reasons
 from gridworld.report.writer import FORMATS, MARKERS, check_markers, check_out, write_readme, write_report
 from gridworld.restore.saved_run import SavedRun

@@ -19,7 +19,7 @@ from pathlib import Path
 from gridworld.commands import parser_of
 from gridworld.errors import InputError
 from gridworld.process.console import printable, telling_if_slow
-from gridworld.process.memory_budget import limited
+from gridworld.process.user_input import limited
 from gridworld.restore.reproduce import check_whole, compare, lengths, population, repeat
 from gridworld.restore.saved_run import settings_of
 from gridworld.run.folder import MANIFEST, check_inside

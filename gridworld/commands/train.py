@@ -30,8 +30,8 @@ from gridworld.config.compose import VERSION_BASE, completed, register_schemas, 
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import conf_folder, own_conf_folders, refuse_dashes, sentence, unreadable_file
 from gridworld.errors import EXIT_CODE, InputError
-from gridworld.process.console import called_from, printable, tell_error
-from gridworld.process.memory_budget import limited
+from gridworld.process.console import printable, tell_error
+from gridworld.process.user_input import called_from, limited
 from gridworld.run.folder import MANIFEST, SWEEP_JSON, alone_in, check_inside, claimed, shown
 from gridworld.run.reader import check_free, check_is_run, is_started
 from gridworld.storage.atomic_write import check_no_links

@@ -32,7 +32,8 @@ from gridworld.config.sweep import LAUNCHER_SCHEMAS, SweepConfig, TuneConfig
 from gridworld.config.train import AgentConfig, TrainConfig
 from gridworld.config.worlds import SOURCES, EnvConfig, schema_of
 from gridworld.errors import InputError
-from gridworld.process.console import printable, users_folder
+from gridworld.process.console import printable
+from gridworld.process.user_input import users_folder
 
 # Where one of these is missing or empty, a run is as those that were made before there was such a setting.
 NEWER = frozenset(
@@ -73,7 +74,7 @@ def _walk(schema: type, section: str = "") -> Iterator[tuple[str, Any, dict[str,
         hint = hints[name]
         yield section + name, hint, metadata
         if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-            others: dict[type, Mapping[str, Any]] = {AgentConfig: agent_schemas(), EnvConfig: SOURCES}
+            others: Mapping[type, Mapping[str, type]] = {AgentConfig: agent_schemas(), EnvConfig: SOURCES}
             for each in (hint, *others.get(hint, {}).values()):
                 yield from _walk(each, f"{section}{name}.")
 

@@ -46,11 +46,11 @@ class SlurmConfig:
     """`hydra/launcher=slurm`; all but the first two are submitit's, by its names."""
 
     _target_: str = "gridworld.sweep.launchers.slurm"
-    jobs_per_task: int = 1
-    array_parallelism: int = 256
-    timeout_min: int = 60
-    signal_delay_s: int = 60
-    cpus_per_task: int = 1  # cores
+    jobs_per_task: int = setting(1, bounds(1))
+    array_parallelism: int = setting(256, bounds(1))
+    timeout_min: int = setting(60, bounds(1))
+    signal_delay_s: int = setting(60, bounds(1))
+    cpus_per_task: int = setting(1, bounds(1))  # cores
     mem_gb: float | None = None
     partition: str | None = None  # of Slurm's, and so below; null: the default
     account: str | None = None  # that pays

@@ -128,19 +128,13 @@ class Evidence:
 
     @cached_property
     def steps_to_goal(self) -> float:
-        """The exact expected number of steps until a random walk first meets a goal.
-
-        By Wald's identity the expected length of an episode by its probability of a goal, time-outs included.
-        """
+        """The exact expected number of steps until a random walk first meets a goal, by Wald's identity."""
         uniform = np.full_like(self.snapshot.sampled, 1 / self.mdp.num_actions)
         walk = Chain(self.mdp, uniform).outcome(self.evaluator.max_episode_steps)
         return walk.expected_length / walk.goal if walk.goal > 0 else np.inf
 
     def setting(self, name: str, default: float = 0.0) -> float:
-        """A number among the agent's settings: as configured, or as its model has it by default.
-
-        Of a schedule it is the first value; the default stands in for what the agent has not.
-        """
+        """A number among the agent's settings or its model's defaults; of a schedule the first value."""
         given = self._given(name)
         if given is None and not self.is_tabular:
             given = getattr(self.agent.model, name, None)
@@ -241,10 +235,7 @@ def faster(run: Evidence) -> tuple[str, ...]:
 
 
 def longer(run: Evidence, times: int, keep_rate: bool = False) -> str:
-    """The words for a run at least so many times as long: for enough updates, and to meet the goal often.
-
-    At a learning rate far below the usual one no length helps, so that changes too, unless `keep_rate`.
-    """
+    """The words for a run so many times as long or more; a small rate changes too, unless `keep_rate`."""
     total = run.config.total_timesteps
     updates = 1.0 if run.is_tabular else _ENOUGH[run.is_actor_critic] / max(run.updates, 1.0)
     goals = _MEETINGS * run.steps_to_goal / total if np.isfinite(run.steps_to_goal) else 1.0

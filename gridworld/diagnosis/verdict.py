@@ -21,12 +21,12 @@ from gridworld.config.train import TrainConfig
 from gridworld.diagnosis.causes import CAUSES, PHRASES
 from gridworld.diagnosis.causes.objective import recommended_gamma
 from gridworld.diagnosis.evidence import Evidence, Finding, RegretSplit
-from gridworld.envs.rendering import AGENT, INK, Frame, board_of
+from gridworld.envs.rendering import Frame, board_of
 from gridworld.errors import InputError
 from gridworld.process.console import command
 from gridworld.restore.saved_run import SavedRun
 from gridworld.visualization.canvas import Canvas, directions, greedy_paths
-from gridworld.visualization.sheet import ORANGES, PAPER, UNREACHABLE, Swatch, is_dark, linear, short
+from gridworld.visualization.sheet import ORANGES, PAPER, UNREACHABLE, linear
 from gridworld.visualization.state_table import StateTable, table_states
 from gridworld.world.evaluation import score_of_optimum
 from gridworld.world.mdp import IntArray, Mdp
@@ -48,27 +48,18 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Why a run is not optimal.
+    """Why a run is not optimal."""
 
-    Attributes:
-        mdp: its world.
-        greedy: (S,), its greedy actions.
-        split: its regret by state.
-        findings: the causes that explain some of it, the largest share first; none for a certified run.
-        shares: the share of the regret that each of them explains; they sum to 1.
-        cause_of: (S,), the number in `findings` of each state's cause, -1 where there is none.
-        offers: the words of at most three command lines to try.
-        tried: those that were tried, up to the first that is certified.
-    """
-
-    mdp: Mdp
-    greedy: IntArray
-    split: RegretSplit
-    findings: tuple[Finding, ...]
-    shares: tuple[float, ...]
-    cause_of: IntArray
-    offers: tuple[tuple[str, ...], ...]
-    tried: tuple[Trial, ...] = ()
+    mdp: Mdp  # its world
+    greedy: IntArray  # (S,), its greedy actions
+    split: RegretSplit  # its regret by state
+    findings: tuple[
+        Finding, ...
+    ]  # what explains some of it, the largest share first; none if it is certified
+    shares: tuple[float, ...]  # the share of the regret that each of them explains; they sum to 1
+    cause_of: IntArray  # (S,), the number in `findings` of each state's cause, -1 where there is none
+    offers: tuple[tuple[str, ...], ...]  # the words of at most three command lines to try
+    tried: tuple[Trial, ...] = ()  # those that were tried, up to the first that is certified
 
     @property
     def commands(self) -> tuple[str, ...]:
@@ -128,11 +119,7 @@ def diagnose(run: Evidence) -> Diagnosis:
 
 
 def _offers(run: Evidence, findings: tuple[Finding, ...]) -> tuple[tuple[str, ...], ...]:
-    """The run's own words with a change each: those of the first cause, then one of each other.
-
-    No change helps as long as even the optimum under the agent's own discount is not certified, so each has
-    another discount with it then.
-    """
+    """The run's own words with a change each: those of the first cause, then one of each other."""
     first, others = findings[0].changes, [word for each in findings[1:] for word in each.changes[:1]]
     changes = list(dict.fromkeys((*first, *others)))[:_MOST_CHANGES]
     key, fits = run.config.agent.key("gamma"), score_of_optimum(run.evaluator, run.own.gamma).certified
@@ -202,7 +189,7 @@ def draw_diagnosis(found: Diagnosis, cell_size: int | None = None) -> Frame:
         table, scale = StateTable(mdp, states, ["regret"]), linear(ORANGES, cost[states], low=0.0)
         table.paint(np.where(cost > 0, cost, np.nan)[:, None], scale)
         table.caption(caption)
-        table.legend(scale, "regret 0", short(scale.high))
+        table.legend(scale, "regret")
         return table.frame()
     canvas = Canvas(mdp, cell_size)
     scale = linear(ORANGES, cost[canvas.board.floor], low=0.0)
@@ -213,15 +200,14 @@ def draw_diagnosis(found: Diagnosis, cell_size: int | None = None) -> Frame:
     ways = directions(mdp)[np.arange(mdp.num_states), found.greedy].tolist()
     paths = greedy_paths(mdp, found.greedy)
     canvas.draw_paths(paths, ways, 0.4)
-    costly = np.flatnonzero((cost > 0) & canvas.board.floor).tolist()
-    texts = {state: short(float(cost[state]), scale.high) for state in costly}
-    size = canvas.number_size(0.8, texts.values())
-    dark = is_dark(colours)
-    for state, text in texts.items() if size is not None else ():
-        ink = PAPER if dark[state] else INK
-        canvas.number(text, canvas.point(state, 0.5, 0.83), size or 0, ink, colours[state])
+    costly = (cost > 0) & canvas.board.floor
+    canvas.write_numbers(
+        *(cost[:, None], costly[:, None], colours[:, None], scale.high),
+        canvas.number_size(cost[costly], scale.high, 0.8),
+        lambda state, _: canvas.point(state, 0.5, 0.83),
+        plates=range(mdp.num_states),
+    )
     canvas.caption(caption)
-    path = Swatch("greedy path from the start" if canvas.cell >= 24 else "greedy path", AGENT, PAPER)
-    swatches = [*([path] if paths else []), *([UNREACHABLE] if canvas.hidden else [])]
-    canvas.legend(scale, "regret 0", short(scale.high), swatches)
+    swatches = [*([canvas.path_swatch] if paths else []), *([UNREACHABLE] if canvas.hidden else [])]
+    canvas.legend(scale, "regret", swatches)
     return canvas.frame()

@@ -56,7 +56,7 @@ class Environments:
         self._batches, self.num_envs = batches, first.num_envs
         self.num_actions, self._num_outcomes = first.mdp.next_state.shape[1:]
         self._tables = first.tables
-        self._thresholds = first.tables.of_pairs() if self._num_outcomes > 1 else np.zeros(0)
+        self._thresholds = first.tables.thresholds
         self._terminal, self._start_states = first.mdp.terminal, first.mdp.start_states
         self._limit = first.step_limit
         self._bounds = np.arange(len(batches) + 1) * self.num_envs

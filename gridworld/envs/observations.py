@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from gridworld.envs import rendering as drawing
 from gridworld.errors import InputError
-from gridworld.process.memory_budget import check_memory
+from gridworld.process.user_input import check_memory
 from gridworld.world.layout import positive_int
 from gridworld.world.mdp import IntArray, Mdp
 

@@ -46,12 +46,7 @@ class Tables(NamedTuple):
     next_state: StateArray
     reward: FloatArray
     terminated: BoolArray
-    thresholds: FloatArray  # (K - 1,) where all states and actions have the same, else (K - 1, S * A)
-
-    def of_pairs(self) -> FloatArray:
-        """The thresholds as (K - 1, S * A)."""
-        count = len(self.thresholds)
-        return np.broadcast_to(self.thresholds.reshape(count, -1), (count, len(self.reward) // (count + 1)))
+    thresholds: FloatArray  # (K - 1, S * A)
 
 
 Advance = tuple[StateArray, FloatArray, BoolArray, BoolArray, Ended | None]
@@ -135,10 +130,10 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         num_states, self._num_actions, self._num_outcomes = self.mdp.next_state.shape
         next_state = self.mdp.next_state.ravel().astype(np.int64)
         thresholds = self.mdp.thresholds.reshape(num_states * self._num_actions, -1)
-        alike = (thresholds == thresholds[:1]).all()
-        thresholds = thresholds[0] if alike else np.ascontiguousarray(thresholds.T)
         terminated = self.mdp.terminal[next_state]
-        self.tables = Tables(next_state, self.mdp.reward.ravel(), terminated, thresholds)
+        self.tables = Tables(
+            next_state, self.mdp.reward.ravel(), terminated, np.ascontiguousarray(thresholds.T)
+        )
         self._state: StateArray = np.full(self.num_envs, self.mdp.start_states[0], dtype=np.int64)
         self._elapsed = np.zeros(self.num_envs, dtype=np.int64)  # steps of the episodes under way
         self._returns = np.zeros(self.num_envs)  # of these, undiscounted; counted where `ended` tells them
@@ -288,9 +283,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         moving = np.flatnonzero(~still)
         draws = self.draw_numbers(pairs[moving])
         outcomes = np.zeros(self.num_envs, dtype=np.int64)
-        thresholds = self.tables.thresholds
-        if thresholds.ndim == 2:
-            thresholds = thresholds.take(pairs[moving], axis=1)
+        thresholds = self.tables.thresholds.take(pairs[moving], axis=1)
         drawn = (draws >= thresholds[0]).astype(np.int64)
         for each in thresholds[1:]:
             drawn += draws >= each

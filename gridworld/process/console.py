@@ -25,13 +25,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from gridworld.errors import InputError
-from gridworld.process.memory_budget import is_limited
+from gridworld.process.user_input import is_limited
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 CONSOLE = "gridworld"
-_called_from: list[Path] = []  # nothing, or the folder that `called_from` names
 _SCRIPTS = Path(__file__).parents[2] / "scripts"
 _SCRIPT = re.compile(r"(?:python )?(?:scripts/)?\b(train|tune|record|report|evaluate|jobs|play|check)\.py")
 
@@ -81,22 +80,6 @@ def _is_console() -> bool:
 def _is_console_word(first: str) -> bool:
     """Whether `sys.argv[0]` is of the console command, which writes e.g. `gridworld train` there."""
     return first.startswith(f"{CONSOLE} ")
-
-
-@contextmanager
-def called_from(folder: Path) -> Iterator[None]:
-    """In this block the command counts as called from `folder`, whatever the current folder is."""
-    before = _called_from.copy()
-    _called_from[:] = [folder]
-    try:
-        yield
-    finally:
-        _called_from[:] = before
-
-
-def users_folder() -> Path:
-    """The folder from which the user names files: the current one, unless a job has changed that."""
-    return _called_from[0] if _called_from else Path.cwd()
 
 
 class _Forgiving(io.FileIO):
@@ -253,7 +236,7 @@ _is_telling: ContextVar[bool] = ContextVar("is_telling", default=False)
 def telling_if_slow(what: str) -> Iterator[None]:
     """Print every few seconds that the block is still at work on `what`, if memory is limited.
 
-    That is so for commands that read what somebody else may have written (`memory_budget`). Within another
+    That is so for commands that read what somebody else may have written (`user_input`). Within another
     such block only the outer one prints.
     """
     if not is_limited() or _is_telling.get():

@@ -12,14 +12,16 @@ import signal
 import sys
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from gridworld.process.signals import exiting, handling, send_sigterm
+from gridworld.process.signals import blocking, exiting, handling, send_sigterm
+
+Task = Callable[..., Any]
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _SECONDS_BETWEEN_TICKS = 0.5
@@ -64,11 +66,12 @@ class LostError(Exception):
 
 
 def run_in_processes(
-    tasks: Sequence[Callable[[], Any]],
+    next_task: Callable[[], Task | None],
     count: int,
     forks: bool,
-    ended: Callable[[int, Any], None],
+    ended: Callable[[Any, Any], None],
     tick: Callable[[], None] = lambda: None,
+    answer: Callable[[Any], Any] | None = None,
 ) -> None:
     """Run tasks until all have ended. A process takes the next task when it has ended one.
 
@@ -76,18 +79,20 @@ def run_in_processes(
     stop soon; at a third they are killed.
 
     Args:
-        tasks: they begin in this order. They and what they return are pickled; they raise `SystemExit` only.
-        count: how many processes.
+        next_task: returns a task, or None if there is none; it is asked again whenever one has ended. Tasks
+            and what they return are pickled; they raise `SystemExit` only.
+        count: how many processes there are at once.
         forks: whether these are forks, with what this process has imported.
-        ended: called with the number of each task and what it returned, or a `LostError`.
+        ended: called with each task and what it returned, or a `LostError`.
         tick: called every now and then.
+        answer: returns the answer to a message. Tasks are then called with a function that sends a message,
+            and returns the answer.
 
     Raises:
         SystemExit: this process was told to stop by SIGINT or SIGTERM, and so was each; all have ended.
     """
     context: Any = multiprocessing.get_context("fork" if forks else "spawn")
-    waiting = deque(enumerate(tasks))
-    at_work: dict[Any, tuple[Any, int | None]] = {}  # by connection: a process, and its task's number
+    at_work: dict[Any, tuple[Any, Task | None]] = {}  # by connection: the process, its task
     received: list[int] = []  # signals
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -96,53 +101,79 @@ def run_in_processes(
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process.pid, signal.SIGKILL if len(received) > 2 else number)
 
-    def give(connection: Any, process: Any) -> None:
-        """Let a process begin the next task, or end."""
-        number, task = waiting.popleft() if waiting and not received else (None, None)
-        at_work[connection] = process, number
+    def following() -> Task | None:
+        return None if received else next_task()
+
+    def give(connection: Any, process: Any, task: Task | None) -> None:
+        """Let a process begin a task; None: let it end."""
+        at_work[connection] = process, task
         with contextlib.suppress(OSError):  # it has ended
             connection.send(task)
 
+    def start_missing() -> None:
+        while len(at_work) < count and (task := following()) is not None:
+            connection, theirs = context.Pipe()
+            with blocking(*_SIGNALS):  # until the process has handlers of its own
+                process = context.Process(target=_work, args=(theirs, os.getpid(), answer is not None))
+                process.start()
+                give(connection, process, task)
+            theirs.close()
+
+    def take(connection: Any) -> None:
+        """Take a result, answer a message, or note that the process has ended."""
+        process, task = at_work[connection]
+        try:
+            is_result, content = connection.recv()
+        except (EOFError, OSError):
+            del at_work[connection]
+            connection.close()
+            process.join()
+            if task is not None and not received:
+                ended(task, LostError(f"exit code {process.exitcode}"))
+            return
+        if is_result:
+            ended(task, content)
+            give(connection, process, following())
+        elif answer is not None:
+            reply = answer(content)
+            with contextlib.suppress(OSError):
+                connection.send(reply)
+
     for stream in (sys.stdout, sys.stderr):
         stream.flush()  # or a fork would write it once more
-    gc.freeze()  # so that forks share what there is
+    if forks:
+        gc.freeze()  # so that they share what there is
+    else:
+        resource_tracker.ensure_running()  # which else would unblock signals while a process starts
     with handling(dict.fromkeys(_SIGNALS, stop)):
         try:
-            while at_work or (waiting and not received):
-                while waiting and not received and len(at_work) < count:
-                    connection, theirs = context.Pipe()
-                    process = context.Process(target=_work, args=(theirs, os.getpid()))
-                    process.start()
-                    theirs.close()
-                    give(connection, process)
-                for connection in list[Any](wait(list(at_work), _SECONDS_BETWEEN_TICKS)):
-                    process, number = at_work[connection]
-                    try:
-                        result = connection.recv()
-                    except (EOFError, OSError):
-                        del at_work[connection]
-                        process.join()
-                        if number is not None and not received:
-                            ended(number, LostError(f"exit code {process.exitcode}"))
-                    else:
-                        assert number is not None
-                        ended(number, result)
-                        give(connection, process)
+            start_missing()
+            while at_work:
+                for connection in wait(list(at_work), _SECONDS_BETWEEN_TICKS):
+                    take(connection)
+                start_missing()
                 tick()
         finally:
             for process, _ in at_work.values():
                 process.kill()
+                process.join()
     if received:
         raise SystemExit(128 + received[0])
 
 
-def _work(connection: Connection[Any, Any], parent: int) -> None:
+def _work(connection: Connection[Any, Any], parent: int, may_ask: bool) -> None:
     """What a process does."""
     os.setpgrp()  # a terminal's Ctrl-C reaches the parent, which passes it on once
     threading.Thread(target=_end_with, args=(parent,), daemon=True, name="watch on the parent").start()
-    with exiting(*_SIGNALS), contextlib.suppress(EOFError):
+
+    def ask(message: Any) -> Any:
+        connection.send((False, message))
+        return connection.recv()
+
+    with exiting(*_SIGNALS), contextlib.suppress(EOFError, BrokenPipeError):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
         while (task := connection.recv()) is not None:
-            connection.send(task())
+            connection.send((True, task(ask) if may_ask else task()))
 
 
 def _end_with(parent: int) -> None:

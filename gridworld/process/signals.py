@@ -18,15 +18,11 @@ from typing import Any, ClassVar
 
 
 class Interrupted(BaseException):
-    """Training was asked to stop; the run's files are closed and say so.
-
-    Attributes:
-        exit_code: 128 + the signal's number, as shells have it.
-    """
+    """Training was asked to stop; the run's files are closed and say so."""
 
     def __init__(self, signal_number: int) -> None:
         super().__init__(f"stopped by {signal_name(signal_number)}")
-        self.exit_code = 128 + signal_number
+        self.exit_code = 128 + signal_number  # as shells have it
 
 
 def signal_name(number: int) -> str:
@@ -111,8 +107,7 @@ class StopRequest:
     def listening(self) -> Iterator[None]:
         """Take the signals for the block. Outside the main thread, where none arrive, it does nothing.
 
-        Raises:
-            Interrupted: the block was interrupted, also where a cleanup inside it failed because of that.
+        An interruption leaves it as `Interrupted`, also where a cleanup inside failed because of that.
         """
         if threading.current_thread() is not threading.main_thread():
             yield

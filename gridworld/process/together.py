@@ -29,9 +29,7 @@ def share_clock(runs: int) -> None:
 def mixing(runs: Mapping[str, str]) -> Iterator[None]:
     """Let runs in the block form populations even where their numbers then depend on each other.
 
-    Args:
-        runs: a hash of the settings of each by its folder's name, in their order; none: where their numbers
-            are those of each alone.
+    `runs` has a hash of the settings of each by its folder's name, in their order; none: let them not.
     """
     token = _mixed.set(runs)
     try:

@@ -1,10 +1,18 @@
-"""What a user names: a file, an .npz of numpy's, a class or function of their own by its import path."""
+"""What a user names, and how much memory may go to what somebody else wrote.
+
+A user names files, and classes or functions of their own by import paths. What opens a run, which may be
+anybody's, is `limited`, and so is a command that reads sweeps or studies. Whoever then allocates by a number
+that was read calls `check_memory` first. The variable `GRIDWORLD_BUDGET` raises the budget. Time has no
+limit: `console.telling_if_slow` says what takes long. Training has neither.
+"""
 
 from __future__ import annotations
 
 import importlib
 import io
+import math
 import os
+import re
 import stat
 import struct
 import tokenize
@@ -12,15 +20,21 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from gridworld.errors import InputError, install_command
-from gridworld.process.console import users_folder
-from gridworld.process.memory_budget import check_memory
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+VARIABLE = "GRIDWORLD_BUDGET"
+_called_from: list[Path] = []  # nothing, or the folder that `called_from` names
+_BYTES = {"MB": 1e6, "GB": 1e9}
+
+_memory: ContextVar[float | None] = ContextVar("memory", default=None)  # bytes; None: no limit yet
 
 DAMAGED = (  # what numpy and zipfile raise for a file that is none of theirs
     *(OSError, ValueError, TypeError, LookupError, ArithmeticError, EOFError, SyntaxError, MemoryError),
@@ -28,6 +42,65 @@ DAMAGED = (  # what numpy and zipfile raise for a file that is none of theirs
 )
 COPIES = 3  # the file, its arrays, and what is computed while they are checked
 _EXTRAS = {"sb3_contrib": ("sb3-contrib", "contrib")}  # of modules: the package, and what installs it
+
+
+class BudgetError(InputError):
+    """Something would take more than the budget."""
+
+
+@contextmanager
+def limited(is_own: bool = False) -> Iterator[None]:
+    """Apply the user's budget to the block, or to the function that this decorates.
+
+    For what is this process's own there is none, nor for what is `limited` in the block.
+    """
+    text = os.environ.get(VARIABLE) or "1GB"
+    found = re.fullmatch(r"([1-9]\d{0,5})(MB|GB)", text.strip().upper(), re.ASCII)
+    if found is None:
+        raise InputError(f"{VARIABLE}={text[:80]}: must be an amount of memory, e.g. 500MB or 8GB")
+    most = math.inf if is_own or _memory.get() == math.inf else int(found[1]) * _BYTES[found[2]]
+    token = _memory.set(most)
+    try:
+        yield
+    finally:
+        _memory.reset(token)
+
+
+def is_limited() -> bool:
+    """Whether a budget applies here."""
+    return _memory.get() not in (None, math.inf)
+
+
+def check_memory(what: object, size: float) -> None:
+    """Raise `BudgetError` for more bytes than the budget, if there is one; `what` is for the message."""
+    most = _memory.get()
+    if most is not None and size > most:
+        enough = min(math.ceil(size / 1e9), 999_999)
+        raise BudgetError(
+            f"{what}: would take about {_shown(size)} of memory, the budget is {_shown(most)}; if you trust "
+            f"it and have room for it, set {VARIABLE}={enough}GB"
+        )
+
+
+def _shown(size: float) -> str:
+    unit, factor = ("GB", 1e9) if size >= 1e9 else ("MB", 1e6)
+    return f"{size / factor:,.3g} {unit}" if size < 1e15 else "more than a million GB"
+
+
+@contextmanager
+def called_from(folder: Path) -> Iterator[None]:
+    """In this block the command counts as called from `folder`, whatever the current folder is."""
+    before = _called_from.copy()
+    _called_from[:] = [folder]
+    try:
+        yield
+    finally:
+        _called_from[:] = before
+
+
+def users_folder() -> Path:
+    """The folder from which the user names files: the current one, unless a job has changed that."""
+    return _called_from[0] if _called_from else Path.cwd()
 
 
 @contextmanager

@@ -32,10 +32,7 @@ Bounds = tuple[float, float]  # of an axis, the lower one first
 
 
 def task_charts(analysis: TaskAnalysis, styles: Styles) -> Iterator[Chart]:
-    """The figures of a task that its runs have the numbers for; none where every number is 0.
-
-    Curves and strips show as many agents as there are colours, the best ones where there are more.
-    """
+    """The figures of a task that its runs have the numbers for, of the best agents where there are many."""
     for sweep in sweeps(analysis.results):
         yield from sweep_charts(sweep, analysis.task)
     shown = [result for result in analysis.results if result in analysis.ranked[:_MOST_DRAWN]]
@@ -130,10 +127,7 @@ def _draw_curves(
     levels: Bounds | None = None,
     references: Mapping[str, float] | None = None,
 ) -> Chart:
-    """Each agent's curve with its band against environment steps, or `levels` of optimality.
-
-    References are lines across. Curves are bold as far as all runs go, and dotted from where the first ended.
-    """
+    """Each agent's curve with its band: bold as far as all runs go, and dotted from where the first ended."""
     seen = {mark: at for mark, at in (references or {}).items() if bounds[0] <= at <= bounds[1]}
     looks = [styles[agent] for agent in bands]
     looks += [{"color": INK, "linestyle": _REFERENCES[mark]} for mark in seen]

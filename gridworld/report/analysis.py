@@ -100,10 +100,7 @@ def _optimality(run: Evidence, world: Reference) -> float:
 
 
 def online_return(run: Evidence, last: float = 1.0) -> float:
-    """Mean return of the training episodes in the `last` part of training; NaN where there is none.
-
-    It is the mean over the curve's rows, weighted by their steps in that part.
-    """
+    """Mean return of the training episodes in the `last` part of training, weighted by steps; NaN: none."""
     if ONLINE not in run.curve:
         return math.nan
     begin = (1 - last) * run.steps
@@ -165,10 +162,7 @@ def on_grid(run: Evidence, column: str, grid: FloatArray) -> FloatArray:
 
 
 def _band(runs: Sequence[Evidence], column: str, grid: FloatArray, seed: int) -> Band:
-    """IQM and mean of a column over runs, with the IQM's 95 % bootstrap band.
-
-    It goes from the first step at which every run has a value to the end of the last run.
-    """
+    """IQM and mean of a column over runs, from the first step at which all have a value."""
     values = np.stack([on_grid(run, column, grid) for run in runs], axis=-1)
     is_whole = ~np.isnan(values).any(axis=-1)
     grid, values = grid[is_whole], values[is_whole]
@@ -358,10 +352,7 @@ def _result(group: Group, world: Reference, grid: FloatArray, seed: int) -> Resu
 
 
 def _compare(tasks: Sequence[Mapping[str, Mapping[str, FloatArray]]], seed: int) -> Comparisons:
-    """Compare every agent with every other on the tasks of both; of several tasks, on two at least.
-
-    `tasks` has samples (runs,) by agent and metric for each task. Each pair is there from either side.
-    """
+    """Compare agents both ways; `tasks` are {agent: {metric: samples}}, two of which both have, if many."""
     agents = sorted({agent for task in tasks for agent in task})
     found: dict[tuple[str, str, str], Interval] = {}
     compared = [metric for metric in METRICS.values() if metric.is_compared]

@@ -13,10 +13,11 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 from cycler import cycler
-from matplotlib import style
+from matplotlib import rc_params_from_file, style
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -27,7 +28,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from gridworld.process.console import plain
 
-INK, MUTED, GRID, PAPER = "#1c2430", "#5d6878", "#e3e7ed", "#ffffff"
+INK, MUTED, PAPER = "#1c2430", "#5d6878", "#ffffff"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#b8578f", "#c98500", "#3a9bd9", "#4a4f57")  # of agents
 _DASHES = ("solid", (0, (6.0, 3.0)), (0, (2.0, 2.5)))
 
@@ -40,44 +41,15 @@ _MOST_LINES = 6  # of a name
 _LEGEND = 63  # characters that fit next to each other in a legend
 _HANDLE = 6  # characters that a name's line and the gaps take there
 
-_RC = {
-    "font.family": ["DejaVu Sans", "sans-serif"],  # the first comes with matplotlib
-    "font.sans-serif": ["DejaVu Sans"],
-    "font.size": SMALL,
-    "text.parse_math": False,  # names may be anybody's: no formulas
-    "text.color": INK,
-    **{f"axes.spines.{side}": False for side in ("left", "right", "top", "bottom")},
-    **{
-        f"{axis}tick.{name}": value
-        for name, value in {"color": MUTED, "major.size": 0.0, "major.pad": 6.0, "labelsize": SMALL}.items()
-        for axis in "xy"
-    },
-    "axes.axisbelow": True,
-    "axes.labelcolor": MUTED,
-    "axes.labelsize": SMALL,
-    "axes.labelpad": 3.0,
-    "xaxis.labellocation": "right",
-    "yaxis.labellocation": "top",
-    "grid.color": GRID,
-    "grid.linewidth": 1.0,
-    "lines.scale_dashes": False,
-    "lines.solid_capstyle": "butt",
-    "lines.markeredgewidth": 0.0,
-    "legend.frameon": False,
-    "legend.borderpad": 0.0,
-    "legend.handlelength": 1.6,
-    "legend.handletextpad": 0.5,
-    "legend.columnspacing": 1.1,
-    "legend.fontsize": SMALL,
-    "svg.fonttype": "none",  # text stays text
-}
+_STYLE_FILE = Path(__file__).with_name("figures.mplstyle")
+_STYLE = {str(name): value for name, value in rc_params_from_file(_STYLE_FILE, False, False).items()}
 _CHANGING = {"svg": "Date", "pdf": "CreationDate", "png": "Software"}  # entries that are left out
 
 
 @contextmanager
 def house_style(salt: str = "") -> Iterator[None]:
     """The report's style, whatever the user's matplotlib is set to; `salt` makes ids in SVG reproducible."""
-    with warnings.catch_warnings(), style.context(["default", _RC | {"svg.hashsalt": salt}]):
+    with warnings.catch_warnings(), style.context(["default", _STYLE, {"svg.hashsalt": salt}]):
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
         warnings.filterwarnings("ignore", "constrained_layout not applied", UserWarning)
         yield
@@ -137,10 +109,7 @@ def new_figure(
     legend: Sequence[tuple[Artist, str]] = (),
     width: float = WIDTH,
 ) -> tuple[Figure, Axes]:
-    """A figure with a heading and a legend above its axes, which are about `height` points high.
-
-    `grid` is the axis with lines across at its numbers, `legend` has handles with names of a line or more.
-    """
+    """A figure with a heading and a legend above its axes, which are about `height` points high."""
     names = [name for _, name in legend]
     columns, lines = 1, sum(name.count("\n") + 1 for name in names)
     if names and lines == len(names):

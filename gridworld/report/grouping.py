@@ -122,10 +122,7 @@ def learning_key(run: Evidence) -> Key:
 
 
 def labels(named: Sequence[tuple[str, Settings]], with_unset: bool = True) -> list[str]:
-    """A label for each (name, settings): the name, with the settings that differ from its namesakes'.
-
-    `with_unset` is whether a setting that only others have is shown as not set.
-    """
+    """A label for each (name, settings): the name, with the settings that differ from its namesakes'."""
     out = []
     for name, settings in named:
         namesakes = [other for other_name, other in named if other_name == name]

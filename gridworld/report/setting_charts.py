@@ -38,10 +38,7 @@ _Marks = list[tuple[str, float]]  # texts at an axis, and where, from 0 to 1
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """The results of one agent on one task by the values of what was swept, the smallest first.
-
-    Not every combination of values need have a result.
-    """
+    """The results of one agent on one task by the values of what was swept, the smallest first."""
 
     agent: str
     keys: tuple[str, ...]

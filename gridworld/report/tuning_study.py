@@ -12,7 +12,7 @@ from typing import Any
 
 from gridworld.errors import InputError
 from gridworld.process.console import plain
-from gridworld.process.memory_budget import check_memory
+from gridworld.process.user_input import check_memory
 from gridworld.storage.csv_text import csv_rows
 from gridworld.storage.safe_read import LARGEST_CSV, as_table, read_bytes, read_sealed, sha256
 

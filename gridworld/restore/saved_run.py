@@ -23,8 +23,7 @@ from gridworld.config.worlds import MapConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.process.console import tell
-from gridworld.process.memory_budget import limited
-from gridworld.process.user_input import DAMAGED
+from gridworld.process.user_input import DAMAGED, limited
 from gridworld.run.folder import shown
 from gridworld.run.reader import RunReader, open_run, stored_world
 from gridworld.training.setup import make_context

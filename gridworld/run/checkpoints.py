@@ -12,8 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gridworld.errors import InputError
-from gridworld.process.memory_budget import BudgetError
 from gridworld.process.together import clock
+from gridworld.process.user_input import BudgetError
 from gridworld.run.folder import CHECKPOINTS
 from gridworld.storage.atomic_write import remove_path, sync_folder, write_bytes
 from gridworld.storage.safe_read import check_no_link, read_bytes

@@ -35,7 +35,8 @@ from typing import Any
 from gridworld.config import train as schema
 from gridworld.config.settings import foreign
 from gridworld.errors import InputError
-from gridworld.process.console import command, printable, users_folder
+from gridworld.process.console import command, printable
+from gridworld.process.user_input import users_folder
 from gridworld.storage.atomic_write import inside, locked, make_folder, remove_path, tidy
 
 MANIFEST = "manifest.json"
@@ -134,9 +135,7 @@ def alone_in(folder: Path) -> Iterator[None]:
 def claimed(folder: Path) -> Iterator[None]:
     """Make a run's folder and hold it for this process; afterwards, undo that where no run was started.
 
-    Raises:
-        InputError: another process holds the folder.
-        OSError: the folder could not be made; or one of the block, which then names the folder.
+    An `OSError` of the block names the folder, if it names nothing.
     """
     make_folder(folder.parent)
     folder.mkdir(exist_ok=True)

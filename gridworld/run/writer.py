@@ -103,11 +103,11 @@ class RunWriter(RunFolder):
 
     def settle(self, *files: Path) -> None:
         """Make the manifest, then these files, and all names in the folder survive a power cut."""
-        if self._is_settled:
+        if not self._is_settled:
+            files = (self.manifest_file, self.world_file, *self.folder.glob("source*.diff"), *files)
+            sync_folder(self.folder.parent)
+        if files:
             sync(files, self.folder)
-            return
-        sync([self.manifest_file, self.world_file, *self.folder.glob("source*.diff"), *files], self.folder)
-        sync_folder(self.folder.parent)
         self._is_settled = True
 
     @property

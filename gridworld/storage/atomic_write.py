@@ -17,6 +17,7 @@ lead to any folder of the reader's: `inside` goes through none.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import json
@@ -36,7 +37,7 @@ from gridworld.storage.safe_read import check_no_link, open_ordinary
 
 _SECONDS_BETWEEN_TRIES = 0.02
 _PIECE = 1 << 20  # bytes of a log that are read at once
-_PART = re.compile(r"\..+\.(\d+)\.(old\.)?part", re.DOTALL)
+_PART = re.compile(r"\..+\.(\d{1,9})\.(old\.)?part", re.DOTALL)
 
 
 @contextmanager
@@ -74,14 +75,8 @@ def is_locked(path: Path) -> bool:
 def replacing(path: Path, durable: bool = False) -> Iterator[Path]:
     """Replace a file atomically: the block writes to a path beside it, which then takes its place.
 
-    If the block raises, the file stays as it was. A symbolic link is replaced and not followed.
-
-    Args:
-        path: the file.
-        durable: a power cut leaves the old content or the new one.
-
-    Raises:
-        OSError: it names `path`, not the path beside it.
+    If the block raises, the file stays as it was, and an `OSError` names it. A symbolic link is replaced and
+    not followed. Where that is to be `durable`, a power cut leaves the old content or the new one.
     """
     part = _part_of(path)
     try:
@@ -139,10 +134,8 @@ def tidy(folder: Path) -> None:
 def _is_alive(process: int) -> bool:
     try:
         os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:  # it is another user's
-        pass
+    except OSError as error:
+        return error.errno == errno.EPERM  # it is another user's
     return True
 
 
@@ -225,9 +218,6 @@ class AppendLog:
     Args:
         path: of a new file, or with `mark` of an existing one.
         mark: to which an existing file is truncated; check it by `holds` before.
-
-    Attributes:
-        length: bytes that are in it.
     """
 
     def __init__(self, path: Path, mark: dict[str, Any] | None = None) -> None:
@@ -238,7 +228,7 @@ class AppendLog:
             self._file = cast("BinaryIO", path.open("w+b", buffering=0))
         else:
             self._file = open_ordinary(path, "r+b")
-        self.length = 0 if mark is None else mark["length"]
+        self.length = 0 if mark is None else mark["length"]  # bytes that are in it
         self._sum = _sum_of(path, self.length)
         self._truncate()
 

@@ -24,7 +24,7 @@ from typing import Any, BinaryIO, cast
 
 from gridworld.bounds import LARGEST_INTEGER
 from gridworld.errors import InputError
-from gridworld.process.memory_budget import check_memory
+from gridworld.process.user_input import check_memory
 
 LARGEST_JSON = 4 * 2**20  # bytes
 LARGEST_CSV = 64 * 2**20
@@ -64,6 +64,11 @@ def read_bytes(path: Path, most: int, copies: int = 1) -> bytes:
             return file.read(most)
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def read_table(path: Path) -> str:
+    """Read the text of a table (CSV) of at most `LARGEST_CSV` bytes."""
+    return as_table(read_bytes(path, LARGEST_CSV), path)
 
 
 def read_object(path: Path, most: int = LARGEST_JSON) -> dict[str, Any]:

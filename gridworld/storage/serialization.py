@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError
-from gridworld.process.memory_budget import BudgetError, check_memory
-from gridworld.process.user_input import npz_arrays
+from gridworld.process.user_input import BudgetError, check_memory, npz_arrays
 from gridworld.storage.safe_read import AS_JSON
 
 State = dict[str, Any]
@@ -30,10 +29,6 @@ _TREE = "state.json"
 _ARRAY = "@"
 _KINDS = "bfiu"  # of arrays, as numpy abbreviates them
 _PLAIN = frozenset((bool, int, float, str))
-_MISFITS = (  # what setting an object to a state that is not its own may raise
-    *(ArithmeticError, AttributeError, LookupError, MemoryError),
-    *(RuntimeError, TypeError, ValueError),
-)
 _MOST = 1 << 38  # bytes of arrays
 
 
@@ -58,12 +53,7 @@ def encode(state: State, compress: bool = False) -> memoryview:
 
 
 def decode(data: bytes | memoryview, name: object = "a state") -> State:
-    """Decode the bytes of a state; `name` says whose it is, for the error's sentence.
-
-    Raises:
-        StateError: they are no such bytes.
-        BudgetError: it would take more memory than the budget.
-    """
+    """Decode the bytes of a state, or raise `StateError`; `name` says whose it is, for a `BudgetError`."""
     try:
         members: dict[str, Any] = npz_arrays(name, data, "a state", _MOST)
         tree = members.pop(_TREE)
@@ -87,16 +77,12 @@ def fitting() -> Iterator[None]:
         yield
     except StateError:
         raise
-    except _MISFITS as error:
+    except Exception as error:
         raise StateError(f"{type(error).__name__}: {error}") from error
 
 
 def fill(target: NDArray[Any], value: Any, where: str) -> None:
-    """Copy an array of a state into `target`.
-
-    Raises:
-        StateError: `value` is no array of the same shape and dtype; the sentence begins with `where`.
-    """
+    """Copy an array of a state into `target`; a `StateError` where shape or dtype differ names `where`."""
     if not isinstance(value, np.ndarray) or value.shape != target.shape or value.dtype != target.dtype:
         found = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
         raise StateError(f"{where} must be {target.dtype} {target.shape}, is {found}")

@@ -11,26 +11,24 @@ import shlex
 import statistics
 import sys
 from collections import Counter, defaultdict
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from gridworld.config.fields import Effect
 from gridworld.config.settings import ON_RESULT, effect_of, flat, with_effects
 from gridworld.envs.rollout import wilson_interval
-from gridworld.errors import InputError, reason
-from gridworld.process.console import aligned, command_line, duration, printable, tell_error
+from gridworld.errors import InputError
+from gridworld.process.console import aligned, command, command_line, duration, printable
 from gridworld.run.reader import read_run
-from gridworld.run.summary import Summary
-from gridworld.sweep.job_table import DONE, FAILED, INTERRUPTED, JOBS_CSV, PENDING, RUNNING, STATUSES, JobRow
+from gridworld.sweep.folder import DONE, FAILED, INTERRUPTED, JOBS_CSV, PENDING, RUNNING, STATUSES, JobRow
 
 _HEADINGS = ("agent", "task", "settings", "certified", "steps to certificate, median")
 _OF_SETTINGS = ON_RESULT - {Effect.SEED, Effect.LABELS, Effect.MACHINE}
 _MOST_NAMED = 3  # jobs
 _LONGEST = 60  # characters of settings
-_MOST_LISTED = 50  # of a kind, on the terminal; jobs.csv has them all
-
-Settings = tuple[tuple[str, str], ...]  # dotted names, values as text
+_MOST_LISTED = 50  # of a kind, on the terminal
 
 
 def counts_text(rows: Iterable[JobRow]) -> str:
@@ -49,46 +47,33 @@ def tell_end(
     folder: Path, rows: Sequence[JobRow], seconds: float, stopped: str, mistakes: Container[str]
 ) -> None:
     """Print the results, how the jobs stand, why some did not end well, and how to go on with the rest."""
-    print(f"sweep {shell_path(folder)}: {counts_text(rows)}, in {duration(seconds)}")
-    results = results_lines(folder, rows)
-    for line in ("", *results[: _MOST_LISTED + 1], "") if results else ():
-        print(printable(f"  {line}".rstrip()))
-    if len(results) > _MOST_LISTED + 1:
-        print(f"  and {len(results) - _MOST_LISTED - 1} more; the report has all")
-    print(f"  jobs: {shell_path(folder / JOBS_CSV)}\n  curves: tensorboard --logdir {shell_path(folder)}")
-    if results:
-        print(f"  report: {_report_command(folder)}")
-    sys.stdout.flush()
+    where, results = shell_path(folder), results_lines(folder, rows)
+    lines = [f"sweep {where}: {counts_text(rows)}, in {duration(seconds)}"]
+    lines += ["", *_most(f"  {line}".rstrip() for line in results), ""] if results else []
+    lines += [f"  jobs: {shell_path(folder / JOBS_CSV)}", f"  curves: tensorboard --logdir {where}"]
+    lines += [f"  report: {command('report')} {where}"] if results else []
+    print(*map(printable, lines), sep="\n", flush=True)
     failed = [row for row in rows if row.status == FAILED]
     halted = [row for row in rows if row.error and row.status in (PENDING, INTERRUPTED)]
-    _list("interrupted", halted)
-    _list("failed", failed)
+    lines = []
+    for what, listed in (("interrupted", halted), ("failed", failed)):
+        lines += [f"{what}:", *_most(f"  {row.overrides}: {row.error}" for row in listed)] if listed else []
     if stopped:
-        print(f"{stopped}; go on with: {resume_command(folder)}", file=sys.stderr)
+        lines.append(f"{stopped}; go on with: {resume_command(folder)}")
     elif any(row.job not in mistakes for row in failed):
-        retry = "hydra.sweeper.retry_failed=true"
-        print(f"to try them again: {resume_command(folder, retry)}", file=sys.stderr)
+        lines.append(f"to try them again: {resume_command(folder, 'hydra.sweeper.retry_failed=true')}")
     elif any(row.status == RUNNING for row in rows):
-        print(f"the rest runs elsewhere; to see how it goes: {resume_command(folder)}", file=sys.stderr)
+        lines.append(f"the rest runs elsewhere; to see how it goes: {resume_command(folder)}")
     elif any(row.status not in (DONE, FAILED) for row in rows):
-        print(f"the rest did not come to its end; go on with: {resume_command(folder)}", file=sys.stderr)
-    sys.stderr.flush()
+        lines.append(f"the rest did not come to its end; go on with: {resume_command(folder)}")
+    for line in lines:
+        print(printable(line), file=sys.stderr, flush=True)
 
 
-def _list(what: str, rows: Sequence[JobRow]) -> None:
-    if rows:
-        print(f"{what}:", file=sys.stderr)
-    for row in rows[:_MOST_LISTED]:
-        print(printable(f"  {row.overrides}: {row.error}"), file=sys.stderr)
-    if len(rows) > _MOST_LISTED:
-        print(f"  and {len(rows) - _MOST_LISTED} more; {JOBS_CSV} has all", file=sys.stderr)
-
-
-def tell_stopped_by(error: OSError, folder: Path) -> None:
-    """Print why the sweep cannot go on, such as a full disk, and how to go on once that is put right."""
-    tell_error(
-        f"{shell_path(folder)}: {reason(error)}; put that right, then go on with: {resume_command(folder)}"
-    )
+def _most(lines: Iterable[str]) -> list[str]:
+    first, *rest = list(lines)
+    more = len(rest) - _MOST_LISTED
+    return [first, *rest[:_MOST_LISTED], *([f"  and {more} more; {JOBS_CSV} has all"] if more > 0 else [])]
 
 
 def resume_command(folder: Path, *more: str) -> str:
@@ -97,15 +82,6 @@ def resume_command(folder: Path, *more: str) -> str:
     if not any(word.startswith("hydra.sweep.dir=") for word in words):
         more = (f"hydra.sweep.dir={folder}", *more)
     return printable(shlex.join([*words, *(word for word in more if word not in words)]))
-
-
-def _report_command(folder: Path) -> str:
-    words = command_line()
-    if words[0] == "python":
-        words[1] = str(Path(words[1]).with_name("report.py"))
-    else:
-        words[1] = "report"
-    return f"{printable(shlex.join(words[:2]))} {shell_path(folder)}"
 
 
 def shell_path(folder: Path) -> str:
@@ -117,20 +93,19 @@ def shell_path(folder: Path) -> str:
 
 def results_lines(folder: Path, rows: Sequence[JobRow]) -> list[str]:
     """The table of the results, a line each with the headings first; empty where no job is done."""
-    groups: dict[tuple[str, str], dict[Settings, list[_Result]]] = defaultdict(lambda: defaultdict(list))
+    groups: dict[tuple[str, str], dict[str, list[_Result]]] = defaultdict(lambda: defaultdict(list))
     lost = []
     for row in rows:
         found = _result(folder / row.job) if row.status == DONE else None
         if found is None:
             lost.append(row.job)
         else:
-            groups[found.summary["agent"], found.summary["env"]][found.settings].append(found)
+            groups[found.summary["agent"], found.summary["env"]][str(found.settings)].append(found)
     cells = []
     for (agent, task), alike in groups.items():
-        told = _differences([results[0] for results in alike.values()])
-        for results, difference in zip(alike.values(), told, strict=True):
-            summaries = [result.summary for result in results]
-            cells.append([agent, task, difference, _certified(summaries), _steps(summaries)])
+        labels = _differences([results[0] for results in alike.values()])
+        for results, label in zip(alike.values(), labels, strict=True):
+            cells.append([agent, task, label, _certified(results), _steps(results)])
     if not cells:
         return []
     keep = [0, 1, *([2] if any(row[2] for row in cells) else []), 3, 4]
@@ -145,64 +120,53 @@ def results_lines(folder: Path, rows: Sequence[JobRow]) -> list[str]:
 
 @dataclass(frozen=True)
 class _Result:
-    """What a job came to, and by which settings and words."""
+    """What a job came to."""
 
-    summary: Summary
-    settings: Settings
-    words: tuple[str, ...]  # that chose settings
+    summary: Mapping[str, Any]
+    settings: Mapping[str, str]  # values as text, by dotted names
+    words: Mapping[str, str]  # of the command line, by the settings that they choose
 
 
 def _result(folder: Path) -> _Result | None:
     try:
         run = read_run(folder)
-        chosen = with_effects(_OF_SETTINGS, run.manifest["config"])
-        settings = tuple((name, str(value)) for name, value in flat(chosen))
-        asked = [word for word in run.manifest["overrides"] if _chooses(_key(word))]
-        words = tuple(_resolved(word, dict(settings)) for word in asked)
+        chosen = flat(with_effects(_OF_SETTINGS, run.manifest["config"]))
+        settings = {name: str(value) for name, value in chosen}
+        words = {}
+        for word in run.manifest["overrides"]:
+            key = word.partition("=")[0].lstrip("+~").partition("@")[0]
+            if key == "preset" or effect_of(key) in _OF_SETTINGS:
+                follows = "${" in word and key in settings  # from other settings, as `n_envs=${seed}` does
+                words[key] = f"{key}={settings[key]}" if follows else word
         return _Result(run.read_summary(), settings, words)
     except InputError:  # it was changed since; `report` says in what
         return None
 
 
-def _chooses(key: str) -> bool:
-    return key == "preset" or effect_of(key) in _OF_SETTINGS
-
-
-def _resolved(word: str, settings: dict[str, str]) -> str:
-    """The word with its value where it names other settings, as `n_envs=${seed}` does."""
-    value = settings.get(_key(word))
-    return f"{_key(word)}={value}" if "${" in word and value is not None else word
-
-
-def _key(word: str) -> str:
-    return word.partition("=")[0].lstrip("+~").partition("@")[0]
-
-
 def _differences(results: Sequence[_Result]) -> list[str]:
     """The words of each that not all have; where one names no such setting, its value."""
-    shared = set(results[0].words).intersection(*(result.words for result in results))
-    keys = dict.fromkeys(_key(word) for result in results for word in result.words if word not in shared)
-    told = []
+    keys = {key: {result.words.get(key) for result in results} for found in results for key in found.words}
+    labels = []
     for result in results:
-        given = {_key(word): word for word in result.words}
-        values = {key: f"{key}={value}" for key, value in result.settings}
-        words = [given.get(key) or values.get(key, "") for key in keys]
-        text = " ".join(word.removeprefix("agent.") for word in words if word)
-        told.append(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…")
-    return told
+        values = {key: f"{key}={value}" for key, value in result.settings.items()} | dict(result.words)
+        words = [values[key].removeprefix("agent.") for key in keys if len(keys[key]) > 1 and key in values]
+        text = " ".join(words)
+        labels.append(text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…")
+    return labels
 
 
-def _certified(found: Sequence[Summary]) -> str:
-    count = sum(bool(summary["certified"]) for summary in found)
-    low, high = wilson_interval(count, len(found))
-    return f"{count} of {len(found)} [{100 * low:.0f} %, {100 * high:.0f} %]"
+def _certified(results: Sequence[_Result]) -> str:
+    count = sum(bool(result.summary["certified"]) for result in results)
+    low, high = wilson_interval(count, len(results))
+    return f"{count} of {len(results)} [{100 * low:.0f} %, {100 * high:.0f} %]"
 
 
-def _steps(found: Sequence[Summary]) -> str:
+def _steps(results: Sequence[_Result]) -> str:
     """The median step of the first certificate, or more than what the runs without one were given."""
-    first = [summary["first_certified_step"] for summary in found]
+    first = [result.summary["first_certified_step"] for result in results]
     median = statistics.median(math.inf if step is None else step for step in first)
     if math.isfinite(median):
         return f"{round(median):,}"
-    given = [summary["timesteps"] for summary in found if summary["first_certified_step"] is None]
+    summaries = [result.summary for result in results]
+    given = [summary["timesteps"] for summary in summaries if summary["first_certified_step"] is None]
     return f"> {min(given):,}"

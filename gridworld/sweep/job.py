@@ -16,21 +16,22 @@ from typing import Any
 
 import yaml
 from hydra.core.utils import JobReturn, JobStatus, configure_log
-from omegaconf import DictConfig, OmegaConf, open_dict, read_write
+from omegaconf import DictConfig, OmegaConf
 
 from gridworld.agents import family
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.errors import FolderLostError, InputError, MachineError, reason
-from gridworld.process.console import called_from, prepare
+from gridworld.process.console import prepare
 from gridworld.process.signals import Interrupted, exiting, handling, send_sigterm
 from gridworld.process.together import mixing
+from gridworld.process.user_input import called_from
 from gridworld.restore.resume import unfinished_of
 from gridworld.run.folder import ERROR_FILE, LOCK, MANIFEST
 from gridworld.run.reader import find_run, is_started
 from gridworld.run.writer import clear, record_failure
 from gridworld.storage.atomic_write import locked, write_bytes, write_text
-from gridworld.sweep.folder import STOP
-from gridworld.sweep.job_table import one_line, run_status
+from gridworld.sweep.folder import STOP, one_line
+from gridworld.sweep.plan import Job
 from gridworld.training.together import Training, run_together
 from gridworld.training.train import training
 
@@ -80,27 +81,24 @@ def run_in_sweep(
         raise JobError(why) from None
 
 
+def run_status(folder: Path) -> str:
+    """The status of the run in a folder: "" where none has begun, "failed" for a damaged manifest."""
+    try:
+        run = find_run(folder)
+    except InputError:
+        return "failed"
+    return "" if run is None else str(run.manifest["status"])
+
+
 def mark_failed(folder: Path, why: str, trace: str = "") -> None:
-    """Note why the job failed: in its manifest, and with the traceback or without a manifest in a file."""
+    """Note why the job failed, unless its run did: in the manifest, or where there is none in a file."""
     run = None
     with contextlib.suppress(InputError):  # a damaged manifest is left as it is
         run = find_run(folder)
         if run is not None and run.manifest["status"] in _UNFINISHED:
             record_failure(run, why)
-    if trace or run is None:
+    if run is None:
         write_text(folder / ERROR_FILE, f"{why}\n{trace}")
-
-
-@dataclass(frozen=True)
-class SweepJob:
-    """A job as its process needs it."""
-
-    folder: Path
-    number: int  # among those of this start of the sweep
-    hash: str
-    config: TrainConfig
-    overrides: tuple[str, ...]
-    replaces: bool  # a finished run in the folder, which is not the job's result
 
 
 @dataclass(frozen=True)
@@ -112,7 +110,7 @@ class Worker:
     master: DictConfig  # the configuration of the sweep itself
     callbacks: Any  # Hydra's, if some are the user's
 
-    def __call__(self, jobs: Sequence[SweepJob]) -> list[str]:
+    def __call__(self, jobs: Sequence[Job]) -> list[str]:
         """Run the jobs of a population; returns the error of each, or ""."""
         prepare()
         os.environ.update(self.master.hydra.job.env_set)
@@ -124,7 +122,7 @@ class Worker:
             results = run_together([self._run(job) for job in jobs])
         return [one_line(reason(result)) if isinstance(result, Exception) else "" for result in results]
 
-    def on_node(self, groups: Sequence[Sequence[SweepJob]]) -> list[str]:
+    def on_node(self, groups: Sequence[Sequence[Job]]) -> list[str]:
         """Run populations one after the other on a node of a cluster."""
         errors: list[str] = []
         # SIGUSR2 is Slurm's warning of its time limit. While training is on, it handles SIGTERM itself.
@@ -141,29 +139,24 @@ class Worker:
             pass
         return errors
 
-    def _run(self, job: SweepJob) -> Training[float]:
-        hydra = self.master.hydra
+    def _run(self, job: Job) -> Training[float]:
+        hydra, overrides = self.master.hydra, list(job.overrides)
         job.folder.mkdir(parents=True, exist_ok=True)
         if hydra.output_subdir is not None:
             _save(job, job.folder / hydra.output_subdir)
         own_folder = contextlib.chdir(job.folder) if hydra.job.chdir else contextlib.nullcontext()
         with called_from(Path(self.where)), own_folder:
-            run = run_in_sweep(
-                job.config, job.folder, list(job.overrides), hydra.sweeper.stop_at_first_failure, job.replaces
-            )
-            if self.callbacks is None:
-                return (yield from run)
-            return (yield from self._between_callbacks(job, run))
+            stops = hydra.sweeper.stop_at_first_failure
+            run = run_in_sweep(job.config, job.folder, overrides, stops, job.replaces)
+            return (yield from run if self.callbacks is None else self._between_callbacks(job, run))
 
-    def _between_callbacks(self, job: SweepJob, run: Training[float]) -> Training[float]:
-        whole = OmegaConf.create(dataclasses.asdict(job.config))
-        with open_dict(whole):
-            whole.hydra = OmegaConf.to_container(self.master.hydra, resolve=False)
-            whole.hydra.runtime.output_dir = str(job.folder)
-            whole.hydra.job.num = job.number
-            whole.hydra.overrides.task = list(job.overrides)
+    def _between_callbacks(self, job: Job, run: Training[float]) -> Training[float]:
+        overrides, hydra = list(job.overrides), OmegaConf.to_container(self.master.hydra, resolve=False)
+        whole = OmegaConf.create(dataclasses.asdict(job.config) | {"hydra": hydra})
+        whole.hydra.runtime.output_dir, whole.hydra.job.num = str(job.folder), job.number
+        whole.hydra.overrides.task = overrides
         self.callbacks.on_job_start(config=whole, task_function=None)
-        done = JobReturn(overrides=list(job.overrides), status=JobStatus.FAILED)
+        done = JobReturn(overrides=overrides, status=JobStatus.FAILED)
         try:
             done.return_value = yield from run
             done.status = JobStatus.COMPLETED
@@ -175,16 +168,9 @@ class Worker:
             self.callbacks.on_job_end(config=whole, job_return=done)
 
 
-def _save(job: SweepJob, folder: Path) -> None:
+def _save(job: Job, folder: Path) -> None:
     """Write the job's settings and overrides, as Hydra does for a single run."""
     folder.mkdir(exist_ok=True)
     for name, content in (("config", dataclasses.asdict(job.config)), ("overrides", list(job.overrides))):
         text = yaml.dump(content, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
         (folder / f"{name}.yaml").write_text(text, encoding="utf-8")
-
-
-def shared_part(master: DictConfig, sweep: Path) -> DictConfig:
-    """The configuration of a sweep with its folder as that of all jobs, for `hydra.job_logging`."""
-    with read_write(master.hydra.runtime), open_dict(master.hydra.runtime):
-        master.hydra.runtime.output_dir = str(sweep)
-    return master

@@ -10,24 +10,29 @@ since their numbers then depend on each other.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import functools
 import itertools
 import math
-import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import PurePath
+from pathlib import Path
 from typing import Any
 
 from hydra.core.config_loader import ConfigLoader
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
-from omegaconf import DictConfig
+from hydra.core.override_parser.types import Override, OverrideType
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
+from gridworld.config.compose import drop_hydra, to_config
 from gridworld.config.presets import with_preset
 from gridworld.config.settings import foreign, has_own_code
 from gridworld.config.sweep import SweepConfig
 from gridworld.config.train import AUTO, TrainConfig
+from gridworld.config.words import prepared
 from gridworld.config.worlds import EnvConfig
 from gridworld.errors import InputError
 from gridworld.process.processes import file_limit, free_memory, worker_count
@@ -41,10 +46,8 @@ _SHARE_OF_MEMORY = 4  # a population takes a fourth of what is free, shared by t
 _RUNS_BYTES = 16 * 2**20  # of a run beside its agent, with its pictures
 _OTHER_FILES = 64  # of the process
 _FEWEST = 4  # runs of a population for which another core is taken
-_LONGEST_NAME = 100  # characters of a job's folder
-_MOST_VALUES = 1_000_000  # of one key
-_HASH_SHOWN = 6  # characters of the hash in a name that needs it
-_SEED = re.compile(r"\+*seed=")
+_MOST_BASES = 64
+_NUMBERED = "${hydra.job.num}"  # hydra.sweep.subdir unless it is set; the sweeper has its own names
 
 
 @dataclass(frozen=True)
@@ -56,65 +59,93 @@ class Job:
     hash: str  # of the settings that matter
     mistake: str | None  # what is wrong with the settings, as far as it is known before training
     config: TrainConfig
-    shape: str | None = None  # equal for jobs that can train as one population; None: it trains alone
     memory: int = 0  # bytes, about, that it takes while it trains
-    in_fork: bool = False  # whether it may run in a fork of the process that plans it
     notes: tuple[str, ...] = ()  # what to say before training
+    # Once it is to run:
+    folder: Path = Path()
+    number: int = 0  # among those of this start of the sweep
+    replaces: bool = False  # a finished run in the folder, which is not the job's result
+
+    @property
+    def shape(self) -> str | None:
+        """What must be equal for jobs to train as one population; None: it trains alone."""
+        config = self.config
+        if config.agent.shape is None or has_own_code(config.callbacks):
+            return None
+        same = (config.n_envs, config.device, config.threads, config.observation, config.callbacks)
+        return repr((config.agent.shape, *same))
+
+
+def may_fork(config: TrainConfig) -> bool:
+    """Whether a run may train in a fork: with only our code and the libraries', on one core."""
+    own_code = has_own_code(config.callbacks) or any(foreign({"agent": dataclasses.asdict(config.agent)}))
+    return config.device == "cpu" and config.threads == 1 and not own_code
 
 
 def expand(
     words: Sequence[str], loader: ConfigLoader, most: int, paired: Sequence[Any] = ()
 ) -> list[tuple[list[str], list[str]]]:
-    """Expand a command line to (overrides, the swept ones among them) of every job.
+    """Expand a command line to (overrides, the swept ones among them) of every job, the last key fastest.
 
-    The last key changes fastest.
-
-    Args:
-        words: the command line's overrides.
-        loader: Hydra's, which knows the groups that `glob` chooses from.
-        most: how many jobs are allowed.
-        paired: keys whose values vary together, or groups of such keys.
+    Hydra's `loader` knows the groups that `glob` chooses from. There may be `most` jobs. `paired` has keys
+    whose values vary together, or groups of such keys.
     """
-    columns: dict[str, tuple[bool, list[str]]] = {}
+    lines: dict[str, list[str]] = {}
+    swept: dict[str, list[str]] = {}
     for override in OverridesParser.create(config_loader=loader).parse_overrides(list(words)):
         key = override.get_key_element()
-        columns.pop(key, None)  # given twice, the last one counts, in its place
+        for earlier in (lines, swept):  # given twice, the last one counts, in its place
+            earlier.pop(key, None)
         if override.is_sweep_override():
-            columns[key] = True, [f"{key}={value}" for value in _values(override)]
+            lines[key] = swept[key] = [f"{key}={value}" for value in _values(override, most)]
         else:
-            columns[key] = False, [str(override.input_line)]
-    axes = list(_axes({key: lines for key, (_, lines) in columns.items()}, _groups(paired, columns)))
-    count = math.prod(map(len, axes))
-    if count > most:
+            lines[key] = [str(override.input_line)]
+    groups = _groups(paired, swept)
+    axes = []  # what varies independently of the rest: of each, {key: line} per value
+    for key in lines:
+        group = next((group for group in groups if key in group), [key])
+        if key == group[0]:
+            together = zip(*(lines[each] for each in group), strict=True)
+            axes.append([dict(zip(group, values, strict=True)) for values in together])
+    if math.prod(map(len, axes)) > most:
         raise InputError(
-            f"{' '.join(words)}: {count:,} jobs; if so many are meant, add hydra.sweeper.max_jobs={count}"
+            f"{' '.join(words)}: more than {most:,} jobs; if so many are meant, raise hydra.sweeper.max_jobs"
         )
-    swept = [key for key, (is_swept, _) in columns.items() if is_swept]
-    jobs = (dict(itertools.chain(*(part.items() for part in parts))) for parts in itertools.product(*axes))
-    return [([job[key] for key in columns], [job[key] for key in swept]) for job in jobs]
+    found = []
+    for parts in itertools.product(*axes):
+        job = {key: line for part in parts for key, line in part.items()}
+        found.append(([job[key] for key in lines], [job[key] for key in swept]))
+    return found
 
 
-def _groups(paired: Sequence[Any], columns: Mapping[str, tuple[bool, list[str]]]) -> list[list[str]]:
+def _values(override: Override, most: int) -> list[str]:
+    """The values of a swept key, one too many where there are more than `most`."""
+    if not override.is_discrete_sweep():
+        raise InputError(f"{override.input_line}: jobs are made of a list, a,b,c, or of range(start, stop)")
+    values = list(itertools.islice(override.sweep_string_iterator(), most + 1))
+    if not values:
+        raise InputError(f"{override.input_line}: there is nothing in it, so there would be no job")
+    return values
+
+
+def _groups(paired: Sequence[Any], swept: Mapping[str, list[str]]) -> list[list[str]]:
     """The keys that vary together, each group in the order of the command line."""
-    by_name = {key.lstrip("+"): key for key in columns}
+    by_name = {key.lstrip("+"): key for key in swept}
     groups = paired if any(map(_is_list, paired)) else [paired]
     found: list[list[str]] = []
     for group in filter(None, groups):
         names = [str(name) for name in (group if _is_list(group) else [group])]
         where = f"hydra.sweeper.paired=[{','.join(names)}]"
-        if len(names) < 2:
-            raise InputError(f"{where}: names one setting; a pair is of two or more, such as [agent,n_envs]")
         for name in names:
-            if name not in by_name or not columns[by_name[name]][0]:
+            if name not in by_name:
                 raise InputError(f"{where}: {name} has no list of values; give it one, {name}=A,B")
-            if names.count(name) > 1 or any(by_name[name] in earlier for earlier in found):
-                raise InputError(f"{where}: {name} is paired already; name it once")
-        counts = [f"{name} has {len(columns[by_name[name]][1])}" for name in names]
-        if len({count.rpartition(" ")[2] for count in counts}) > 1:
-            raise InputError(
-                f"{where}: lists that vary together are equally long; {', '.join(counts)} values"
-            )
-        found.append([key for key in columns if key in {by_name[name] for name in names}])
+        keys = [key for key in swept if key in {by_name[name] for name in names}]
+        if len(keys) < max(2, len(names)) or set(keys) & set(itertools.chain(*found)):
+            raise InputError(f"{where}: must name two settings or more, such as [agent,n_envs], each once")
+        if len({len(swept[key]) for key in keys}) > 1:
+            counts = ", ".join(f"{name} has {len(swept[by_name[name]])}" for name in names)
+            raise InputError(f"{where}: lists that vary together are equally long; {counts} values")
+        found.append(keys)
     return found
 
 
@@ -122,26 +153,64 @@ def _is_list(entry: Any) -> bool:
     return isinstance(entry, Sequence) and not isinstance(entry, str)
 
 
-def _axes(columns: Mapping[str, list[str]], groups: Sequence[list[str]]) -> Iterator[list[dict[str, str]]]:
-    """What varies independently of the rest: of each, {key: line} per value."""
-    for key in columns:
-        group = next((group for group in groups if key in group), [key])
-        if key == group[0]:
-            yield [
-                dict(zip(group, lines, strict=True))
-                for lines in zip(*(columns[each] for each in group), strict=True)
-            ]
+class Configurations:
+    """Composes jobs: by Hydra once per choice of files, whose values are then put into copies.
+
+    Hydra reads every file anew for every job, which takes as long as a short run.
+    """
+
+    def __init__(self, loader: ConfigLoader, master: DictConfig) -> None:
+        self._loader, self._master, self._shared = loader, master, _shared(master)
+        subdir = self._shared["sweep"]["subdir"]
+        if subdir != _NUMBERED:
+            raise InputError(
+                f"hydra.sweep.subdir={subdir}: a sweep names the folders of its jobs itself, by the settings "
+                "in which they differ; leave it out"
+            )
+        HydraConfig.instance().set_config(master)  # settings may refer to it: ${hydra:runtime.cwd}
+        self._base = functools.lru_cache(maxsize=_MOST_BASES)(self._by_hydra)
+        self._is_group = functools.cache(lambda key: bool(loader.get_group_options(key)))
+
+    def __call__(self, words: Sequence[str]) -> TrainConfig:
+        """Compose a job's overrides."""
+        overrides = OverridesParser.create(config_loader=self._loader).parse_overrides(prepared(words))
+        rest = [each for each in overrides if not self._is_choice(each)]
+        own = [place for place, override in enumerate(rest, 1) if not _is_value(override)]
+        ours = rest[max(own, default=0) :]  # Hydra applies values in their order, after all choices
+        lines = [str(each.input_line) for each in overrides if each not in ours]
+        settings = copy.deepcopy(self._base(*lines))
+        try:
+            for override in ours:
+                OmegaConf.update(settings, override.key_or_group, override.value())
+        except OmegaConfBaseException:
+            settings = self._by_hydra(*(str(each.input_line) for each in overrides))  # says what is wrong
+        return to_config(settings)
+
+    def _by_hydra(self, *words: str) -> DictConfig:
+        whole = self._loader.load_sweep_config(self._master, list(words))
+        for key, value in _shared(whole).items():
+            if value != self._shared[key]:
+                raise InputError(
+                    f"hydra.{key}: is set in a file that only some of the jobs choose, and all jobs of a "
+                    "sweep have it in common; choose that file for all, or give it on the command line"
+                )
+        return drop_hydra(whole)
+
+    def _is_choice(self, override: Override) -> bool:
+        return self._is_group(override.key_or_group) and not isinstance(override.value(), dict)
 
 
-def _values(override: Override) -> list[str]:
-    if not override.is_discrete_sweep():
-        raise InputError(f"{override.input_line}: jobs are made of a list, a,b,c, or of range(start, stop)")
-    values = list(itertools.islice(override.sweep_string_iterator(), _MOST_VALUES + 1))
-    if len(values) > _MOST_VALUES:
-        raise InputError(f"{override.input_line}: more than {_MOST_VALUES:,} values; a sweep takes fewer")
-    if not values:
-        raise InputError(f"{override.input_line}: there is nothing in it, so there would be no job")
-    return values
+def _is_value(override: Override) -> bool:
+    """Whether an override changes a plain value, and nothing else."""
+    is_change = override.type is OverrideType.CHANGE and override.package is None
+    return is_change and not isinstance(override.value(), dict | list)
+
+
+def _shared(whole: DictConfig) -> dict[str, Any]:
+    """Of Hydra's own part, what all jobs of a sweep have in common, unresolved."""
+    own: Any = OmegaConf.to_container(whole.hydra, resolve=False)
+    parts = {key: own[key] for key in ("sweep", "sweeper", "launcher", "callbacks", "output_subdir")}
+    return parts | {f"job.{key}": own["job"][key] for key in ("chdir", "env_set")}
 
 
 def plan(
@@ -149,14 +218,13 @@ def plan(
 ) -> list[Job]:
     """Compose and check the jobs, each once; `jobs` has (overrides, the swept ones among them) of each."""
     worlds: dict[str, Mdp] = {}
+    known: dict[str, tuple[str, ...]] = {}  # notes
 
     def world(env: EnvConfig) -> Mdp:
         key = repr(env)
         if key not in worlds:
             worlds[key] = env.compile()
         return worlds[key]
-
-    known: dict[str, tuple[str, ...]] = {}
 
     def noted(config: TrainConfig, mdp: Mdp) -> tuple[str, ...]:
         key = repr(dataclasses.replace(config, seed=0))
@@ -180,88 +248,38 @@ def plan(
         except InputError as error:
             mistake = str(error)
         digest = settings_hash(dataclasses.asdict(config), layout)
-        planned.setdefault(
-            digest,
-            Job(
-                overrides=(*given, *chosen),
-                swept=tuple(swept),
-                hash=digest,
-                mistake=mistake,
-                config=config,
-                shape=shape(config),
-                memory=memory,
-                in_fork=_in_fork(config),
-                notes=said,
-            ),
-        )
+        job = Job((*given, *chosen), tuple(swept), digest, mistake, config, memory, said)
+        first = planned.setdefault(digest, job)
+        if other := [word for word in swept if word not in first.swept]:
+            shown = " ".join(word for word in first.swept if word not in swept)
+            note = f"{' '.join(other)} makes the same runs as {shown}, and these are run once"
+            planned[digest] = dataclasses.replace(first, notes=(*first.notes, note))
     return list(planned.values())
 
 
-def _in_fork(config: TrainConfig) -> bool:
-    """Whether it has only our code and the libraries', and trains on one core."""
-    classes = foreign({"agent": dataclasses.asdict(config.agent)})
-    own_code = has_own_code(config.callbacks) or any(classes)
-    return config.device == "cpu" and config.threads == 1 and not own_code
-
-
-def shape(config: TrainConfig) -> str | None:
-    """What must be equal for runs to train as one population; None: it trains alone."""
-    if config.agent.shape is None or has_own_code(config.callbacks):
-        return None
-    same = (config.n_envs, config.device, config.threads, config.observation, config.callbacks)
-    return repr((config.agent.shape, *same))
-
-
-def folder_name(job: Job, taken: Collection[str], common: Collection[str] = ()) -> str:
-    """A name for the job's folder, of the overrides in which it differs from other jobs.
-
-    It is of the swept overrides, or else of all but the common ones; where neither is short enough and free,
-    it ends with a part of the hash. The seed is always in it.
-    """
-    for lines in (job.swept or job.overrides, [line for line in job.overrides if line not in common]):
-        name = ",".join(map(_slug, lines)) or "job"
-        if len(name) <= _LONGEST_NAME and name.lower() not in taken:
-            return name
-    lines = job.swept or job.overrides
-    seed = [_slug(line) for line in lines if _SEED.match(line)]
-    head = ",".join(_slug(line) for line in lines if not _SEED.match(line))
-    for characters in (_HASH_SHOWN, len(job.hash)):
-        ending = ",".join([*seed, job.hash[:characters]])
-        name = ",".join(filter(None, [head[: _LONGEST_NAME - len(ending) - 1].rstrip(",.-"), ending]))
-        if name.lower() not in taken:
-            break
-    return name
-
-
-def _slug(override: str) -> str:
-    """The override in letters, digits and a few safe signs; of a path, its last part."""
-    key, equals, value = override.partition("=")
-    if "/" in value:
-        value = PurePath(value.strip("'\"")).stem
-    return re.sub(r"[^A-Za-z0-9_.=+-]+", "-", key + equals + value).strip("-.+~")
+def runs_apart(launcher: str, config: TrainConfig) -> bool:
+    """Whether a job runs in another process on this machine, where there are several."""
+    return launcher == "joblib" or (launcher == "forks" and may_fork(config))
 
 
 def populations(
     jobs: Sequence[Job], settings: SweepConfig, launcher: str, own: Mapping[str, Any], hydra: DictConfig
 ) -> list[list[Job]]:
     """Divide jobs into populations."""
-    workers = worker_count(own["n_jobs"]) if launcher in ("forks", "joblib") else 1
-    memory = free_memory() / _SHARE_OF_MEMORY / workers
     shapes: dict[str, list[Job]] = {}
     for job in jobs:
         shapes.setdefault(job.hash if job.shape is None else f"shape {job.shape}", []).append(job)
-    most = _most(settings)
-    if runs_in_turn(settings, hydra):
-        most = 1
+    most = 1 if runs_in_turn(settings, hydra) else _most(settings)
     found = []
     for members in shapes.values():
-        in_this_process = launcher == "forks" and not any(job.in_fork for job in members)
-        share = len(members) if most and in_this_process else math.ceil(len(members) / workers)
+        workers = worker_count(own["n_jobs"]) if runs_apart(launcher, members[0].config) else 1
+        share = math.ceil(len(members) / workers)
         bounds = [most or LARGEST, (file_limit() - _OTHER_FILES) // RUNS_FILES]
         bounds.append(max(share, _FEWEST) if launcher == "forks" else share)
-        if most is None:
-            bounds.append(int(memory / (_RUNS_BYTES + max(job.memory for job in members))))
         bounds.append(own.get("jobs_per_task", len(members)))
+        if most is None:
+            memory = free_memory() / _SHARE_OF_MEMORY / workers
+            bounds.append(int(memory / (_RUNS_BYTES + max(job.memory for job in members))))
         count = math.ceil(len(members) / max(1, min(bounds)))
         if count > workers:
             count = min(len(members), math.ceil(count / workers) * workers)  # so that all end at once

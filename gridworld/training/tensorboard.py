@@ -30,7 +30,7 @@ from tensorboard.plugins.text import metadata as text_metadata
 from gridworld.config.settings import ON_RESULT, flat, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.memory_budget import check_memory
+from gridworld.process.user_input import check_memory
 from gridworld.storage.atomic_write import AppendLog
 from gridworld.storage.safe_read import open_ordinary
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,16 +29,17 @@ from gridworld.report.tables import number, steps_up_to
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import find_run
 from gridworld.storage.atomic_write import check_no_links, inside, remove_path
+from gridworld.sweep.folder import FAILED, job_row
 from gridworld.sweep.job import JobError, run_in_sweep
-from gridworld.sweep.job_table import FAILED, JobTable
 from gridworld.training.together import Training, run_together
-from gridworld.tune.objective import SEEDS, FinalRuns, SeedScore, read_score, score
+from gridworld.tune.objective import FINAL, SEEDS, Outcome, SeedScore, Trials, read_score, score
 from gridworld.tune.study_spec import StudySpec
 from gridworld.tune.workers import Ask, Workers
 from gridworld.world.mdp import FloatArray
 
-FINAL = "final "  # what the names of these attributes begin with
-_FAILED = sys.float_info.max  # the regret of a run that did
+CONFIRM = "confirm"  # the folder of the winner's runs, in the study's
+_HASH_SHOWN = 8  # characters
+_LOST_REGRET = sys.float_info.max  # of a run that failed
 
 
 @dataclass(frozen=True)
@@ -73,49 +74,40 @@ def rank_finalists(
 ) -> list[Finalist]:
     """Run what the finalists lack on the final seeds; returns them, the winner first."""
     runs = {
-        _name(trial, seed): (spec.space.values(trial.params), seed)
+        _name(trial, seed): (spec.space.values(trial.params), (seed,))
         for seed in spec.final_seeds
         for trial in trials
         if _name(trial, seed) not in study.user_attrs
     }
     if runs:
-        print(
-            f"the {len(trials)} finalists on {len(spec.final_seeds)} seeds more: {len(runs)} runs",
-            file=sys.stderr,
-            flush=True,
-        )
+        tell(f"the {len(trials)} finalists on {len(spec.final_seeds)} seeds more: {len(runs)} runs")
     shares = workers.shares(list(runs), spec.base.agent.shape is not None)
-    tasks = [FinalRuns(spec.objective, {name: runs[name] for name in names}) for names in shares]
+    tasks = (Trials(spec.objective, {name: runs[name] for name in names}) for names in shares)
 
-    def on_end(task: FinalRuns, results: Mapping[str, SeedScore | str] | None) -> None:
-        for name, (_, seed) in task.runs.items():
-            result = results[name] if results is not None else "the workers that ran it were killed"
-            if isinstance(result, str):
-                tell(f"{name.removeprefix(FINAL)} failed, and counts as not certified: {result}")
-                result = SeedScore(seed, None, _FAILED)
-            study.set_user_attr(name, dataclasses.asdict(result))
+    def on_end(task: Trials, outcomes: Sequence[Outcome] | None) -> None:
+        lost = Outcome(error="the workers that ran it were killed")
+        ended = outcomes or [lost] * len(task.trials)
+        for (name, (_, (seed,))), outcome in zip(task.trials.items(), ended, strict=True):
+            if outcome.error:
+                tell(f"{name.removeprefix(FINAL)} failed, and counts as not certified: {outcome.error}")
+            found = SeedScore(seed, None, _LOST_REGRET) if outcome.error else outcome.seeds[0]
+            study.set_user_attr(name, dataclasses.asdict(found))
 
-    workers.run(lambda: tasks.pop(0) if tasks else None, on_end)
-    return sorted(_ranked(spec, study, trials), key=lambda finalist: (finalist.score, finalist.trial))
-
-
-def _ranked(spec: StudySpec, study: Study, trials: Sequence[FrozenTrial]) -> Iterator[Finalist]:
-    attributes: Mapping[str, Any] = study.user_attrs
+    workers.run_all(tasks, on_end)
+    attributes = study.user_attrs
+    ranked = []
     for trial in trials:
         results = [read_score(each) for each in trial.user_attrs[SEEDS]]
         results += [read_score(attributes[_name(trial, seed)]) for seed in spec.final_seeds]
-        certified = sum(result.certified_since is not None for result in results)
         value = score(results, spec.base.total_timesteps, len(results))
-        failed = sum(result.regret == _FAILED for result in results)
-        yield Finalist(trial.number, value, certified, len(results), failed)
+        certified = sum(result.certified_since is not None for result in results)
+        failed = sum(result.regret == _LOST_REGRET for result in results)
+        ranked.append(Finalist(trial.number, value, certified, len(results), failed))
+    return sorted(ranked, key=lambda finalist: (finalist.score, finalist.trial))
 
 
 def _name(trial: FrozenTrial, seed: int) -> str:
     return f"{FINAL}trial={trial.number},seed={seed}"
-
-
-CONFIRM = "confirm"  # the runs' folder, in the study's
-_HASH_SHOWN = 8  # characters
 
 
 @dataclass(frozen=True)
@@ -132,11 +124,10 @@ class HeldOutRuns:
 
     runs: tuple[HeldOutRun, ...]
 
-    def __call__(self, ask: Ask) -> bool:
+    def __call__(self, ask: Ask) -> None:
         for result in run_together([_run(run) for run in self.runs]):
             if isinstance(result, Exception):
                 raise result
-        return True
 
 
 def _run(run: HeldOutRun) -> Training[None]:
@@ -172,46 +163,47 @@ def prepare(folder: Path, runs: Sequence[HeldOutRun]) -> None:
             remove_path(path)
     for run in runs:
         if damaged := _damage(run.folder):
-            tell(f"{'; '.join(damaged)}; it is run again")
+            tell(f"{damaged}; it is run again")
             remove_path(run.folder)
 
 
-def _damage(folder: Path) -> list[str]:
-    """A sentence for each file of a run that is not the one that it wrote."""
+def _damage(folder: Path) -> str:
+    """What is wrong with the files of a run: which are not those that it wrote."""
     try:
         run = find_run(folder)
     except InputError as error:
-        return [str(error)]
-    return [] if run is None or not run.is_finished else list(run.damage().values())
+        return str(error)
+    return "; ".join(run.damage().values()) if run is not None and run.is_finished else ""
 
 
 def certified_since(folder: Path) -> float | None:
     """The steps until a run's certificate that held, infinite without one; None for a run that failed."""
     if damaged := _damage(folder):
-        raise InputError("; ".join(damaged))
-    run = find_run(folder)
-    row = JobTable(folder.parent).row(folder.name)
-    if run is None or run.manifest["status"] == "failed":
-        if run is not None or (row is not None and row.status == FAILED):
-            return None
-    elif run.is_finished:
-        since = run.read_summary().get("certified_since_step")
-        if since is not None and (type(since) is not int or since < 0):
-            raise InputError(f"{run.summary_file}: certified_since_step must be a number of steps, or null")
-        return math.inf if since is None else float(since)
-    why = (row.error if row is not None else "") or (run.manifest.get("error", "") if run is not None else "")
-    raise InputError("it did not come to its end" + (f" ({why})" if why else ""))
+        raise InputError(damaged)
+    run, row = find_run(folder), job_row(folder)
+    if row.status == FAILED:
+        return None
+    if run is None or not run.is_finished:
+        raise InputError("it did not come to its end" + (f" ({row.error})" if row.error else ""))
+    since = run.read_summary().get("certified_since_step")
+    if since is not None and (type(since) is not int or since < 0):
+        raise InputError(f"{run.summary_file}: certified_since_step must be a number of steps, or null")
+    return math.inf if since is None else float(since)
 
 
 @dataclass(frozen=True)
 class HeldOutResults:
     """What the held-out runs of one configuration came to."""
 
-    certified: statistics.Share
     steps: FloatArray  # (seeds,), environment steps until the certificate that held; infinite without one
     total: int  # environment steps of a run
     failed: tuple[str, ...] = ()  # runs that ended by an error: they count as not certified
     left_out: tuple[str, ...] = ()  # runs that have no result; in none of the numbers
+
+    @property
+    def certified(self) -> statistics.Share:
+        """The share of the runs that were certified."""
+        return statistics.share(int(np.isfinite(self.steps).sum()), len(self.steps))
 
     def text(self) -> str:
         """The share certified, and the median step, with their intervals, in a few words."""
@@ -224,13 +216,18 @@ class HeldOutResults:
         )
         notes = []
         if self.failed:
-            notes += [f"{len(self.failed)} failed and count as not certified: {', '.join(self.failed)}"]
+            notes.append(f"{len(self.failed)} failed and count as not certified: {', '.join(self.failed)}")
         if self.left_out:
-            asked = len(self.steps) + len(self.left_out)
-            notes += [
-                f"{len(self.left_out)} of {asked} left out, without a result: {', '.join(self.left_out)}"
-            ]
+            of = len(self.steps) + len(self.left_out)
+            names = ", ".join(self.left_out)
+            notes.append(f"{len(self.left_out)} of {of} left out, without a result: {names}")
         return f"{text} ({'; '.join(notes)})" if notes else text
+
+    def plain(self) -> dict[str, Any]:
+        """The results as JSON."""
+        steps = [int(step) if math.isfinite(step) else None for step in self.steps]
+        own = {"steps": steps, "failed": self.failed, "left_out": self.left_out}
+        return {"certified": dataclasses.asdict(self.certified), **own}
 
 
 def read_results(runs: Sequence[HeldOutRun]) -> HeldOutResults:
@@ -247,12 +244,10 @@ def read_results(runs: Sequence[HeldOutRun]) -> HeldOutResults:
         failed += [run.folder.name] if found is None else []
     if not steps:
         raise InputError(f"{runs[0].folder.parent}: no held-out run has a result; run the command again")
-    share_of = statistics.share(int(np.isfinite(steps).sum()), len(steps))
-    total = runs[0].config.total_timesteps
-    return HeldOutResults(share_of, np.array(steps), total, tuple(failed), tuple(left_out))
+    return HeldOutResults(np.array(steps), runs[0].config.total_timesteps, tuple(failed), tuple(left_out))
 
 
-def verdict_on(winner: HeldOutResults, began_from: HeldOutResults, name: str) -> dict[str, Any]:
+def verdict_on(winner: HeldOutResults, began_from: HeldOutResults) -> dict[str, Any]:
     """Whether the winner is better than what the search began from.
 
     It goes by what the search minimises: first the share certified, then how soon. The latter is the
@@ -268,7 +263,7 @@ def verdict_on(winner: HeldOutResults, began_from: HeldOutResults, name: str) ->
     verdict = ("does not beat", "cannot be told apart from", "beats")[1 + side]
     asked = len(winner.steps) + len(winner.left_out)
     sentence = (
-        f"On {asked} held-out seeds {name} {verdict} the settings that the search began from: "
+        f"On {asked} held-out seeds the winner {verdict} the settings that the search began from: "
         f"{winner.text()}, against {began_from.text()}; a run of it is certified sooner with probability "
         f"{number(sooner.point)} [{number(sooner.low)}, {number(sooner.high)}]."
     )
@@ -277,20 +272,11 @@ def verdict_on(winner: HeldOutResults, began_from: HeldOutResults, name: str) ->
         "sentence": sentence,
         "more_certified": dataclasses.asdict(more),
         "probability_sooner": dataclasses.asdict(sooner),
-        "winner": _plain(winner),
-        "began_from": _plain(began_from),
+        "winner": winner.plain(),
+        "began_from": began_from.plain(),
     }
 
 
 def _side(interval: statistics.Interval, neutral: float) -> int:
     """On which side of the neutral value the whole interval lies; 0 where it holds it."""
     return int(interval.low > neutral) - int(interval.high < neutral)
-
-
-def _plain(results: HeldOutResults) -> dict[str, Any]:
-    return {
-        "certified": dataclasses.asdict(results.certified),
-        "steps": [int(step) if math.isfinite(step) else None for step in results.steps],
-        "failed": results.failed,
-        "left_out": results.left_out,
-    }

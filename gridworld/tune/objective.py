@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import signal
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -34,6 +35,7 @@ from gridworld.config.compose import to_config
 from gridworld.config.train import TrainConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError, reason
+from gridworld.process.signals import handling
 from gridworld.training.learning_curve import LearningCurve
 from gridworld.training.setup import check_settings, make_context
 from gridworld.training.together import Training, run_together
@@ -41,6 +43,7 @@ from gridworld.tune.workers import Ask
 from gridworld.world.evaluation import Evaluator
 
 SEEDS, ERROR, WORKER, DRAW = "seeds", "error", "worker", "draw"  # attributes of a trial in the study
+FINAL = "final "  # what attributes of the study begin with that are finalists' runs
 
 Values = Mapping[str, Any]  # {"agent.learning_rate": 0.01, ...}
 
@@ -131,12 +134,14 @@ class Trials:
     """A worker's task: trials, which train together where they can. Returns their outcomes."""
 
     objective: Objective
-    values: Mapping[int, Values]  # by the trial's number
+    trials: Mapping[Any, tuple[Values, tuple[int, ...]]]  # values and seeds, by the trial's number or name
 
     def __call__(self, ask: Ask) -> list[Outcome]:
-        places = range(len(self.objective.seeds))
-        trials = [_Trial(self.objective, number, values, ask) for number, values in self.values.items()]
-        run_together([trial.training(place) for trial in trials for place in places])
+        trials = [_Trial(self.objective, name, *trial, ask) for name, trial in self.trials.items()]
+        runs = [trial.training(place) for trial in trials for place in range(len(trial.seeds))]
+        at_once = dict.fromkeys((signal.SIGINT, signal.SIGTERM), signal.SIG_DFL)
+        with handling(at_once):  # there is nothing to save
+            run_together(runs)
         return [trial.outcome or Outcome() for trial in trials]
 
 
@@ -147,11 +152,14 @@ class _EndedError(Exception):
 class _Trial:
     """A trial while its seeds train. Each is reported when those before it have ended."""
 
-    def __init__(self, objective: Objective, number: int, values: Values, ask: Ask) -> None:
+    def __init__(
+        self, objective: Objective, name: Any, values: Values, seeds: tuple[int, ...], ask: Ask
+    ) -> None:
         self.outcome: Outcome | None = None
-        self._objective, self._number, self._values, self._ask = objective, number, values, ask
-        self._standings: list[list[SeedScore]] = [[] for _ in objective.seeds]  # at each report that is due
-        self._results: list[SeedScore | Exception | None] = [None for _ in objective.seeds]
+        self.seeds = seeds
+        self._objective, self._name, self._values, self._ask = objective, name, values, ask
+        self._standings: list[list[SeedScore]] = [[] for _ in seeds]  # at each report that is due
+        self._results: list[SeedScore | Exception | None] = [None for _ in seeds]
         self._ended: list[SeedScore] = []  # seeds that are reported to their end
         self._reported = 0  # points of the next one
 
@@ -159,8 +167,8 @@ class _Trial:
         """Train the seed at this place, unless the trial ends without it."""
         try:
             self._check()
-            config, seed = self._objective.config(self._values), self._objective.seeds[place]
-            result = yield from learning(config, seed, partial(self._note, place))
+            config = self._objective.config(self._values)
+            result = yield from learning(config, self.seeds[place], partial(self._note, place))
             self._results[place] = result
             self._note(place, 1.0, result)
         except _EndedError:
@@ -182,19 +190,17 @@ class _Trial:
 
     def _report(self) -> None:
         """Report what is due, the seeds in order, as far as they have come."""
-        reports, of = self._objective.reports, len(self._objective.seeds)
+        reports, of = self._objective.reports, len(self.seeds)
         total = self._objective.base.total_timesteps
         while self.outcome is None and len(self._ended) < of:
             place, point = len(self._ended), self._reported
             standings, result = self._standings[place], self._results[place]
             if point < len(standings):
                 self._reported += 1
-                step, is_skipped = (
-                    place * reports + point,
-                    any(standings[point] is later for later in standings[point + 1 :]),
-                )
-                value = score([*self._ended, standings[point]], total, of)
-                is_behind = self._ask(Report(self._number, step, value, not is_skipped))
+                standing, step = standings[point], place * reports + point
+                value = score([*self._ended, standing], total, of)
+                is_skipped = any(standing is later for later in standings[point + 1 :])
+                is_behind = self._ask(Report(self._name, step, value, not is_skipped))
                 if is_behind and step + 1 < of * reports:
                     self.outcome = Outcome(seeds=self._ended)
             elif isinstance(result, Exception):
@@ -209,22 +215,6 @@ class _Trial:
             is_number = not math.isnan(value)
             error = "" if is_number else "the objective is NaN"
             self.outcome = Outcome(value if is_number else None, error, self._ended)
-
-
-@dataclass(frozen=True)
-class FinalRuns:
-    """A worker's task: runs by name, of values on a seed. Returns the score of each, or why it failed."""
-
-    objective: Objective
-    runs: Mapping[str, tuple[Values, int]]
-
-    def __call__(self, ask: Ask) -> dict[str, SeedScore | str]:
-        found = run_together([self._run(*run) for run in self.runs.values()])
-        told = [reason(result) if isinstance(result, Exception) else result for result in found]
-        return dict(zip(self.runs, told, strict=True))
-
-    def _run(self, values: Values, seed: int) -> Training[SeedScore]:
-        return (yield from learning(self.objective.config(values), seed))
 
 
 def learning(

@@ -14,29 +14,32 @@ import json
 import math
 import os
 import socket
-import sys
 import time
 import uuid
 import warnings
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import optuna
 from optuna.exceptions import ExperimentalWarning, OptunaError
-from optuna.trial import TrialState
+from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
 from gridworld.errors import InputError
-from gridworld.process.console import ProgressLine, program, time_left
+from gridworld.process.console import ProgressLine, tell, time_left
+from gridworld.report.tuning_study import TRIALS_CSV
+from gridworld.storage.atomic_write import write_text
+from gridworld.storage.csv_text import csv_text
 from gridworld.sweep.console import shell_path
-from gridworld.sweep.job_table import one_line
-from gridworld.tune.confirmation import FINAL
+from gridworld.sweep.folder import one_line
 from gridworld.tune.objective import (
     DRAW,
     ERROR,
+    FINAL,
     SEEDS,
     WORKER,
     Outcome,
@@ -45,9 +48,7 @@ from gridworld.tune.objective import (
     Values,
     read_score,
 )
-from gridworld.tune.search_space import SearchSpace
-from gridworld.tune.study_folder import write_trials
-from gridworld.tune.study_spec import StudySpec
+from gridworld.tune.study_spec import SearchSpace, StudySpec
 from gridworld.tune.workers import SearchError, Workers
 
 # Attributes of the study.
@@ -57,6 +58,7 @@ _CONNECT_SECONDS = 10
 _LOCKED_SECONDS = 60  # to wait for others at an SQLite file
 _EXAMPLES = "sqlite:////shared/study.db or postgresql://user@host/name"
 _SECONDS_BETWEEN_TABLES = 2.0
+_STATUSES = {TrialState.COMPLETE: "done", TrialState.PRUNED: "pruned", TrialState.FAIL: "failed"}
 _DAMAGE = (
     *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, AssertionError),
     *(SQLAlchemyError, OptunaError),
@@ -85,10 +87,7 @@ def _connect(url: str) -> optuna.storages.RDBStorage:
     options = {"timeout": _LOCKED_SECONDS} if is_sqlite else {"connect_timeout": _CONNECT_SECONDS}
     try:
         return optuna.storages.RDBStorage(url, engine_kwargs={"connect_args": options})
-    except ImportError as error:
-        cause, driver = error.__cause__ or error, parsed.drivername
-        raise InputError(f"{_shown(url)}: {cause}; pip install the driver for {driver}") from None
-    except (SQLAlchemyError, OptunaError, RuntimeError) as error:
+    except (ImportError, SQLAlchemyError, OptunaError, RuntimeError) as error:
         raise InputError(f"{_shown(url)}: cannot be reached ({_first_line(error)})") from None
 
 
@@ -106,14 +105,9 @@ def open_study(
                 "or choose another tune.folder"
             )
         study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True)
-        trials, attributes = study.get_trials(deepcopy=False), study.user_attrs
-        if ABOUT not in attributes:
-            if trials:
-                raise InputError(
-                    f"tune.study={name}: is there, but not of {program('tune')}; choose another tune.study"
-                )
+        if ABOUT not in study.user_attrs:
             study.set_user_attr(ABOUT, about)
-        _check_same(name, attributes.get(ABOUT, about), about)
+        _check_same(name, study.user_attrs[ABOUT], about)
         _check_readable(study, space)
     except InputError:
         raise
@@ -176,8 +170,8 @@ def _first_line(error: BaseException) -> str:
 def search(spec: StudySpec, study: optuna.Study, workers: Workers) -> None:
     """Run trials until there are enough or it is time to end; keeps trials.csv up to date."""
     run, line = Search(spec, study), ProgressLine(spec.base.logging.progress)
-    asked, begun, before = spec.settings.trials, time.monotonic(), len(study.get_trials(deepcopy=False))
-    wrote = begun
+    asked, before = spec.settings.trials, len(study.get_trials(deepcopy=False))
+    begun = wrote = time.monotonic()
 
     def text() -> str:
         states = [trial.state for trial in study.get_trials(deepcopy=False)]
@@ -199,11 +193,9 @@ def search(spec: StudySpec, study: optuna.Study, workers: Workers) -> None:
     try:
         if before < asked:
             more = f", {before} of them there already" if before else ""
-            print(
+            tell(
                 f"study {spec.name} in {shell_path(spec.folder)}: {asked} trials of {spec.settings.seeds} "
-                f"seeds{more}, {workers.count * (spec.settings.together or 1)} at once",
-                file=sys.stderr,
-                flush=True,
+                f"seeds{more}, {workers.count * (spec.settings.together or 1)} at once"
             )
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", ExperimentalWarning)  # of multivariate sampling
@@ -231,7 +223,7 @@ class Search:
 
     def next(self) -> Trials | None:
         """As many trials as train at once, or are missing."""
-        begun: dict[int, Values] = {}
+        begun: dict[int, tuple[Values, tuple[int, ...]]] = {}
         while len(begun) < (self._settings.together or 1) and time.monotonic() < self._deadline:
             ended = self._study.get_trials(deepcopy=False)
             if len(ended) + len(self.running) >= self._settings.trials:
@@ -249,7 +241,7 @@ class Search:
             new = self._memory.ask(self._spec.space.distributions)
             new.set_user_attr(DRAW, draw)
             new.set_user_attr(WORKER, self._name)
-            begun[new.number] = self._spec.space.values(new.params)
+            begun[new.number] = self._spec.space.values(new.params), self._objective.seeds
             self.running[new.number] = new
         return Trials(self._objective, begun) if begun else None
 
@@ -262,7 +254,7 @@ class Search:
     def end(self, trials: Trials, outcomes: Sequence[Outcome] | None) -> None:
         """Store how trials ended; None where they have killed too many workers."""
         killed = Outcome(error="the workers that ran it were killed")
-        for number, outcome in zip(trials.values, outcomes or [killed] * len(trials.values), strict=True):
+        for number, outcome in zip(trials.trials, outcomes or [killed] * len(trials.trials), strict=True):
             trial = self.running.pop(number)
             if outcome.seeds:
                 trial.set_user_attr(SEEDS, [dataclasses.asdict(seed) for seed in outcome.seeds])
@@ -292,3 +284,33 @@ class Search:
             return optuna.pruners.HyperbandPruner(min_resource=reports, max_resource=most)
         # Half a seed's budget is given to everybody: until then most have learnt nothing yet.
         return optuna.pruners.MedianPruner(n_warmup_steps=reports // 2)
+
+
+def write_trials(folder: Path, study: optuna.Study, space: SearchSpace, durable: bool = False) -> None:
+    """Write a row per trial, with its values as a run would get them; `durable` as for `replacing`."""
+    rows = []
+    for trial in study.get_trials(deepcopy=False, states=tuple(_STATUSES)):
+        values = space.values(trial.params)
+        rows.append(_row(trial) | {key: values.get(key, "") for key in space.dimensions})
+    head = [*_row(optuna.create_trial(state=TrialState.FAIL)), *space.dimensions]
+    write_text(folder / TRIALS_CSV, csv_text([head, *(list(row.values()) for row in rows)]), durable)
+
+
+def _row(trial: FrozenTrial) -> dict[str, Any]:
+    seeds = trial.user_attrs.get(SEEDS, [])
+    steps = [seed["certified_since"] for seed in seeds if seed["certified_since"] is not None]
+    value = trial.value
+    if trial.state == TrialState.PRUNED and trial.intermediate_values:
+        value = trial.intermediate_values[max(trial.intermediate_values)]
+    duration = trial.duration
+    return {
+        "trial": trial.number,
+        "status": _STATUSES[trial.state],
+        "score": "" if value is None or math.isnan(value) else f"{value:.6f}",
+        "certified": f"{len(steps)}/{len(seeds)}" if seeds else "",
+        "steps": round(fmean(steps)) if steps else "",
+        "regret": f"{fmean(seed['regret'] for seed in seeds):.6g}" if seeds else "",
+        "seconds": "" if duration is None else f"{duration.total_seconds():.2f}",
+        "worker": trial.user_attrs.get(WORKER, ""),
+        "error": trial.user_attrs.get(ERROR, ""),
+    }

@@ -1,27 +1,60 @@
-"""A study from its beginning to its verdict: search, finalists, confirmation."""
+"""A study from its beginning to its verdict, and its folder.
+
+search.json     the study's name and what makes its trials comparable, from its beginning on
+trials.csv      a row per trial that has ended
+study.json      what was searched and what came of it, with the checksum of trials.csv
+confirm/        the held-out runs; see `confirmation`
+experiment/     the winner as a recipe, which train.py takes: recipe=runs/STUDY
+study.db        Optuna's storage, unless tune.storage names another
+.lock           held by the command at work, unless the study is in a database that others share
+
+The tables are made anew from the storage, which may be elsewhere, or be deleted. The report reads them, so
+that it needs neither Optuna nor the database.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
+import math
+import os
 import shlex
-import sys
+import signal
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import optuna
-from optuna.trial import FrozenTrial
+from omegaconf import OmegaConf
+from optuna.trial import FrozenTrial, TrialState
 
-from gridworld.config.compose import search_path
-from gridworld.config.recipe_file import TRUST, overrides
+from gridworld.config.compose import search_path, to_config
+from gridworld.config.fields import Effect
+from gridworld.config.recipe_file import IN_A_STUDY, TRUST, overrides
+from gridworld.config.settings import ON_RESULT, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
-from gridworld.process.console import command, printable
-from gridworld.process.signals import StopRequest
+from gridworld.process.console import command, printable, recorded_command_line, tell
+from gridworld.process.processes import can_fork
+from gridworld.process.signals import Interrupted, exiting
+from gridworld.report.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
 from gridworld.report.writer import write_over_seeds
-from gridworld.run.folder import LOCK
-from gridworld.storage.atomic_write import is_locked
+from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, alone_in, check_writable
+from gridworld.run.provenance import versions
+from gridworld.storage.atomic_write import (
+    check_no_links,
+    inside,
+    is_locked,
+    make_folder,
+    tidy,
+    write_json,
+    write_text,
+)
+from gridworld.storage.safe_read import LARGEST_CSV, file_sha256, read_sealed, sealed
 from gridworld.sweep.console import shell_path
+from gridworld.sweep.plan import may_fork
+from gridworld.training.setup import import_for
 from gridworld.training.tensorboard import hparams
 from gridworld.tune.confirmation import (
     CONFIRM,
@@ -36,35 +69,44 @@ from gridworld.tune.confirmation import (
     verdict_on,
 )
 from gridworld.tune.objective import ERROR, with_values
-from gridworld.tune.recipe import write_recipe
 from gridworld.tune.search import in_reach, open_study, search, study_url
-from gridworld.tune.study_folder import at_work_in, check_study_folder, claim, is_claimed, write_study
-from gridworld.tune.study_spec import StudySpec
+from gridworld.tune.study_spec import ConfFolders, StudySpec, compose_in
 from gridworld.tune.workers import SearchError, Workers
+
+SEARCH_JSON = "search.json"
+_EXPERIMENT, _WINNER = IN_A_STUDY
+_OF_A_RECIPE = ON_RESULT - {Effect.SEED, Effect.MACHINE}
 
 
 def tune(spec: StudySpec) -> None:
     """Run what the study lacks, confirm the winner, and write and print what came of it."""
     check_study_folder(spec.folder)
-    with (
-        at_work_in(spec.folder, is_shared=spec.settings.storage is not None),
-        StopRequest().listening(),
-        Workers(int(spec.settings.workers)) as workers,
-    ):
-        url, about = study_url(spec), _about(spec)
-        is_begun = is_claimed(spec.folder, spec.name)
-        study = open_study(url, spec.name, about, spec.space, must_exist=is_begun)
-        claim(spec.folder, spec.name, about)
-        with in_reach(url):
-            search(spec, study, workers)
-            trials = choose_finalists(study, spec)
-            if not trials:
-                errors = [error for trial in study.trials if (error := trial.user_attrs.get(ERROR))]
-                why = f"all {len(errors)} failed, the first: {errors[0]}" if errors else "there was no time"
-                raise SearchError(f"{shell_path(spec.folder)}: no trial came to a score; {why}")
-            ranked = rank_finalists(spec, study, trials, workers)
-            best = next(trial for trial in trials if trial.number == ranked[0].trial)
-            _conclude(spec, study, best, ranked, workers)
+    is_shared = spec.settings.storage is not None
+    try:
+        with at_work_in(spec.folder, is_shared), exiting(signal.SIGINT, signal.SIGTERM):
+            _tune(spec)
+    except SystemExit as stop:
+        raise Interrupted(int(str(stop.code)) - 128) from None
+
+
+def _tune(spec: StudySpec) -> None:
+    url, about = study_url(spec), _about(spec)
+    is_begun = is_claimed(spec.folder, spec.name)
+    study = open_study(url, spec.name, about, spec.space, must_exist=is_begun)
+    claim(spec.folder, spec.name, about)
+    workers = Workers(int(spec.settings.workers), can_fork() and may_fork(spec.base))
+    if workers.forks:
+        import_for(spec.base)  # once for all of them
+    with in_reach(url):
+        search(spec, study, workers)
+        trials = choose_finalists(study, spec)
+        if not trials:
+            errors = [error for trial in study.trials if (error := trial.user_attrs.get(ERROR))]
+            why = f"all {len(errors)} failed, the first: {errors[0]}" if errors else "there was no time"
+            raise SearchError(f"{shell_path(spec.folder)}: no trial came to a score; {why}")
+        ranked = rank_finalists(spec, study, trials, workers)
+        best = next(trial for trial in trials if trial.number == ranked[0].trial)
+        _conclude(spec, study, best, ranked, workers)
 
 
 def _about(spec: StudySpec) -> dict[str, Any]:
@@ -139,20 +181,132 @@ def _confirm(
     """Run both and compare them; an empty `winner` is for settings that the search began from."""
     runs = [run for pair in itertools.zip_longest(began_from, winner) for run in pair if run is not None]
     count = len(began_from)
-    print(f"{len(runs)} runs on {count} held-out seeds confirm the winner", file=sys.stderr, flush=True)
+    tell(f"{len(runs)} runs on {count} held-out seeds confirm the winner")
     prepare(spec.folder, runs)
-    waiting = [HeldOutRuns(tuple(part)) for part in workers.shares(runs, spec.base.agent.shape is not None)]
-
-    def on_end(task: HeldOutRuns, result: object) -> None:
-        if elsewhere := [run for run in task.runs if is_locked(run.folder / LOCK)]:
-            waiting.append(HeldOutRuns(tuple(elsewhere)))  # another machine is at work on them
-
-    workers.run(lambda: waiting.pop(0) if waiting else None, on_end)
+    while runs:
+        shares = workers.shares(runs, spec.base.agent.shape is not None)
+        workers.run_all(HeldOutRuns(tuple(share)) for share in shares)
+        runs = [run for run in runs if is_locked(run.folder / LOCK)]  # another machine is at work on them
     before = read_results(began_from)
     if winner:
-        return verdict_on(read_results(winner), before, "the winner")
+        return verdict_on(read_results(winner), before)
     return {
         "verdict": "is",
         "sentence": f"No trial came out better than the settings that the search began from: on {count} "
         f"held-out seeds these are {before.text()}.",
     }
+
+
+def check_study_folder(folder: Path) -> None:
+    """Raise `InputError` for a folder of something else, one that cannot be written, or links in it."""
+    for name, kind in ((MANIFEST, "a single run"), (SWEEP_JSON, "a sweep")):
+        if (folder / name).exists():
+            raise InputError(f"{folder}: is the folder of {kind}; choose another tune.folder")
+    check_writable(folder, "tune.folder")
+    for names in ((), (CONFIRM,), (_EXPERIMENT,)):
+        check_no_links(folder, *names)
+
+
+@contextlib.contextmanager
+def at_work_in(folder: Path, is_shared: bool = False) -> Iterator[None]:
+    """Make the folder and hold it, unless others share the study; one that stays empty is removed."""
+    make_folder(folder)
+    try:
+        with contextlib.nullcontext() if is_shared else alone_in(folder):
+            if not is_shared:
+                tidy(folder)
+            yield
+    finally:
+        with contextlib.suppress(OSError):
+            if [path.name for path in folder.iterdir()] == [LOCK]:
+                (folder / LOCK).unlink()
+            folder.rmdir()
+
+
+def is_claimed(folder: Path, name: str) -> bool:
+    """Whether the folder is the named study's already."""
+    if not os.path.lexists(folder / SEARCH_JSON):
+        return False
+    owner = read_sealed(folder / SEARCH_JSON).get("study")
+    if owner != name:
+        raise InputError(
+            f"{folder}: is the folder of the study {owner}; choose another tune.folder, or tune.study={owner}"
+        )
+    return True
+
+
+def claim(folder: Path, name: str, about: Mapping[str, Any]) -> None:
+    """Write that the folder is this study's."""
+    write_json(folder / SEARCH_JSON, sealed({"study": name, "about": about}), durable=True)
+
+
+def write_study(spec: StudySpec, study: optuna.Study, outcome: dict[str, Any]) -> None:
+    """Write what was searched, and the `outcome`: the winner, the finalists and the confirmation."""
+    content = {
+        "study": spec.name,
+        "agent": spec.base.agent.name,
+        "env": spec.base.env.name,
+        "command": recorded_command_line(),
+        "versions": versions() | {"optuna": optuna.__version__},
+        "total_timesteps": spec.base.total_timesteps,
+        "seeds": list(spec.objective.seeds),
+        "space": spec.space.plain(),
+        "began_from": spec.space.parameters_of(spec.base),
+        "importances": _importances(study),
+        **outcome,
+        TRIALS_SUM: file_sha256(spec.folder / TRIALS_CSV, LARGEST_CSV),
+    }
+    write_json(spec.folder / STUDY_JSON, sealed(content), durable=True)
+
+
+def _importances(study: optuna.Study) -> dict[str, float]:
+    """The importance of each key, by Optuna's PED-ANOVA; empty where there are too few trials for it."""
+    complete = study.get_trials(deepcopy=False, states=[TrialState.COMPLETE])
+    if len(complete) < 4 or len({trial.value for trial in complete}) < 2:
+        return {}
+    evaluator = optuna.importance.PedAnovaImportanceEvaluator()
+    found = optuna.importance.get_param_importances(study, evaluator=evaluator)
+    return {key: round(float(share), 6) for key, share in found.items() if math.isfinite(share)}
+
+
+def write_recipe(
+    folder: Path, folders: ConfFolders, choices: Mapping[str, str], config: TrainConfig, about: str
+) -> Path:
+    """Write the winner as a recipe, and check that it composes to `config` again.
+
+    It names the agent, the world and the observation, and every value in which the winner differs from
+    these. `config.recipe_file` reads it as data. In a study of one's own, Hydra takes it as well:
+    --config-dir runs/STUDY experiment=winner.
+    """
+
+    def composed(words: list[str], more: tuple[Path, ...] = ()) -> dict[str, Any]:
+        own = dataclasses.replace(folders, own=(*folders.own, *more))
+        return _relevant(to_config(compose_in(own, "train", words)))
+
+    bare = composed([f"{group}={choice}" for group, choice in choices.items()])
+    values = _difference(bare, _relevant(config))
+    lines = ["# @package _global_", f"# {about}", "defaults:"]
+    lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
+    lines += ["  - _self_", "", OmegaConf.to_yaml(OmegaConf.create(values)) if values else ""]
+    path = inside(folder, _EXPERIMENT) / _WINNER
+    path.parent.mkdir(exist_ok=True)
+    write_text(path, "\n".join(lines), durable=True)
+    for words in ([f"experiment={path.stem}"], overrides(path, trust=True)):
+        assert composed(words, (folder,)) == _relevant(config), f"{path} does not say what the winner is"
+    return path
+
+
+def _relevant(config: TrainConfig) -> dict[str, Any]:
+    return with_effects(_OF_A_RECIPE, dataclasses.asdict(config))
+
+
+def _difference(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+    found = {}
+    for key, value in after.items():
+        was = before.get(key)
+        if isinstance(value, dict) and isinstance(was, dict):
+            if inner := _difference(was, value):
+                found[key] = inner
+        elif key not in before or value != was:
+            found[key] = value
+    return found

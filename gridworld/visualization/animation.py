@@ -104,10 +104,7 @@ def _cards(mdp: Mdp, episode: Episode) -> Iterator[tuple[str, ...]]:
 
 
 def animation_of_frames(frames: Iterable[Frame | Packed], likely: Iterable[Sequence[int]] = ()) -> Animation:
-    """Show frames one after the other: (height, width, 3) each, RGB, or (height, width), packed.
-
-    The palette begins with the `likely` colours; to know those of most pixels before saves time.
-    """
+    """Show RGB or packed frames one after the other; `likely` colours of most pixels save time."""
     numbered = _number(frames, likely)
     if numbered is None:
         raise InputError(f"more than {_MOST_COLOURS} colours are too many for a film, which has one palette")

@@ -22,8 +22,6 @@ from gridworld.visualization.sheet import (
     Scale,
     Sheet,
     Swatch,
-    is_dark,
-    short,
 )
 from gridworld.world.grid import GridMdp
 from gridworld.world.layout import MOVES
@@ -74,15 +72,17 @@ class Canvas(Sheet):
         return bool((self.board.kind == Kind.UNREACHABLE).any())
 
     @property
+    def path_swatch(self) -> Swatch:
+        """What the legend says of `draw_paths`."""
+        return Swatch("greedy path from the start" if self.cell >= 24 else "greedy path", AGENT, PAPER)
+
+    @property
     def has_grid(self) -> bool:
         """Whether cells are large enough for lines between them."""
         return self.cell >= _NO_GRID
 
     def paint(self, colours: ColourArray, parts: NDArray[np.intp] | None = None) -> None:
-        """Fill the cells with the colours (S, P, 3) of their P parts.
-
-        `parts` (cell, cell) says which part each pixel of a cell belongs to; None: all to the first.
-        """
+        """Fill the cells with colours (S, P, 3); `parts` (cell, cell) says which part a pixel belongs to."""
         board, cell = self.board, self.cell
         cells, is_fixed = colours[board.state], board.kind != Kind.FLOOR
         fixed = _WITH_GRID if self.has_grid else _WITHOUT_GRID
@@ -109,12 +109,10 @@ class Canvas(Sheet):
             box = (left, top, panel.cols * self.cell + 2, panel.rows * self.cell + 2)
             drawing.import_pygame().draw.rect(self.world, INK, box, 1)
 
-    def draw_numbers(
-        self, numbers: FloatArray, scale: Scale, low: str, high: str, missing: str, caption: str
-    ) -> Frame:
+    def draw_numbers(self, numbers: FloatArray, scale: Scale, name: str, missing: str, caption: str) -> Frame:
         """The finished picture of numbers (S, 1), or (S, 4) in the order of `MOVES`, a triangle for each.
 
-        NaN is left white, which the legend calls `missing`; `low` and `high` name the scale's ends.
+        NaN is left white, which the legend calls `missing`.
         """
         playable, known, by_move = self.board.floor, np.isfinite(numbers), numbers.shape[1] > 1
         colours = scale.colours(np.where(known, numbers, scale.low))
@@ -126,17 +124,16 @@ class Canvas(Sheet):
             self.paint(colours)
         self.draw_world()
         known &= playable[:, None]
-        texts = {number: short(number, scale.high) for number in set(numbers[known].tolist())}
-        size = self.number_size(0.36 if by_move else 0.8, texts.values())
-        dark = is_dark(colours)
-        for state, part in np.argwhere(known).tolist() if size is not None else []:
+        size = self.number_size(numbers[known], scale.high, 0.36 if by_move else 0.8)
+
+        def middle(state: int, part: int) -> Point:
             down, right = MOVES[part] if by_move else (0, 0)
-            middle = self.point(state, 0.5 + 0.29 * right, 0.5 + 0.33 * down)
-            ink = PAPER if dark[state, part] else INK
-            self.number(texts[float(numbers[state, part])], middle, size or 0, ink)
+            return self.point(state, 0.5 + 0.29 * right, 0.5 + 0.33 * down)
+
+        self.write_numbers(numbers, known, colours, scale.high, size, middle)
         self.caption(caption)
         unknown = [] if known[playable].all() else [Swatch(missing)]
-        self.legend(scale, low, high, [*unknown, *([UNREACHABLE] if self.hidden else [])])
+        self.legend(scale, name, [*unknown, *([UNREACHABLE] if self.hidden else [])])
         return self.frame()
 
     def _triangles(self) -> NDArray[np.intp]:
@@ -163,10 +160,7 @@ class Canvas(Sheet):
             rect(self.world, colour, (left + 1, top + 1, cell - 1, cell - 1), thick)
 
     def draw_paths(self, paths: list[list[int]], ways: list[list[int]], middle: float) -> None:
-        """A ring around each start, and lines through the states where one is next to the last.
-
-        `ways` are each state's arrow, down and right; lines are `middle` of a cell below its upper edge.
-        """
+        """A ring around each start, and lines through neighbours, `middle` of a cell below its edge."""
         place = self.board.place
         for path in paths:
             placed, lines = [state for state in path if place[state][0] >= 0], []
@@ -243,11 +237,7 @@ def moving_actions(mdp: Mdp) -> tuple[int, ...] | None:
 
 
 def greedy_paths(mdp: Mdp, greedy: IntArray) -> list[list[int]]:
-    """Follow the greedy policy (S,) from each start, each time to the most probable next state.
-
-    A path ends with the episode, or with the first state that comes twice. There are none from more than four
-    start states.
-    """
+    """Follow the greedy policy (S,) from each start, of four at most, until a state comes twice."""
     starts = mdp.start_states.tolist()
     likely = mdp.probability[np.arange(mdp.num_states), greedy].argmax(axis=1)
     following = mdp.next_state[np.arange(mdp.num_states), greedy, likely].tolist()

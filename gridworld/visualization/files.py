@@ -28,10 +28,7 @@ _LONGEST_GIF_FRAME = 0xFFFF  # hundredths of a second
 
 
 def save(drawn: Frame | Animation, path: Path, fps: int) -> bytes | None:
-    """Write a picture as its path's ending says; without an ending, an animation's numbered PNGs.
-
-    Returns the content of a GIF.
-    """
+    """Write a picture as its path's ending says, or numbered PNGs; returns the content of a GIF."""
     if not isinstance(drawn, Animation):
         save_png(drawn, path)
     elif not path.suffix:

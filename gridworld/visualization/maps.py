@@ -42,7 +42,6 @@ from gridworld.visualization.sheet import (
     counting,
     is_dark,
     linear,
-    short,
 )
 from gridworld.visualization.state_table import StateTable, table_states
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
@@ -106,10 +105,7 @@ def learning(subject: Subject) -> Draw:
 
 
 def q_error(subject: Subject) -> Draw:
-    """The map of |Q - Q*|, or |V - V*| without Q.
-
-    Q* is the optimum under the discount that the agent learns with, which may differ from the evaluation's.
-    """
+    """The map of |Q - Q*|, or |V - V*| without Q; the optimum is that under the agent's own discount."""
     mdp, snapshot, gamma = subject.evaluator.mdp, subject.snapshot, agents_gamma(subject)
     best = subject.evaluator.solution
     error = value_error(snapshot, best if gamma == best.gamma else solved(mdp, gamma))
@@ -117,10 +113,11 @@ def q_error(subject: Subject) -> Draw:
     caption = f"{name} after {subject.steps:,} steps, at the agent's gamma {gamma:g}"
     if board_of(mdp).panels:
         return lambda cell_size: draw_error_map(mdp, error, caption, cell_size)
-    states = table_states(mdp, visits_of(subject))
-    scale = linear(ORANGES, error[states], low=0.0)
-    table = StateTable(mdp, states, ["V"] if snapshot.q is None else mdp.action_names)
-    picture = table.draw_numbers(error, scale, "error 0", short(scale.high), _NO_OPTIMUM, caption)
+    columns = ["V"] if snapshot.q is None else mdp.action_names
+    table = StateTable(mdp, table_states(mdp, visits_of(subject)), columns)
+    picture = table.draw_numbers(
+        error, linear(ORANGES, error[table.states], low=0.0), "error", _NO_OPTIMUM, caption
+    )
     return lambda cell_size: picture
 
 
@@ -130,11 +127,9 @@ def visits(subject: Subject) -> Draw:
     caption = f"where {counts.sum():,} training steps were taken"
     if board_of(mdp).panels:
         return lambda cell_size: draw_visit_map(mdp, counts, caption, cell_size)
-    states = table_states(mdp, counts)
-    scale = counting(BLUES, counts[states])
-    table = StateTable(mdp, states, mdp.action_names)
-    numbers = np.where(counts > 0, counts, np.nan)
-    picture = table.draw_numbers(numbers, scale, *_visit_ends(scale), "never", caption)
+    table = StateTable(mdp, table_states(mdp, counts), mdp.action_names)
+    scale, numbers = counting(BLUES, counts[table.states]), np.where(counts > 0, counts, np.nan)
+    picture = table.draw_numbers(numbers, scale, "visits", "never", caption)
     return lambda cell_size: picture
 
 
@@ -174,14 +169,13 @@ def draw_policy_map(
     canvas.paint(colours[:, None])
     canvas.draw_world()
     with_numbers = scale is None and len(canvas.board.panels) <= 1  # of several panels the cells are small
-    texts = {value: short(value, own.high) for value in set(values[known].tolist()) if with_numbers}
-    size = canvas.number_size(0.8, texts.values())
+    size = canvas.number_size(values[known], own.high, 0.8) if with_numbers else 0
     inks = np.where(known[:, None], np.where(is_dark(colours)[:, None], PAPER, INK), UNKNOWN_INK).tolist()
-    middle = 0.5 if size is None else 0.4  # of the arrows, above the numbers
+    middle = 0.4 if size else 0.5  # of the arrows, above the numbers
     paths = greedy_paths(mdp, greedy)
     ways = directions(mdp)[np.arange(mdp.num_states), greedy].tolist()
     canvas.draw_paths(paths, ways, middle)
-    length = canvas.cell if size is None else 0.85 * canvas.cell
+    length = 0.85 * canvas.cell if size else canvas.cell
     letter = min(round(0.32 * length), 20)
     draw = drawing.import_pygame().draw
     for state in np.flatnonzero(playable).tolist() if canvas.cell >= _SMALLEST_ARROW_CELL else []:
@@ -192,21 +186,20 @@ def draw_policy_map(
         draw.circle(canvas.world, inks[state], point, round(0.2 * length))
         if letter >= SMALLEST_TEXT:
             name = mdp.action_names[greedy[state]]
-            canvas.number(name[:1].upper(), point, letter, colours[state].tolist())
-    on_path = set().union(*paths)
-    for state in np.flatnonzero(known).tolist() if size is not None else []:
-        plate = colours[state] if state in on_path else None
-        below = canvas.point(state, 0.5, 0.83)
-        canvas.number(texts[float(values[state])], below, size or 0, inks[state], plate)
+            canvas.write(name[:1].upper(), point, letter, colours[state].tolist())
+    canvas.write_numbers(
+        *(values[:, None], known[:, None], colours[:, None], own.high, size),
+        lambda state, _: canvas.point(state, 0.5, 0.83),
+        plates=set().union(*paths),
+    )
     wrong = playable & ~optimal[np.arange(mdp.num_states), greedy]
     canvas.mark(np.flatnonzero(wrong & ~known), _UNKNOWN_DISAGREES)
     canvas.mark(np.flatnonzero(wrong & known), DISAGREES)
     canvas.caption(caption)
-    path = Swatch("greedy path from the start" if canvas.cell >= 24 else "greedy path", AGENT, PAPER)
-    swatches = [path] if paths else []
+    swatches = [canvas.path_swatch] if paths else []
     swatches.append(Swatch("not optimal in this cell", frame=DISAGREES, thick=2))
     swatches += [] if known[playable].all() and not canvas.hidden else [NEVER_VISITED]
-    canvas.legend(ends, f"value {short(ends.low, ends.high)}", short(ends.high), swatches)
+    canvas.legend(ends, "value", swatches)
     return canvas
 
 
@@ -238,7 +231,7 @@ def _finish_policy_table(
     swatches = [Swatch("greedy action", frame=AGENT, thick=2)]
     swatches.append(Swatch("greedy, not optimal", frame=DISAGREES, thick=2))
     swatches += [] if known[states].all() else [NEVER_VISITED]
-    table.legend(scale, f"{name} {short(scale.low, scale.high)}", short(scale.high), swatches)
+    table.legend(scale, name, swatches)
     return table
 
 
@@ -249,15 +242,12 @@ def value_error(snapshot: PolicySnapshot, best: Solution) -> FloatArray:
 
 
 def draw_error_map(mdp: Mdp, error: FloatArray, caption: str = "", cell_size: int | None = None) -> Frame:
-    """Draw errors (S, A) as four triangles in each cell, or (S, 1) as its colour.
-
-    Where the cells are too small, or the actions are not the four moves, a cell shows the largest error.
-    """
+    """Draw errors (S, A) as four triangles in each cell; a cell too small for them shows the largest."""
     canvas = Canvas(mdp, cell_size)
     moves = moving_actions(mdp) if error.shape[1] > 1 and canvas.has_grid else None
     error = error.max(axis=1, keepdims=True) if moves is None else error[:, moves]
     scale = linear(ORANGES, error[canvas.board.floor], low=0.0)
-    return canvas.draw_numbers(error, scale, "error 0", short(scale.high), _NO_OPTIMUM, caption)
+    return canvas.draw_numbers(error, scale, "error", _NO_OPTIMUM, caption)
 
 
 def draw_visit_map(
@@ -267,8 +257,4 @@ def draw_visit_map(
     counts = visits.sum(axis=1, keepdims=True)
     scale = counting(BLUES, counts[board_of(mdp).floor])
     numbers = np.where(counts > 0, counts, np.nan)
-    return Canvas(mdp, cell_size).draw_numbers(numbers, scale, *_visit_ends(scale), "never", caption)
-
-
-def _visit_ends(scale: Scale) -> tuple[str, str]:
-    return f"visits {short(scale.low)}", short(scale.high) + (", log scale" if scale.logarithmic else "")
+    return Canvas(mdp, cell_size).draw_numbers(numbers, scale, "visits", "never", caption)

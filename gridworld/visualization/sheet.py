@@ -7,7 +7,7 @@ GIF.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -131,17 +131,34 @@ class Sheet:
         self._surface.fill(PAPER)
         self.world: Any = self._surface.subsurface((side, top, width, height))
 
-    def number_size(self, room: float, texts: Collection[str]) -> int | None:
-        """The font size at which numbers fit into `room` cells; None where they could not be read."""
-        size = min(round(0.3 * self.cell), 20)
-        if size < SMALLEST_TEXT or not texts:
-            return None
-        return text_size(max(texts, key=lambda text: text_width(text, size)), size, room * self.cell)
+    def number_size(self, numbers: FloatArray, high: float, room: float) -> int:
+        """The font size at which numbers fit into `room` cells; 0 where they could not be read."""
+        most, texts = min(round(0.3 * self.cell), 20), {short(each, high) for each in set(numbers.tolist())}
+        if most < SMALLEST_TEXT or not texts:
+            return 0
+        return text_size(max(texts, key=lambda text: text_width(text, most)), most, room * self.cell) or 0
 
-    def number(
+    def write_numbers(
+        self,
+        numbers: FloatArray,
+        chosen: BoolArray,
+        colours: ColourArray,
+        high: float,
+        size: int,
+        middle: Callable[[int, int], Point],
+        plates: Container[int] = (),
+    ) -> None:
+        """Write the chosen ones of numbers (S, P) on colours (S, P, 3), those of `plates` over a path."""
+        dark = is_dark(colours)
+        for state, part in np.argwhere(chosen).tolist() if size else []:
+            ink = PAPER if dark[state, part] else INK
+            plate = colours[state, part] if state in plates else None
+            self.write(short(float(numbers[state, part]), high), middle(state, part), size, ink, plate)
+
+    def write(
         self, text: str, middle: Point, size: int, ink: Colour, plate: ColourArray | None = None
     ) -> None:
-        """Write a text around a point of `world`, on a plate of that colour where something lies below it."""
+        """Write a text around a point of `world`, on a plate of that colour."""
         image = font(size).render(text, True, ink)
         box = image.get_rect(center=middle)
         if plate is not None:
@@ -168,13 +185,12 @@ class Sheet:
             size = text_size(text, size, width - left - 6) or SMALLEST_TEXT
             write(self._surface, text, left, middle, size)
 
-    def legend(self, scale: Scale, low: str, high: str, swatches: Sequence[Swatch] = ()) -> None:
-        """Draw the colour bar between the names of its ends, and the swatches, in the second row if any."""
-        total, edge, bottom = (
-            self._surface.get_width(),
-            self.world.get_offset()[0] + self.cell,
-            self._bottom(),
-        )
+    def legend(self, scale: Scale, name: str, swatches: Sequence[Swatch] = ()) -> None:
+        """Draw the colour bar between its ends, and the swatches, in the second row if any."""
+        low = f"{name} {short(scale.low, scale.high)}"
+        high = short(scale.high) + (", log scale" if scale.logarithmic else "")
+        total, bottom = self._surface.get_width(), self._bottom()
+        edge = self.world.get_offset()[0] + self.cell
         rows = (0.5,) if self._legend_rows == 1 else (0.32, 0.74)  # heights within what is below the grid
         middles = [bottom + round((self._surface.get_height() - bottom) * row) for row in rows]
         size, gap = self.text_size, self.text_size // 2

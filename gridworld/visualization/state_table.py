@@ -12,8 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.envs import rendering as drawing
-from gridworld.envs.rendering import INK, SMALLEST_TEXT, UNKNOWN, Colour, Frame, text_size, text_width, write
-from gridworld.visualization.sheet import PAPER, Scale, Sheet, Swatch, is_dark, short
+from gridworld.envs.rendering import (
+    INK,
+    SMALLEST_TEXT,
+    UNKNOWN,
+    Colour,
+    Frame,
+    Point,
+    text_size,
+    text_width,
+    write,
+)
+from gridworld.visualization.sheet import PAPER, Scale, Sheet, Swatch, short
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp
 
 _MOST_ROWS = 24
@@ -24,10 +34,7 @@ _NARROWEST, _WIDEST = 8, 80  # pixels, of a column
 
 
 def table_states(mdp: Mdp, visits: NDArray[np.int64] | None = None) -> IntArray:
-    """The states (rows,) of a table, in its order, chosen by how often training took each action (S, A).
-
-    States that are terminal or cannot be reached are not among them.
-    """
+    """The live states (rows,) of a table, in its order; of many those with most `visits` (S, A)."""
     states = np.flatnonzero(mdp.reachable & ~mdp.terminal)
     states = states[np.argsort(mdp.steps_away[states], kind="stable")]
     counts = np.zeros(len(states)) if visits is None else visits[states].sum(axis=1)
@@ -43,7 +50,7 @@ class StateTable(Sheet):
         hidden = int((mdp.reachable & ~mdp.terminal).sum()) - len(states)
         self._label = max((text_width(name, _TEXT) for name in names), default=0) + _ROW // 2
         self._column = max(_NARROWEST, min(_WIDEST, _WIDTH // len(columns)))
-        self._states = states
+        self.states = states
         width = self._label + len(columns) * self._column
         super().__init__(width + 2 * _ROW, (3 + len(states) + (hidden > 0)) * _ROW, _ROW, legend_rows)
         for row, name in enumerate(names):
@@ -69,12 +76,9 @@ class StateTable(Sheet):
     def paint(
         self, table: FloatArray, scale: Scale, known: BoolArray | None = None, written: bool = True
     ) -> None:
-        """Fill the cells with numbers (S, columns) as colours, and as text if `written`.
-
-        NaN is left white; the rows of states that are not `known` (S,) are grey. None: all are.
-        """
-        values = table[self._states]
-        rows = np.ones(len(values), dtype=np.bool_) if known is None else known[self._states]
+        """Fill the cells with numbers (S, columns); NaN is white, rows that are not `known` (S,) grey."""
+        values = table[self.states]
+        rows = np.ones(len(values), dtype=np.bool_) if known is None else known[self.states]
         there = np.isfinite(values) & rows[:, None]
         colours = scale.colours(np.where(there, values, scale.low))
         colours[~there] = PAPER
@@ -82,13 +86,13 @@ class StateTable(Sheet):
         for row, column in np.ndindex(*values.shape):
             self.world.fill(colours[row, column].tolist(), self.box(row, column))
             drawing.import_pygame().draw.rect(self.world, INK, self.box(row, column), 1)
-        texts = {value: short(value, scale.high) for value in set(values[there].tolist())}
-        size = min((text_size(text, _TEXT, 0.8 * self._column) or 0 for text in texts.values()), default=0)
-        dark = is_dark(colours)
-        for row, column in np.argwhere(there).tolist() if written and size else []:
-            middle = self.box(row, column)[0] + self._column / 2, self._middle(row)
-            ink = PAPER if dark[row, column] else INK
-            self.number(texts[float(values[row, column])], middle, size, ink)
+        texts = [short(value, scale.high) for value in set(values[there].tolist())]
+        size = min((text_size(text, _TEXT, 0.8 * self._column) or 0 for text in texts), default=0)
+
+        def middle(row: int, column: int) -> Point:
+            return self.box(row, column)[0] + self._column / 2, self._middle(row)
+
+        self.write_numbers(values, there & written, colours, scale.high, size, middle)
 
     def mark(self, row: int, column: int, colour: Colour) -> None:
         """A frame inside a cell, edged in white."""
@@ -97,11 +101,9 @@ class StateTable(Sheet):
         rect(self.world, PAPER, (left + 1, top + 1, width - 2, height - 2), 3)
         rect(self.world, colour, (left + 1, top + 1, width - 2, height - 2), 2)
 
-    def draw_numbers(
-        self, table: FloatArray, scale: Scale, low: str, high: str, missing: str, caption: str
-    ) -> Frame:
+    def draw_numbers(self, table: FloatArray, scale: Scale, name: str, missing: str, caption: str) -> Frame:
         """The finished picture of numbers (S, columns); see `Canvas.draw_numbers`."""
         self.paint(table, scale)
         self.caption(caption)
-        self.legend(scale, low, high, [] if np.isfinite(table[self._states]).all() else [Swatch(missing)])
+        self.legend(scale, name, [] if np.isfinite(table[self.states]).all() else [Swatch(missing)])
         return self.frame()

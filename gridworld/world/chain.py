@@ -10,8 +10,6 @@ Reference: M. L. Puterman, Markov Decision Processes, 1994, chapters 6 and 7 and
 
 from __future__ import annotations
 
-import ctypes
-import functools
 import itertools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,7 +23,8 @@ from numpy.typing import ArrayLike
 
 from gridworld.bounds import discount
 from gridworld.errors import InputError
-from gridworld.process.memory_budget import check_memory
+from gridworld.process.user_input import check_memory
+from gridworld.workarounds import blas_threads
 from gridworld.world.layout import positive_int
 from gridworld.world.mdp import BoolArray, FloatArray, IntArray, Mdp, steps_from
 
@@ -42,24 +41,13 @@ def in_one_thread() -> Iterator[None]:
     Systems divided among threads have other last bits with another number of cores, and the threads wait for
     one another at work.
     """
-    count, limit = _openblas()
+    count, limit = blas_threads()
     before = count()
     limit(1)
     try:
         yield
     finally:
         limit(before)
-
-
-@functools.cache
-def _openblas() -> tuple[Callable[[], int], Callable[[int], Any]]:
-    """OpenBLAS's functions that tell and set the number of its threads."""
-    library: Any = ctypes.CDLL(np.linalg._umath_linalg.__file__)
-    for prefix, suffix in itertools.product(("scipy_openblas", "openblas"), ("64_", "_64", "")):
-        tell, limit = (f"{prefix}_{verb}_num_threads{suffix}" for verb in ("get", "set"))
-        if hasattr(library, tell) and hasattr(library, limit):
-            return getattr(library, tell), getattr(library, limit)
-    return (lambda: 1), (lambda threads: None)
 
 
 @dataclass(frozen=True)

@@ -43,18 +43,9 @@ class GridMdp(Mdp):
         """The map."""
         return self.layout.text()
 
-    def rewards_text(self) -> tuple[str, str]:
-        """See `Mdp`."""
-        return f"step_reward={self.step_reward}", " or a step_reward of at most 0"
-
     def coordinates(self, state: int) -> tuple[int, ...]:
         """Row and column."""
         return divmod(state, self.layout.num_cols)
-
-    def state_name(self, state: int) -> str:
-        """See `Mdp`."""
-        row, col = self.coordinates(state)
-        return f"row {row + 1}, column {col + 1}"
 
 
 def compile_mdp(

@@ -152,10 +152,6 @@ class Mdp:
         where = f"row {row + 1}, column {col + 1}"
         return f"{where} ({self.panel_names[panel]})" if self.panel_names else where
 
-    def rewards_text(self) -> tuple[str, str]:
-        """What messages call that which pays on the way, and how it could be changed, if it can."""
-        return f"the rewards of {self.name}", ""
-
     def action_choices(self) -> str:
         """The actions for a message: 0 (up), 1 (right), 2 (down) or 3 (left)."""
         *others, last = (f"{number} ({name})" for number, name in enumerate(self.action_names))

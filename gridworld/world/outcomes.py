@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError
-from gridworld.process.memory_budget import check_memory
+from gridworld.process.user_input import check_memory
 from gridworld.world.layout import positive_int
 from gridworld.world.mdp import (
-    EXACT,
     LEAST_REWARD,
     MOST_REWARD,
     BoolArray,
@@ -70,7 +69,6 @@ def mdp_from_outcomes(
     panel_names: Sequence[str] = (),
     max_episode_steps: int | None = None,
     own_observation: NDArray[Any] | None = None,
-    truth: str = EXACT,
 ) -> Mdp:
     """Compile what a source says into a world, whose states 0 to N - 1 are the numbered ones.
 
@@ -111,7 +109,6 @@ def mdp_from_outcomes(
         panel_names=tuple(panel_names),
         max_episode_steps=None if max_episode_steps is None else int(max_episode_steps),
         own_observation=None if own_observation is None else frozen(own_observation[number]),
-        truth=truth,
     )
 
 

@@ -6,7 +6,7 @@ cannot change or cannot be copied (spaces, functions, modules) is kept as it is.
 
 A method is a function of its argument alone if it gives the same whenever it is asked, and all that it could
 remember by or draw from stays the same: attributes, and by cloudpickle also classes, defaults, closures and
-globals, but for those of libraries.
+globals, but for those of installed packages.
 """
 
 from __future__ import annotations
@@ -19,6 +19,9 @@ import marshal
 import pickle
 import random
 import sys
+import sysconfig
+import threading
+import weakref
 from collections import deque
 from collections.abc import Collection, Iterable
 from enum import Enum
@@ -30,6 +33,7 @@ import gymnasium as gym
 import numpy as np
 
 from gridworld.errors import InputError, in_short
+from gridworld.workarounds import generator_of
 
 _GENERATORS = (np.random.Generator, np.random.RandomState, random.Random)
 _KEPT = (
@@ -42,11 +46,12 @@ _REDUCED = (  # classes made of these are read as pickle reduces them
     functools.partial,
 )
 _SHORT = 16  # numbers; a position is the same whether it is a tuple or an array
-_LIBRARIES = {
-    *sys.stdlib_module_names,
-    *("cloudpickle", "gymnasium", "gridworld", "minigrid", "numpy", "sb3_contrib", "scipy"),
-    *("stable_baselines3", "torch"),
-} - {"__main__"}
+_TRUSTED = {
+    *("gridworld", "gymnasium", "minigrid", "numpy", "sb3_contrib", "scipy", "stable_baselines3", "torch")
+}
+_INSTALLED = ("site-packages", "dist-packages", sysconfig.get_path("stdlib"))  # in a library's path
+_DATA = (int, float, str, list, dict, set, np.ndarray, *_GENERATORS)  # of a module
+_LOCKS = (type(threading.Lock()), type(threading.RLock()))
 _CALLS = 1000  # at least
 SO_UNKNOWN = (
     ", so what it makes of the task is not exactly known; "
@@ -182,9 +187,10 @@ def random_states(env: gym.Env[Any, Any] | None = None) -> list[Any]:
     """The states of all generators that a step may draw from: the environment's, and those that all share."""
     torch = sys.modules.get("torch")
     shared = [] if torch is None else [torch.get_rng_state().numpy().tobytes()]
-    shared += [random.getstate(), _generator_state(np.random.mtrand._rand)]
+    numpys = np.random.get_state(legacy=False)["state"]
+    shared += [random.getstate(), (numpys["key"].tobytes(), numpys["pos"])]
     held = [] if env is None else [env, *vars(env).values()]
-    found = [getattr(each, "_np_random", each) for each in held]
+    found = [generator_of(each) or each for each in held]
     return shared + [_generator_state(each) for each in found if isinstance(each, _GENERATORS)]
 
 
@@ -238,18 +244,23 @@ class _AnotherEnvError(Exception):
 
 
 class _Reader(cloudpickle.Pickler):  # type: ignore[misc]
-    """Writes what objects hold. `known` are not read; other environments are refused, or `skips_envs`."""
+    """Writes what objects hold, and the code of `modules`.
 
-    def __init__(self, write: Any, known: Iterable[Any], skips_envs: bool) -> None:
+    `known` objects are not read; other environments are refused, or `skips_envs`.
+    """
+
+    def __init__(self, write: Any, known: Iterable[Any], skips_envs: bool, modules: Collection[str]) -> None:
         super().__init__(SimpleNamespace(write=write), protocol=5)
         self._known = {id(each): place for place, each in enumerate(known)}
-        self._skips_envs = skips_envs
+        self._skips_envs, self._modules = skips_envs, modules
 
     def persistent_id(self, obj: Any) -> Any:
         if id(obj) in self._known:
             return self._known[id(obj)]
-        if isinstance(obj, FunctionType | type) and _is_library(obj):
-            return obj.__qualname__
+        if isinstance(obj, FunctionType | type):
+            of_function = getattr(obj, "__globals__", {}).get("__name__")  # `functools.wraps` has another's
+            if obj.__module__ not in self._modules and of_function not in self._modules:
+                return obj.__qualname__
         if isinstance(obj, gym.Env) and not self._skips_envs:
             raise _AnotherEnvError
         if self._skips_envs and isinstance(obj, gym.Env | gym.Space):
@@ -258,29 +269,40 @@ class _Reader(cloudpickle.Pickler):  # type: ignore[misc]
 
     def reducer_override(self, obj: Any) -> Any:
         kind = type(obj)
-        if not (_is_library(kind) or _is_library(obj) or isinstance(obj, (type, *_REDUCED))):
+        if isinstance(obj, ModuleType) and obj.__name__ in self._modules:
+            held = {name: value for name, value in vars(obj).items() if isinstance(value, _DATA)}
+            held.pop("__builtins__", None)
+            return object, (), held
+        if isinstance(obj, (weakref.ref, *_LOCKS)):  # `cached_property` and `singledispatch` have them
+            return object, (), obj() if isinstance(obj, weakref.ref) else repr(obj)
+        if kind.__module__ in self._modules and not isinstance(obj, (type, *_REDUCED)):
             # also what its own way of being pickled hides
             return object, (), (kind, object.__getstate__(obj), obj.__reduce_ex__(pickle.HIGHEST_PROTOCOL))
         return super().reducer_override(obj)
 
 
-def _is_library(thing: Any) -> bool:
-    return str(getattr(thing, "__module__", None)).partition(".")[0] in _LIBRARIES
+def _users_modules(package: str) -> dict[str, ModuleType]:
+    """The modules whose code is read: those that are not installed, and those of one package."""
+    found = {}
+    for name, module in list(sys.modules.items()):
+        top = name.partition(".")[0]
+        if isinstance(module, ModuleType) and top not in _TRUSTED:
+            path = vars(module).get("__file__")
+            is_installed = path is None or any(part in path for part in _INSTALLED)
+            if name == "__main__" or not is_installed or (path and top == package):
+                found[module.__name__] = module
+    return found
 
 
-def _content(value: Any, known: Iterable[Any], skips_envs: bool = False) -> bytes:
-    """A digest of what a value holds, and of the code that it refers to, but for that of libraries."""
+def _content(owner: Any, value: Any, known: Iterable[Any], skips_envs: bool = False) -> bytes:
+    """A digest of what a value holds, and of the code that it and the class of `owner` refer to."""
     found = hashlib.sha256()
-    modules = {
-        module.__name__: module
-        for name, module in list(sys.modules.items())
-        if isinstance(module, ModuleType) and name.partition(".")[0] not in _LIBRARIES
-    }
+    modules = _users_modules(type(owner).__module__.partition(".")[0])
     names = modules.keys() & sys.modules.keys() - cloudpickle.list_registry_pickle_by_value()
     for name in names:
         cloudpickle.register_pickle_by_value(modules[name])
     try:
-        _Reader(found.update, known, skips_envs).dump(value)
+        _Reader(found.update, known, skips_envs, modules.keys()).dump(value)
     finally:
         for name in names:
             cloudpickle.unregister_pickle_by_value(modules[name])
@@ -295,8 +317,9 @@ def alike(one: Any, other: Any, without: Collection[str] = ()) -> bool:
     """Whether two objects of one class hold the same values and functions, but for some attributes."""
     if type(one) is not type(other):
         return False
+    pair = [(each, _held(each, without), [each]) for each in (one, other)]
     try:
-        mine, theirs = (_content(_held(each, without), [each], skips_envs=True) for each in (one, other))
+        mine, theirs = (_content(*each, skips_envs=True) for each in pair)
     except Exception:  # what cannot be read may differ
         return False
     return mine == theirs
@@ -308,10 +331,10 @@ def remembered(where: str, name: str, owner: Any, chain: Iterable[Any] = ()) -> 
     envs = [each for each in known if isinstance(each, gym.Env)]
     generators = [(env.np_random, env.action_space, env.observation_space) for env in envs]
     try:
-        found = _content((generators, _held(owner, ("env",)), type(owner)), known)
+        found = _content(owner, (generators, _held(owner, ("env",)), type(owner)), known)
     except _AnotherEnvError:
         raise InputError(f"{where}: {name} looks into an environment{SO_UNKNOWN}") from None
-    except Exception as error:  # locks, open files, generators
+    except Exception as error:  # open files, generators, sockets
         cannot = f"what {name} refers to cannot be read ({in_short(error)})"
         raise InputError(f"{where}: {cannot}{SO_UNKNOWN}") from error
     return [found, *random_states()]

@@ -269,10 +269,9 @@ def _resting_policy(mdp: Mdp) -> IntArray:
     playing = ~mdp.absorbing
     going_on = _staying(mdp, possible, playing, np.ones(possible.shape[:2], dtype=np.bool_))
     if (going_on & (possible & (mdp.reward > 0)).any(axis=2)).any():
-        paid, remedy = mdp.rewards_text()
         raise InputError(
-            f"gamma=1 with {paid}: who goes on for ever is paid on the way, so that the return may grow "
-            f"without end; take a gamma below 1{remedy}"
+            f"gamma=1 in {mdp.name}: who goes on for ever is paid on the way, so that the return may grow "
+            "without end; take a gamma below 1, or rewards of at most 0 on the way, e.g. env.step_reward=0"
         )
     free = ~np.asarray((possible & (mdp.reward != 0)).any(axis=2))
     resting = _staying(mdp, possible, playing, free)

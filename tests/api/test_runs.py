@@ -1,9 +1,9 @@
 """`gridworld.train`, `compose` and `open_run`: the commands' results, without a command line."""
 
 import csv
-import io
 import json
 import re
+import shutil
 import signal
 import threading
 from pathlib import Path
@@ -11,6 +11,7 @@ from pathlib import Path
 import hydra
 import numpy as np
 import pytest
+import torch
 from helpers.support import CONF, SHORT, configure, script
 from hydra.core.global_hydra import GlobalHydra
 from hydra.version import getbase
@@ -61,8 +62,15 @@ def test_bit_for_bit_what_the_command_does(agent: str, tmp_path: Path) -> None:
     assert bare.config == gridworld.compose(*SHORT[agent], "logging.progress=false", seed=3)
 
 
-def test_the_folder_is_an_ordinary_run(tmp_path: Path) -> None:
-    gridworld.train(*SHORT["q_learning"], folder=tmp_path / "mine", progress=False)
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> gridworld.RunResult:
+    """Of a table, in a folder."""
+    folder = tmp_path_factory.mktemp("api") / "run"
+    return gridworld.train(*SHORT["q_learning"], folder=folder, progress=False)
+
+
+def test_the_folder_is_an_ordinary_run(run: gridworld.RunResult, tmp_path: Path) -> None:
+    shutil.copytree(str(run.folder), tmp_path / "mine")
     for command in (["evaluate.py", "mine"], ["report.py", "."], ["reproduce.py", "mine"]):
         done = script(*command, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
@@ -79,9 +87,8 @@ def test_without_a_folder_nothing_is_left(tmp_path: Path, monkeypatch: pytest.Mo
     assert run.evaluator.score(run.evaluator.optimal_policy()).certified  # nothing more is read
 
 
-def test_the_curve_has_the_columns_of_the_file(tmp_path: Path) -> None:
-    run = gridworld.train(*SHORT["q_learning"], folder=tmp_path / "run", progress=False)
-    rows = list(csv.DictReader(io.StringIO((tmp_path / "run" / "curve.csv").read_text())))
+def test_the_curve_has_the_columns_of_the_file(run: gridworld.RunResult) -> None:
+    rows = list(csv.DictReader((Path(run.folder or "") / "curve.csv").read_text().splitlines()))
     assert list(run.curve) == list(rows[0])
     for name, column in run.curve.items():
         expected = [float(row[name]) if row[name] else np.nan for row in rows]
@@ -183,8 +190,14 @@ def test_ctrl_c_leaves_a_run_that_the_same_call_goes_on_with(
     assert np.array_equal(continued.policy.q, whole.policy.q)
 
 
-def test_calls_in_threads_have_the_same_results() -> None:
-    alone = gridworld.train(*SHORT["dqn"], progress=False)
+def test_calls_in_threads_have_the_same_results_and_torch_keeps_its_number_of_threads() -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        alone = gridworld.train(*SHORT["dqn"], progress=False)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
     found: list[gridworld.RunResult] = []
     threads = [
         threading.Thread(target=lambda: found.append(gridworld.train(*SHORT["dqn"], progress=False)))
@@ -194,9 +207,7 @@ def test_calls_in_threads_have_the_same_results() -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(found) == 2
-    for run in found:
-        assert np.array_equal(run.policy.q, alone.policy.q)
+    assert [np.array_equal(run.policy.q, alone.policy.q) for run in found] == [True] * 2
 
 
 def test_a_program_that_uses_hydra_keeps_its_own() -> None:
@@ -212,18 +223,6 @@ def test_a_program_that_uses_hydra_keeps_its_own() -> None:
         assert str(getbase()) == "1.2"
         assert hydra.compose("train", ["seed=4"]).seed == 4
     assert OmegaConf.create({"a": "${slug:b}"}).a == "mine b"
-
-
-def test_torch_keeps_its_number_of_threads() -> None:
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        gridworld.train(*SHORT["dqn"], progress=False)
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
 
 
 def test_progress_is_shown_or_not(

@@ -1,7 +1,7 @@
 """A run's folder is data: nothing that a stranger puts into one is run, leaks, or writes elsewhere.
 
 Every entry of the catalogue in hostile.py meets every command that reads a run. CI takes a third of it, each
-with half of the commands that only look:
+with one of the READERS in turn:
 GRIDWORLD_HOSTILE=all python -m pytest tests/commands/test_hostile_runs.py
 takes all.
 """
@@ -54,7 +54,7 @@ FIRST = {
 RUNS = SHORT | {"lake": [*SHORT["q_learning"], "env=frozen_lake_v1", "n_envs=4"]}  # which has tables
 ALL = os.environ.get("GRIDWORLD_HOSTILE") == "all"
 CASES = [case for case in CATALOGUE if ALL or case.name in FIRST]
-ALWAYS = ("evaluate", "play", "resume")
+READERS = ("export", "diagnose", "reproduce", "play")
 
 
 @pytest.fixture(scope="module")
@@ -91,8 +91,9 @@ def test_nothing_of_a_hostile_run_gets_out(case: Hostile, good: Path, tmp_path: 
     assert not (base / "canary").exists()
 
     looked_at = -1
-    for number, (command, words) in enumerate(WORDS.items(), CATALOGUE.index(case)):
-        if not ALL and command not in ALWAYS and number % 2:
+    one = READERS[CASES.index(case) % len(READERS)]
+    for command, words in WORDS.items():
+        if command in READERS and command != one and not ALL:
             continue
         variables = {**AWAY, "PYTHONPATH": f"{ROOT}{os.pathsep}{base}"}
         ended = forks.run(

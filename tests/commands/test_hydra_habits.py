@@ -7,7 +7,7 @@ from helpers.support import script
 
 from gridworld.commands.tune import main as tune
 from gridworld.errors import InputError
-from gridworld.process.console import called_from, users_folder
+from gridworld.process.user_input import called_from, users_folder
 from gridworld.run.folder import RunFolder, shown
 
 

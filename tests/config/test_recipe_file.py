@@ -17,7 +17,7 @@ from gridworld.config.train import TrainConfig
 from gridworld.config.worlds import BuiltConfig
 from gridworld.errors import InputError
 from gridworld.storage.safe_read import read_object
-from gridworld.tune.recipe import write_recipe
+from gridworld.tune.study import write_recipe
 from gridworld.tune.study_spec import ConfFolders, compose_in, compose_study
 
 WINNERS = {

@@ -20,8 +20,8 @@ from gridworld.report.evidence import Evidence, read
 from gridworld.report.grouping import arrange, learning_key, task_key
 from gridworld.run.provenance import identity, settings_hash
 from gridworld.training.tensorboard import hparams
-from gridworld.tune.recipe import _relevant
-from gridworld.tune.search_space import SearchSpace
+from gridworld.tune.study import _relevant
+from gridworld.tune.study_spec import SearchSpace
 
 DECLARED = {
     Effect.LENGTH: {"total_timesteps"},

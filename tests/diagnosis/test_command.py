@@ -34,6 +34,10 @@ def test_it_ends_with_a_sentence_and_commands_that_can_be_typed(spoilt: Path, ca
     assert 1 <= len(lines) <= 3
     for line in lines:
         gridworld.compose(*shlex.split(line)[2:])  # every one is a valid setting
+    run = gridworld.open_run(spoilt)
+    found = gridworld.diagnose(run)
+    assert found.sentence() == gridworld.diagnose(spoilt).sentence()
+    assert found.split.cost.sum() == pytest.approx(run.summary["regret"], abs=1e-9)
 
 
 def test_the_picture_has_the_world_and_the_cells_that_cost(spoilt: Path) -> None:
@@ -41,17 +45,9 @@ def test_the_picture_has_the_world_and_the_cells_that_cost(spoilt: Path) -> None
     with Image.open(spoilt / "diagnosis.png") as picture:
         assert min(picture.size) > 200
     found = gridworld.diagnose(spoilt)
-    frame = draw_diagnosis(found, 40)
-    costly = int(np.argmax(found.split.cost))
-    row, col = divmod(costly, 6)
-    cell = frame[(row + 1) * 40 + 4, (col + 1) * 40 + 36]
+    row, col = divmod(int(np.argmax(found.split.cost)), 6)
+    cell = draw_diagnosis(found, 40)[(row + 1) * 40 + 4, (col + 1) * 40 + 36]
     assert cell.tolist() == [127, 0, 0]  # the end of the scale
-
-
-def test_a_folder_and_an_open_run_are_the_same(spoilt: Path) -> None:
-    run = gridworld.open_run(spoilt)
-    assert gridworld.diagnose(spoilt).sentence() == gridworld.diagnose(run).sentence()
-    assert gridworld.diagnose(run).split.cost.sum() == pytest.approx(run.summary["regret"], abs=1e-9)
 
 
 def test_a_world_without_places_is_diagnosed_and_drawn_too() -> None:
@@ -117,8 +113,3 @@ def test_of_a_certified_run_nothing_is_named_or_drawn(tmp_path: Path, capsys) ->
     told = capsys.readouterr().out.splitlines()
     assert told[1:] == ["Certified optimal: there is no regret to explain."]
     assert not (tmp_path / "best" / "diagnosis.png").exists()
-
-
-def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(gridworld.InputError, match=r"no such folder; give the folder of a run"):
-        diagnose.main([str(tmp_path / "nowhere")])

@@ -132,32 +132,27 @@ def test_what_else_is_told(what: str) -> None:
     assert "ent_coef" not in told
 
 
-def test_nothing_is_named_for_a_certified_run() -> None:
-    run = gridworld.train("agent=q_learning", seed=0, progress=False)
-    found = gridworld.diagnose(run)
-    assert run.summary["certified"]
-    assert found.cause is None
-    assert found.findings == found.commands == ()
-
-
 def test_a_certificate_that_was_lost_is_said() -> None:
     run = gridworld.train(*_SLOW, progress=False)
     first = gridworld.diagnose(run).commands[0]  # takes the place of the setting that it changes
     assert re.search(r"train.py agent=q_learning seed=0 agent.learning_rate=0\.\d+$", first)
-    run.curve["certified"] = run.curve["certified"].copy()
-    run.curve["certified"][3] = True
-    found = gridworld.diagnose(run)
-    assert found.cause == "lost"
+    found = diagnosed_as_lost(run)
     assert f"certified at step {run.curve['step'][3]:,}" in found.sentence()
 
 
 def test_a_rate_that_falls_is_not_told_to_fall_and_falls_in_what_is_told() -> None:
     falls = ["agent=q_learning", "agent.learning_rate=quad_0.001", "evaluation.stop_after=5"]
-    run = gridworld.train(*falls, seed=0, progress=False)
+    (told,) = diagnosed_as_lost(gridworld.train(*falls, seed=0, progress=False)).commands
+    assert told.endswith("evaluation.stop_after=5 seed=0 agent.learning_rate=quad_0.0001")
+
+
+def diagnosed_as_lost(run: gridworld.RunResult) -> Diagnosis:
+    """As if it had been certified once."""
     run.curve["certified"] = run.curve["certified"].copy()
     run.curve["certified"][3] = True
-    (told,) = gridworld.diagnose(run).commands
-    assert told.endswith("evaluation.stop_after=5 seed=0 agent.learning_rate=quad_0.0001")
+    found = gridworld.diagnose(run)
+    assert found.cause == "lost"
+    return found
 
 
 # fmt: off

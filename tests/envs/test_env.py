@@ -43,7 +43,8 @@ def test_gymnasium_knows_the_id(imports, env_id):
         "print(env.reset()[0], type(env.unwrapped).__name__, env.unwrapped.mdp.slip);"
         "print(*envs.reset()[0], type(envs.unwrapped).__name__, envs.unwrapped.mdp.slip);"
         "import sys; print(*[finder for finder in sys.meta_path if 'gridworld' in str(finder)]);"
-        "import gridworld; gridworld.register_envs(); assert gym.spec(gridworld.ENV_ID) is env.unwrapped.spec"
+        "import gridworld; spec = gym.spec(gridworld.ENV_ID); gridworld.register_envs();"
+        "assert gym.spec(gridworld.ENV_ID) is spec"
     )
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, timeout=60

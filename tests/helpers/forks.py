@@ -4,13 +4,13 @@ The process is multiprocessing's fork server, which imports `helpers.warm` when 
 """
 
 import functools
+import importlib
 import json
 import multiprocessing
 import os
 import select
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import dataclass, field
 from multiprocessing import forkserver
@@ -62,8 +62,8 @@ def run(
         if secret is not None:
             environment = {"TMPDIR": place, **environment}
             watched = (str(secret), str(report))
-        began = time.monotonic()
         process = _start(name, words, cwd, environment, str(out), str(err), watched)
+        began = time.monotonic()  # not what the first script waits for, until the server has imported all
         process.join(timeout)
         if process.exitcode is None:
             process.kill()
@@ -132,6 +132,11 @@ class Started:
         self.wait(60)
 
 
+def megabytes(name: str) -> float:
+    """A number of this process's memory, as /proc has it."""
+    return int(Path("/proc/self/status").read_text().split(f"{name}:")[1].split()[0]) / 1024
+
+
 def _start(
     name: str,
     words: tuple[str, ...],
@@ -142,8 +147,8 @@ def _start(
     watched: tuple[str, str] | None,
 ) -> Any:
     script = str(TESTS.parent / "scripts" / name)
-    given = ([script, *words], str(cwd), {**os.environ, **environment}, out, err, watched)
-    process = _context().Process(target=_run, args=given, daemon=True)
+    given = ([script, *words], str(cwd), {**os.environ, **environment}, watched)
+    process = _context().Process(target=_run, args=(out, err, *given), daemon=True)
     process.start()
     return process
 
@@ -165,5 +170,13 @@ def _context() -> Any:
     return context
 
 
-def _run(*given: Any) -> None:
-    sys.modules["helpers.warm"].run(*given)  # not there: the server could not import it
+def _run(out: str, err: "str | Connection[Any, Any]", *given: Any) -> None:
+    files = [os.open(name, os.O_WRONLY | os.O_CREAT) for name in (out, err) if isinstance(name, str)]
+    os.dup2(files[0], 1)
+    os.dup2(files[1] if isinstance(err, str) else err.fileno(), 2)
+    if not isinstance(err, str):
+        err.close()
+        os.setsid()
+    for file in files:
+        os.close(file)
+    importlib.import_module("helpers.warm").run(*given)  # the server's; or says why that has none

@@ -1,7 +1,6 @@
 """Made-up maps, settings, manifests and model files, each from a seed; and what a program makes of one."""
 
 import contextlib
-import copy
 import hashlib
 import io
 import json
@@ -14,6 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from helpers.forks import megabytes
+from helpers.hostile import seal
 from helpers.support import SHORT, configure
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -21,7 +22,6 @@ from omegaconf.errors import OmegaConfBaseException
 from gridworld.agents import family
 from gridworld.commands import jobs as jobs_command
 from gridworld.config.compose import to_config
-from gridworld.config.train import TrainConfig
 from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.report.evidence import read
@@ -31,7 +31,7 @@ from gridworld.report.tuning_study import TRIALS_SUM, find_tunings
 from gridworld.restore.saved_run import SavedRun
 from gridworld.storage.safe_read import sealed
 from gridworld.training.setup import check_settings, make_context
-from gridworld.tune.study_folder import is_claimed
+from gridworld.tune.study import is_claimed
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load
@@ -40,38 +40,17 @@ OURS = (InputError, OmegaConfBaseException)  # both end as one sentence with exi
 Target = Callable[[random.Random, Path], None]
 
 # Odd values of every type. What is large is so large that no machine has room for it, or small enough.
+# fmt: off
 ODD: list[Any] = [
-    *(None, True, False, -1, 0, 1, 2, 3, 7, 100, -(10**12), 10**12, 10**18, 10**30),
-    *(0.0, 0.5, -0.5, 1.5, 1e-300, 1e300, math.nan, math.inf, -math.inf),
-    *(
-        "",
-        " ",
-        "abc",
-        "classic",
-        "cliff",
-        "nowhere.txt",
-        "../../x",
-        "/dev/zero",
-        "/etc",
-        "\x00",
-        "\x1b[2J",
-        "\ud800",
-    ),
-    *(
-        "lin_0.1",
-        "lin_-1",
-        "lin_nan",
-        "lin_",
-        "1e400",
-        "${seed}",
-        "${oc.env:HOME}",
-        "${",
-        "???",
-        "x" * 10_000,
-    ),
-    *("torch.nn.ReLU", "os.system", "stable_baselines3.PPO", "stable_baselines3", "..", "a.b", "MlpPolicy"),
-    *([], [64, 64], [0], [10**12], ["a"], [[1]], {}, {"a": 1}, {"pi": [8], "vf": [8]}, {1: 2}),
+    None, True, False, -1, 0, 1, 2, 3, 7, 100, -(10**12), 10**12, 10**18, 10**30,
+    0.0, 0.5, -0.5, 1.5, 1e-300, 1e300, math.nan, math.inf, -math.inf,
+    "", " ", "abc", "classic", "cliff", "nowhere.txt", "../../x", "/dev/zero", "/etc", "\x00", "\x1b[2J",
+    "\ud800",
+    "lin_0.1", "lin_-1", "lin_nan", "lin_", "1e400", "${seed}", "${oc.env:HOME}", "${", "???", "x" * 10_000,
+    "torch.nn.ReLU", "os.system", "stable_baselines3.PPO", "stable_baselines3", "..", "a.b", "MlpPolicy",
+    [], [64, 64], [0], [10**12], ["a"], [[1]], {}, {"a": 1}, {"pi": [8], "vf": [8]}, {1: 2},
 ]
+# fmt: on
 
 
 def fuzz_map(random: random.Random, folder: Path) -> None:
@@ -82,11 +61,8 @@ def fuzz_map(random: random.Random, folder: Path) -> None:
     text = "\n".join(lines)
     if kind == "damaged":
         place = random.randrange(len(text))
-        text = (
-            text[:place]
-            + random.choice(["x", "\n", "\t", "é", "\x00", "\r", "\u2028", "s", ""])
-            + text[place + 1 :]
-        )
+        odd = random.choice(["x", "\n", "\t", "é", "\x00", "\r", "\u2028", "s", ""])
+        text = f"{text[:place]}{odd}{text[place + 1 :]}"
     elif kind == "text":
         text = "".join(chr(random.randrange(1, 0xD000)) for _ in range(random.randint(0, 300)))
     elif kind == "long":
@@ -102,7 +78,7 @@ def fuzz_map(random: random.Random, folder: Path) -> None:
 def fuzz_config(random: random.Random, folder: Path) -> None:
     """Settings of an agent with a few odd values, as far as training would take them before it begins."""
     agent = random.choice(sorted(SHORT))
-    settings = OmegaConf.structured(configured(agent))
+    settings = OmegaConf.structured(configure(*SHORT[agent]))
     content = OmegaConf.to_container(settings)
     assert isinstance(content, dict)
     for _ in range(random.randint(1, 3)):
@@ -114,16 +90,6 @@ def fuzz_config(random: random.Random, folder: Path) -> None:
     observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
     Evaluator(mdp, config.evaluation.gamma, config.env.max_episode_steps)
     family(config.agent).build(config.agent, make_context(config, mdp, observation))
-
-
-_configured: dict[str, TrainConfig] = {}
-
-
-def configured(agent: str) -> TrainConfig:
-    """The settings of a short run, composed once."""
-    if agent not in _configured:
-        _configured[agent] = configure(*SHORT[agent])
-    return copy.deepcopy(_configured[agent])
 
 
 def spoil(random: random.Random, content: dict[Any, Any]) -> None:
@@ -160,9 +126,7 @@ def fuzz_manifest(random: random.Random, folder: Path) -> None:
         raw = damaged(random, raw)
     (run / name).write_bytes(raw)
     if name != "manifest.json":
-        content = json.loads((run / "manifest.json").read_bytes())
-        content["sha256"][name] = hashlib.sha256(raw).hexdigest()
-        (run / "manifest.json").write_text(json.dumps(sealed(content)))
+        seal(run, name)
     assert read(run) is not None  # a report names what is wrong and goes on
     saved = SavedRun(run)
     saved.evaluator().score(saved.snapshot().sampled)
@@ -171,20 +135,14 @@ def fuzz_manifest(random: random.Random, folder: Path) -> None:
 def fuzz_model(random: random.Random, folder: Path) -> None:
     """A model file with changed bytes, whose checksum was made to fit."""
     run = fresh_copy(random, folder)
-    raw = damaged(random, (run / "model.zip").read_bytes())
-    (run / "model.zip").write_bytes(raw)
-    content = json.loads((run / "manifest.json").read_text())
-    content["sha256"]["model.zip"] = hashlib.sha256(raw).hexdigest()
-    (run / "manifest.json").write_text(json.dumps(sealed(content)))
+    seal(run, "model.zip", damaged(random, (run / "model.zip").read_bytes()))
     snapshot = SavedRun(run).snapshot()
     assert all(math.isfinite(value) for value in snapshot.values)
 
 
 def fuzz_sweep(random: random.Random, folder: Path) -> None:
     """A sweep's folder with something changed, by meaning or by bytes, as jobs.py lists it."""
-    sweep = folder / "sweep"
-    shutil.rmtree(sweep, ignore_errors=True)
-    shutil.copytree(folder / "good-sweep", sweep)
+    sweep = whole_copy(folder, "sweep")
     names = ["sweep.json", "sweep.json", "jobs.csv", "seed=0/manifest.json", "seed=0/summary.json"]
     change(random, sweep / random.choice(names))
     with contextlib.redirect_stdout(io.StringIO()) as told:
@@ -194,9 +152,7 @@ def fuzz_sweep(random: random.Random, folder: Path) -> None:
 
 def fuzz_study(random: random.Random, folder: Path) -> None:
     """A study's folder with something changed, as a report shows it."""
-    study = folder / "study"
-    shutil.rmtree(study, ignore_errors=True)
-    shutil.copytree(folder / "good-study", study)
+    study = whole_copy(folder, "study")
     change(random, study / random.choice(["study.json", "study.json", "trials.csv", "search.json"]))
     is_claimed(study, "mine")
     found, problems = find_tunings([study])
@@ -227,10 +183,14 @@ def change(random: random.Random, path: Path) -> None:
         content = json.loads(study.read_bytes()) | {TRIALS_SUM: hashlib.sha256(path.read_bytes()).hexdigest()}
         study.write_text(json.dumps(sealed(content)))
     if name == "summary.json":
-        manifest = path.with_name("manifest.json")
-        content = json.loads(manifest.read_bytes())
-        content["sha256"][name] = hashlib.sha256(path.read_bytes()).hexdigest()
-        manifest.write_text(json.dumps(sealed(content)))
+        seal(path.parent, name)
+
+
+def whole_copy(folder: Path, name: str) -> Path:
+    """Of the good sweep or study."""
+    copy = folder / name
+    shutil.rmtree(copy, ignore_errors=True)
+    return shutil.copytree(folder / f"good-{name}", copy)
 
 
 def fresh_copy(random: random.Random, folder: Path) -> Path:
@@ -253,9 +213,8 @@ def damaged(random: random.Random, raw: bytes) -> bytes:
             case "flip":
                 content[place] ^= 1 << random.randrange(8)
             case "set":
-                content[place : place + 4] = random.choice(
-                    [b"\xff\xff\xff\xff", b"\0\0\0\0", b"\x7f\xff\xff\xff"]
-                )
+                extremes = [b"\xff\xff\xff\xff", b"\0\0\0\0", b"\x7f\xff\xff\xff"]
+                content[place : place + 4] = random.choice(extremes)
             case "cut":
                 del content[place : place + random.choice([1, 100, len(content)])]
                 content += b"" if content else b"x"
@@ -279,7 +238,7 @@ TARGETS: dict[str, Target] = {
 def attempt(name: str, seed: int, folder: Path) -> tuple[str, float, float]:
     """How the example ended ("accepted", "refused" or a foreign exception), seconds, megabytes at most."""
     Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
-    before, started = _megabytes("VmRSS"), time.process_time()
+    before, started = megabytes("VmRSS"), time.process_time()
     try:
         TARGETS[name](random.Random(f"{name} {seed}"), folder)
         outcome = "accepted"
@@ -291,9 +250,4 @@ def attempt(name: str, seed: int, folder: Path) -> tuple[str, float, float]:
             place = place.tb_next
         where = "" if place is None else f"{place.tb_frame.f_code.co_filename}:{place.tb_lineno}"
         outcome = f"{type(error).__name__}: {error} ({where})"
-    return outcome, time.process_time() - started, _megabytes("VmHWM") - before
-
-
-def _megabytes(field: str) -> float:
-    status = Path("/proc/self/status").read_text()
-    return int(status.split(f"{field}:")[1].split()[0]) / 1024
+    return outcome, time.process_time() - started, megabytes("VmHWM") - before

@@ -33,11 +33,7 @@ _SEEDS = re.compile(r"seed=(?:range\(\d+\)|[\d,]+,\d+)$")
 _FEW_STEPS = ["total_timesteps=1000", "evaluation.every=500"]
 NO_PICTURES = [f"recording.{picture.setting}=false" for picture in PICTURES]
 _FEW_TRIALS = [
-    "tune.trials=2",
-    "tune.seeds=1",
-    "tune.final_seeds=1",
-    "tune.confirm_seeds=2",
-    "tune.workers=1",
+    *("tune.trials=2", "tune.seeds=1", "tune.final_seeds=1", "tune.confirm_seeds=2", "tune.workers=1"),
 ]
 
 
@@ -150,11 +146,8 @@ class Reader:
         variables = dict(word.split("=", 1) for word in words if word.startswith("PYTHONPATH="))
         program, *words = words[len(variables) :]
         if program == "tensorboard":
-            command = [
-                str(Path(sys.executable).with_name(program)),
-                *words,
-                "--inspect",
-            ]  # reads the same, and ends
+            reads = str(Path(sys.executable).with_name(program))
+            command = [reads, *words, "--inspect"]  # reads the same, and ends
             return subprocess.run(command, cwd=self.folder, capture_output=True, text=True, timeout=300)
         assert program == "python"
         words[0] = words[0].removeprefix("scripts/")

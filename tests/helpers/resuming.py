@@ -21,8 +21,11 @@ from gridworld.training.together import run_together
 from gridworld.training.train import train, training
 
 OF_THE_CLOCK = {"train_seconds", "evaluation_seconds"}
-TIMED_TAGS = {"time/fps"}
-TIMED_LEAVES = ("env", "start_time", "ep_info_buffer")  # hold the seconds since the start
+TIMED_FILES = (
+    *(".", "events.", "manifest", "summary", "checkpoints/", "model", "best_model"),
+    *("source.diff", "train.log"),
+)
+TIMED_TAGS = ("time/fps", "_hparams_", "run/command", "run/settings")
 
 
 class Crash(BaseException):
@@ -88,9 +91,7 @@ def points(folder: Path) -> list[tuple[Any, ...]]:
             number = None if kind is None else getattr(value, kind)
             if kind not in ("simple_value", None):
                 number = number.SerializeToString()
-            timed = value.tag in TIMED_TAGS or value.tag.startswith(
-                ("_hparams_", "run/command", "run/settings")
-            )
+            timed = value.tag.startswith(TIMED_TAGS)
             found.append((value.tag, event.step, None if timed else number))
     return found
 
@@ -100,12 +101,7 @@ def left_behind(folder: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
-        if path.is_file() and not name.startswith(
-            (
-                *(".", "events.", "manifest", "summary", "checkpoints/", "model", "best_model"),
-                *("source.diff", "train.log"),
-            )
-        ):
+        if path.is_file() and not name.startswith(TIMED_FILES):
             found[name] = path.read_bytes()
     summary = json.loads((folder / "summary.json").read_text())
     found["summary"] = {key: value for key, value in summary.items() if key not in OF_THE_CLOCK}
@@ -161,16 +157,10 @@ def differences(one: Any, other: Any, path: str = "") -> list[str]:
     if isinstance(one, list | tuple) and isinstance(other, list | tuple):
         if len(one) != len(other):
             return [f"{path}: {len(one)} and {len(other)} items"]
-        return [
-            d
-            for index, pair in enumerate(zip(one, other, strict=True))
-            for d in differences(*pair, f"{path}[{index}]")
-        ]
+        pairs = enumerate(zip(one, other, strict=True))
+        return [each for index, pair in pairs for each in differences(*pair, f"{path}[{index}]")]
     if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
         equal = one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
         return [] if equal else [f"{path}: arrays"]
-    return (
-        []
-        if one == other or (one != one and other != other)
-        else [f"{path}: {str(one)[:50]} and {str(other)[:50]}"]
-    )
+    equal = one == other or (one != one and other != other)
+    return [] if equal else [f"{path}: {str(one)[:50]} and {str(other)[:50]}"]

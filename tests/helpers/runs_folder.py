@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from helpers.support import configure
 
+from gridworld.config.train import TrainConfig
 from gridworld.report import tuning_study as tuning
 from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import read_run
 from gridworld.storage.safe_read import sealed, sha256
 from gridworld.sweep.folder import SweepFolder
-from gridworld.sweep.job_table import FAILED, JobRow, JobTable
 from gridworld.sweep.plan import Job
-from gridworld.tune.study_folder import SEARCH_JSON
+from gridworld.tune.study import SEARCH_JSON
 from gridworld.world.evaluation import Evaluator
 
 _COLUMNS = ("value", "regret", "certified", "goal_probability", "trap_probability", "timeout_probability")
@@ -129,12 +129,13 @@ def write_sweep(folder: Path, run: Path) -> None:
     manifest = read_run(run).manifest
     digest = settings_hash(manifest["config"], "\n".join(manifest["layout"]))
     hashes = {"seed=0": digest, "seed=1": "1" * 32, "seed=2": "2" * 32}
-    jobs = [Job((job,), (job,), hashes[job], None, False) for job in hashes]
+    jobs = [Job((job,), (job,), hashes[job], None, TrainConfig()) for job in hashes]
     with sweep.at_work():
         sweep.add(jobs, ["seed=0,1,2"])
     shutil.copytree(run, folder / "seed=0")
-    table, wrong = JobTable(sweep.path), "agent.learning_rate=12: must be less than 10"
-    table.write(table.inspect(sweep.entries.values(), {"seed=1": JobRow("", "", FAILED, error=wrong)}))
+    (folder / "seed=1").mkdir()
+    (folder / "seed=1" / "error.txt").write_text("agent.learning_rate=12: must be less than 10\n")
+    sweep.write(sweep.rows())
 
 
 def write_study(folder: Path) -> None:

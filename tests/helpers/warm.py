@@ -26,13 +26,13 @@ import threading
 import weakref
 from collections.abc import Callable
 from multiprocessing import process, util
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 import PIL.Image
 import torch
+from helpers.forks import megabytes
 from helpers.quickly import collapse_memory, compose_quickly
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
@@ -83,7 +83,7 @@ def _prepare() -> None:
     console._SECONDS_BETWEEN_LINES = 600.0
     tune_search._SECONDS_BETWEEN_TABLES = 0.3
     if launcher := sys.modules.get("gridworld.sweep.launchers.slurm"):  # it runs here: files are not late
-        vars(launcher).update(_POLL_SECONDS=0.2, _SECONDS_BETWEEN_QUESTIONS=1.0, _FILES_ARRIVE_WITHIN=1.0)
+        vars(launcher).update(_SECONDS_BETWEEN_QUESTIONS=1.0, _FILES_ARRIVE_WITHIN=1.0)
     compose_quickly()
     compose([])
     for file in _CONF.rglob("*.yaml"):
@@ -99,25 +99,10 @@ def _prepare() -> None:
     gc.enable()
 
 
-def run(
-    words: list[str],
-    cwd: str,
-    environment: dict[str, str],
-    out: str,
-    err: "str | Connection[Any, Any]",
-    watched: tuple[str, str] | None,
-) -> NoReturn:
-    """Run a script in this fork; `words` are its command line, `err` is a file or a pipe."""
-    files = [os.open(name, os.O_WRONLY | os.O_CREAT) for name in (out, err) if isinstance(name, str)]
-    os.dup2(files[0], 1)
-    os.dup2(files[1] if isinstance(err, str) else err.fileno(), 2)
-    if not isinstance(err, str):
-        err.close()
-        os.setsid()
-    for file in files:
-        os.close(file)
+def run(words: list[str], cwd: str, environment: dict[str, str], watched: tuple[str, str] | None) -> NoReturn:
+    """Run a script in this fork; `words` are its command line."""
     vars(process).update(_current_process=_MAIN, _parent_process=None)
-    if "tune.py" in words[0] or any(word.endswith("launcher=joblib") for word in words):
+    if any(word.endswith("launcher=joblib") for word in words):
         _keep_workers()
 
     def program() -> None:
@@ -271,11 +256,6 @@ def _watch(cwd: str, secret: str, report: str) -> None:
                 deeds.append(f"{event} {arguments}"[:300])
 
     sys.addaudithook(hook)
-
-
-def megabytes(name: str) -> float:
-    """A number of this process's memory, as /proc has it."""
-    return int(Path("/proc/self/status").read_text().split(f"{name}:")[1].split()[0]) / 1024
 
 
 if process.parent_process() is None:  # in the server, not in one of its forks

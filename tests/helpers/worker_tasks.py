@@ -21,8 +21,3 @@ class Killed:
             (self.folder / f"{self.name}-{marks}").touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return f"{self.name} {ask(self.name)}"
-
-
-def fail(ask: Any) -> None:
-    """A bug."""
-    raise ZeroDivisionError

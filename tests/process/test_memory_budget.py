@@ -12,7 +12,7 @@ from gridworld.commands import evaluate
 from gridworld.errors import InputError
 from gridworld.process import console
 from gridworld.process.console import telling_if_slow
-from gridworld.process.memory_budget import VARIABLE, BudgetError, check_memory, is_limited, limited
+from gridworld.process.user_input import VARIABLE, BudgetError, check_memory, is_limited, limited
 from gridworld.storage.safe_read import as_object, as_table
 from gridworld.storage.serialization import decode, encode
 

@@ -14,13 +14,13 @@ from helpers.support import SHORT, train_in
 
 from gridworld.commands import evaluate, jobs, record, report, reproduce, run
 from gridworld.commands import train as train_command
+from gridworld.config.train import TrainConfig
 from gridworld.process.console import prepare
 from gridworld.report.tables import Table, to_captioned_markdown, to_csv, to_markdown
 from gridworld.report.tuning_study import find_tunings
 from gridworld.storage.safe_read import sealed
 from gridworld.sweep import console
-from gridworld.sweep.folder import SweepFolder
-from gridworld.sweep.job_table import FAILED, JobRow, JobTable
+from gridworld.sweep.folder import FAILED, JobRow, SweepFolder
 from gridworld.sweep.plan import Job
 
 EVIL = "x\x1b[2J\x1b]0;owned\x07\n\r\u202e<b onclick=x>|[a](javascript:x)\udcff"
@@ -98,11 +98,13 @@ def test_names_in_a_study_are_text(tmp_path: Path) -> None:
 def test_what_is_said_of_a_sweeps_jobs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sweep = SweepFolder(tmp_path / EVIL)
     with sweep.at_work():
-        sweep.add([Job((f"env={EVIL}",), (EVIL,), "1" * 32, None, False)], [EVIL])
+        sweep.add([Job((f"env={EVIL}",), (EVIL,), "1" * 32, None, TrainConfig())], [EVIL])
     (entry,) = sweep.entries.values()
-    JobTable(sweep.path).write({entry.job: JobRow(entry.job, EVIL, FAILED, error=EVIL)})
+    (sweep.path / entry.job).mkdir()
+    (sweep.path / entry.job / "error.txt").write_text(EVIL, errors="replace")
     row, total = told(jobs.main, capsys, sweep.path)
-    assert SHOWN in row
+    assert row.isprintable()
+    assert "owned" in row
     assert total == "1 job: 1 failed"
     raw = (sweep.path / "sweep.json").read_text()
     content = json.loads(raw)

@@ -16,7 +16,11 @@ from gridworld.process.processes import LostError, run_in_processes
 
 def run(tasks: Sequence[Callable[[], Any]], count: int = 2, forks: bool = True) -> list[Any]:
     found: dict[int, Any] = {}
-    run_in_processes(tasks, count, forks, lambda number, result: found.update({number: result}))
+    waiting = list(tasks)
+    run_in_processes(
+        lambda: waiting.pop(0) if waiting else None,
+        *(count, forks, lambda task, result: found.update({tasks.index(task): result})),
+    )
     return [found[number] for number in range(len(tasks))]
 
 

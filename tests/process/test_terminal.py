@@ -1,6 +1,5 @@
 """What commands print: columns in line, whatever numbers are in them, and nothing that acts on a terminal."""
 
-import dataclasses
 import json
 import re
 from pathlib import Path
@@ -13,7 +12,8 @@ from gridworld.commands import jobs as jobs_command
 from gridworld.process.console import aligned, printable
 from gridworld.run.summary import summary_text
 from gridworld.storage.safe_read import sealed
-from gridworld.sweep.job_table import JobRow, JobTable
+from gridworld.sweep import folder
+from gridworld.sweep.folder import JobRow
 
 WORDS = st.text("ab-.0", min_size=1, max_size=30)
 USUAL = {
@@ -84,9 +84,7 @@ def test_the_list_of_a_sweeps_jobs(
     jobs = [{"job": row.job, "hash": row.job, "overrides": []} for row in rows]
     (tmp_path / "sweep.json").write_text(json.dumps(sealed({"asked": [{"overrides": []}], "jobs": jobs})))
     told = {row.job: row for row in rows}
-    monkeypatch.setattr(
-        JobTable, "_inspect", lambda self, entry, before: dataclasses.replace(told[entry.job])
-    )
+    monkeypatch.setattr(folder, "job_row", lambda path, entry: told[path.name])
     jobs_command.main([str(tmp_path)])
     assert capsys.readouterr().out.splitlines() == [
         "seed=0            interrupted 12345678.90 s  it was stopped",

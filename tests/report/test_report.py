@@ -3,12 +3,11 @@
 import csv
 import itertools
 import json
+import logging
 import math
 import os
 import re
-import shutil
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -18,7 +17,7 @@ import numpy as np
 import pytest
 from helpers.hostile import seal
 from helpers.runs_folder import Maker, sweep, write_study
-from helpers.support import SHORT, script, train_in
+from helpers.support import train_in
 from matplotlib.colors import to_rgba
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -51,7 +50,6 @@ from gridworld.storage.safe_read import sealed
 from gridworld.world.evaluation import Evaluator
 
 FORMATS = ("png", "pdf", "svg")  # more words of `--formats`
-NO_CACHE = {"MPLCONFIGDIR": "/proc/nowhere"}  # what matplotlib has to say of that is not for the user
 
 
 @pytest.fixture(scope="module")
@@ -113,23 +111,22 @@ def figures_of(task: TaskAnalysis) -> dict[str, Chart]:
 
 
 def test_real_runs_are_reported(tmp_path: Path) -> None:
+    short = ("agent=q_learning", "total_timesteps=200", "evaluation.every=100", "recording.frames=false")
     for seed in (0, 1):
-        train_in(tmp_path / "runs" / f"dqn{seed}", *SHORT["dqn"], f"seed={seed}")
+        train_in(tmp_path / "runs" / f"{seed}", *short, f"seed={seed}")
     folder = report_of(tmp_path / "runs")
     (result,) = rows_of(folder / "tables" / "results.csv")
-    assert (result["task"], result["agent"], result["seeds certified of"]) == ("classic", "dqn", "2")
+    assert (result["task"], result["agent"], result["seeds certified of"]) == ("classic", "q_learning", "2")
     assert result["why not"] == "too few steps (2 of 2)"
-    runs = {(row["agent"], row["seed"]): row for row in rows_of(folder / "tables" / "runs.csv")}
-    for agent, seed in runs:
-        summary = json.loads((tmp_path / "runs" / f"{agent}{seed}" / "summary.json").read_text())
-        row = runs[agent, seed]
+    for row in rows_of(folder / "tables" / "runs.csv"):
+        summary = json.loads((tmp_path / "runs" / row["seed"] / "summary.json").read_text())
         assert float(row["regret"]) == pytest.approx(summary["regret"])
         assert row["first certificate"] == str(summary["first_certified_step"] or "")
     page = (folder / "report.html").read_text()
     assert page.count('src="data:image/png;base64,') == 3  # the maps of the median seed
     why = rows_of(folder / "tables" / "not_certified.csv")
-    assert {(row["agent"], row["seed"]) for row in why} == set(runs)
-    assert all(int(row["to try"].removeprefix("total_timesteps=")) >= 20000 for row in why)
+    assert {row["seed"] for row in why} == {"0", "1"}
+    assert all(int(row["to try"].removeprefix("total_timesteps=")) >= 2000 for row in why)
     assert "Why runs are not certified" in page
 
 
@@ -148,13 +145,13 @@ def test_reasons_are_asked_of_each_cell_before_the_second_of_any(maker: Maker, t
 
     found, problems = reasons(report.study.groups, ask, 5)
     assert problems == [f"{tmp_path / 'a2'}: is not diagnosed; a2/visits.npy: is another"]
-    assert sorted(asked[:2]) == ["a1", "b0"]
-    assert sorted(asked) == ["a1", "a2", "b0", "b1", "b2"]
+    assert (sorted(asked[:2]), sorted(asked)) == (["a1", "b0"], ["a1", "a2", "b0", "b1", "b2"])
     table = tables.results_table(report.tasks, found)
-    assert table.columns[-1] == "why not"
-    assert [row[-1] for row in table.rows] == ["cause True (2 of 2)", "cause False (1 of 1)"]
+    assert (table.columns[-1], [row[-1] for row in table.rows]) == (
+        "why not",
+        ["cause True (2 of 2)", "cause False (1 of 1)"],
+    )
     assert "; 4 more were not looked into" in tables.reasons_table(report.study, found).caption
-    assert "why not" not in tables.results_table(report.tasks, {}).columns
 
 
 def test_runs_that_differ_are_reported_apart_and_the_report_says_so(tmp_path: Path) -> None:
@@ -236,12 +233,11 @@ def test_an_endless_walk_that_costs_infinitely_much_is_shown(tmp_path: Path) -> 
 
 
 def test_agents_are_compared_on_each_task_and_on_those_that_they_share(study: Report) -> None:
-    assert set(group_sizes(study).values()) == {4, 5}
+    assert {len(group.runs) for group in study.study.groups} == {4, 5}
     of_tasks = {task.task: task.comparisons for task in study.tasks}
     assert of_tasks["cliff"]["online_return_end", "sarsa", "q_learning"].point == 1.0
     assert of_tasks["cliff"]["online_return_end", "q_learning", "sarsa"].point == 0.0
     q_learning, sarsa = next(task.results for task in study.tasks if task.task == "cliff")
-    assert sarsa.online is not None
     assert (q_learning.certified.count, sarsa.certified.count) == (5, 0)
     assert q_learning.estimates["online_return", "mean"].high < sarsa.estimates["online_return", "mean"].low
     assert study.overall is not None
@@ -261,10 +257,8 @@ def test_the_last_observation_is_carried_forward(maker: Maker, tmp_path: Path) -
     assert on_grid(run, "regret", grid).tolist() == run.curve["regret"][newest].tolist()
     assert math.isnan(online_return(run))
     maker.write(tmp_path / "long", 1, 9000)
-    (task,) = gather([tmp_path]).tasks
-    band = task.results[0].regret
-    assert band.whole_until == 5000  # beyond, the short run only keeps its last value
-    assert band.steps[-1] == 20000
+    band = gather([tmp_path]).tasks[0].results[0].regret
+    assert (band.whole_until, band.steps[-1]) == (5000, 20000)  # beyond, the short run keeps its last value
 
 
 # ---- bad input -----------------------------------------------------------------------------------------
@@ -349,22 +343,26 @@ def test_two_runs_of_one_seed_are_counted_once(
     assert [row["folder"] for row in rows_of(folder / "tables" / "runs.csv")] == [str(tmp_path / "first")]
 
 
-def test_paths_without_runs(maker: Maker, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "file.txt").write_text("S.G")
-    maker.write(tmp_path / "runs" / "one", 0, 3000)
-    for name, words in (
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
         ("empty", "holds no run, there is no manifest.json in it or below it"),
         ("file.txt", "is a file; give the folder of a run"),
         ("missing", "no such folder; give the folder of a run"),
-    ):
-        options = ("--out", str(tmp_path / "out"))
-        with pytest.raises(InputError, match=f"^nothing to report: {tmp_path / name}: {words}"):
-            command.main([str(tmp_path / name), *options])
-        assert not (tmp_path / "out").exists()
-        report_of(tmp_path / "runs", tmp_path / name, code=1, options=options)
-        assert f"{tmp_path / name}: {words}" in capsys.readouterr().err
-        shutil.rmtree(tmp_path / "out")
+    ],
+)
+def test_paths_without_runs(
+    name: str, words: str, maker: Maker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file.txt").write_text("S.G")
+    maker.write(tmp_path / "runs" / "one", 0, 3000)
+    options = ("--out", str(tmp_path / "out"))
+    with pytest.raises(InputError, match=f"^nothing to report: {tmp_path / name}: {words}"):
+        command.main([str(tmp_path / name), *options])
+    assert not (tmp_path / "out").exists()
+    report_of(tmp_path / "runs", tmp_path / name, code=1, options=options)
+    assert f"{tmp_path / name}: {words}" in capsys.readouterr().err
 
 
 def test_a_link_that_is_named_is_followed_and_others_are_not(maker: Maker, tmp_path: Path) -> None:
@@ -376,16 +374,14 @@ def test_a_link_that_is_named_is_followed_and_others_are_not(maker: Maker, tmp_p
     (tmp_path / "linked").symlink_to(tmp_path / "runs")
     for paths in ([tmp_path / "linked"], [tmp_path / "runs", run], [run, tmp_path / "linked"]):
         report = gather(paths)
-        assert [found.seed for group in report.study.groups for found in group.runs] == [0]
+        assert [found.seed for found in report.runs] == [0]
         assert not report.sentences()
-    assert len(gather([tmp_path / "runs" / "mine"]).study.groups[0].runs) == 1
+    assert len(gather([tmp_path / "runs" / "mine"]).runs) == 1
     for study in ("mine", "runs/deep"):
         (tmp_path / study / "study.json").write_text("{}")
     _, problems = find_tunings([tmp_path / "runs", tmp_path / "runs" / "mine"])
-    assert [problem.split("/study.json: has format None")[0] for problem in problems] == [
-        str(tmp_path / "runs" / "deep"),
-        str(tmp_path / "runs" / "mine"),
-    ]
+    named = [problem.split("/study.json: has format None")[0] for problem in problems]
+    assert named == [str(tmp_path / "runs" / name) for name in ("deep", "mine")]
 
 
 def test_a_search_for_runs_ends_and_names_what_may_not_be_read(
@@ -413,8 +409,9 @@ def test_a_search_for_runs_ends_and_names_what_may_not_be_read(
 # ---- figures -------------------------------------------------------------------------------------------
 
 
-def test_swept_settings_are_a_line_or_a_heatmap_and_the_opening_is_short(tmp_path: Path) -> None:
-    maker = Maker("agent=ppo")
+def test_swept_settings_are_a_line_or_a_heatmap_and_the_opening_is_short(
+    maker: Maker, tmp_path: Path
+) -> None:
     for rate, depth, seed in itertools.product((0.01, 0.002, 0.1), (3, 10, 20), (0, 1)):
         at = math.inf if rate == 0.1 else 1000 * depth * (1 + seed)
         name = f"{rate} {depth} {seed}"
@@ -425,8 +422,7 @@ def test_swept_settings_are_a_line_or_a_heatmap_and_the_opening_is_short(tmp_pat
     assert swept.keys == ("agent.learning_rate", "agent.n_epochs")
     assert swept.values == (("0.002", "0.01", "0.1"), ("3", "10", "20"))
     assert swept.results["0.002", "20"].group.agent == "ppo (learning_rate=0.002, n_epochs=20)"
-    drawn = figures_of(task)
-    keys = "learning_rate and n_epochs"
+    drawn, keys = figures_of(task), "learning_rate and n_epochs"
     words = [text.get_text() for text in drawn[f"classic ppo certified by {keys}"].figure.axes[0].texts]
     # With 3 and 10 epochs at the two smaller rates; with 20, one seed at step 20,000, the other not.
     assert [words.count(f"{count}/2") for count in (2, 0, 1)] == [4, 3, 2]
@@ -435,35 +431,34 @@ def test_swept_settings_are_a_line_or_a_heatmap_and_the_opening_is_short(tmp_pat
     assert cells.count(to_rgba("#c6c6c6")) == 5  # half of their seeds or more are never certified
     assert len(set(cells)) == 3  # 3 epochs, 10, never: the worst finite number has another colour
     assert drawn[f"classic ppo steps by {keys}"].caption.endswith("grey cells have no finite value.")
-    assert "grey" not in drawn[f"classic ppo regret by {keys}"].caption
     assert "the 7 best of 9" in drawn["classic regret"].caption
     (only,) = sweeps([result for result in task.results if "n_epochs=3)" in result.group.agent])
-    assert only.keys == ("agent.learning_rate",)
     assert next(sweep_charts(only, "classic")).title == "Seeds certified by learning_rate"
     assert not list(sweep_charts(replace(swept, keys=(*swept.keys, "agent.gamma")), "classic"))
     assert not sweeps(task.results[:2])  # two are a comparison
-    drawn_page = render(report, {task.task: [], "": []})
-    opening = drawn_page[drawn_page.index("<header>") : drawn_page.index('<section id="task-1"')]
-    assert "18 runs, 1 agent, 9 configurations, 1 task" in opening
-    assert "4 of 9 configurations of ppo are certified optimal on all of their seeds; 3 on none" in opening
-    assert "<title>9 agents on classic, gridworld</title>" in drawn_page
-    assert '<th scope="col">ppo (learning_<wbr>rate=<wbr>0.1, n_<wbr>epochs=<wbr>3)</th>' in drawn_page
+    page = render(report, {task.task: [], "": []})
+    for words in (
+        "18 runs, 1 agent, 9 configurations, 1 task",
+        "4 of 9 configurations of ppo are certified optimal on all of their seeds; 3 on none",
+        "<title>9 agents on classic, gridworld</title>",
+        '<th scope="col">ppo (learning_<wbr>rate=<wbr>0.1, n_<wbr>epochs=<wbr>3)</th>',
+    ):
+        assert words in page
 
 
 def test_steps_are_logarithmic_where_one_agent_is_ten_times_slower(maker: Maker, tmp_path: Path) -> None:
-    for seed in (0, 1):
-        maker.write(tmp_path / f"fast{seed}", seed, 1000, agent__name="fast")
-        maker.write(tmp_path / f"slow{seed}", seed, 9000, agent__name="slow")
-    (task,) = gather([tmp_path]).tasks
-    assert not task.log_steps
-    assert figures_of(task)["classic certified"].figure.axes[0].get_xscale() == "linear"
-    (task,) = gather([tmp_path], log_steps=True).tasks
-    assert figures_of(task)["classic certified"].figure.axes[0].get_xscale() == "log"
-    for seed in (0, 1):
-        maker.write(tmp_path / f"slower{seed}", seed, 10_000, agent__name="slower")
-    (task,) = gather([tmp_path]).tasks
-    assert task.log_steps
-    steps = task.results[0].regret.steps
+    def scale(**options: bool) -> str:
+        (task,) = gather([tmp_path], **options).tasks
+        drawn = figures_of(task)["classic certified"].figure.axes[0].get_xscale()
+        assert (drawn == "log") == task.log_steps
+        return str(drawn)
+
+    for name, at in (("fast", 1000), ("slow", 9000)):
+        maker.write(tmp_path / name, 0, at, agent__name=name)
+    assert (scale(), scale(log_steps=True)) == ("linear", "log")
+    maker.write(tmp_path / "slower", 0, 10_000, agent__name="slower")
+    assert scale() == "log"
+    steps = gather([tmp_path]).tasks[0].results[0].regret.steps
     assert (steps[0], steps[-1]) == (0, 20000)
     assert (np.diff(np.log(steps[1:])) < 0.16).all()  # as fine at the beginning as at the end
 
@@ -479,18 +474,16 @@ def test_no_figure_has_only_zeros_and_labels_are_whole(maker: Maker, tmp_path: P
     drawn = figures_of(task)  # nobody is ever certified
     assert set(drawn) == {"classic regret", "classic final regret", "classic steps to the first certificate"}
     assert "ppo (gamma=0.9, learning_rate=0.3, total_timesteps=1000)" in agents
-    axes = drawn["classic final regret"].figure.axes[0]
-    assert {label.get_text().replace("\n", " ") for label in axes.get_yticklabels()} == agents
-    legends = [
-        text.get_text() for each in drawn["classic regret"].figure.legends for text in each.get_texts()
-    ]
-    assert agents <= {text.replace("\n", " ") for text in legends}
+
+    def rows(chart: Chart) -> set[str]:
+        return {each.get_text().replace("\n", " ") for each in chart.figure.axes[0].get_yticklabels()}
+
+    assert rows(drawn["classic final regret"]) == agents
     assert drawn["classic regret"].caption.endswith("exact; one seed, so no interval; 0 is optimal.")
     pairs = {("regret", "dqn", agent): Interval(0.9, 0.8, 1) for agent in agents - {"dqn"}}
     look = styles(sorted(agents))
     _, improvement = overall_charts(Overall(2, {}, pairs, np.linspace(0, 1, 5), {}), look)
-    rows = {label.get_text().replace("\n", " ") for label in improvement.figure.axes[0].get_yticklabels()}
-    assert rows == {f"dqn > {agent}" for agent in agents - {"dqn"}}
+    assert rows(improvement) == {f"dqn > {agent}" for agent in agents - {"dqn"}}
     assert short_names(["ppo (a=1)", "ppo (a=2)"], 25) == ["a=1", "a=2"]
     assert short_names(["ppo (a=1)", "dqn"], 25) == ["ppo (a=1)", "dqn"]
     assert short_names(["_" * 600], 25)[0].count("\n") == 5
@@ -507,7 +500,7 @@ NAMES = (
 )
 
 
-@pytest.mark.parametrize("names", [NAMES[:3], NAMES[3:6], NAMES[6:]], ids=ascii)
+@pytest.mark.parametrize("names", [NAMES[:3], NAMES[3:6], NAMES[6:]], ids=range(3))
 def test_names_in_figures_are_text(names: tuple[str, ...], study: Report) -> None:
     task = study.tasks[0]
     named = [
@@ -516,9 +509,9 @@ def test_names_in_figures_are_text(names: tuple[str, ...], study: Report) -> Non
     ]
     charts = list(task_charts(replace(task, results=tuple(named), task=names[-1]), styles(names)))
     assert len(charts) == 4
+    assert charts[0].saved_as("png").startswith(b"\x89PNG")
+    assert charts[0].saved_as("pdf").startswith(b"%PDF-")
     for chart in charts:
-        assert chart.saved_as("png").startswith(b"\x89PNG")
-        assert chart.saved_as("pdf").startswith(b"%PDF-")
         svg = chart.saved_as("svg").decode()
         tags = ElementTree.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")
         found = [each.text or "" for each in tags]
@@ -542,41 +535,22 @@ def test_a_users_matplotlib_settings_do_not_matter(study: Report) -> None:
 # ---- what is written -----------------------------------------------------------------------------------
 
 
-class Links(HTMLParser):
-    """Everything that a page would fetch or lead to, and whether its tags are closed."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: list[str] = []
-        self.open: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        assert tag not in ("script", "link", "iframe", "object", "embed", "base")
-        self.found += [value or "" for name, value in attrs if name in ("src", "href", "srcset")]
-        assert not [name for name, _ in attrs if name.startswith("on")]
-        if tag not in ("meta", "wbr", "img", "br", "hr", "input"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-
 def test_the_page_needs_nothing_else(written: Path) -> None:
     page = (written / "report.html").read_text()
-    links = Links()
-    links.feed(page)
-    assert not links.open
-    assert all(link.startswith(("#", "data:image/svg+xml;base64,")) for link in links.found)
-    assert page.count('class="chart"') == 2 * 4 + 7 + 3  # over all tasks, a profile and two metrics
-    for anchor in (link[1:] for link in links.found if link.startswith("#")):
+    assert not re.search(r"<(script|link|iframe|object|embed|base)\b|\son\w+=|url\(|@import|https?://", page)
+    links = re.findall(r'(?:src|href|srcset)="([^"]*)"', page)
+    assert all(link.startswith(("#", "data:image/svg+xml;base64,")) for link in links)
+    for anchor in (link[1:] for link in links if link.startswith("#")):
         assert f'id="{anchor}"' in page
-    assert not re.search(r"url\(|@import|https?://", page)
+    for tag in ("section", "table", "tr", "td", "figure", "details", "div", "p", "ul", "li", "span"):
+        assert len(re.findall(f"<{tag}[ >]", page)) == page.count(f"</{tag}>")
+    assert page.count('class="chart"') == 2 * 4 + 7 + 3  # over all tasks, a profile and two metrics
     for words in ("Statistical Precipice", "Interquartile mean", "Mann", "Wilson", "training diverged"):
         assert words in page
 
 
 def test_figures_and_tables_are_files_too(written: Path) -> None:
-    figures = sorted((written / "figures").iterdir())
+    figures, of_tables = (sorted((written / name).iterdir()) for name in ("figures", "tables"))
     names = {path.stem for path in figures}
     assert {"classic_regret", "cliff_on-line_return", "all_tasks_profiles"} <= names
     assert not [name for name in names if " " in name]
@@ -594,16 +568,12 @@ def test_figures_and_tables_are_files_too(written: Path) -> None:
             root = ElementTree.fromstring(content)
             assert root.get("width") == "440pt"
             assert "on classic" in "".join(root.itertext()) or "classic" not in path.stem
-    names = {path.stem for path in (written / "tables").iterdir()}
-    assert {path.name for path in (written / "tables").iterdir()} == {
-        f"{name}.{kind}" for name in names for kind in ("csv", "md")
+    assert {path.name for path in of_tables} == {
+        f"{path.stem}.{kind}" for path in of_tables for kind in ("csv", "md")
     }
-    header = (written / "tables" / "results.csv").read_text().splitlines()[0].split(",")
-    text = (written / "tables" / "results.md").read_text()
-    assert header[:6] == ["task", "agent", "seeds certified"] + [
-        f"seeds certified {part}" for part in ("of", "low", "high")
-    ]
-    assert "| classic | dqn | 5 / 5 [57 %, 100 %] |" in text
+    header = (written / "tables" / "results.csv").read_text().splitlines()[0]
+    assert header.startswith("task,agent,seeds certified,seeds certified of,seeds certified low,seeds certif")
+    assert "| classic | dqn | 5 / 5 [57 %, 100 %] |" in (written / "tables" / "results.md").read_text()
 
 
 def test_the_same_runs_give_the_same_bytes(written: Path, study: Report) -> None:
@@ -651,40 +621,22 @@ def test_a_studys_page_has_its_own_title_and_explains_its_medians(maker: Maker, 
     assert "<h1>Which agent solves which task</h1>" in render(report, charts(report))
 
 
-def test_names_out_of_a_folder_stay_text(maker: Maker, tmp_path: Path) -> None:
-    name = "<script>alert(1)</script>|`../../x"
-    for seed in (0, 1):
-        maker.write(tmp_path / str(seed), seed, 3000, agent__name=name)
-    folder = report_of(tmp_path)
-    page = (folder / "report.html").read_text()
-    assert "<script" not in page
-    assert "&lt;script&gt;alert(1)" in page
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["0", "1", "report"]
-    table = (folder / "tables" / "results.md").read_text().splitlines()
-    assert {len(re.findall(r"(?<!\\)\|", line)) for line in table[2:]} == {7}
-
-
 def test_a_readmes_table_is_replaced(maker: Maker, tmp_path: Path) -> None:
     maker.write(tmp_path / "runs" / "one", 0, 3000)
     readme = tmp_path / "README.md"
     readme.write_text(f"before\n\n{MARKERS[0]}\nold\n{MARKERS[1]}\n\nafter\n")
     report_of(tmp_path / "runs", options=("--readme", str(readme)))
-    lines = readme.read_text().splitlines()
-    assert lines[:3] == ["before", "", MARKERS[0]]
-    assert lines[3].startswith("| task | agent | seeds certified |")
-    assert lines[5].startswith("| classic | ppo | 1 / 1 ")
-    assert lines[6:] == [MARKERS[1], "", "after"]
     once = readme.read_text()
+    assert once.startswith(f"before\n\n{MARKERS[0]}\n| task | agent | seeds certified |")
+    assert "\n| classic | ppo | 1 / 1 " in once
+    assert once.endswith(f" |\n{MARKERS[1]}\n\nafter\n")
     report_of(tmp_path / "runs", options=("--readme", str(readme)))
     assert readme.read_text() == once
-
-    shutil.rmtree(tmp_path / "runs" / "report")
     for text in ("no markers", MARKERS[0], f"{MARKERS[1]}{MARKERS[0]}", f"{once}{once}"):
         readme.write_text(text)
         with pytest.raises(InputError, match="must have one line <!-- results --> and, after it"):
             command.main([str(tmp_path / "runs"), "--readme", str(readme)])
         assert readme.read_text() == text
-        assert not (tmp_path / "runs" / "report").exists()
     with pytest.raises(InputError, match="no such file"):
         command.main([str(tmp_path / "runs"), "--readme", str(tmp_path / "missing.md")])
 
@@ -706,18 +658,14 @@ def test_only_a_report_is_replaced(
     with pytest.raises(SystemExit):
         command.main([str(tmp_path), "--seed", "-1"])
     assert "--seed: -1: must be at least 0" in capsys.readouterr().err
-    maker.write(tmp_path / "runs" / "one", 0, 3000)
-    monkeypatch.setattr(command.webbrowser, "open", lambda uri: False)
-    report_of(tmp_path / "runs", options=("--open",))
-    assert "--open: there is no browser here; open" in capsys.readouterr().err
-
-
-def test_the_script(maker: Maker, tmp_path: Path) -> None:
     for folder in ("a", "b"):
         maker.write(tmp_path / folder / "one", ord(folder), 3000)
-    words = ("report.py", "a", "b", "--open", "--formats")
-    done = script(*words, cwd=tmp_path, BROWSER="true %s", DISPLAY="", **NO_CACHE)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "runs/report/report.html\n", "")
+    monkeypatch.chdir(tmp_path)  # of two folders the report is in neither
+    monkeypatch.setattr(command.webbrowser, "open", lambda uri: not uri.endswith("runs/report/report.html"))
+    command.main(["a", "b", "--open", "--formats"])
+    told = capsys.readouterr()
+    assert (told.out, told.err[:35]) == ("runs/report/report.html\n", "--open: there is no browser here; o")
+    assert logging.getLogger("matplotlib").handlers  # it says nothing on standard error
 
 
 def test_pictures_are_embedded_within_bounds(maker: Maker, tmp_path: Path) -> None:

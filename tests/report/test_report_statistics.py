@@ -1,6 +1,7 @@
 """The report's statistics against naive computation and known numbers."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -46,19 +47,55 @@ def test_infinity_is_a_number_like_any_other() -> None:
     assert (nowhere.point, nowhere.low, nowhere.high) == (inf, inf, inf)
 
 
+def scipys(samples: list, statistic: Callable, resamples: int = statistics.RESAMPLES) -> list:
+    """Point and bounds by `scipy.stats.bootstrap`, from the same draws."""
+    options = {"n_resamples": resamples, "axis": -1, "method": "percentile"}
+    seen = bootstrap(samples, statistic, **options, rng=np.random.default_rng(5))
+    return [statistic(*samples), *seen.confidence_interval]
+
+
 def test_intervals_are_those_of_scipy() -> None:
-    chance = np.random.default_rng(3)
-    tasks = [chance.normal(size=(7, 9)), chance.normal(size=(7, 6))]
+    rng = np.random.default_rng(3)
+    tasks = [rng.normal(size=(7, 9)), rng.normal(size=(7, 6))]
 
     def theirs(*drawn: np.ndarray, axis: int = -1) -> np.ndarray:
         return np.asarray(trim_mean(np.concatenate(drawn, axis=axis), 0.25, axis=axis))
 
-    answer = bootstrap(
-        tasks, theirs, n_resamples=400, axis=-1, method="percentile", rng=np.random.default_rng(5)
-    ).confidence_interval
-    point, low, high = bands(iqm, tasks, 5, resamples=400)
-    np.testing.assert_allclose(point, theirs(*tasks), rtol=1e-13)
-    np.testing.assert_allclose([low, high], [answer.low, answer.high], rtol=1e-13)
+    np.testing.assert_allclose(bands(iqm, tasks, 5, resamples=400), scipys(tasks, theirs, 400), rtol=1e-13)
+
+
+def test_improvement_over_tasks_is_a_stratified_bootstrap(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As rliable's: runs of either agent are drawn anew within each task."""
+    rng = np.random.default_rng(2)
+    sizes = ((6, 8), (5, 4), (9, 3))
+    samples = [rng.integers(0, 6, size).astype(float) + 3 * k for k, two in enumerate(sizes) for size in two]
+
+    def probability(*drawn: np.ndarray, axis: int = -1) -> np.ndarray:
+        of_pairs = [(x[..., :, None], y[..., None, :]) for x, y in zip(drawn[::2], drawn[1::2], strict=True)]
+        return np.mean([((x > y) + 0.5 * (x == y)).mean(axis=(-2, -1)) for x, y in of_pairs], axis=0)
+
+    pairs = list(zip(samples[::2], samples[1::2], strict=True))
+    told = improvement(pairs, 5)
+    theirs = scipys(samples, probability)
+    assert [told.point, told.low, told.high] == pytest.approx(theirs, rel=1e-12)
+    monkeypatch.setattr(statistics, "_LARGEST_BATCH", 1000)  # in many batches: other draws
+    parts = improvement(pairs, 5)
+    assert [parts.point, parts.low, parts.high] == pytest.approx(theirs, abs=0.03)
+
+
+def test_a_profile_is_the_mean_share_of_runs_above_each_level_with_a_stratified_bootstrap() -> None:
+    rng = np.random.default_rng(4)
+    tasks = [rng.random(7).round(2), 0.5 + 0.5 * rng.random(12).round(2)]
+    levels = np.array([-0.1, 0.25, float(np.median(tasks[0])), 0.75, 1.0])  # one of them is a score
+
+    def shares(*above: np.ndarray, axis: int = -1) -> np.ndarray:
+        return np.mean([each.mean(axis=axis) for each in above], axis=0)
+
+    found = profile(tasks, levels, 5)
+    above = [(task > levels[:, None]).astype(float) for task in tasks]
+    np.testing.assert_allclose(found, scipys(above, shares), rtol=1e-12)
+    assert [each[0] for each in found] == [1, 1, 1]
+    assert found[0][-1] == 0
 
 
 def test_the_bootstrap_is_stratified_and_one_run_has_no_interval() -> None:
@@ -86,55 +123,6 @@ def test_improvement_without_anything_to_draw_is_exact() -> None:
     never = np.array([-math.inf, -math.inf])
     assert improvement([(never, never)], 0).point == 0.5
     assert improvement([(np.array([-5.0, -7.0]), never)], 0).point == 1.0
-
-
-def resampled(rng: np.random.Generator, sample: list[float]) -> list[float]:
-    return [sample[rng.integers(len(sample))] for _ in sample]
-
-
-def test_improvement_over_tasks_is_a_stratified_bootstrap(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As rliable's: runs of either agent are drawn anew within each task; here in plain loops."""
-    rng = np.random.default_rng(2)
-    sizes = ((6, 8), (5, 4), (9, 3))
-    tasks = [[rng.integers(0, 6, size).astype(float) + 3 * k for size in two] for k, two in enumerate(sizes)]
-
-    def probability(pairs: list[list[list[float]]]) -> float:
-        shares = []
-        for xs, ys in pairs:
-            won = sum(1.0 if x > y else 0.5 if x == y else 0.0 for x in xs for y in ys)
-            shares.append(won / (len(xs) * len(ys)))
-        return sum(shares) / len(shares)
-
-    plain = [[list(map(float, sample)) for sample in pair] for pair in tasks]
-    pairs = [(first, second) for first, second in tasks]
-    told = improvement(pairs, 0)
-    assert told.point == pytest.approx(probability(plain))
-    draws = [probability([[resampled(rng, each) for each in pair] for pair in plain]) for _ in range(2000)]
-    assert [told.low, told.high] == pytest.approx(np.quantile(draws, [0.025, 0.975]), abs=0.02)
-    monkeypatch.setattr(statistics, "_LARGEST_BATCH", 1000)  # in many batches: other draws
-    parts = improvement(pairs, 0)
-    assert parts.point == told.point
-    assert [parts.low, parts.high] == pytest.approx([told.low, told.high], abs=0.03)
-
-
-def test_a_profile_is_the_mean_share_of_runs_above_each_level_with_a_stratified_bootstrap() -> None:
-    rng = np.random.default_rng(4)
-    tasks = [rng.random(7).round(2), 0.5 + 0.5 * rng.random(12).round(2)]
-    levels = np.array([-0.1, 0.25, float(np.median(tasks[0])), 0.75, 1.0])  # one of them is a score
-
-    def shares(samples: list[list[float]]) -> list[float]:
-        above = [[sum(score > level for score in each) / len(each) for each in samples] for level in levels]
-        return [sum(each) / len(each) for each in above]
-
-    point, low, high = profile(tasks, levels, 0)
-    plain = [each.tolist() for each in tasks]
-    assert point.tolist() == pytest.approx(shares(plain))
-    assert (point[0], low[0], high[0], point[-1]) == (1, 1, 1, 0)
-    assert (np.diff(point) <= 0).all()
-    draws = [shares([resampled(rng, each) for each in plain]) for _ in range(2000)]
-    lows, highs = np.quantile(draws, [0.025, 0.975], axis=0)
-    assert low == pytest.approx(lows, abs=0.03)
-    assert high == pytest.approx(highs, abs=0.03)
 
 
 def test_wilsons_interval_is_that_of_scipy() -> None:

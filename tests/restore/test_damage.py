@@ -37,9 +37,8 @@ from gridworld.run.reader import read_run
 from gridworld.storage.safe_read import sealed
 from gridworld.storage.serialization import decode, encode
 from gridworld.sweep.folder import SweepFolder
-from gridworld.sweep.job_table import JobTable
 from gridworld.tune.confirmation import certified_since
-from gridworld.tune.study_folder import is_claimed
+from gridworld.tune.study import is_claimed
 
 Telling = Callable[[Path], str]  # all that a command makes of a folder; raises `InputError`
 
@@ -88,8 +87,7 @@ def confirmed(folder: Path) -> str:
 
 
 def listed(folder: Path) -> str:
-    table, sweep = JobTable(folder / "sweep"), SweepFolder(folder / "sweep")
-    rows = table.inspect(sweep.entries.values(), {}).values()
+    rows = SweepFolder(folder / "sweep").rows().values()
     if any("changed" in row.error for row in rows):
         raise InputError(str(rows))
     return str(rows)
@@ -162,25 +160,6 @@ def places(raw: bytes) -> list[int]:
     return found if raw.isascii() else list(range(len(raw)))
 
 
-def test_what_the_table_alone_says_is_told_as_such(
-    good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Nobody else knows of a job that never came to a manifest; all other rows are those of their runs."""
-    shutil.copytree(good / "sweep", tmp_path / "sweep")
-    jobs_command.main([str(tmp_path / "sweep")])
-    before = capsys.readouterr().out.splitlines()
-    assert [line for line in before if line.endswith("(says jobs.csv alone)")] == [before[1]]
-    raw = (tmp_path / "sweep" / "jobs.csv").read_bytes()
-    for place in places(raw):
-        changed = bytearray(raw)
-        changed[place] = ord("5") if raw[place] != ord("5") else ord("6")
-        (tmp_path / "sweep" / "jobs.csv").write_bytes(changed)
-        jobs_command.main([str(tmp_path / "sweep")])
-        after = capsys.readouterr().out.splitlines()
-        assert after[0::2] == before[0::2] or "pending" in after[1], raw[place - 20 : place + 20]
-        assert "alone" in after[1] or "pending" in after[1]
-
-
 @pytest.mark.parametrize("format", [0, 3, "2", None, True, 1])
 def test_a_format_that_is_not_the_seals_is_told(format: Any, good: Path, tmp_path: Path) -> None:
     shutil.copytree(good / "run", tmp_path / "run")
@@ -243,10 +222,10 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda sweep: in_json(sweep / "sweep.json", jobs=[JOB, JOB | {"hash": "2"}]),
         r"error: .*sweep.json: damaged \(two jobs have one folder, or one hash\)",
     ),
-    "jobs.csv is a pipe": (lambda sweep: pipe(sweep / "jobs.csv"), "3 jobs: 2 pending, 1 done"),
+    "jobs.csv is a pipe": (lambda sweep: pipe(sweep / "jobs.csv"), "3 jobs: 1 pending, 1 done, 1 failed"),
     "jobs.csv is huge": (
         lambda sweep: (sweep / "jobs.csv").write_text('job,overrides\n"' + 10**6 * "x"),
-        "3 jobs: 2 pending, 1 done",
+        "3 jobs: 1 pending, 1 done, 1 failed",
     ),
     "summary.json is a pipe": (
         lambda sweep: pipe(sweep / "seed=0" / "summary.json"),

@@ -21,7 +21,7 @@ CASES = {
     ],
     "dqn stock that stores an observation once": [
         *(*SHORT["dqn"], "agent.engine=stock", "n_envs=8", "agent.optimize_memory_usage=true"),
-        "+agent.replay_buffer_kwargs.handle_timeout_termination=false",
+        *("+agent.replay_buffer_kwargs.handle_timeout_termination=false", "agent.gradient_steps=4"),
     ],
     "ppo": [
         *SHORT["ppo"],

@@ -25,7 +25,7 @@ from gridworld.storage.atomic_write import AppendLog
 from gridworld.training import session
 from gridworld.training.pictures import Pictures
 
-KILLS = int(os.environ.get("GRIDWORLD_RUN_KILLS", "30"))
+KILLS = int(os.environ.get("GRIDWORLD_RUN_KILLS", "20"))
 ROUNDS = int(os.environ.get("GRIDWORLD_POINT_KILLS", "1"))
 LESS = ["recording.frames=false", "recording.gif=false", "logging.progress=false", "checkpoint.every=100"]
 RUNS = {

@@ -1,6 +1,7 @@
 """No cell of a CSV file is a formula, and a text is read as it was written."""
 
 import csv
+import dataclasses
 import io
 import re
 from pathlib import Path
@@ -13,7 +14,7 @@ import gridworld
 from gridworld.process.console import plain
 from gridworld.report.tables import Table, to_csv
 from gridworld.storage.csv_text import csv_rows, csv_text
-from gridworld.sweep.job_table import JobRow, JobTable
+from gridworld.sweep.folder import JobRow, SweepFolder
 
 FORMULA = re.compile(r"[=+\-@\t\r\n]")
 TEXTS = st.text(st.sampled_from("=+-@\t\r\n',;\"a1. "), max_size=6)
@@ -44,13 +45,11 @@ def test_tables_of_reports_and_of_sweeps_have_no_formulas(tmp_path: Path) -> Non
     name = '@SUM(1+1)*cmd|" /C calc"!A0'
     table = to_csv(Table("runs", "", ["-x", "n"], [[name, -1.5], ["\tq", None]]))
     assert list(csv.reader(io.StringIO(table))) == [["'-x", "n"], [f"'{name}", "-1.5"], ["\\tq", ""]]
-    jobs = JobTable(tmp_path)
-    rows = {
-        job: JobRow(job, "", "failed", objective="-0.25", error="-> it broke") for job in (name, "+agent.x=1")
-    }
-    jobs.write(rows)
-    assert jobs.file.read_text().count(",'-> it broke") == 2
-    assert jobs.read() == rows
+    row = JobRow(name, "", "failed", objective="-0.25", error="-> it broke")
+    SweepFolder(tmp_path).write({name: row})
+    written = (tmp_path / "jobs.csv").read_text()
+    assert ",'-> it broke" in written
+    assert list(csv_rows(written))[1] == list(dataclasses.astuple(row))
 
 
 def test_only_one_module_writes_csv() -> None:

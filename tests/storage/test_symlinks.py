@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from helpers.support import SHORT, configure, script
 
+from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.run.folder import alone_in
 from gridworld.run.reader import check_free
@@ -12,7 +13,7 @@ from gridworld.storage.atomic_write import check_no_links, inside, is_locked
 from gridworld.sweep.folder import SweepFolder
 from gridworld.sweep.plan import Job
 from gridworld.tune import confirmation as confirm
-from gridworld.tune.study_folder import check_study_folder
+from gridworld.tune.study import check_study_folder
 
 REFUSED = "is a symbolic link, which is not written through; remove it"
 
@@ -80,7 +81,7 @@ def test_a_study_with_a_link_is_refused_before_anything(name: str, tmp_path: Pat
 @pytest.mark.parametrize("link", ["", ".hydra", ".hydra/config.yaml"])
 def test_a_sweep_with_a_job_that_leads_elsewhere_is_refused(link: str, tmp_path: Path, victim: Path) -> None:
     sweep = tmp_path / "sweep"
-    jobs = [Job((f"seed={seed}",), (f"seed={seed}",), str(seed) * 32, None, False) for seed in (0, 1)]
+    jobs = [Job((f"seed={seed}",), (f"seed={seed}",), str(seed) * 32, None, TrainConfig()) for seed in (0, 1)]
     folder = SweepFolder(sweep)
     with folder.at_work():
         folder.add(jobs[:1], ["seed=0"])

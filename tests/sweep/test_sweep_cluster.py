@@ -133,12 +133,12 @@ def test_slurms_warning_interrupts_a_job_and_a_restart_has_the_rest(cluster: Clu
 
 
 @pytest.mark.parametrize("cluster", ["slurm"], indirect=True)
-def test_what_slurm_would_refuse_is_refused_before(cluster: Cluster, tmp_path: Path) -> None:
+def test_what_slurm_refuses_is_one_sentence(cluster: Cluster, tmp_path: Path) -> None:
     done = cluster.sweep("seed=range(150)", cwd=tmp_path)
     assert done.returncode == 2
-    assert "150 tasks, but this cluster takes 100 in an array" in done.stderr
-    assert done.stderr.rstrip().endswith("hydra.launcher.jobs_per_task=2")
+    assert "hydra/launcher=slurm: Slurm took no array of 150 tasks (" in done.stderr
+    assert done.stderr.rstrip().endswith("of more jobs each, by hydra.launcher.jobs_per_task")
     nowhere = cluster.sweep("seed=0,1", "hydra.launcher.partition=nowhere", cwd=tmp_path)
     assert nowhere.returncode == 2
-    assert "hydra/launcher=slurm: Slurm took no jobs (" in nowhere.stderr
+    assert "hydra/launcher=slurm: Slurm took no array of 2 tasks (" in nowhere.stderr
     assert "nvalid partition" in nowhere.stderr

@@ -15,9 +15,10 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from hypothesis import given
 from hypothesis import strategies as st
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from gridworld.config.compose import register_schemas, to_config
+from gridworld.config.sweep import SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import sentence
 from gridworld.errors import InputError
@@ -25,8 +26,8 @@ from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import read_run
 from gridworld.run.writer import RunWriter
 from gridworld.storage.safe_read import read_object
-from gridworld.sweep.configurations import Configurations
-from gridworld.sweep.plan import Job, expand, folder_name, plan
+from gridworld.sweep.folder import folder_name
+from gridworld.sweep.plan import Configurations, Job, expand, plan, populations
 from gridworld.training.setup import check_settings
 
 
@@ -38,8 +39,8 @@ def loader() -> Iterator[ConfigLoader]:
     HydraConfig.instance().cfg = None
 
 
-def lines(loader: ConfigLoader, *words: str, most: int = 1000) -> list[str]:
-    return [" ".join(overrides) for overrides, _ in expand(words, loader, most)]
+def lines(loader: ConfigLoader, *words: str) -> list[str]:
+    return [" ".join(overrides) for overrides, _ in expand(words, loader, 1000)]
 
 
 def hashes(*jobs: Sequence[str]) -> list[str]:
@@ -71,8 +72,10 @@ def test_every_combination_is_a_job(loader: ConfigLoader) -> None:
         ("seed=range(0)", "seed=range(0): there is nothing in it"),
         ("seed=range(5,5)", "there is nothing in it"),
         ("env=glob(mars*)", "there is nothing in it"),
-        ("seed=range(1001)", "1,001 jobs; if so many are meant, add hydra.sweeper.max_jobs=1001"),
-        ("seed=range(1000000000)", "more than 1,000,000 values"),
+        (
+            "seed=range(1000000000)",
+            "more than 1,000 jobs; if so many are meant, raise",
+        ),
         ("seed=interval(0,1)", "jobs are made of a list"),
     ],
 )
@@ -108,12 +111,15 @@ def test_a_manifest_has_the_settings_of_its_job(agent: str, tmp_path: Path) -> N
 
 
 def test_a_sweep_runs_the_same_job_once_and_knows_mistakes() -> None:
-    jobs = plan(
-        [([f"seed={seed}"], [f"seed={seed}"]) for seed in ("0", "1", "0", "-1")],
-        lambda words: configure(*words),
-    )
+    def of(*lines: str) -> list[Job]:
+        return plan([(line.split(), line.split()) for line in lines], lambda words: configure(*words))
+
+    jobs = of("seed=0", "seed=1", "seed=0", "seed=-1")
     assert [job.overrides for job in jobs] == [("seed=0",), ("seed=1",), ("seed=-1",)]
     assert [job.mistake for job in jobs] == [None, None, "seed=-1: must be from 0 to 4294967295"]
+    assert [job.notes for job in jobs] == [(), (), ()]
+    (job,) = of("preset=auto seed=0", "preset=none seed=0")
+    assert job.notes[-1] == "preset=none makes the same runs as preset=auto, and these are run once"
 
 
 def job(*overrides: str, swept: Sequence[str] = (), digest: str = "0123456789abcdef") -> Job:
@@ -130,6 +136,34 @@ def test_a_folder_is_named_by_what_makes_its_job_different() -> None:
     assert folder_name(job("+a.b={c: 1e-5}", "~d"), ()) == "a.b=-c-1e-5,d"
     assert folder_name(job("agent=ppo", "seed=3", swept=["seed=3"]), {"seed=3"}) == "agent=ppo,seed=3"
     assert folder_name(job("seed=3", swept=["seed=3"]), {"seed=3"}) == "seed=3,012345"
+
+
+@pytest.mark.parametrize(
+    ("population", "launcher", "device", "files", "sizes"),
+    [
+        (8, "forks", "cpu", 1000, [4, 3, 3]),
+        (8, "forks", "cuda", 1000, [5, 5]),  # which no fork takes
+        ("auto", "forks", "cuda", 1000, [10]),
+        (10, "basic", "cpu", 10, [1] * 10),  # so few may be open
+        (10, "basic", "cpu", 90, [5, 5]),
+        (10, "basic", "cpu", 114, [10]),
+    ],
+)
+def test_jobs_are_divided_into_populations(
+    population: int | str,
+    launcher: str,
+    device: str,
+    files: int,
+    sizes: list[int],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("gridworld.sweep.plan.file_limit", lambda: files)
+    config = configure("agent=ppo", f"device={device}")
+    jobs = [Job((), (), str(number), None, config) for number in range(10)]
+    hydra = OmegaConf.create({"job": {"chdir": None}})
+    groups = populations(jobs, SweepConfig(population=population), launcher, {"n_jobs": 4}, hydra)
+    assert sorted(map(len, groups), reverse=True) == sizes
+    assert [job for group in groups for job in group] == jobs
 
 
 words = st.text(st.characters(min_codepoint=32, max_codepoint=300), max_size=80)
@@ -157,15 +191,12 @@ def master_of(loader: ConfigLoader, *words: str) -> DictConfig:
     ("words", "composed"),
     [
         ([], 1),
-        (["agent=ppo", "seed=range(3)"], 1),
         (["agent=ppo,q_learning", "env.slip=0,0.1", "seed=0,1"], 2),
         (["env=maze", "agent=q_learning", "agent.learning_rate=lin_0.5,0.25", "seed=1,2"], 1),
         (["agent=a2c", "+agent.arguments.max_grad_norm=0.5", "seed=0,1", "observation=coordinates"], 1),
         (["agent.gamma=0.1,0.2", "agent.policy_kwargs.net_arch=[8,8]", "agent=dqn", "++n_envs=4"], 2),
         (["agent.gamma=0.1,0.2", "agent={gamma: 0.5}", "env.layout='my map.txt'"], 2),
         (["n_envs=${seed}", "seed=1,2,3"], 1),  # it follows from the seed
-        (["seed=${n_envs}", "n_envs=1,2"], 1),
-        (["evaluation.stop_after=null", "device='cpu'", "stratified_draws=true,false"], 1),
     ],
 )
 def test_each_job_is_what_hydra_composes(
@@ -186,25 +217,10 @@ def test_each_job_is_what_hydra_composes(
     assert configs == [to_config(compose("train", job)) for job in jobs]
 
 
-@pytest.mark.parametrize(
-    ("word", "told"),
-    [("agent.gama=0.5", "did you mean gamma"), ("total_timesteps=often", "total_timesteps=often: Value")],
-)
-def test_a_mistake_is_told_as_hydra_tells_it(loader: ConfigLoader, word: str, told: str) -> None:
+def test_a_mistake_is_told_as_hydra_tells_it(loader: ConfigLoader) -> None:
     with pytest.raises(HydraException) as mistake:
-        Configurations(loader, master_of(loader))(["agent=dqn", word])
-    assert told in sentence(mistake.value)
-
-
-def test_what_all_jobs_have_in_common_is_not_some_jobs_own(loader: ConfigLoader, tmp_path: Path) -> None:
-    (tmp_path / "experiment").mkdir()
-    text = "# @package _global_\nhydra: {sweep: {dir: mine}}\n"
-    (tmp_path / "experiment" / "dir.yaml").write_text(text)
-    master = master_of(loader, f"hydra.searchpath=[file://{tmp_path}]")
-    with pytest.raises(InputError, match=r"^hydra\.sweep: is set in a file that only some of the jobs"):
-        Configurations(loader, master)(["experiment=dir"])
-    with pytest.raises(InputError, match=r"^hydra\.sweep\.subdir=\$\{seed\}: a sweep names the folders"):
-        Configurations(loader, master_of(loader, "hydra.sweep.subdir=${seed}"))
+        Configurations(loader, master_of(loader))(["agent=dqn", "agent.gama=0.5"])
+    assert "did you mean gamma" in sentence(mistake.value)
 
 
 GRID = """\
@@ -252,6 +268,7 @@ def test_a_yaml_says_what_is_swept_and_that_it_is_a_sweep(conf: Path, tmp_path: 
         ("experiment=grid env=maze", "[agent.learning_rate,env]: env has no list of values; give it one"),
         ("experiment=other,maze_dqn", "hydra.sweeper: is set in a file that only some of the jobs choose"),
         ("experiment=no_text", "hydra.sweeper.params.seed: must be text as on the command line, such as 0,1"),
+        ("hydra.sweep.subdir=x seed=0", "hydra.sweep.subdir=x: a sweep names the folders of its jobs itself"),
     ],
 )
 def test_a_yaml_that_cannot_be_swept_is_refused(words: str, told: str, conf: Path, tmp_path: Path) -> None:
@@ -264,24 +281,20 @@ def test_a_yaml_that_cannot_be_swept_is_refused(words: str, told: str, conf: Pat
 
 def test_lists_that_vary_together(loader: ConfigLoader) -> None:
     words = ["agent=dqn,ppo", "device=cpu", "seed=0,1", "+n_envs=2,4", "threads=3,4"]
-
-    def lines(*paired: object) -> list[str]:
-        return [" ".join(job) for job, _ in expand(words, loader, 16, paired)]
-
-    assert lines("agent", "n_envs") == [
+    found = [" ".join(job) for job, _ in expand(words, loader, 8, ["agent", "n_envs"])]
+    assert found == [
         f"agent={agent} device=cpu seed={seed} +n_envs={n_envs} threads={threads}"
         for agent, n_envs in (("dqn", 2), ("ppo", 4))
         for seed in (0, 1)
         for threads in (3, 4)
     ]
-    assert lines(["threads", "seed"], ["n_envs", "agent"]) == [
+    jobs = expand(words, loader, 4, [["threads", "seed"], ["n_envs", "agent"]])
+    assert [" ".join(job) for job, _ in jobs] == [
         f"agent={agent} device=cpu seed={seed} +n_envs={n_envs} threads={threads}"
         for agent, n_envs in (("dqn", 2), ("ppo", 4))
         for seed, threads in ((0, 3), (1, 4))
     ]
-    assert len(lines()) == 16
-    _, swept = expand(words, loader, 4, [["seed", "threads"], ["agent", "n_envs"]])[0]
-    assert swept == ["agent=dqn", "seed=0", "+n_envs=2", "threads=3"]
+    assert jobs[0][1] == ["agent=dqn", "seed=0", "+n_envs=2", "threads=3"]
 
 
 @pytest.mark.parametrize(
@@ -293,9 +306,12 @@ def test_lists_that_vary_together(loader: ConfigLoader) -> None:
         ),
         (["agent", "n_envs"], "[agent,n_envs]: n_envs has no list of values; give it one, n_envs=A,B"),
         (["agent", "sed"], "[agent,sed]: sed has no list of values"),
-        (["agent"], "[agent]: names one setting; a pair is of two or more"),
-        (["agent", "agent"], "[agent,agent]: agent is paired already; name it once"),
-        ([["agent", "env"], ["env", "agent"]], "[env,agent]: env is paired already; name it once"),
+        (["agent"], "[agent]: must name two settings or more"),
+        (
+            ["agent", "agent"],
+            "[agent,agent]: must name two settings or more",
+        ),
+        ([["agent", "env"], ["env", "agent"]], "[env,agent]: must name two settings or more"),
         ([1, 2], "[1,2]: 1 has no list of values"),
     ],
 )

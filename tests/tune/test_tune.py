@@ -20,8 +20,7 @@ from optuna.trial import TrialState, create_trial
 from gridworld.commands import report as report_command
 from gridworld.commands import tune as tune_command
 from gridworld.errors import InputError
-from gridworld.storage.safe_read import sealed
-from gridworld.tune.study_folder import at_work_in
+from gridworld.tune.study import at_work_in
 
 QUICK = (
     *("agent=q_learning", "total_timesteps=1500", "recording.gif=false", "recording.learning=false"),
@@ -115,22 +114,6 @@ def test_the_report_shows_the_study(studied: Path, tmp_path: Path) -> None:
     assert len(list((tmp_path / "out" / "figures").glob("*parallel*.png"))) == 1
 
 
-def test_a_changed_study_is_reported_as_damaged(studied: Path, tmp_path: Path) -> None:
-    from gridworld.report.tuning_study import find_tunings
-
-    study = json.loads((studied / "study" / "study.json").read_text())
-    study["space"]["agent.learning_rate"]["low"] = "<b>"
-    (tmp_path / "trials.csv").write_bytes((studied / "study" / "trials.csv").read_bytes())
-    for content, words in (
-        (study, "study.json: was changed or damaged, its seal is not that of its content"),
-        (sealed(study), "study.json: is not a finished study, or was changed"),
-    ):
-        (tmp_path / "study.json").write_text(json.dumps(content))
-        found, problems = find_tunings([tmp_path])
-        assert not found
-        assert words in problems[0]
-
-
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
@@ -192,87 +175,32 @@ def test_a_search_that_comes_to_nothing_is_no_mistake_of_the_command_line(
     assert told == "error: study: no trial came to a score; all 1 failed, the first: training diverged"
 
 
-FLOAT = "agent.learning_rate: {type: float, low: 1e-3, high: 1e-2}"
+def refused(title: str) -> list[list[str]]:
+    """The cases of a section of `refused.txt`."""
+    sections = Path(__file__).with_name("refused.txt").read_text("utf-8").split("\n\n")
+    lines = next(section for section in sections if section.startswith(f"# {title}:")).splitlines()
+    return [line.split("  =>  ") for line in lines[1:]]
 
 
-@pytest.mark.parametrize(
-    ("yaml", "sentence"),
-    [
-        (
-            f"\n{FLOAT}",
-            "Key 'agent.learning_rate' not in 'TuneConfig'",
-        ),  # without the line that says where it goes
-        ("", "there is nothing to search"),
-        ("agent.x: {type: float\n b", "bad.yaml: line 3, column 3: is not valid YAML"),
-        ("agent.gamma: 3", "int is not a subclass of DimensionConfig"),
-        ("agent.gamma: {type: flaot, low: 0, high: 1}", "type=flaot must be"),
-        ("agent.gamma: {type: float, lo: 0}", "Key 'lo' not in 'DimensionConfig'"),
-        ("agent.gamma: {type: float, low: 1, high: 0}", "takes two numbers, low=1.0 below high=0.0"),
-        ("agent.gamma: {type: float, low: 0, high: 1, log: true}", "`low > 0` must hold"),
-        ("agent.gamma: {type: float, low: 0, high: 1, step: 0.3}", "is not divisible by `step`"),
-        ("agent.gamma: {type: categorical, choices: [0.9, 0.9]}", "a list of different values"),
-        ("agent.gamma: {type: categorical, low: 1}", "a list of different values"),
-        ("n_envs: {type: int, low: 1.5, high: 3}", "takes whole numbers"),
-        ("n_envs: {type: categorical, choices: [many]}", "n_envs=many"),
-        ("agent.gamma: {type: float, low: 0.5, high: 5}", "agent.gamma=5.0: must be from"),
-        (
-            "agent.learning_rate: {type: float, low: -3, high: -1}",
-            "tune=bad: agent.learning_rate=-3.0: must be a number of at least 0",
-        ),
-        (
-            "agent.learning_rate: {type: categorical, choices: [0.1, abc]}",
-            "tune=bad: agent.learning_rate=abc",
-        ),
-        (
-            "observation.kind: {type: categorical, choices: [one_hot, coordinates]}",
-            "tune=bad: observation=one_hot: agent=q_learning keeps a table",
-        ),
-        ("agent.gama: {type: float, low: 0, high: 1}", "agent.gama"),
-        ("env.slip: {type: float, low: 0, high: 1}", "is part of the task"),
-        (
-            "checkpoint.every: {type: int, low: 100, high: 1000}",
-            "checkpoint.every: changes nothing about what is learnt",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("yaml", "sentence"), refused("search space"))
 def test_a_search_space_that_makes_no_sense(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, yaml: str, sentence: str
 ) -> None:
     (tmp_path / "tune").mkdir()
-    head = "" if yaml.startswith("\n") else "# @package tune.space\n"
-    (tmp_path / "tune" / "bad.yaml").write_text(head + yaml)
-    monkeypatch.setattr("gridworld.tune.search_space._CORNERS", 5)  # it goes with none of them
+    head = "" if yaml.startswith("# @") else "# @package tune.space\n"
+    (tmp_path / "tune" / "bad.yaml").write_text(head + yaml.replace("|", "\n"))
+    monkeypatch.setattr("gridworld.tune.study_spec._CORNERS", 5)  # it goes with none of them
     told = refusal(monkeypatch, tmp_path, "agent=q_learning", "tune=bad", "--config-dir", ".")
     assert sentence in told
     assert "\n" not in told
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["agent=nobody"], "agent=nobody: there is no such choice; there are a2c"),
-        (["agent=value_iteration"], "tune=value_iteration: there is no such choice; there are a2c"),
-        (["agent=dqn,ppo"], "agent=dqn,ppo: a study searches from one configuration"),
-        (["tune.trails=3"], "Key 'trails' not in 'TuneConfig'; did you mean trials"),
-        (["tune.trials=0"], "tune.trials=0: must be at least 1"),
-        (["tune.together=0"], "tune.together=0: must be at least 1"),
-        (["tune.pruner=axe"], "tune.pruner=axe: must be median, hyperband or none"),
-        (["tune.storage=nonsense"], "tune.storage=nonsense: is no URL of a database"),
-        (["tune.storage=sqlite://"], "tune.storage=sqlite://: is a database in memory; name a file"),
-        (["tune.storage=sqlite:///:memory:"], "in memory; name a file, e.g. sqlite:////shared"),
-        (["tune.storage='sqlite:///file:x?mode=memory&uri=true'"], "is a database in memory"),
-        (["tune.storage=sqlite:////no/such/x.db"], "cannot be reached (unable to open database file)"),
-        (["tune.storage=postgresql://me:secret@127.0.0.1:1/x"], "tune.storage=postgresql://me:***@127.0.0.1"),
-        (["tune.study=a/b"], "tune.study=a/b: must be of letters"),
-        (["hydra.run.dir=x"], "tune.py makes its own folder"),
-        (["--config-dir", "nowhere", "env=cliff"], "--config-dir nowhere: no such folder"),
-    ],
-)
+@pytest.mark.parametrize(("words", "sentence"), refused("command line"))
 def test_a_command_line_that_cannot_be_meant(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], sentence: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, sentence: str
 ) -> None:
-    told = refusal(monkeypatch, tmp_path, "agent=q_learning", "env=classic", *words)
+    told = refusal(monkeypatch, tmp_path, "agent=q_learning", "env=classic", *words.split())
     assert sentence in told
     assert "secret" not in told
     assert not list(tmp_path.glob("runs/*"))
@@ -290,13 +218,13 @@ LONG = (
 )
 
 
-def workers_of(process: int) -> list[int]:
-    """The processes that it has started and that are at work, not in reserve."""
+def workers_of(process: int, hundredths: int = 5) -> list[int]:
+    """The processes that it has started and that have worked for so long."""
     found = []
     for file in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
             name, fields = file.parent.name, file.read_text().rpartition(")")[2].split()
-            if int(fields[1]) == process and fields[0] != "Z" and int(fields[11]) >= 5:  # hundredths
+            if int(fields[1]) == process and fields[0] != "Z" and int(fields[11]) >= hundredths:
                 found.append(int(name))
     return found
 
@@ -310,11 +238,14 @@ def wait_for_workers(process: int, count: int, but: int = 0) -> list[int]:
     raise AssertionError("no worker is at work")
 
 
-def is_alive(process: int) -> bool:
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+def check_ended(processes: list[int]) -> None:
+    """They are gone, or will be in a moment."""
+    end = time.monotonic() + 10
+    for process in processes:
+        with contextlib.suppress(OSError):
+            while Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z":
+                assert time.monotonic() < end
+                time.sleep(0.02)
 
 
 def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path: Path) -> None:
@@ -322,13 +253,13 @@ def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path
         killed = wait_for_workers(process.pid, 2)[0]
         os.kill(killed, signal.SIGKILL)
         told = next(line for line in process.stderr if "lost" in line)
-        assert told.strip() == "a worker was lost to SIGKILL; its task is run again"
+        assert told.strip() == "a worker was lost (exit code -9), attempt 1 of 4 at its task"
         others = wait_for_workers(process.pid, 2, but=killed)
         process.send_signal(signal.SIGINT)
         told = process.stderr.read()  # until the last worker has let go of it
     assert process.returncode == 130
     assert "stopped by SIGINT; nothing that ended is lost; go on with: python" in told
-    assert not any(map(is_alive, others))
+    check_ended(others)
     ended = rows(tmp_path)
 
     again = script("tune.py", *QUICK, *LONG, cwd=tmp_path)
@@ -355,9 +286,10 @@ def test_a_search_of_one_worker_is_the_same_however_it_is_killed(tmp_path: Path)
                 wait_for_trials(tmp_path / name / "study" / "study.db", ended)
                 worker = wait_for_workers(process.pid, 1)[0]
                 os.kill(worker, signal.SIGKILL)
-                wait_for_workers(process.pid, 1, but=worker)
+                workers = wait_for_workers(process.pid, 1, but=worker)
                 process.kill()
                 process.stderr.read()  # until the last worker has let go of it
+                check_ended(workers)
         done = script("tune.py", *words, cwd=tmp_path / name)
         assert done.returncode == 0, done.stderr
     assert outcome(tmp_path / "killed") == outcome(tmp_path / "calm")
@@ -382,15 +314,21 @@ def test_a_database_that_disappears_is_one_sentence_and_no_worker_is_left(tmp_pa
     assert len(errors) == 1
     assert errors[0].startswith("error: tune.storage=sqlite:////")
     assert not [line for line in told if "Traceback" in line or "Error" in line]
-    assert not any(map(is_alive, workers))
+    check_ended(workers)
 
 
-def test_no_worker_outlives_a_search_that_is_killed(tmp_path: Path) -> None:
-    with start("tune.py", *QUICK, *LONG, cwd=tmp_path) as process:
-        workers = wait_for_workers(process.pid, 2)
-        process.kill()
-        process.stderr.read()  # until the last worker has let go of it
-    assert not any(map(is_alive, workers))
+@pytest.mark.parametrize("threads", [1, 2])  # workers are forks, or new processes
+def test_ctrl_c_while_workers_start_is_one_sentence(threads: int, tmp_path: Path) -> None:
+    for children in (1, 2):
+        with start("tune.py", *QUICK, *LONG, f"threads={threads}", cwd=tmp_path) as process:
+            end = time.monotonic() + 60
+            while len(workers_of(process.pid, 0)) < children and time.monotonic() < end:
+                time.sleep(0.001)
+            os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+            told = process.stderr.read()
+        assert process.returncode == 130
+        assert "Traceback" not in told
+        assert "stopped by SIGINT; nothing that ended is lost; go on with: python" in told
 
 
 def test_every_key_of_the_settings_stands_in_its_yaml() -> None:

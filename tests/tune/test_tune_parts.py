@@ -20,14 +20,14 @@ import pytest
 from helpers.hostile import seal
 from helpers.runs_folder import Maker
 from helpers.support import CONF, SHORT, configure
-from helpers.worker_tasks import Killed, fail
+from helpers.worker_tasks import Killed
 from hypothesis import given
 from hypothesis import strategies as st
 from optuna.trial import FrozenTrial, TrialState, create_trial
+from test_tune import refused
 
 from gridworld.config.sweep import DimensionConfig
 from gridworld.errors import InputError
-from gridworld.report import statistics
 from gridworld.storage.safe_read import sealed
 from gridworld.training.setup import check_settings
 from gridworld.training.together import run_alone
@@ -41,7 +41,6 @@ from gridworld.tune.confirmation import (
     verdict_on,
 )
 from gridworld.tune.objective import (
-    FinalRuns,
     Objective,
     Outcome,
     Report,
@@ -51,13 +50,15 @@ from gridworld.tune.objective import (
     score,
     with_values,
 )
-from gridworld.tune.search import in_reach, open_study, search
-from gridworld.tune.search_space import SearchSpace
-from gridworld.tune.study_folder import SEARCH_JSON, is_claimed
-from gridworld.tune.study_spec import ConfFolders, StudySpec, compose_study
-from gridworld.tune.workers import SearchError, Workers
+from gridworld.tune.search import open_study, search
+from gridworld.tune.study_spec import ConfFolders, SearchSpace, StudySpec, compose_study
+from gridworld.tune.workers import Workers
 
-SPACES = sorted(file.stem for file in (CONF / "tune").glob("*.yaml"))
+SPACES = sorted(
+    file.stem
+    for file in (CONF / "agent").glob("*.yaml")
+    if not file.stem.endswith("_sb3_defaults") and file.stem != "value_iteration"
+)
 FOLDERS = ConfFolders(CONF)
 TOTAL = 1000
 ONE_SEED = st.builds(
@@ -88,8 +89,7 @@ def test_the_score_of_known_seeds() -> None:
     seeds = [SeedScore(0, 500, 0.0), SeedScore(1, 250, 0.0), SeedScore(2, None, 1.0)]
     assert score(seeds, TOTAL, 3) == pytest.approx((1 + (0.25 + 0.125 + 0.75) / 3) / 4)
     assert score(seeds[:1], TOTAL, 3) == pytest.approx(0.25 / 4)
-    less_regret = [dataclasses.replace(seeds[2], regret=0.5)]
-    assert score(less_regret, TOTAL, 3) < score(seeds[2:], TOTAL, 3)
+    assert score([SeedScore(2, None, 0.5)], TOTAL, 3) < score(seeds[2:], TOTAL, 3)
 
 
 @pytest.mark.parametrize("name", SPACES)
@@ -99,17 +99,9 @@ def test_a_shipped_space_holds_the_shipped_settings_and_suggests_what_can_train(
     assert first is not None
     assert with_values(asked.base, asked.space.values(first)) == asked.base
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
-    for _ in range(20):
+    for _ in range(60):
         suggested = asked.space.values(study.ask(asked.space.distributions).params)
         check_settings(with_values(asked.base, suggested))
-
-
-def test_every_batch_of_ppo_divides_every_rollout() -> None:
-    asked = compose_study(FOLDERS, ["agent=ppo"])
-    keys = ("agent.n_steps", "agent.batch_size")
-    lists = [asked.space.dimensions[key].choices or [] for key in keys]
-    for choice in itertools.product(*lists):
-        check_settings(with_values(asked.base, dict(zip(keys, choice, strict=True))))
 
 
 def test_choices_that_need_each_other_are_no_mistake() -> None:
@@ -119,12 +111,6 @@ def test_choices_that_need_each_other_are_no_mistake() -> None:
         SearchSpace(batch, "own").check(base, check_settings(base))
     rollout = {"agent.n_steps": DimensionConfig("categorical", choices=[3, 16])}
     SearchSpace(batch | rollout, "own").check(base, check_settings(base))
-
-
-def test_there_is_a_space_for_every_agent_that_learns() -> None:
-    agents = {file.stem for file in (CONF / "agent").glob("*.yaml")}
-    learn = {name for name in agents if not name.endswith("_sb3_defaults")} - {"value_iteration"}
-    assert set(SPACES) == learn
 
 
 def test_lists_and_arguments_of_a_class_can_be_searched() -> None:
@@ -185,7 +171,8 @@ def reported(objective: Objective, rates: dict[int, float]) -> tuple[list[Outcom
         reports.append(report)
         return report.can_prune and report.step >= ENDS.get(report.trial, 99)
 
-    trials = Trials(objective, {number: {"agent.learning_rate": rate} for number, rate in rates.items()})
+    values = {number: {"agent.learning_rate": rate} for number, rate in rates.items()}
+    trials = Trials(objective, {number: (each, objective.seeds) for number, each in values.items()})
     return trials(answer), sorted(reports, key=lambda report: (report.trial, report.step))
 
 
@@ -205,44 +192,23 @@ def test_trials_and_seeds_that_train_together_are_those_that_train_one_by_one(
     alone = [reported(objective, {number: rate}) for number, rate in enumerate(RATES)]
     assert [outcome for found, _ in alone for outcome in found] == outcomes
     assert [report for _, found in alone for report in found] == reports
-
-
-def test_final_runs_that_train_together_are_those_alone() -> None:
-    base = configure(*SHORT["ppo"], "total_timesteps=512")
-    objective = Objective(base, (0,), 4, None)
-    runs: dict[str, Any] = {
-        f"{rate} {seed}": ({"agent.learning_rate": rate}, seed) for rate in (0.01, 0.02) for seed in (7, 8)
-    }
-    runs["fails"] = {"agent.learning_rate": 1e30}, 7
-    found = FinalRuns(objective, runs)(lambda message: None)
-    assert "diverged" in str(found.pop("fails"))
-    for name, result in found.items():
-        values, seed = runs[name]
-        assert result == run_alone(learning(objective.config(values), seed))
+    assert outcomes[0].seeds == [
+        run_alone(learning(objective.config({"agent.learning_rate": RATES[0]}), seed)) for seed in range(3)
+    ]
 
 
 class Inline(Workers):
-    """Runs tasks in this process; in place of trials, a function of their values where there is one."""
+    """In place of trials, a function of their values; None is for a task that has killed its workers."""
 
-    def __init__(self, function: Callable[[Any, Callable[[Any], bool]], Outcome] | None = None) -> None:
-        super().__init__(1)
+    def __init__(self, function: Callable[[Any, Callable[[Any], bool]], Outcome | None]) -> None:
+        super().__init__(1, True)
         self._function = function
 
-    def run(
-        self,
-        next_task: Any,
-        on_end: Any,
-        answer: Any = lambda message: None,
-        on_tick: Any = lambda: None,
-    ) -> None:
+    def run(self, next_task: Any, on_end: Any, answer: Any = print, on_tick: Any = None) -> None:
         while (task := next_task()) is not None:
-            if self._function is None:
-                on_end(task, task(answer))
-                continue
-            on_end(
-                task,
-                [self._function(values, answer_of(answer, number)) for number, values in task.values.items()],
-            )
+            trials = task.trials.items()
+            found = [self._function(values, answer_of(answer, name)) for name, (values, _) in trials]
+            on_end(task, None if None in found else found)
 
 
 def answer_of(answer: Callable[[Report], bool], number: int) -> Callable[[Any], bool]:
@@ -263,15 +229,8 @@ def outcome(value: float | None = None, error: str = "") -> Outcome:
 
 def test_what_fails_is_a_trial_with_its_reason_and_the_study_goes_on(tmp_path: Path) -> None:
     answers = iter([outcome(0.5), outcome(error="too\nlarge"), None, outcome(0.25)])
-
-    class Failing(Inline):
-        def run(self, next_task: Any, on_end: Any, *more: Any) -> None:
-            while (task := next_task()) is not None:
-                answer = next(answers)
-                on_end(task, answer and [answer])
-
     spec, study = asked(tmp_path, "tune.trials=4")
-    search(spec, study, Failing())
+    search(spec, study, Inline(lambda *_: next(answers)))
     states = [TrialState.COMPLETE, TrialState.FAIL, TrialState.FAIL, TrialState.COMPLETE]
     assert [trial.state for trial in study.trials] == states
     table = (tmp_path / "trials.csv").read_text()
@@ -293,10 +252,12 @@ def test_a_trial_that_is_worse_than_the_median_is_pruned(tmp_path: Path) -> None
     assert all(len(trial.intermediate_values) == 10 for trial in study.trials)
 
 
-@pytest.mark.parametrize("words", [["tune.sampler=tpe"], ["tune.sampler=random"], ["tune.pruner=hyperband"]])
-@pytest.mark.parametrize("killed", [(0, 1, 1), (3, 11)])
+@pytest.mark.parametrize(
+    ("word", "killed"),
+    [("tune.sampler=tpe", (0, 1, 1)), ("tune.sampler=random", (3, 11)), ("tune.pruner=hyperband", (3, 11))],
+)
 def test_a_search_of_one_worker_is_the_same_however_it_was_stopped(
-    words: list[str], killed: tuple[int, ...], tmp_path: Path
+    word: str, killed: tuple[int, ...], tmp_path: Path
 ) -> None:
     def searched(name: str, kills: Sequence[int]) -> list[tuple[Any, ...]]:
         calls = itertools.count()
@@ -310,7 +271,7 @@ def test_a_search_of_one_worker_is_the_same_however_it_was_stopped(
             return outcome(error="too large") if rate > 0.9 else outcome(rate)
 
         for _ in range(len(kills) + 1):
-            spec, study = asked(tmp_path / name, "tune.trials=14", *words)
+            spec, study = asked(tmp_path / name, "tune.trials=14", word)
             with contextlib.suppress(KeyboardInterrupt):
                 search(spec, study, Inline(function))
         return [told(trial) for trial in study.trials]
@@ -352,21 +313,16 @@ def test_a_final_run_that_fails_is_named_and_counted_as_failed(
     spec, study = asked(tmp_path, "tune.trials=1", "tune.final_seeds=3")
     search(spec, study, Inline(lambda values, _: outcome(0.1)))
 
-    class Results(Inline):
-        def run(self, next_task: Any, on_end: Any, *more: Any) -> None:
-            results: list[Any] = ["training diverged", SeedScore(3, 100, 0.0), None]
-            while (task := next_task()) is not None:
-                result = results.pop(0)
-                on_end(task, result and dict.fromkeys(task.runs, result))
-
-    (finalist,) = rank_finalists(spec, study, choose_finalists(study, spec), Results())
+    results = iter([Outcome(error="training diverged"), Outcome(0.1, "", [SeedScore(3, 100, 0.0)]), None])
+    ranked = rank_finalists(spec, study, choose_finalists(study, spec), Inline(lambda *_: next(results)))
+    (finalist,) = ranked
     error = capsys.readouterr().err
     assert "trial=0,seed=2 failed, and counts as not certified: training diverged\n" in error
     assert (
         "trial=0,seed=4 failed, and counts as not certified: the workers that ran it were killed\n" in error
     )
     assert (finalist.certified, finalist.seeds, finalist.failed) == (2, 4, 2)
-    assert rank_finalists(spec, study, study.trials, Results()) == [finalist]  # nothing is run again
+    assert rank_finalists(spec, study, study.trials, Inline(lambda *_: next(results))) == ranked
 
 
 def test_a_task_whose_worker_is_killed_is_run_again_until_it_has_killed_four(
@@ -374,41 +330,25 @@ def test_a_task_whose_worker_is_killed_is_run_again_until_it_has_killed_four(
 ) -> None:
     tasks = [Killed("never", 0, tmp_path), Killed("once", 1, tmp_path), Killed("ever", 9, tmp_path)]
     found = {}
-    with Workers(2) as workers:
-        workers.run(
-            lambda: tasks.pop(0) if tasks else None,
-            lambda task, result: found.update({task.name: result}),
-            lambda message: f"heard {message}",
-        )
-        assert found == {"never": "never heard never", "once": "once heard once", "ever": None}
-        assert capsys.readouterr().err.count("a worker was lost to SIGKILL; its task is run again\n") == 5
-        tasks = [fail]  # type: ignore[list-item]
-        with pytest.raises(SearchError, match="a worker failed, with the reason above"):
-            workers.run(lambda: tasks.pop(0) if tasks else None, lambda task, result: None)
+    Workers(2, forks=True).run(
+        lambda: tasks.pop(0) if tasks else None,
+        lambda task, result: found.update({task.name: result}),
+        lambda message: f"heard {message}",
+    )
+    assert found == {"never": "never heard never", "once": "once heard once", "ever": None}
+    assert capsys.readouterr().err.count("a worker was lost (exit code -9)") == 5
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 7, 40])
-@pytest.mark.parametrize("can_join", [True, False])
-def test_workers_share_all_runs(count: int, can_join: bool) -> None:
-    shares = list(Workers(count).shares(range(60), can_join))
-    assert [run for share in shares for run in share] == list(range(60))
-    assert max(map(len, shares)) == (min(32, math.ceil(60 / count)) if can_join else 1)
-
-
-def test_a_database_that_goes_away_is_one_sentence(tmp_path: Path) -> None:
-    _, study = asked(tmp_path)
-    (tmp_path / "study.db").unlink()
-    url = f"sqlite:///{tmp_path / 'study.db'}"
-    with pytest.raises(SearchError, match=r"study\.db: the study cannot be"), in_reach(url):
-        study.set_user_attr("x", 1)
-    with pytest.raises(ZeroDivisionError), in_reach(url):
-        _ = 1 / 0
+@given(st.integers(1, 40), st.integers(0, 80), st.booleans())
+def test_workers_share_all_runs(count: int, runs: int, can_join: bool) -> None:
+    shares = list(Workers(count, True).shares(range(runs), can_join))
+    assert [run for share in shares for run in share] == list(range(runs))
+    assert max(map(len, shares), default=1) <= (32 if can_join else 1)
+    assert len(shares) <= max(count, math.ceil(runs / (32 if can_join else 1)))
 
 
 def results(*steps: float) -> HeldOutResults:
-    found = np.array(steps, dtype=np.float64)
-    certified = int(np.isfinite(found).sum())
-    return HeldOutResults(statistics.share(certified, len(found)), found, TOTAL)
+    return HeldOutResults(np.array(steps, dtype=np.float64), TOTAL)
 
 
 def test_held_out_runs_of_other_settings_are_other_runs(tmp_path: Path) -> None:
@@ -451,7 +391,7 @@ UNCLEAR = "cannot be told apart from"
     ],
 )
 def test_the_verdict(winner: Sequence[float], began_from: Sequence[float], verdict: str) -> None:
-    found = verdict_on(results(*winner), results(*began_from), "the winner")
+    found = verdict_on(results(*winner), results(*began_from))
     assert found["verdict"] == verdict
     assert f"held-out seeds the winner {verdict} the settings" in found["sentence"]
 
@@ -475,7 +415,7 @@ def test_the_verdict_says_which_runs_it_is_without(tmp_path: Path) -> None:
     manifest = before[0].folder / "manifest.json"
     failed = json.loads(manifest.read_text()) | {"status": "failed", "error": "diverged"}
     manifest.write_text(json.dumps(sealed(failed)))
-    found = verdict_on(read_results(winner), read_results(before), "the winner")
+    found = verdict_on(read_results(winner), read_results(before))
     names = ", ".join(run.folder.name for run in winner[:4])
     assert found["sentence"].startswith("On 6 held-out seeds the winner ")
     assert "certified on 2 of 2 [34 %, 100 %], for good by step 3,000" in found["sentence"]
@@ -488,25 +428,6 @@ def test_the_verdict_says_which_runs_it_is_without(tmp_path: Path) -> None:
         read_results(winner)
 
 
-TRIALS, ATTRIBUTES = "UPDATE trials SET", "UPDATE trial_user_attributes SET value_json ="
-SQL = {
-    "a score that is no number": "UPDATE trial_values SET value = NULL",
-    "a score of a kind that there is not": "UPDATE trial_values SET value_type = 'x'",
-    "no score": "DELETE FROM trial_values",
-    "a choice that there is not": "UPDATE trial_params SET param_value = 77",
-    "a distribution that is no JSON": "UPDATE trial_params SET distribution_json = '{'",
-    "seeds that are no JSON": f"{ATTRIBUTES} '['",
-    "seeds without a regret": f"{ATTRIBUTES} '[{{\"seed\": 0}}]'",
-    "a state that there is not": f"{TRIALS} state = 'x'",
-    "what it is about, no object": "UPDATE study_user_attributes SET value_json = '[1]'",
-    "what it is about, nested as deep as Python goes": "UPDATE study_user_attributes SET value_json = '"
-    + 10**5 * "["
-    + "'",
-    "final seeds that are none": "INSERT INTO study_user_attributes (study_id, key, value_json) "
-    "VALUES (1, 'final trial=0,seed=9', '3')",
-    "another direction": "UPDATE study_directions SET direction = 'MAXIMIZE'",
-    "a database of nothing": "DROP TABLE studies",
-}
 ABOUT = {"objective": {"seeds": [0, 1]}}
 TWO = SearchSpace(
     {
@@ -535,24 +456,13 @@ def sqlite_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-@pytest.mark.parametrize("what", SQL)
+@pytest.mark.parametrize(("what", "statement"), refused("altered database"))
 def test_a_study_whose_database_was_altered_is_refused_in_a_sentence(
-    what: str, sqlite_study: Path, tmp_path: Path
+    what: str, statement: str, sqlite_study: Path, tmp_path: Path
 ) -> None:
     shutil.copy(sqlite_study, tmp_path / "study.db")
     with contextlib.closing(sqlite3.connect(tmp_path / "study.db")) as database, database:
-        database.execute(SQL[what])
+        database.execute(statement)
     with pytest.raises(InputError, match=r"^tune\.(storage|study)=.*") as caught:
         open_study(f"sqlite:///{tmp_path / 'study.db'}", "mine", ABOUT, TWO, must_exist=True)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"\xff", b'{"study": 3}'])
-def test_a_folder_that_does_not_say_whose_it_is_is_refused(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / SEARCH_JSON).write_bytes(content)
-    with pytest.raises(InputError):
-        is_claimed(tmp_path, "mine")
-    (tmp_path / SEARCH_JSON).unlink()
-    os.mkfifo(tmp_path / SEARCH_JSON)
-    with pytest.raises(InputError, match=r"search\.json: is no ordinary file"):
-        is_claimed(tmp_path, "mine")

@@ -20,6 +20,7 @@ from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse
 
 CLASSIC = compile_mdp(load("classic"))
+FRAME = draw_frame(CLASSIC, 0, 20)
 WALK = np.array([0, 1, 1, 2, 3, 4, 5, 11, 17, 16])
 
 
@@ -32,7 +33,7 @@ def frames_of(content: bytes) -> list[tuple[np.ndarray, float]]:
 
 
 @pytest.mark.parametrize("encode", [files.encode_gif, files.encode_apng])
-@pytest.mark.parametrize("fps", [1, 4, 25])
+@pytest.mark.parametrize("fps", [1, 25])
 def test_animations_are_exact_and_last_as_long_as_they_should(encode, fps: int) -> None:
     shown = frames_of(encode(animation_of_states(CLASSIC, WALK, cell_size=20), fps))
     distinct = [state for state, before in zip(WALK, [None, *WALK], strict=False) if state != before]
@@ -70,7 +71,7 @@ def test_a_gif_holds_any_film_exactly() -> None:
 def test_png_is_exact() -> None:
     noise = np.random.default_rng(0).integers(256, size=(13, 17, 3), dtype=np.uint8)
     half = np.concatenate([np.zeros_like(noise), noise, np.tile(noise[-1:], (9, 1, 1))])
-    for frame in (noise, draw_frame(CLASSIC, 0, 20), half, noise[:1, :1]):
+    for frame in (noise, FRAME, half, noise[:1, :1]):
         image = Image.open(io.BytesIO(files.encode_png(frame)))
         image.load()  # checks the sums
         assert image.mode == "RGB"
@@ -162,20 +163,13 @@ def test_a_folder_takes_the_place_of_a_link_and_not_of_what_it_leads_to(tmp_path
     assert [path.name for path in (tmp_path / "outside").iterdir()] == ["file"]
 
 
-WRITERS = {
-    "json": lambda path: write_json(path, {}),
-    "png": lambda path: files.save_png(draw_frame(CLASSIC, 0, 20), path),
-    "pngs": lambda path: files.save_pngs(animation_of_states(CLASSIC, WALK[:1], 20), path),
-}
-
-
 @pytest.mark.parametrize("place", ["thing", "file/thing", "nowhere/thing"])
-@pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
+@pytest.mark.parametrize(
+    "write", [lambda path: write_json(path, {}), lambda path: files.save_png(FRAME, path)]
+)
 def test_what_cannot_be_written_is_named_and_nothing_else_is_touched(
     write: Callable[[Path], None], place: str, tmp_path: Path
 ) -> None:
-    if write is WRITERS["pngs"] and place != "file/thing":
-        return  # a folder is replaced, and its parents are made
     (tmp_path / "thing" / "full").mkdir(parents=True)
     (tmp_path / "file").touch()
     path = tmp_path / place

@@ -6,7 +6,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -45,26 +44,10 @@ from gridworld.world.outcomes import Outcomes, mdp_from_outcomes
 from gridworld.world.solver import value_iteration
 
 DIRECTIONS = {"up": (-1, 0), "right": (0, 1), "down": (1, 0), "left": (0, -1)}
-
-
-def from_gymnasium(name: str, places: IntArray, names: str, panel_names: tuple[str, ...] = ()) -> Mdp:
-    env = gym.make(name).unwrapped
-    table = env.P  # type: ignore[attr-defined]
-    most = len(table[0][0])
-    rows = [list(row.values()) for row in table.values()]
-    padded = [[(each + most * [(0.0, 0, 0.0, False)])[:most] for each in row] for row in rows]
-    probability, next_state, reward, terminated = np.moveaxis(np.array(padded, dtype=float), -1, 0)
-    start = np.asarray(env.initial_state_distrib, dtype=float)  # type: ignore[attr-defined]
-    outcomes = Outcomes(
-        next_state=next_state.astype(int),
-        probability=probability,
-        reward=reward,
-        terminated=terminated.astype(bool),
-        start=start,
-    )
-    return mdp_from_outcomes(
-        name, outcomes, action_names=names.split(), places=places, panel_names=panel_names
-    )
+DIRECTIONS |= {"north": (-1, 0), "east": (0, 1), "south": (1, 0), "west": (0, -1)}
+FROZEN_LAKE, CLIFF_WALKING, TAXI = (
+    GymnasiumConfig(id=name).compile() for name in ("FrozenLake-v1", "CliffWalking-v1", "Taxi-v4")
+)
 
 
 def certain(name: str, next_state: IntArray, end: int, reward: float = 0.0, **settings: Any) -> Mdp:
@@ -74,25 +57,6 @@ def certain(name: str, next_state: IntArray, end: int, reward: float = 0.0, **se
     tables = {"next_state": targets, "probability": np.ones(targets.shape), "reward": rewards}
     outcomes = Outcomes(**tables, terminated=targets == end, start=start)
     return mdp_from_outcomes(name, outcomes, **settings)
-
-
-def one_panel(rows: int, cols: int) -> IntArray:
-    return np.array([(0, *divmod(state, cols)) for state in range(rows * cols)])
-
-
-def taxi_places() -> IntArray:
-    states = np.arange(500)
-    return np.stack([states // 4 % 5 * 4 + states % 4, states // 100, states // 20 % 5], axis=1)
-
-
-FROZEN_LAKE = from_gymnasium("FrozenLake-v1", one_panel(4, 4), "left down right up")
-CLIFF_WALKING = from_gymnasium("CliffWalking-v1", one_panel(4, 12), "up right down left")
-TAXI = from_gymnasium(
-    "Taxi-v4",
-    taxi_places(),
-    "down up right left pickup dropoff",
-    tuple(f"{here} to {there}" for here in ("R", "G", "Y", "B", "taxi") for there in "RGYB"),
-)
 
 
 def chain(length: int) -> Mdp:
@@ -109,32 +73,23 @@ def deep_sea(size: int, mirrored: bool) -> Mdp:
     right = (np.arange(2) == 1) != ((rows % 2 == 1) & mirrored)[:, None]
     beside = np.clip(np.where(right, cols[:, None] + 1, cols[:, None] - 1), 0, size - 1)
     next_state = np.where(rows[:, None] == size - 1, cells, (rows[:, None] + 1) * size + beside)
-    places = np.append(one_panel(size, size), [[-1, -1, -1]], axis=0)
+    places = np.array([*((0, *divmod(cell, size)) for cell in range(cells)), (-1, -1, -1)])
     return certain("deep sea", np.append(next_state, [[cells, cells]], axis=0), cells, places=places)
 
 
 def subject(mdp: Mdp, q: NDArray[np.float64], visits: NDArray[np.int64]) -> Subject:
-    evaluator = Evaluator(mdp, 0.95, 50)
     snapshot = PolicySnapshot(q.argmax(axis=1), np.full(q.shape, 1 / q.shape[1]), q.max(axis=1), q)
     history = PolicyHistory(mdp.num_states)
     for step in range(3):
         history.add(step, snapshot)
-    return SimpleNamespace(
-        is_trusted=True,
-        config=TrainConfig(),
-        evaluator=evaluator,
-        snapshot=snapshot,
-        steps=3,
-        visits=visits,
-        history=history,
-    )
+    run = {"config": TrainConfig(), "evaluator": Evaluator(mdp, 0.95, 50), "steps": 3, "is_trusted": True}
+    return SimpleNamespace(**run, snapshot=snapshot, visits=visits, history=history)
 
 
 def cell_of(mdp: Mdp, frame: Frame, state: int, legend_rows: int = 1) -> Frame:
     canvas = Canvas(mdp, legend_rows=legend_rows)
-    left, top = canvas.world.get_offset()
-    x, y = (int(side) for side in canvas.point(state, 0, 0))
-    return frame[top + y : top + y + canvas.cell, left + x : left + x + canvas.cell]
+    left, top = np.add(canvas.world.get_offset(), canvas.point(state, 0, 0)).astype(int)
+    return frame[top : top + canvas.cell, left : left + canvas.cell]
 
 
 def has(picture: Frame, colour: tuple[int, ...]) -> bool:
@@ -218,11 +173,10 @@ def test_the_policy_of_a_mosaic_has_dots_where_no_action_moves_and_diagonal_path
 
 
 def test_a_table_has_the_most_visited_states_in_the_order_in_which_they_are_met() -> None:
-    world = chain(40)
-    assert table_states(world).tolist() == list(range(24))
     visits = np.ones((41, 2), dtype=np.int64)
     visits[[3, 30]] = 100
-    assert table_states(world, visits).tolist() == [*range(23), 30]
+    assert table_states(chain(40)).tolist() == list(range(24))
+    assert table_states(chain(40), visits).tolist() == [*range(23), 30]
     assert table_states(chain(5)).tolist() == [0, 1, 2, 3, 4]
 
 
@@ -251,15 +205,13 @@ def test_a_policy_table_frames_the_greedy_action(has_q: bool) -> None:
 
 
 def test_a_visit_table_leaves_actions_never_taken_white() -> None:
-    world = chain(3)
+    world, white = chain(3), (255, 255, 255)
     counts = np.array([[1, 50], [0, 25], [0, 0], [0, 0]])
     frame = visits(subject(world, np.zeros((4, 2)), counts))(None)
     table = StateTable(world, table_states(world), world.action_names)
-    corners = [[tuple(table_cell(table, frame, row, col)[3, 3]) for col in range(2)] for row in range(3)]
-    white = (255, 255, 255)
-    assert corners[0] == [tuple(BLUES[0]), tuple(BLUES[127])]
-    assert corners[1][0] == corners[2][0] == corners[2][1] == white
-    assert corners[1][1] != white
+    corners = [tuple(table_cell(table, frame, row, col)[3, 3]) for row in range(3) for col in range(2)]
+    assert corners[:3] == [tuple(BLUES[0]), tuple(BLUES[127]), white]
+    assert corners[4:] == [white, white] != corners[3:4] * 2
 
 
 @pytest.mark.parametrize(
@@ -323,8 +275,5 @@ def test_an_episode_shows_the_frames_of_the_environment(monkeypatch: pytest.Monk
 def test_foreign_frames_of_few_colours_stay_exact() -> None:
     frames = [np.full((4, 6, 3), colour, dtype=np.uint8) for colour in (AGENT, TRAP)]
     shown = animation_of_rendered(frames, [1, 0, 1])
-    assert [tuple(np.asarray(shown.draw(key).convert("RGB"))[0, 0]) for key in shown.keys] == [
-        TRAP,
-        AGENT,
-        TRAP,
-    ]
+    colours = [tuple(np.asarray(shown.draw(key).convert("RGB"))[0, 0]) for key in shown.keys]
+    assert colours == [TRAP, AGENT, TRAP]

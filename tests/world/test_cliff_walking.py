@@ -24,6 +24,15 @@ def safe_way():
     return one_hot_policy(actions, 4)
 
 
+def merged(outcomes):
+    """{(next state, reward, whether it is over): probability}"""
+    found = {}
+    for p, following, reward, over in outcomes:
+        key = int(following), float(reward), bool(over)
+        found[key] = found.get(key, 0.0) + float(p)
+    return found
+
+
 @pytest.mark.parametrize("slippery", [False, True])
 @pytest.mark.parametrize(
     ("env", "env_id", "order", "settings"),
@@ -41,16 +50,9 @@ def test_every_row_of_gymnasiums_table(env, env_id, order, settings, slippery):
     for state in np.flatnonzero(~mdp.terminal).tolist():  # nobody plays on where it is over
         for action, ours_of in enumerate(order):
             row = state, ours_of
-            ours, theirs = {}, {}
-            for p, following, reward in zip(
-                mdp.probability[row], mdp.next_state[row].tolist(), mdp.reward[row].tolist(), strict=True
-            ):
-                key = following, reward, bool(mdp.terminal[following])
-                ours[key] = ours.get(key, 0.0) + p
-            for p, following, reward, over in table[state][action]:
-                key = int(following), float(reward), bool(over)
-                theirs[key] = theirs.get(key, 0.0) + p
-            assert ours == pytest.approx(theirs)
+            leads_to = mdp.next_state[row].tolist()
+            ours = zip(mdp.probability[row], leads_to, mdp.reward[row], mdp.terminal[leads_to], strict=True)
+            assert merged(ours) == pytest.approx(merged(table[state][action]))
 
 
 def test_its_known_returns():

@@ -16,7 +16,8 @@ from gridworld.envs.rollout import play, sample_episodes
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.training.setup import make_context
-from gridworld.world.chain import Chain, _openblas, one_hot_policy
+from gridworld.workarounds import blas_threads
+from gridworld.world.chain import Chain, one_hot_policy
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.grid import compile_mdp
 from gridworld.world.layout import load, parse, shipped_layouts
@@ -218,7 +219,7 @@ def test_undiscounted_optima_end_and_certify(world: list[str], slip: float, step
 def test_a_value_has_the_same_bits_with_any_number_of_threads(env: str) -> None:
     mdp = configure(f"env={env}").env.compile()
     policy = np.random.default_rng(0).dirichlet(np.ones(mdp.num_actions), mdp.num_states)
-    count, limit = _openblas()
+    count, limit = blas_threads()
     before, found = count(), set()
     try:
         for threads in (1, 2, 3):

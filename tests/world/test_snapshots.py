@@ -1,18 +1,24 @@
 """A method that could remember something, wherever it keeps that, is no function of its argument alone."""
 
+import dataclasses
+import functools
 import itertools
-import threading
+import sys
 from typing import Any
 
 import gymnasium as gym
+import matplotlib
+import numpy as np
 import pytest
+import torch
 
 from gridworld.errors import InputError
 from gridworld.world.snapshots import alike, asked
 
 TOTAL = [0]
+MODULE = sys.modules[__name__]
 TICKS, GENERATOR = itertools.count(), (number for number in range(10**6))
-LOCK, CART = threading.Lock(), gym.make("CartPole-v1")
+CART = gym.make("CartPole-v1")
 
 
 class Counter:
@@ -58,6 +64,30 @@ def by_closure() -> Any:
     return paid
 
 
+@functools.wraps(np.sum)
+def pretending(reward: Any) -> Any:
+    TOTAL[0] += 1
+    return reward
+
+
+@torch.no_grad()
+def decorated(reward: Any) -> Any:
+    TOTAL[0] += 1
+    return reward
+
+
+@dataclasses.dataclass(frozen=True)
+class Scaled:
+    factor: float
+
+    @functools.cached_property
+    def doubled(self) -> float:
+        return 2 * self.factor
+
+    def __call__(self, reward: Any) -> float:
+        return float(reward) * self.doubled / 2
+
+
 class Sampling(gym.RewardWrapper[Any, Any]):
     def reward(self, reward: Any) -> float:
         self.action_space.sample()
@@ -80,10 +110,12 @@ def asked_of(function: Any) -> list[Any]:
         (Sampling, "draws random numbers"),
         (lambda reward: counted(reward), "keeps a memory"),
         (by_default, "keeps a memory"),
+        (pretending, "keeps a memory"),
+        (decorated, "keeps a memory"),
         (by_closure(), "keeps a memory"),
+        (lambda reward: MODULE.counted(reward), "keeps a memory"),
         (lambda reward: float(reward) + 0 * next(TICKS), "keeps a memory"),
         (lambda reward: float(reward) + 0 * next(GENERATOR), "cannot be read"),
-        (lambda reward: float(reward) + LOCK.locked(), "cannot be read"),
         (lambda reward: float(reward) + (CART.render_mode is None), "looks into an environment"),
     ],
 )
@@ -94,6 +126,9 @@ def test_a_memory_is_found_wherever_it_is_kept(function: Any, told: str) -> None
 
 def test_a_function_of_its_argument_is_asked() -> None:
     assert asked_of(lambda reward: 2 * reward - len(TOTAL)) == [-1.0, 1.0]
+    assert asked_of(Scaled(3.0)) == [0.0, 3.0]
+    # code of installed packages is not read, whatever it holds
+    assert asked_of(lambda reward: pytest.approx(reward).expected + len(matplotlib.colormaps) * 0) == [0, 1]
 
 
 def test_what_is_made_alike() -> None:

@@ -25,8 +25,8 @@ from gridworld.agents.sb3.settings import FALLING, SCHEDULES, SB3ClassConfig, SB
 from gridworld.agents.sb3.vec_env import GridWorldVecEnv
 from gridworld.config.fields import falls, parse_schedule
 from gridworld.errors import InputError, in_short
-from gridworld.process.memory_budget import check_memory, is_limited
-from gridworld.process.user_input import imported
+from gridworld.process.user_input import check_memory, imported, is_limited
+from gridworld.workarounds import generator_of, keep_compiler_out
 
 Arguments = dict[str, Any]
 
@@ -174,7 +174,7 @@ def make_model(
         raise
     except Exception as error:  # the class may be anybody's
         raise failed(config, "cannot be built", error) from error
-    if model.observation_space._np_random is not None:
+    if generator_of(model.observation_space) is not None:
         # A network for images is shown a random one to see its size; SB3 seeds the actions' space only.
         model.observation_space.seed(context.seed)
     if reason is not None:
@@ -204,17 +204,6 @@ def _device(name: str) -> str:
     if kind == "cuda" and not torch.cuda.is_available():
         raise InputError(f"device={name}: torch finds no CUDA device here; set device=cpu")
     return name
-
-
-def keep_compiler_out() -> None:
-    """Spare a run the 1.2 seconds in which optimisers import torch's compiler.
-
-    They do so to exempt some methods from compilation, which are marked as exempt beforehand here.
-    """
-    for name in ("add_param_group", "state_dict", "load_state_dict"):
-        method = getattr(getattr(torch.optim.Optimizer, name), "__wrapped__", None)
-        if method is not None and not hasattr(method, "__dynamo_disable"):
-            method.__dict__["__dynamo_disable"] = method
 
 
 def make_callbacks(entries: Sequence[Any]) -> list[BaseCallback]:

@@ -43,10 +43,7 @@ def faulty_class(run: Evidence) -> Finding | None:
 
 
 def of_library(config: AgentConfig) -> SB3ClassConfig | None:
-    """The same settings for the algorithm of SB3 or sb3-contrib that a class is derived from.
-
-    They lack arguments that only the derived class takes. None where it is the library's own class.
-    """
+    """The same settings for the library's class that a class is derived from; None: it is that itself."""
     if not isinstance(config, SB3ClassConfig):
         return None
     from gridworld.agents.sb3.factory import algorithm_class  # imports torch

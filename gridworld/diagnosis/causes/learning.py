@@ -101,10 +101,7 @@ def overshot(run: Evidence) -> Finding | None:
 
 
 def not_there_yet(run: Evidence) -> Finding | None:
-    """Its values lag behind: a backup is nearer to the truth, or changes little, as those ahead lag too.
-
-    Of an actor-critic it is the policy that lags: it has hardly made up its mind.
-    """
+    """Its values lag behind: a backup is nearer to the truth; or its policy is hardly decided."""
     if run.is_actor_critic:
         states = run.split.wrong & (run.spread > _SPREAD)
     else:

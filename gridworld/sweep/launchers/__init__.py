@@ -1,100 +1,126 @@
-"""Where the populations of a sweep run; `hydra/launcher` chooses one of these modules."""
+"""Where the populations of a sweep run: on this machine, or by one of the modules beside this one."""
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import shutil
+import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Protocol
+from functools import partial
+from importlib import import_module
+from typing import Any, TypeVar
 
 from omegaconf import DictConfig, OmegaConf
 
+from gridworld.config.train import check_bounds
 from gridworld.errors import InputError, install_command
-from gridworld.process.processes import LostError, can_fork
-from gridworld.sweep.job import StopSweep, SweepJob, Worker
+from gridworld.process.processes import LostError, can_fork, run_in_processes, worker_count
+from gridworld.sweep.folder import STOP
+from gridworld.sweep.job import StopSweep, Worker
+from gridworld.sweep.plan import Job, runs_apart
+from gridworld.training.setup import import_for
 
-# By the launcher: the package that it needs, the extra that installs it, and commands.
-_NEEDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
-    "slurm": ("submitit", "slurm", ("sbatch", "srun", "squeue", "scancel")),
-    "ray": ("ray", "ray", ()),
-}
-_AT_LEAST_ONE = ("jobs_per_task", "array_parallelism", "timeout_min", "cpus_per_task", "signal_delay_s")
+# By the launcher: the package that it needs, and commands.
+_NEEDS = {"slurm": ("submitit", ("sbatch", "srun", "squeue", "scancel")), "ray": ("ray", ())}
+_SECONDS_BETWEEN_TICKS = 1.0
 
-Group = Sequence[SweepJob]
+Group = Sequence[Job]
+Task = TypeVar("Task")  # populations that run on a cluster
 
 
 @dataclass(frozen=True)
 class Launch:
-    """Populations to run, and what is called meanwhile.
+    """Populations to run, and what is called meanwhile."""
 
-    Args:
-        worker: runs a population.
-        groups: the populations.
-        stop: a file that is there once no more jobs are to begin.
-        ended: called with jobs that have ended, and their errors or a `LostError`; there may be fewer errors.
-        tick: called every now and then.
-    """
-
-    worker: Worker
+    worker: Worker  # runs a population
     groups: Sequence[Group]
-    stop: Path
-    ended: Callable[[Group, list[str] | LostError], None]
-    tick: Callable[[], None]
-
-
-class Task(Protocol):
-    """Populations that run on a cluster, in the manner of `concurrent.futures.Future`."""
-
-    def done(self) -> bool:
-        """Whether it has ended."""
-
-    def result(self) -> list[str]:
-        """The errors of its jobs. Raises `LostError`."""
-
-
-def collect(launch: Launch, tasks: Mapping[Task, Group], seconds: float) -> None:
-    """Wait until tasks on a cluster have ended. Raises `StopSweep`."""
-    left = dict(tasks)
-    while left:
-        launch.tick()
-        time.sleep(seconds)
-        if launch.stop.exists():
-            raise StopSweep("a job failed")
-        for task in [task for task in left if task.done()]:
-            jobs = left.pop(task)
-            try:
-                launch.ended(jobs, task.result())
-            except LostError as error:
-                launch.ended(jobs, error)
+    ended: Callable[[Group, list[str] | LostError], None]  # with the errors of its first jobs
+    tick: Callable[[], None]  # called every now and then
 
 
 def launcher_settings(config: DictConfig) -> tuple[str, dict[str, Any]]:
     """The launcher that is chosen, and its settings. Raises `InputError` where it cannot work."""
-    settings = OmegaConf.to_container(config.hydra.launcher)
-    assert isinstance(settings, dict)
-    kind = str(settings.pop("_target_")).rpartition(".")[2]
+    settings: Any = OmegaConf.to_object(config.hydra.launcher)
+    check_bounds(settings, "hydra.launcher.")
+    own = dataclasses.asdict(settings)
+    kind = str(own.pop("_target_")).rpartition(".")[2]
     choice = f"hydra/launcher={config.hydra.runtime.choices['hydra/launcher']}"
-    if settings.get("n_jobs") == 0:
+    if own.get("n_jobs") == 0:
         raise InputError("hydra.launcher.n_jobs=0: must be the number of workers, or -1 for one on each core")
-    for key in _AT_LEAST_ONE:
-        if settings.get(key, 1) < 1:
-            raise InputError(f"hydra.launcher.{key}={settings[key]}: must be at least 1")
-    package, extra, commands = _NEEDS.get(kind, ("", "", ()))
-    if package and not _is_installed(package):
-        raise InputError(f"{choice}: {package} is not installed; {install_command(extra)}")
-    missing = [name for name in commands if shutil.which(name) is None]
-    if missing:
-        raise InputError(
-            f"{choice}: there is no {missing[0]} on this machine; start the sweep on one of the cluster's"
+    if kind in _NEEDS:
+        package, commands = _NEEDS[kind]
+        if importlib.util.find_spec(package) is None:
+            raise InputError(f"{choice}: {package} is not installed; {install_command(kind)}")
+        missing = [name for name in commands if shutil.which(name) is None]
+        if missing:
+            raise InputError(
+                f"{choice}: there is no {missing[0]} on this machine; start the sweep on one of the cluster's"
+            )
+    return "basic" if kind == "forks" and not can_fork() else kind, own
+
+
+def run_groups(launch: Launch, launcher: str, own: Mapping[str, Any]) -> None:
+    """Run populations. Raises `StopSweep`, `SystemExit`, or `InputError` where a cluster takes no jobs."""
+    if launcher in _NEEDS:
+        import_module(f"gridworld.sweep.launchers.{launcher}").run(launch, own)
+        return
+    apart: list[partial[list[str]]] = []  # in other processes
+    here: list[partial[list[str]]] = []  # in this one, when the others have ended
+    for group in launch.groups:
+        (apart if runs_apart(launcher, group[0].config) else here).append(partial(launch.worker, group))
+    if apart:
+        if launcher == "forks":
+            import_for(apart[0].args[0][0].config)  # once for all: forks share it
+        run_in_processes(
+            lambda: apart.pop(0) if apart else None,
+            worker_count(own["n_jobs"]),
+            launcher == "forks",
+            lambda task, errors: launch.ended(task.args[0], errors),
+            launch.tick,
         )
-    return "basic" if kind == "forks" and not can_fork() else kind, {str(k): v for k, v in settings.items()}
+    with _ticking(launch.tick):
+        for task in here:
+            launch.ended(task.args[0], task())
 
 
-def _is_installed(package: str) -> bool:
+@contextmanager
+def _ticking(tick: Callable[[], None]) -> Iterator[None]:
+    """Call `tick` now and then while the block runs."""
+    over = threading.Event()
+
+    def watch() -> None:
+        while not over.wait(_SECONDS_BETWEEN_TICKS):
+            tick()
+
+    thread = threading.Thread(target=watch, daemon=True, name="sweep progress")
+    thread.start()
     try:
-        return importlib.util.find_spec(package) is not None
-    except ValueError:  # where sys.modules has None
-        return False
+        yield
+    finally:
+        over.set()
+        thread.join(timeout=2)
+
+
+def collect(
+    launch: Launch,
+    tasks: Mapping[Task, Group],
+    is_done: Callable[[Task], bool],
+    result: Callable[[Task], list[str]],
+) -> None:
+    """Wait until tasks on a cluster have ended. Raises `StopSweep`."""
+    left = dict(tasks)
+    while left:
+        launch.tick()
+        time.sleep(_SECONDS_BETWEEN_TICKS)
+        if (launch.worker.sweep / STOP).exists():
+            raise StopSweep("a job failed")
+        for task in [task for task in left if is_done(task)]:
+            jobs = left.pop(task)
+            try:
+                launch.ended(jobs, result(task))
+            except LostError as error:
+                launch.ended(jobs, error)

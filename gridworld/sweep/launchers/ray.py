@@ -14,68 +14,60 @@ from ray.exceptions import RayError, TaskCancelledError
 from gridworld.errors import InputError
 from gridworld.process.processes import LostError
 from gridworld.process.signals import handling
-from gridworld.sweep.job import StopSweep, SweepJob, Worker
-from gridworld.sweep.launchers import Group, Launch, Task, collect
+from gridworld.sweep.job import StopSweep, Worker
+from gridworld.sweep.launchers import Launch, collect
+from gridworld.sweep.plan import Job
 
-_POLL_SECONDS = 1.0
 _ENDED_WITHIN = 1.0  # seconds
 
 
-class RayTask:
-    """A population's task."""
-
-    def __init__(self, reference: Any) -> None:
-        self.reference = reference
-
-    def done(self) -> bool:
-        """See `Task`."""
-        return bool(ray.wait([self.reference], timeout=0)[0])
-
-    def result(self) -> list[str]:
-        """See `Task`."""
-        try:
-            errors: list[str] = ray.get(self.reference)
-        except TaskCancelledError:
-            return []
-        except RayError as error:
-            raise LostError(type(error).__name__) from None
-        return errors
-
-
 def run(launch: Launch, settings: Mapping[str, Any]) -> None:
-    """Run populations. Raises as `launchers.local.run`, and `InputError` where there is no Ray."""
+    """Run populations; see `run_groups`."""
     _connect(settings["init"])
     remote = ray.remote(**settings["remote"]) if settings["remote"] else ray.remote
     function, worker = remote(_run), ray.put(launch.worker)
-    own = [RayTask(function.remote(worker, list(jobs))) for jobs in launch.groups]
-    tasks: dict[Task, Group] = dict(zip(own, launch.groups, strict=True))
+    tasks = {function.remote(worker, list(jobs)): jobs for jobs in launch.groups}
     try:
-        collect(launch, tasks, _POLL_SECONDS)
+        collect(launch, tasks, _is_done, _result)
     except StopSweep:
         # Tasks that wait see the file and end by themselves. Ray's own process is aborted where a task is
         # cancelled in the moment in which it ends.
-        _cancel(_not_ended(own))
+        _cancel(_wait_for(list(tasks), _ENDED_WITHIN))
         raise
     except BaseException:
-        _cancel([task.reference for task in own if not task.done()])
+        _cancel(_wait_for(list(tasks), 0))
         raise
 
 
-def _run(worker: Worker, jobs: list[SweepJob]) -> list[str]:
+def _run(worker: Worker, jobs: list[Job]) -> list[str]:
     return worker.on_node([jobs])
 
 
-def _not_ended(tasks: list[RayTask]) -> list[Any]:
-    references = [task.reference for task in tasks]
-    return list(ray.wait(references, num_returns=len(references), timeout=_ENDED_WITHIN)[1])
+def _is_done(task: Any) -> bool:
+    return not _wait_for([task], 0)
 
 
-def _cancel(references: list[Any]) -> None:
-    for reference in references:
-        ray.cancel(reference)
-    if references:
-        ray.wait(references, num_returns=len(references), timeout=_ENDED_WITHIN)
-    print(f"ray: {len(references)} tasks cancelled", file=sys.stderr, flush=True)
+def _result(task: Any) -> list[str]:
+    try:
+        errors: list[str] = ray.get(task)
+    except TaskCancelledError:
+        return []
+    except RayError as error:
+        raise LostError(type(error).__name__) from None
+    return errors
+
+
+def _wait_for(tasks: list[Any], seconds: float) -> list[Any]:
+    """The tasks that have not ended within so many seconds."""
+    return list(ray.wait(tasks, num_returns=len(tasks), timeout=seconds)[1])
+
+
+def _cancel(tasks: list[Any]) -> None:
+    for task in tasks:
+        ray.cancel(task)
+    if tasks:
+        _wait_for(tasks, _ENDED_WITHIN)
+    print(f"ray: {len(tasks)} tasks cancelled", file=sys.stderr, flush=True)
 
 
 def _connect(arguments: dict[str, Any]) -> None:

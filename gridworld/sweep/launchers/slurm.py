@@ -8,9 +8,6 @@ only works where accounting is set up.
 from __future__ import annotations
 
 import contextlib
-import functools
-import math
-import re
 import subprocess
 import sys
 import time
@@ -24,70 +21,66 @@ from gridworld.errors import InputError
 from gridworld.process.console import printable
 from gridworld.process.processes import LostError
 from gridworld.storage.atomic_write import inside, remove_path
-from gridworld.sweep.launchers import Group, Launch, Task, collect
+from gridworld.sweep.launchers import Group, Launch, collect
 
 _FOLDER = ".slurm"  # in the sweep's: what submitit writes
-_POLL_SECONDS = 1.0
 _SECONDS_BETWEEN_QUESTIONS = 5.0  # to Slurm, which answers others too
 _FILES_ARRIVE_WITHIN = 15.0  # seconds, over a network
 _SLURMS_NAMES = {"array_parallelism", "partition", "account", "qos", "constraint", "setup", "signal_delay_s"}
 
-
-class SlurmTask:
-    """A task of the array."""
-
-    def __init__(self, job: submitit.Job[list[str]]) -> None:
-        self.job = job
-        self._left: float | None = None  # when it was first not in the queue
-
-    def done(self) -> bool:
-        """See `Task`."""
-        if self.job.paths.result_pickle.exists():
-            return True
-        queue = _queue(time.monotonic() // _SECONDS_BETWEEN_QUESTIONS)
-        if queue is None or self.job.job_id in queue:
-            return False
-        self._left = self._left or time.monotonic()
-        return time.monotonic() > self._left + _FILES_ARRIVE_WITHIN
-
-    def result(self) -> list[str]:
-        """See `Task`."""
-        if not self.job.paths.result_pickle.exists():
-            lines = [line for line in (self.job.stderr() or "").splitlines() if line.strip()]
-            why = lines[-1].strip() if lines else f"nothing was written to {self.job.paths.stderr}"
-        elif (error := self.job.exception()) is not None:
-            why = str(error).strip().splitlines()[-3]
-        else:
-            return self.job.result()
-        print(printable(f"slurm: task {self.job.job_id} was lost: {why}"), file=sys.stderr, flush=True)
-        raise LostError(why)
-
-
-@functools.lru_cache(maxsize=1)  # asked once in a while
-def _queue(moment: float) -> tuple[str, ...] | None:
-    """The user's tasks in Slurm's queue; None where the question failed."""
-    command = ["squeue", "--me", "--noheader", "--array", "--format=%i"]
-    answer = subprocess.run(command, capture_output=True, text=True, check=False)
-    return tuple(answer.stdout.split()) if answer.returncode == 0 else None
+SlurmTask = submitit.Job[list[str]]
 
 
 def run(launch: Launch, settings: Mapping[str, Any]) -> None:
-    """Run populations. Raises as `launchers.local.run`, and `InputError` where Slurm takes no jobs."""
+    """Run populations; see `run_groups`."""
     chunks = _chunks(launch.groups, settings["jobs_per_task"])
-    _refuse_too_many(len(chunks), sum(map(len, launch.groups)))
     folder = inside(launch.worker.sweep, _FOLDER)
     folder.mkdir(exist_ok=True)
-    jobs = _submit(folder, settings, launch, chunks)
+    tasks = _submit(folder, settings, launch, chunks)
     of_task = [[job for group in chunk for job in group] for chunk in chunks]
-    tasks: dict[Task, Group] = dict(zip(map(SlurmTask, jobs), of_task, strict=True))
     try:
-        collect(launch, tasks, _POLL_SECONDS)
+        collect(launch, dict(zip(tasks, of_task, strict=True)), _IsDone(), _result)
     except BaseException:
-        _cancel(jobs[0].job_id.partition("_")[0])
+        _cancel(tasks[0].job_id.partition("_")[0])
         raise
-    if all(job.paths.result_pickle.exists() for job in jobs):
+    if all(task.paths.result_pickle.exists() for task in tasks):
         with contextlib.suppress(OSError):
             remove_path(folder)  # of a lost task the logs are kept
+
+
+class _IsDone:
+    """Whether a task has ended: by its files, or as it is not in the queue any more."""
+
+    def __init__(self) -> None:
+        self._queue: tuple[str, ...] = ()  # the user's tasks
+        self._due = 0.0  # when Slurm is asked again
+        self._left: dict[str, float] = {}  # when a task was first not in the queue
+
+    def __call__(self, task: SlurmTask) -> bool:
+        if task.paths.result_pickle.exists():
+            return True
+        now = time.monotonic()
+        if now >= self._due:
+            command = ["squeue", "--me", "--noheader", "--array", "--format=%i"]
+            answer = subprocess.run(command, capture_output=True, text=True, check=False)
+            if answer.returncode != 0:
+                return False
+            self._queue, self._due = tuple(answer.stdout.split()), now + _SECONDS_BETWEEN_QUESTIONS
+        if task.job_id in self._queue:
+            return False
+        return now > self._left.setdefault(task.job_id, now) + _FILES_ARRIVE_WITHIN
+
+
+def _result(task: SlurmTask) -> list[str]:
+    if not task.paths.result_pickle.exists():
+        lines = [line for line in (task.stderr() or "").splitlines() if line.strip()]
+        why = lines[-1].strip() if lines else f"nothing was written to {task.paths.stderr}"
+    elif (error := task.exception()) is not None:
+        why = str(error).strip().splitlines()[-3]
+    else:
+        return task.result()
+    print(printable(f"slurm: task {task.job_id} was lost: {why}"), file=sys.stderr, flush=True)
+    raise LostError(why)
 
 
 def _chunks(groups: Sequence[Group], most: int) -> list[list[Group]]:
@@ -103,7 +96,7 @@ def _chunks(groups: Sequence[Group], most: int) -> list[list[Group]]:
 
 def _submit(
     folder: Path, settings: Mapping[str, Any], launch: Launch, chunks: list[list[Group]]
-) -> list[submitit.Job[list[str]]]:
+) -> list[SlurmTask]:
     executor = submitit.AutoExecutor(folder=folder, cluster="slurm")
     parameters = {
         f"slurm_{key}" if key in _SLURMS_NAMES else key: value
@@ -115,18 +108,10 @@ def _submit(
         return executor.map_array(launch.worker.on_node, chunks)
     except (submitit.core.utils.FailedJobError, subprocess.SubprocessError, OSError) as error:
         last = (str(error).strip().splitlines() or [type(error).__name__])[-1]
-        raise InputError(f"hydra/launcher=slurm: Slurm took no jobs ({last})") from None
-
-
-def _refuse_too_many(tasks: int, jobs: int) -> None:
-    answer = subprocess.run(["scontrol", "show", "config"], capture_output=True, text=True, check=False)
-    known = re.search(r"MaxArraySize\s*=\s*(\d+)", answer.stdout)
-    if known and tasks >= (most := int(known.group(1))):
-        fitting = math.ceil(jobs / max(1, most - 1))
         raise InputError(
-            f"hydra/launcher=slurm: {tasks:,} tasks, but this cluster takes {most - 1:,} in an array; "
-            f"let each run several jobs: hydra.launcher.jobs_per_task={fitting}"
-        )
+            f"hydra/launcher=slurm: Slurm took no array of {len(chunks):,} tasks ({last}); there are fewer "
+            "tasks, of more jobs each, by hydra.launcher.jobs_per_task"
+        ) from None
 
 
 def _cancel(array: str) -> None:

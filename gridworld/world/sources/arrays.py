@@ -35,8 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gridworld.errors import InputError, in_short
-from gridworld.process.memory_budget import check_memory
-from gridworld.process.user_input import imported, npz_arrays, npz_bytes, open_users_file
+from gridworld.process.user_input import check_memory, imported, npz_arrays, npz_bytes, open_users_file
 from gridworld.world.mdp import Mdp, frozen
 from gridworld.world.outcomes import Outcomes, checked_text, mdp_from_outcomes, verified
 

@@ -31,7 +31,7 @@ from scipy.sparse.csgraph import breadth_first_order
 
 from gridworld.errors import InputError
 from gridworld.process.console import telling_if_slow
-from gridworld.process.memory_budget import check_memory
+from gridworld.process.user_input import check_memory
 from gridworld.world.mdp import BoolArray, Mdp
 from gridworld.world.outcomes import MOST_ACTIONS, MOST_STATES, Outcomes, mdp_from_outcomes
 from gridworld.world.snapshots import Snapshots, digest, random_states
