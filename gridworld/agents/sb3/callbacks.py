@@ -4,14 +4,8 @@ SB3 calls `on_step` before it has stored the transition. Nothing is half done at
 transitions are stored, the update is made. What was saved is put back when training starts, after SB3 has
 reset everything that it resets then.
 
-The state is exact for the classes of Stable-Baselines3 and sb3-contrib: all that they change while they learn
-is listed here. What a custom class keeps, only that class can know: it defines
-
-    get_state(): a dict of numbers, strings, None, arrays, and of dicts and lists of these
-    set_state(state): mirrors it
-
-For an algorithm, that is in addition to what its base class keeps, for a layer to its parameters; a replay
-buffer or callback says everything. With a custom class that does not define them a run has no checkpoints.
+The state is exact for the classes of Stable-Baselines3 and sb3-contrib. A custom class says by `get_state`
+and `set_state` what else it keeps (docs/how-to/resume.md); with one that does not a run has no checkpoints.
 """
 
 from __future__ import annotations

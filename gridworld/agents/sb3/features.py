@@ -44,8 +44,7 @@ class FourierFeatures(_Extractor):
     ones any function of the cell is linear in them. A state without a place, whose coordinates are negative,
     has zeros.
 
-    G. Konidaris, S. Osentoski, P. Thomas: Value Function Approximation in Reinforcement Learning using the
-    Fourier Basis, AAAI 2011. R. Sutton, A. Barto: Reinforcement Learning, section 9.5.2.
+    G. Konidaris et al.: Value Function Approximation in Reinforcement Learning using the Fourier Basis, 2011.
 
     Args:
         observation_space: a Box of shape (d,).

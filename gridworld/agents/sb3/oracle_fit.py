@@ -1,8 +1,8 @@
 """The oracle ablation: a model's network fitted to the exact answer by supervised learning.
 
 What keeps failing is the network itself, since nothing else of reinforcement learning is left: no
-exploration, no bootstrapping, no moving target. A network that is too large to be fitted in about a second
-is not judged: the answer is None.
+exploration, no bootstrapping, no moving target. A network too large to be fitted in about a second is not
+judged: the answer is None.
 """
 
 from __future__ import annotations
@@ -32,12 +32,8 @@ def oracle_fit(
 ) -> bool | None:
     """Whether greedy actions become optimal where a copy of a model's network is fitted to the optimum.
 
-    Args:
-        agent: an `SB3Agent`; stays as it is.
-        best: the optimum under the agent's own discount.
-        states: (n,), those to fit: that an episode can come to.
-        is_optimal: judges greedy actions (S,).
-        fresh: whether to begin with new weights, not those that the model has learnt.
+    `best` is the optimum under the agent's own discount, `states` (n,) are those that an episode can come to,
+    `is_optimal` judges greedy actions (S,), and `fresh` weights are not those that the model has learnt.
     """
     fit = _Fit(agent, best, states, advantages=True)
     actions = np.argmax(best.q, axis=1)

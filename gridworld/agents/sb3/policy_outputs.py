@@ -1,7 +1,6 @@
-"""Outputs of an SB3 policy for given observations: action probabilities or Q values, and values.
+"""Outputs of an SB3 policy for given observations, by what it has, not by its class.
 
-They are found by what a policy can do, not by its class: an actor-critic has a distribution and values, a
-value-based one has a network of Q values, or of their quantiles, whose mean they are.
+An actor-critic has action probabilities and values, others have Q values or their quantiles.
 """
 
 from __future__ import annotations

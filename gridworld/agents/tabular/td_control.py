@@ -4,9 +4,6 @@ After a step from (s, a) to reward r and state s', Q(s, a) moves towards r + γ 
 algorithm's own estimate. Q of a terminal state is 0 and stays 0, so that nothing follows there. An episode
 that the step limit cuts off is no end: its target looks at the state where it was cut.
 
-An algorithm defines `state_values`. By default its target is taken from them, and the next actions are drawn
-after the update, as in the book; SARSA overrides both.
-
 Reference: R. Sutton and A. Barto, Reinforcement Learning, 2nd ed., 2018, chapter 6.
 """
 
