@@ -205,7 +205,7 @@ def _parser() -> argparse.ArgumentParser:
     option("--gamma", type=float, help="discount of returns, 0 to 1 (default 0.99)")
     option("--seed", type=whole(0), default=0, help="of starts and slips (default 0)")
     option("--cell-size", type=whole(8), help="pixels (default 100, less on large maps)")
-    option("--agent", type=Path, metavar="RUN", help="a finished run, whose agent plays beside you")
+    option("--agent", type=Path, metavar="RUN", help="a finished run, whose agent plays next to you")
     return parser
 
 

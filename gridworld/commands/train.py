@@ -147,7 +147,7 @@ def _sum_up(sweep: Path, kind: object, error: BaseException | None, trace: objec
     from gridworld.report.writer import write_over_seeds
 
     if (folder := write_over_seeds(sweep, sweep)) is not None:
-        print(f"  over seeds: {printable(shown(folder))}, beside the jobs in TensorBoard")
+        print(f"  over seeds: {printable(shown(folder))}, next to the jobs in TensorBoard")
 
 
 def run_job(settings: DictConfig) -> float:

@@ -166,7 +166,7 @@ def unreadable_file(error: Exception, folders: Iterable[Path]) -> str:
             OmegaConf.load(file)
         except type(error) as found:
             if isinstance(found, UnicodeDecodeError):
-                return f"{file}: byte {found.start + 1} is no UTF-8"
+                return f"{file}: byte {found.start + 1} is not UTF-8"
             return f"{file}: is nested too deeply, or contains itself"
         except Exception:
             continue  # which would name its file itself

@@ -54,8 +54,8 @@ def diverged(run: Evidence) -> Finding | None:
         return None
     why = f"its values diverged: they reach {highest:.3g} where no policy earns more than {possible:.3g}"
     interval = run.setting("target_update_interval")
-    seldom = (run.change("target_update_interval", 4 * interval),) if interval else ()
-    return Finding("diverged", run.split.wrong, why, (slower(run)[0], *seldom))
+    rarely = (run.change("target_update_interval", 4 * interval),) if interval else ()
+    return Finding("diverged", run.split.wrong, why, (slower(run)[0], *rarely))
 
 
 def scaled(run: Evidence) -> Finding | None:
