@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from helpers.pages import NO_PICTURES
-from helpers.support import script, start, train_on_full_disk
+from helpers.support import ROOT, script, start, train_on_full_disk
 
 from gridworld.commands import jobs as jobs_command
 from gridworld.run.reader import read_run
@@ -68,7 +68,7 @@ def two_jobs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.returncode == 0, done.stderr
     assert "sweep sweep: 2 jobs: 2 done" in done.stdout
     assert "curves: tensorboard --logdir sweep" in done.stdout
-    assert "report: python scripts/report.py sweep\n" in done.stdout
+    assert f"report: python {ROOT}/scripts/report.py sweep\n" in done.stdout
     assert results(done.stdout) == [["q_learning", "classic", "0 of 2 [0 %, 66 %]", "> 512"]]
     return folder
 

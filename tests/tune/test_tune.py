@@ -41,7 +41,7 @@ def studied(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = script("tune.py", *QUICK, "tune.trials=6", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert "held-out seeds" in done.stdout
-    assert "  train it: python scripts/train.py recipe=study\n" in done.stdout
+    assert f"  train it: python {ROOT}/scripts/train.py recipe=study\n" in done.stdout
     told = "  curves over seeds: tensorboard --logdir study/_over_seeds  (of each run: study/confirm)\n"
     assert told in done.stdout
     assert any(folder.glob("study/_over_seeds/* on */events.out.tfevents.*"))
