@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from gridworld.commands import parser_of
 from gridworld.commands.manual import choices
-from gridworld.config.words import conf_folder, refuse_dashes
+from gridworld.config.words import conf_folder, refuse_unclear
 from gridworld.errors import InputError, install_command
 from gridworld.process.console import (
     as_called,
@@ -55,7 +55,7 @@ examples:
 
 def main(arguments: Sequence[str]) -> None:
     """Search, confirm the winner, and print the verdict."""
-    refuse_dashes(arguments)
+    refuse_unclear(arguments)
     parser = _parser(conf_folder())
     options = parser.parse_intermixed_args(arguments)
     if options.cfg not in (None, *_KINDS):

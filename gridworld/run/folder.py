@@ -137,6 +137,7 @@ def claimed(folder: Path) -> Iterator[None]:
 
     An `OSError` of the block names the folder, if it names nothing.
     """
+    is_first = not folder.parent.exists()
     make_folder(folder.parent)
     folder.mkdir(exist_ok=True)
     with alone_in(folder):
@@ -153,3 +154,5 @@ def claimed(folder: Path) -> Iterator[None]:
                     remove_path(inside(folder, HYDRA))
                     (folder / LOCK).unlink(missing_ok=True)
                     folder.rmdir()
+                    if is_first:
+                        folder.parent.rmdir()

@@ -8,7 +8,7 @@ from helpers.support import configure
 from hydra.errors import HydraException
 
 import gridworld
-from gridworld.config.words import prepared, refuse_dashes, sentence
+from gridworld.config.words import prepared, refuse_unclear, sentence
 from gridworld.errors import InputError
 
 
@@ -78,12 +78,12 @@ def test_every_way_into_a_run_takes_whole_numbers(tmp_path: Path) -> None:
 )
 def test_settings_with_dashes_are_answered_by_what_is_right(words: list[str], told: str) -> None:
     with pytest.raises(InputError, match=f"^{re.escape(told)}$"):
-        refuse_dashes(words)
+        refuse_unclear(words)
 
 
 def test_options_have_dashes() -> None:
-    refuse_dashes([])
-    refuse_dashes(["-m", "--cfg", "job", "--config-dir=a", "--frobnicate", "--help", "agent.gamma=--seed"])
+    refuse_unclear([])
+    refuse_unclear(["-m", "--cfg", "job", "--config-dir=a", "--frobnicate", "--help", "agent.gamma=--seed"])
 
 
 @pytest.mark.parametrize(

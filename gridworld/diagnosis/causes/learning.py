@@ -155,7 +155,8 @@ def _slow_table(run: Evidence, states: BoolArray) -> Finding | None:
     if left < _FORGOTTEN:
         return None
     why = (
-        f"its values have not got there: in {where}, {tried:,} updates left {left:.2g} of what it began with"
+        f"its values have not got there: in {where}, its first values still count for {left:.0%} after "
+        f"{'1 update' if tried == 1 else f'{tried:,} updates'}"
     )
     changes = [run.change("learning_rate_power", 0.0)] if power else []
     if rate < run.usual_rate:  # with as many updates, enough of it
