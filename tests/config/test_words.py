@@ -74,9 +74,13 @@ def test_every_way_into_a_run_takes_whole_numbers(tmp_path: Path) -> None:
         (["--env.slip", "seed=3"], "--env.slip: a setting is written without dashes; write env.slip=VALUE"),
         (["--experiment"], "--experiment: a setting is written without dashes; write experiment=VALUE"),
         (["--resume", "runs/a"], "--resume runs/a: a setting is written without dashes; write resume=runs/a"),
+        (["-m", ""], "an empty word: is not a setting; a setting is written key=value, as in agent=dqn"),
+        (["seed=3", "ppo"], "ppo: is not a setting; write agent=ppo"),
+        (["--config-dir", "mine", "maze"], "maze: is not a setting; write env=maze"),
+        (['"seed=1"'], '"seed=1": is in quotation marks, which the shell passed on; leave them out'),
     ],
 )
-def test_settings_with_dashes_are_answered_by_what_is_right(words: list[str], told: str) -> None:
+def test_unclear_words_are_answered_by_what_is_right(words: list[str], told: str) -> None:
     with pytest.raises(InputError, match=f"^{re.escape(told)}$"):
         refuse_unclear(words)
 
