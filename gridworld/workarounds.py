@@ -48,10 +48,9 @@ def generator_of(thing: Any) -> Any:
 
 
 def blas_threads() -> tuple[Callable[[], int], Callable[[int], Any]]:
-    """OpenBLAS's functions that tell and set the number of its threads; another library is left as it is.
+    """OpenBLAS's functions that get and set the number of its threads; another library is left as it is.
 
-    Called before and after each solution, they take a microsecond; `threadpoolctl` takes as long as the
-    solution of a small world.
+    With one thread a solution has the same bits on every machine of a kind; a call takes a microsecond.
     """
     if not _blas:
         import ctypes

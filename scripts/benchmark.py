@@ -1,4 +1,4 @@
-"""Measure this project beside its peers: `python scripts/benchmark.py`; see `--help`."""
+"""Measure this project and its peers: `python scripts/benchmark.py`; see `--help`."""
 
 from gridworld.process.signals import listen
 

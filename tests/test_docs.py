@@ -42,6 +42,32 @@ def test_a_page_runs(page: Path, reader: Reader, monkeypatch: pytest.MonkeyPatch
     reader.read(page)
 
 
+# Turns that a reader stumbles over, and the usual ones.
+TURNS = {
+    r"told|tells": "say, print, show",
+    r"beside": "next to, compared with, in addition to",
+    r"seldom": "rarely",
+    r"stands? (in|beside)": "is in",
+    r"go(es)? on (with|from)": "resume, continue",
+    r"brings? in": "use",
+    r"of one's own": "your own, custom",
+    r"by itself": "automatically, alone",
+    r"(came|comes) out": "result",
+    r"in the place of": "instead of",
+    r"gives? up": "cancel, abandon",
+    r"(?<!there )is no (?!longer)\w+": "is not a",
+}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_page_uses_the_usual_words(page: Path) -> None:
+    if page.stem == "CHANGELOG":  # what was written stays
+        return
+    text = page.read_text("utf-8")
+    found = {turn: usual for turn, usual in TURNS.items() if re.search(rf"\b({turn})\b", text, re.IGNORECASE)}
+    assert not found
+
+
 def test_the_pictures_are_the_ones_that_a_command_draws() -> None:
     figures = _module("figures")
     assert {path.name for path in figures.IMAGES.iterdir()} == set(figures.SOURCES)

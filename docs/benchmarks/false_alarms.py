@@ -1,4 +1,4 @@
-"""How seldom a right implementation fails a probe: a bound from how far it stays from each threshold.
+"""How rarely a right implementation fails a probe: a bound from how far it stays from each threshold.
 
 A trial tells which share of the way to its threshold an algorithm came: 1 or more has failed. With mean m
 and variance v of this share over classes and seeds, Cantelli's inequality bounds the chance p of a failure by

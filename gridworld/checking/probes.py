@@ -248,7 +248,7 @@ PROBES = (
           "gamma is ignored or applied at the wrong step, or a reward belongs to another step",
           gamma=0.5),
     Probe("choice", BANDIT, optimal,
-          "worse actions are preferred: the sign of the advantage, or rewards beside the wrong actions"),
+          "worse actions are preferred: the sign of the advantage, or rewards assigned to the wrong actions"),
     Probe("context", TWO_CONTEXTS, optimal,
           "the policy does not depend on the state: observations are lost, mixed up or of another step",
           arguments=_NO_EXPLORATION_LEFT),

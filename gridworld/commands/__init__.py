@@ -31,8 +31,8 @@ COMMANDS = {
     "reproduce": "run a run again and compare bit for bit",
     "tune": "search an agent's settings for a task, and confirm the winner",
     "check": "check an algorithm's implementation on worlds with known answers",
-    "play": "play a world with the arrow keys, beside a trained agent if you like",
-    "benchmark": "measure the speed of this project beside its peers",
+    "play": "play a world with the arrow keys, with a trained agent next to you if you like",
+    "benchmark": "measure the speed of this project and of its peers",
 }
 _MANUAL = """\
 A Stable-Baselines3 experiment harness whose ground truth is known.

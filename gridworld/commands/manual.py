@@ -22,7 +22,7 @@ Choices:
 
 Keys, with their values: python scripts/train.py --cfg job
   seed, total_timesteps, n_envs, device, threads  the run itself
-  exploration_bonus  what training pays for actions that were seldom taken; 0 for nothing
+  exploration_bonus  what training pays for actions that were rarely taken; 0 for nothing
   agent.*, env.*, observation.*      what learns, in which world, and what it sees
   evaluation.*, logging.*, recording.*, checkpoint.*  what is computed and kept on the way
   hydra.run.dir  the folder to write to, instead of a new one in runs/

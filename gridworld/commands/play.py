@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from gridworld.commands import parser_of, whole
+from gridworld.config.compose import compose
 from gridworld.config.train import EvaluationConfig
 from gridworld.config.worlds import MapConfig
 from gridworld.envs import rendering as drawing
@@ -199,13 +200,14 @@ def play(game: Game, cell_size: int) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("play", __doc__, "--best")
     option = parser.add_argument
+    option("words", nargs="*", metavar="env=NAME", help="the world, as for train: env=cliff env.slip=0.1")
     option("--layout", help="a shipped map's name or a map file (default classic)")
     for name, (kind, meaning) in _WORLD.items():
         option(f"--{name.replace('_', '-')}", type=kind, help=meaning)
     option("--gamma", type=float, help="discount of returns, 0 to 1 (default 0.99)")
     option("--seed", type=whole(0), default=0, help="of starts and slips (default 0)")
     option("--cell-size", type=whole(8), help="pixels (default 100, less on large maps)")
-    option("--agent", type=Path, metavar="RUN", help="a finished run, whose agent plays beside you")
+    option("--agent", type=Path, metavar="RUN", help="a finished run, whose agent plays next to you")
     return parser
 
 
@@ -213,7 +215,12 @@ def _game(options: argparse.Namespace) -> Game:
     """A game in the world of the options; with an agent, its run's settings are the defaults."""
     given = {name: getattr(options, name) for name in _WORLD if getattr(options, name) is not None}
     if options.agent is None:
-        env = MapConfig(**given, **({} if options.layout is None else {"layout": options.layout}))
+        env = compose(options.words).env if options.words else MapConfig()
+        if not isinstance(env, MapConfig):
+            raise InputError(f"{env.name}: has no map to draw; give env=... of a map, such as env=four_rooms")
+        env = dataclasses.replace(
+            env, **given, **({} if options.layout is None else {"layout": options.layout})
+        )
         mdp = env.compile()
         gamma = EvaluationConfig().gamma if options.gamma is None else options.gamma
         return Game(Evaluator(mdp, gamma, env.step_limit(mdp)), options.seed)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import os
+import re
 import sys
 import threading
 import traceback
@@ -28,7 +29,7 @@ from gridworld.bounds import digits
 from gridworld.commands.manual import manual
 from gridworld.config.compose import VERSION_BASE, completed, register_schemas, to_config
 from gridworld.config.train import TrainConfig
-from gridworld.config.words import conf_folder, own_conf_folders, refuse_dashes, sentence, unreadable_file
+from gridworld.config.words import conf_folder, own_conf_folders, refuse_unclear, sentence, unreadable_file
 from gridworld.errors import EXIT_CODE, InputError
 from gridworld.process.console import printable, tell_error
 from gridworld.process.user_input import called_from, limited
@@ -84,7 +85,7 @@ def _call_hydra() -> None:
 
 def _prepare_command_line() -> None:
     """Write `sys.argv` as Hydra takes it: with the words of a recipe and a preset, and plain numbers."""
-    refuse_dashes(sys.argv[1:])
+    refuse_unclear(sys.argv[1:])
     if any(word.startswith("recipe=") for word in sys.argv[1:]):
         from gridworld.config.recipe_file import with_recipe
 
@@ -109,6 +110,9 @@ class RefuseUsedFolders(Callback):
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Hold the run's folder; an unfinished run in it must have the same settings."""
         _check_place(config, "run")
+        for word in config.hydra.overrides.hydra:
+            if re.match(r"\+*hydra[./](launcher|sweeper)\b", word):
+                raise InputError(f"{word}: is about a sweep; add -m, or leave it out")
         folder = Path(config.hydra.run.dir).absolute()  # a job may change the current folder
         check_free(Path(config.hydra.run.dir))
         if config.hydra.output_subdir is not None:
@@ -147,7 +151,7 @@ def _sum_up(sweep: Path, kind: object, error: BaseException | None, trace: objec
     from gridworld.report.writer import write_over_seeds
 
     if (folder := write_over_seeds(sweep, sweep)) is not None:
-        print(f"  over seeds: {printable(shown(folder))}, beside the jobs in TensorBoard")
+        print(f"  over seeds: {printable(shown(folder))}, next to the jobs in TensorBoard")
 
 
 def run_job(settings: DictConfig) -> float:

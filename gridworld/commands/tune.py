@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from gridworld.commands import parser_of
 from gridworld.commands.manual import choices
-from gridworld.config.words import conf_folder, refuse_dashes
+from gridworld.config.words import conf_folder, refuse_unclear
 from gridworld.errors import InputError, install_command
 from gridworld.process.console import (
     as_called,
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 _KINDS = ("job", "all")  # of --cfg
 _EPILOG = """\
-keys, beside all of train.py's (with their defaults: --cfg all):
+keys, in addition to train.py's (with their defaults: --cfg all):
   tune=NAME            another file of conf/tune, or of --config-dir's tune/
   tune.trials          how many, those of earlier calls included; tune.seeds of each: seed, seed + 1, ...
   tune.finalists       trials that are run on more seeds, tune.final_seeds; tune.confirm_seeds for the winner
@@ -55,7 +55,7 @@ examples:
 
 def main(arguments: Sequence[str]) -> None:
     """Search, confirm the winner, and print the verdict."""
-    refuse_dashes(arguments)
+    refuse_unclear(arguments)
     parser = _parser(conf_folder())
     options = parser.parse_intermixed_args(arguments)
     if options.cfg not in (None, *_KINDS):
@@ -89,7 +89,7 @@ def main(arguments: Sequence[str]) -> None:
         sys.exit(1)
     except Interrupted as interruption:
         again = shlex.join(command_line())
-        print(printable(f"{interruption}; nothing that ended is lost; go on with: {again}"), file=sys.stderr)
+        print(printable(f"{interruption}; nothing that ended is lost; resume with: {again}"), file=sys.stderr)
         sys.stderr.flush()
         os._exit(interruption.exit_code)  # finalising the interpreter would take seconds
 
@@ -99,7 +99,7 @@ def _parser(conf: Path) -> argparse.ArgumentParser:
     parser = parser_of("tune", about, epilog=as_called(_EPILOG))
     option = parser.add_argument
     option("overrides", nargs="*", metavar="key=value", help=as_called("train.py's and tune.*"))
-    option("--config-dir", type=Path, help="a folder of your own yaml files, beside conf/")
+    option("--config-dir", type=Path, help="a folder of your own yaml files, in addition to conf/")
     option(
         *("--cfg", "-c"),
         nargs="?",

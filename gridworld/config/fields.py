@@ -95,7 +95,7 @@ class Text(Enum):
     ENV = r"[^:]*", "imports the module before the colon"
     ARGUMENTS = (  # of a class of the libraries; a class may be among them, or a rate that falls
         rf"{_OF_KEYWORD}|(lin|sqrt|quad)_[\d.e+-]+|{_OF_LIBRARIES}",
-        f"is no plain word, nor a class of {', '.join(LIBRARIES)}",
+        f"is not a plain word, nor a class of {', '.join(LIBRARIES)}",
     )
     KWARGS = _OF_KEYWORD, "is for code that may take it for a file or a module"  # of code that is not ours
 

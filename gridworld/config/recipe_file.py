@@ -51,7 +51,7 @@ def with_recipe(words: Sequence[str]) -> list[str]:
     rest = [word for word in words if word != given[0]]
     for word in rest:
         if word.lstrip("+").startswith("experiment="):
-            raise InputError(f"{word}: chooses another recipe beside {given[0]}; give one of them")
+            raise InputError(f"{word}: chooses another recipe in addition to {given[0]}; give one of them")
     truths = [word for word in rest if word.startswith(f"{TRUST}=")]
     if not set(truths) <= {f"{TRUST}=true", f"{TRUST}=false"}:
         raise InputError(f"{truths[0]}: must be true or false")
@@ -174,7 +174,7 @@ def literal(value: Any, where: str) -> str:
     if isinstance(value, dict):
         for key in value:
             if not isinstance(key, str) or not _NAME.fullmatch(key):
-                raise InputError(f"{where}: has the key {str(key)[:80]!r}, which is no name")
+                raise InputError(f"{where}: has the key {str(key)[:80]!r}, which is not a name")
         return f"{{{','.join(f'{key}:{literal(v, where)}' for key, v in value.items())}}}"
     if isinstance(value, list):
         return f"[{','.join(literal(item, where) for item in value)}]"

@@ -90,7 +90,7 @@ class TuneConfig:
 
     trials: int = setting(100, bounds(1))  # the search ends after so many
     seeds: int = setting(3, bounds(1, _MOST_RUNS))  # a trial's: seed, seed + 1, ...
-    # trials that go on to more seeds, beside what the search began from
+    # trials that go on to more seeds, with what the search began from
     finalists: int = setting(5, bounds(1, _MOST_RUNS))
     final_seeds: int = setting(10, bounds(0, _MOST_RUNS))  # the next ones, for the finalists
     # the next ones, for the winner and for what the search began from

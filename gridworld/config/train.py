@@ -212,7 +212,7 @@ def check(config: TrainConfig) -> None:
     discount("evaluation.gamma", config.evaluation.gamma)
     source = getattr(config.env, "source", None)
     if source is not None and SOURCES.get(source) is not type(config.env):
-        raise InputError(f"env.source={source}: is no setting of its own; choose a source by env=...")
+        raise InputError(f"env.source={source}: is not a setting; choose a source by env=...")
     every = config.checkpoint.every
     if not (every is None or every == AUTO or (type(every) is int and 1 <= every < LARGEST_INTEGER)):
         raise InputError(

@@ -113,8 +113,8 @@ def pairs() -> dict[str, tuple[str, str]]:
     return {name: pair for name, pair in found.items() if not (conf / "experiment" / f"{name}.yaml").exists()}
 
 
-def refuse_dashes(words: Sequence[str]) -> None:
-    """Refuse settings that are written as the options of other programs are: `--seed 3`."""
+def refuse_unclear(words: Sequence[str]) -> None:
+    """Refuse settings that are written as options, `--seed 3`, in quotation marks, or without a key."""
     known = {*OF_THE_COMMAND, *settings_of_a_run()}
     for word, following in itertools.pairwise([*words, ""]):
         option, equals, value = word.partition("=")
@@ -124,6 +124,18 @@ def refuse_dashes(words: Sequence[str]) -> None:
             given = f"{word} {following}" if takes_next else word
             value = (following if takes_next else value) or "VALUE"
             raise InputError(f"{given}: a setting is written without dashes; write {name}={value}")
+    for index, word in enumerate(words):
+        if not is_override(words, index):
+            continue
+        if word[:1] in ("'", '"'):
+            raise InputError(f"{word}: is in quotation marks, which the shell passed on; leave them out")
+        if "=" not in word and not word.startswith("~"):
+            groups = ("agent", "env", "observation", "preset", "experiment")
+            found = [each for each in groups if (conf_folder() / each / f"{word}.yaml").is_file() and word]
+            wanted = (
+                f"write {found[0]}={word}" if found else "a setting is written key=value, as in agent=dqn"
+            )
+            raise InputError(f"{word or 'an empty word'}: is not a setting; {wanted}")
 
 
 def sentence(error: BaseException) -> str:
@@ -166,7 +178,7 @@ def unreadable_file(error: Exception, folders: Iterable[Path]) -> str:
             OmegaConf.load(file)
         except type(error) as found:
             if isinstance(found, UnicodeDecodeError):
-                return f"{file}: byte {found.start + 1} is no UTF-8"
+                return f"{file}: byte {found.start + 1} is not UTF-8"
             return f"{file}: is nested too deeply, or contains itself"
         except Exception:
             continue  # which would name its file itself
@@ -182,6 +194,8 @@ def _unknown_choice(message: str) -> str:
     if where == "experiment":
         choices = sorted({*choices, *pairs()})
     fact = f"{where}={name}: there is no such choice"
+    if where == "env" and re.search(r"-v\d+$", name):
+        return f"{fact}; an environment of Gymnasium is env=gymnasium env.id={name}{meant(name, choices)}"
     if len(choices) <= _LISTED:
         return f"{fact}; there are {', '.join(choices)}{meant(name, choices)}"
     near = [choice for choice in choices if choice.startswith(name)]
@@ -196,9 +210,13 @@ def _suggestion(facts: str, message: str) -> str:
             return hint
     if added := re.search(r"Could not override '([^']*)'.*Key '([^']*)' is not in struct", facts, re.DOTALL):
         place, name = added.groups()
+        if place.startswith("tune.space"):
+            return "; what is searched is written in a yaml of conf/tune, which tune=NAME chooses"
         entry = place if place.endswith(f".{name}") else f"{place}.{name}"
         return f"; a new entry of a dictionary needs a plus: +{entry}=..."
     if unknown := re.search(r"Key '([^']*)' not in '\w+'", facts):
+        if unknown[1] == "tune":
+            return "; that is a setting of tune.py"
         place = re.search(r"full_key: (\S+)", message + facts) or re.search(r"override '([^']*)'", facts)
         return _alike((place or unknown)[1], unknown[1])
     return ""
@@ -219,7 +237,7 @@ def _alike(name: str, key: str) -> str:
 def meant(key: str, known: list[str]) -> str:
     """The names that `key` looks like, or is the initials of, as a question; "" if there is none."""
     initials = [name for name in known if "_" in name and "".join(w[:1] for w in name.split("_")) == key]
-    return _or(initials or difflib.get_close_matches(key, known, n=3))
+    return _or(initials or difflib.get_close_matches(key.lower(), known, n=3))
 
 
 def _or(names: list[str]) -> str:

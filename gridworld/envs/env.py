@@ -140,7 +140,7 @@ class GridWorldEnv(gym.Env[int, int]):
         state = _whole_number(value)
         if not 0 <= state < self.mdp.num_states or self.mdp.wall[state]:
             last = self.mdp.num_states - 1
-            raise InputError(f"state={value!r}: must be the number of a cell that is no wall, 0 to {last}")
+            raise InputError(f"state={value!r}: must be the number of a cell that is not a wall, 0 to {last}")
         self._state = state
 
     def reset(

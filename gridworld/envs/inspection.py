@@ -130,7 +130,7 @@ def _single(env: gym.Env[Any, Any]) -> Task:
     mdp = getattr(real, "mdp", None)
     if real is not innermost or not isinstance(real, gym.Env):
         raise InputError(
-            f"env: {type(innermost).__name__} is in the place of {type(real).__name__} and may do anything "
+            f"env: {type(innermost).__name__} replaces {type(real).__name__} and may do anything "
             "with its steps, so nothing exact is known of it; make it a gymnasium.Wrapper"
         )
     if isinstance(mdp, GridMdp):
@@ -173,7 +173,7 @@ def _stacked(observations: list[Any], space: gym.Space[Any]) -> Any:
         given = np.stack([np.asarray(each) for each in observations])
         rows = given.astype(space.dtype)
     except (TypeError, ValueError):
-        raise InputError(f"env: its observations are no arrays of {space}, as its space says") from None
+        raise InputError(f"env: its observations are not arrays of {space}, as its space says") from None
     if not np.allclose(rows.astype(np.float64), given.astype(np.float64), rtol=1e-3, atol=1e-6):
         raise InputError(
             f"env: its observations are {given.dtype}, and others as {space.dtype}, which its space says and "
@@ -238,7 +238,7 @@ def _batch(env: Any) -> Task:
     kind, name = known_class(env, _BATCHES, (*_DECISIVE, *of_wrapper)), type(env).__name__
     if kind is None:
         raise InputError(
-            f"env: {name} is no batch, and no wrapper of one, whose effect on the task is known, so nothing "
+            f"env: {name} is not a batch or a wrapper of one whose effect on the task is known, so nothing "
             "exact is known of what is in it; leave it out, or give one environment as env=..."
         )
     if kind == _PROCESSES:

@@ -14,6 +14,7 @@ import io
 import logging
 import os
 import re
+import shlex
 import shutil
 import sys
 import threading
@@ -25,7 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from gridworld.errors import InputError
-from gridworld.process.user_input import is_limited
+from gridworld.process.user_input import is_limited, users_folder
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
@@ -47,8 +48,13 @@ TOLD.propagate = False
 
 
 def command(name: str) -> str:
-    """What the user types for a command: `gridworld train`, or in a checkout `python scripts/train.py`."""
-    return f"{CONSOLE} {name}" if _is_console() else f"python scripts/{name}.py"
+    """What to type for a command, as this one was typed: `gridworld train`, `python scripts/train.py`."""
+    if _is_console():
+        return f"{CONSOLE} {name}"
+    folder = Path(sys.argv[0]).parent
+    if (users_folder() / sys.argv[0]).resolve().parent != _SCRIPTS.resolve():  # Python itself, or a program
+        folder = Path(_SCRIPTS.name)
+    return f"python {shlex.quote(str(folder / f'{name}.py'))}"
 
 
 def program(name: str) -> str:

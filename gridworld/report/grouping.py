@@ -17,7 +17,7 @@ from gridworld.storage.safe_read import sha256
 
 _OF_LEARNING = (Effect.LEARNING, Effect.LENGTH, Effect.EVALUATION)
 _MAP = ("env.layout", "env.num_rows", "env.num_cols")
-_SOURCE = "env.source"  # of a world that is no map
+_SOURCE = "env.source"  # of a world that is not a map
 _OF_TABLES = ("layout", "max_episode_steps", "evaluation.gamma")
 _NULL = "null"
 _EMPTY = "{}"  # a mapping; where it has entries, these are settings of their own

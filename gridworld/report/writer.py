@@ -288,7 +288,7 @@ def _around_markers(path: Path) -> tuple[str, str]:
     try:
         text = path.read_text("utf-8")
     except UnicodeDecodeError:
-        raise InputError(f"--readme {path}: is no UTF-8 text") from None
+        raise InputError(f"--readme {path}: is not UTF-8 text") from None
     begin, end = MARKERS
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
         raise InputError(f"--readme {path}: must have one line {begin} and, after it, one line {end}")

@@ -88,7 +88,7 @@ def population(then: RunReader) -> list[RunReader]:
     if depends_on and folder.name not in depends_on:
         raise InputError(
             f"{then.folder}: its numbers depend on {len(depends_on)} runs that its manifest names, and its "
-            "folder has the name of none of them; give it its own name again, beside the others"
+            "folder has the name of none of them; give it its own name again, next to the others"
         )
     return [_member(then, folder.parent / name, digest) for name, digest in depends_on.items()]
 

@@ -7,7 +7,7 @@
     summary.json    the result
     model.zip       the trained model; best_model.zip: that of the lowest exact regret, the first of equals
     evaluations.npz the learning curve's exact returns and lengths, as SB3's EvalCallback writes sampled ones
-    world.npz       the world's tables, where it is no map (`gridworld.world.sources.arrays`)
+    world.npz       the world's tables, where it is not a map (`gridworld.world.sources.arrays`)
     visits.npy      how often training took each action in each state, (S, A)
     policy.png, q_error.png, visits.png, learning.gif   what was learnt, how well, where, and how
     frames/, episode.gif, ...   the final policy's episode
@@ -137,6 +137,7 @@ def claimed(folder: Path) -> Iterator[None]:
 
     An `OSError` of the block names the folder, if it names nothing.
     """
+    is_first = not folder.parent.exists()
     make_folder(folder.parent)
     folder.mkdir(exist_ok=True)
     with alone_in(folder):
@@ -153,3 +154,5 @@ def claimed(folder: Path) -> Iterator[None]:
                     remove_path(inside(folder, HYDRA))
                     (folder / LOCK).unlink(missing_ok=True)
                     folder.rmdir()
+                    if is_first:
+                        folder.parent.rmdir()

@@ -152,9 +152,16 @@ def is_started(folder: Path) -> bool:
 def check_is_run(folder: Path) -> None:
     """Check that a folder has a manifest, whatever is in it."""
     if not folder.exists():
-        raise InputError(f"{folder}: no such folder; give the folder of a run, e.g. one in runs/")
+        key, _, value = str(folder).partition("=")
+        is_there = bool(value) and Path(value).is_dir()
+        wanted = f"leave out {key}=" if is_there else "give the folder of a run, e.g. one in runs/"
+        raise InputError(f"{folder}: no such folder; {wanted}")
     if not os.path.lexists(folder / MANIFEST):
-        raise InputError(f"{folder}: not a run's folder, it has no {MANIFEST}")
+        what = f"not a run's folder, it has no {MANIFEST}"
+        if (folder / SWEEP_JSON).exists():
+            what = "is a sweep's folder, not a run's"
+        runs = sorted(path.parent for path in folder.glob(f"*/{MANIFEST}"))
+        raise InputError(f"{folder}: {what}" + (f"; give one of its runs, e.g. {runs[0]}" if runs else ""))
 
 
 def check_free(folder: Path, key: str = "hydra.run.dir") -> None:

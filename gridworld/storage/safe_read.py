@@ -56,7 +56,7 @@ def open_ordinary(path: Path, mode: str = "rb", most: float = math.inf) -> Binar
         return cast("BinaryIO", open(descriptor, mode, buffering=-1 if mode == "rb" else 0))
     os.close(descriptor)
     if not stat.S_ISREG(found.st_mode):
-        raise InputError(f"{path}: is no ordinary file")
+        raise InputError(f"{path}: is not an ordinary file")
     size = f"{most / 2**20:,.0f} MiB" if most >= 2**20 else f"{most:,} bytes"
     raise InputError(f"{path}: is larger than {size}")
 
@@ -86,7 +86,7 @@ def as_text(content: bytes, path: Path) -> str:
     try:
         return content.decode("utf-8")
     except UnicodeDecodeError:
-        raise InputError(f"{path}: cannot be read, it is no UTF-8 text") from None
+        raise InputError(f"{path}: cannot be read, it is not UTF-8 text") from None
 
 
 def as_table(content: bytes, path: Path) -> str:
@@ -102,7 +102,7 @@ def as_object(content: bytes, path: Path) -> dict[str, Any]:
     try:
         found = json.loads(text, parse_constant=_number, parse_float=_number, parse_int=_whole)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is no JSON, it was changed or cut off ({error})") from None
+        raise InputError(f"{path}: is not JSON, it was changed or cut off ({error})") from None
     if not isinstance(found, dict):
         raise InputError(f"{path}: holds no JSON object")
     if _is_deeper(found, _DEEPEST):

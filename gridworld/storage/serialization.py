@@ -66,7 +66,7 @@ def decode(data: bytes | memoryview, name: object = "a state") -> State:
     except (ValueError, TypeError, LookupError, RecursionError) as error:
         raise StateError(f"its content makes no sense ({type(error).__name__})") from None
     if not isinstance(state, dict):
-        raise StateError("its content is no state")
+        raise StateError("its content is not a state")
     return state
 
 

@@ -59,13 +59,13 @@ def tell_end(
     for what, listed in (("interrupted", halted), ("failed", failed)):
         lines += [f"{what}:", *_most(f"  {row.overrides}: {row.error}" for row in listed)] if listed else []
     if stopped:
-        lines.append(f"{stopped}; go on with: {resume_command(folder)}")
+        lines.append(f"{stopped}; resume with: {resume_command(folder)}")
     elif any(row.job not in mistakes for row in failed):
         lines.append(f"to try them again: {resume_command(folder, 'hydra.sweeper.retry_failed=true')}")
     elif any(row.status == RUNNING for row in rows):
         lines.append(f"the rest runs elsewhere; to see how it goes: {resume_command(folder)}")
     elif any(row.status not in (DONE, FAILED) for row in rows):
-        lines.append(f"the rest did not come to its end; go on with: {resume_command(folder)}")
+        lines.append(f"the rest did not come to its end; resume with: {resume_command(folder)}")
     for line in lines:
         print(printable(line), file=sys.stderr, flush=True)
 

@@ -71,7 +71,7 @@ def run_sweep(words: list[str], context: HydraContext, master: DictConfig, setti
     except OSError as error:
         again = console.resume_command(folder.path)
         where = console.shell_path(folder.path)
-        tell_error(f"{where}: {reason(error)}; put that right, then go on with: {again}")
+        tell_error(f"{where}: {reason(error)}; put that right, then resume with: {again}")
         code = 1
     if code:
         raise SystemExit(code)

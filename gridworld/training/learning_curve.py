@@ -199,7 +199,7 @@ class LearningCurve:
         snapshot = self._agent.snapshot()
         if not (np.isfinite(snapshot.values).all() and np.isfinite(snapshot.sampled).all()):
             raise InputError(
-                f"training diverged: the agent's values are no finite numbers after {step} steps; "
+                f"training diverged: the agent's values are not finite numbers after {step} steps; "
                 "try a smaller learning rate"
             )
         evaluation = self._scored(step, snapshot, returns)

@@ -169,7 +169,7 @@ class Session:
             return
         if self._events is not None:
             self._events.hparams(hparams(self._config))
-            self._events.charts("greedy and sampled policy beside the optimum", CHARTS)
+            self._events.charts("greedy and sampled policy with the optimum", CHARTS)
             self._events.text("run/command", f"    {shlex.join(self._run.manifest['command'])}", 0)
             self._events.text("run/settings", as_markdown(dataclasses.asdict(self._config)), 0)
         self._curve.evaluate(0)

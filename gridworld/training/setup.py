@@ -99,9 +99,7 @@ def notes(config: TrainConfig, mdp: Mdp) -> list[str]:
         elsewhere = "" if is_its else ", tuned in another world"
         found.append(f"recipe {config.recipe}{elsewhere}: {steps}; tuned=none {otherwise}")
     elif config.preset == AUTO and (fitting := fitting_preset(config, lambda: mdp)) is not None:
-        found.append(
-            f"{why}: preset={fitting} is made for that; auto leaves it out beside the given settings"
-        )
+        found.append(f"{why}: preset={fitting} is made for that; auto leaves it out with the given settings")
     if config.preset in (STOCHASTIC, LARGE):
         found.append(f"{why}: preset={config.preset}, {steps}; preset=none {otherwise}")
     if config.known_failure is not None:

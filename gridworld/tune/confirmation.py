@@ -260,7 +260,7 @@ def verdict_on(winner: HeldOutResults, began_from: HeldOutResults) -> dict[str, 
     side, time = _side(more, 0.0), _side(sooner, 0.5)
     if side == 0 and time * more.point >= 0:
         side = time
-    verdict = ("does not beat", "cannot be told apart from", "beats")[1 + side]
+    verdict = ("does not beat", "cannot be distinguished from", "beats")[1 + side]
     asked = len(winner.steps) + len(winner.left_out)
     sentence = (
         f"On {asked} held-out seeds the winner {verdict} the settings that the search began from: "

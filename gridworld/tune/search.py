@@ -80,7 +80,7 @@ def _connect(url: str) -> optuna.storages.RDBStorage:
     try:
         parsed = make_url(url)
     except SQLAlchemyError:
-        raise InputError(f"tune.storage={url}: is no URL of a database, e.g. {_EXAMPLES}") from None
+        raise InputError(f"tune.storage={url}: is not the URL of a database, e.g. {_EXAMPLES}") from None
     is_sqlite = parsed.drivername.startswith("sqlite")
     if is_sqlite and (parsed.database in (None, "", ":memory:", "file::memory:") or "mode" in parsed.query):
         raise InputError(f"{_shown(url)}: is a database in memory; name a file, e.g. {_EXAMPLES}")

@@ -172,11 +172,11 @@ def _read(layout: str | PathLike[str]) -> Layout:
     if given in shipped_layouts():
         return parse(files("gridworld").joinpath("layouts", f"{given}.txt").read_text("utf-8"), name=given)
     try:
-        # A row may end in blanks or \r\n; far more than that is no map, and is not read.
+        # A row may end in blanks or \r\n; far more than that is not a map, and is not read.
         with open_users_file(given) as file:
             raw = None if file is None else file.read(4 * MAX_CELLS + 1)
         if raw is None:
-            raise InputError(f"layout {given!r}: is no ordinary file; give a readable text file")
+            raise InputError(f"layout {given!r}: is not an ordinary file; give a readable text file")
         if len(raw) > 4 * MAX_CELLS:
             raise InputError(f"{given}: the map is too large; at most {MAX_CELLS} cells fit")
         return parse(raw.decode("utf-8-sig"), name=given)

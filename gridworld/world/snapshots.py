@@ -211,7 +211,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 def asked(where: str, owner: Any, method: str, arguments: list[Any], chain: Iterable[Any] = ()) -> list[Any]:
-    """What a method of `owner` makes of (copies of) each argument; refuses what is no function of it alone.
+    """What a method of `owner` makes of (copies of) each argument; refuses what is not a function of it.
 
     `chain` are the environments that it may refer to; `where` is what messages call the environment.
     """

@@ -9,7 +9,7 @@ import warnings
 from pathlib import Path
 
 import pytest
-from helpers.support import NO_FILES, SHORT, configure, script, train_in
+from helpers.support import NO_FILES, ROOT, SHORT, configure, script, train_in
 
 from gridworld.errors import InputError
 from gridworld.storage.safe_read import sealed
@@ -140,7 +140,7 @@ def test_a_folder_that_cannot_be_a_runs_is_refused_and_left_alone(tmp_path: Path
     manifest = sealed({"status": "finished", "config": {}, "layout": []})
     (tmp_path / "used" / "manifest.json").write_text(json.dumps(manifest))
     before = sorted(tmp_path.rglob("*"))
-    longer = "make that run longer by python scripts/train.py resume=used total_timesteps=..."
+    longer = f"make that run longer by python {ROOT}/scripts/train.py resume=used total_timesteps=..."
     for folder, told in (
         ("used", f"used: holds a run already; choose another folder, or {longer}"),
         ("file/run", "file/run: cannot be made, file is a file; choose another hydra.run.dir"),

@@ -81,7 +81,7 @@ def test_a_signal_ends_a_run_cleanly(number: signal.Signals, code: int, tmp_path
         _, errors = process.communicate(timeout=20)
     assert process.returncode == code
     assert f"stopped by {number.name}: all " in errors
-    assert "steps are saved; go on with  python scripts/train.py resume=run" in errors
+    assert f"steps are saved; go on with  python {ROOT}/scripts/train.py resume=run" in errors
     assert "Traceback" not in errors
     assert json.loads((tmp_path / "run" / "manifest.json").read_text())["status"] == "interrupted"
 

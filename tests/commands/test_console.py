@@ -79,6 +79,9 @@ def test_what_is_typed_and_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert console.command_line() == ["gridworld", "train", "agent=dqn"]
     assert console.recorded_command_line() == ["gridworld", "train", "agent=dqn"]
     monkeypatch.setattr(sys, "argv", ["../scripts/train.py", "agent=dqn"])
+    monkeypatch.chdir(ROOT / "docs")
+    assert console.command("report") == "python ../scripts/report.py"
+    monkeypatch.chdir(ROOT)
     assert console.command("report") == "python scripts/report.py"
     assert console.program("report") == "report.py"
     assert console.command_line() == ["python", "../scripts/train.py", "agent=dqn"]

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from helpers.support import script
+from helpers.support import ROOT, script
 
 from gridworld.commands.tune import main as tune
 from gridworld.errors import InputError
@@ -20,7 +20,7 @@ def test_a_job_in_its_own_folder_speaks_of_the_users(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "  files: runs/own\n  curves: tensorboard --logdir runs/own\n" in done.stdout
     again = script("train.py", *words, "hydra.job.chdir=true", cwd=tmp_path)
-    assert "python scripts/train.py resume=runs/own total_timesteps=" in again.stderr
+    assert f"python {ROOT}/scripts/train.py resume=runs/own total_timesteps=" in again.stderr
 
 
 def test_commands_name_folders_from_where_the_user_is(

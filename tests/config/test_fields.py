@@ -135,14 +135,15 @@ HOSTILE = {
     CLASS + "{algorithm: stable_baselines3_evil.A}": "agent.algorithm=stable_baselines3_evil.A is from none",
     CLASS + "{policy: evil.Policy}": "agent.policy=evil.Policy is from none of",
     CLASS + "{arguments: {policy_kwargs: {optimizer_class: evil.Adam}}}": "optimizer_class=evil.Adam is no",
-    CLASS + "{arguments: {whatever: [[evil.Adam]]}}": "agent.arguments.whatever=evil.Adam is no plain word",
     CLASS
-    + "{arguments: {tensorboard_log: /tmp/x}}": "agent.arguments.tensorboard_log=/tmp/x is no plain word",
+    + "{arguments: {whatever: [[evil.Adam]]}}": "agent.arguments.whatever=evil.Adam is not a plain word",
+    CLASS
+    + "{arguments: {tensorboard_log: /tmp/x}}": "agent.arguments.tensorboard_log=/tmp/x is not a plain word",
     "agent: {policy_kwargs: {activation_fn: os.system}}": "activation_fn=os.system is from none of",
-    "agent: {policy_kwargs: {features_extractor_kwargs: {a: evil.X}}}": "a=evil.X is no plain word",
+    "agent: {policy_kwargs: {features_extractor_kwargs: {a: evil.X}}}": "a=evil.X is not a plain word",
     "agent: {policy_kwargs: {optimizer_kwargs: {_target_: os.system}}}": "_target_=os.system is no plain",
     "agent: {replay_buffer_class: evil.Buffer}": "agent.replay_buffer_class=evil.Buffer is from none of",
-    "agent: {rollout_buffer_kwargs: {path: a/b}}": "agent.rollout_buffer_kwargs.path=a/b is no plain word",
+    "agent: {rollout_buffer_kwargs: {path: a/b}}": "agent.rollout_buffer_kwargs.path=a/b is not a plain word",
 }
 
 

@@ -69,7 +69,9 @@ def test_the_command_line_goes_before_the_recipe(tmp_path: Path) -> None:
         assert config.total_timesteps == 80_000
     assert with_recipe([recipe, "-m", "seed=0,1"])[0] == "-m"
     assert with_recipe([recipe, "--config-dir", "a=b", "seed=1"])[:3] == ["--config-dir", "a=b", "agent=dqn"]
-    with pytest.raises(InputError, match=r"experiment=cliff_ppo: chooses another recipe beside recipe="):
+    with pytest.raises(
+        InputError, match=r"experiment=cliff_ppo: chooses another recipe in addition to recipe="
+    ):
         of_words(recipe, "experiment=cliff_ppo")
     with pytest.raises(InputError, match=r"recipe is given already"):
         of_words(recipe, "recipe=x")
@@ -103,8 +105,8 @@ CONTENTS = {
     "agent: {arguments: {'${oc.env:HOME}': 1}}": "line 1: has the interpolation",
     "seed: 0x" + "f" * 9999: "is too large a number",
     "agent: {name: '???'}": "agent.name: has no value",
-    "agent: {arguments: {'a.b=1,c': 1}}": "agent.arguments: has the key 'a.b=1,c', which is no name",
-    "agent: {arguments: {3: 1}}": "agent.arguments: has the key '3', which is no name",
+    "agent: {arguments: {'a.b=1,c': 1}}": "agent.arguments: has the key 'a.b=1,c', which is not a name",
+    "agent: {arguments: {3: 1}}": "agent.arguments: has the key '3', which is not a name",
     "agent: {net_arch: " + "[" * 30 + "]" * 30 + "}": "is nested too deeply, more than 20 levels",
     "agent: " + "[" * 30_000: "is nested too deeply, more than 20 levels",
     BOMB: "line 1: has an anchor or an alias",
@@ -149,10 +151,10 @@ FILES: dict[str, tuple[Callable[[Path], object], str]] = {
     "none": (lambda path: None, "has no winner.yaml"),
     "a link": (lambda path: path.symlink_to("/etc/hostname"), "winner.yaml: is a symbolic link"),
     "a device": (lambda path: path.symlink_to("/dev/zero"), "winner.yaml: is a symbolic link"),
-    "a pipe": (os.mkfifo, "winner.yaml: is no ordinary file"),
-    "a folder": (Path.mkdir, "winner.yaml: is no ordinary file"),
+    "a pipe": (os.mkfifo, "winner.yaml: is not an ordinary file"),
+    "a folder": (Path.mkdir, "winner.yaml: is not an ordinary file"),
     "a gigabyte": (large, "winner.yaml: is larger than 65,536 bytes"),
-    "no text": (lambda path: path.write_bytes(b"\xff"), "winner.yaml: cannot be read, it is no UTF-8 text"),
+    "no text": (lambda path: path.write_bytes(b"\xff"), "winner.yaml: cannot be read, it is not UTF-8 text"),
 }
 
 
@@ -172,7 +174,7 @@ def test_a_study_whose_recipe_is_elsewhere_is_refused(tmp_path: Path) -> None:
     for word, told in (
         (f"recipe={tmp_path / 'study'}", "study/experiment: is a symbolic link"),
         ("recipe=", "recipe=: must be a recipe's yaml, or the folder of a study"),
-        ("recipe=/dev/zero", "/dev/zero: is no ordinary file"),
+        ("recipe=/dev/zero", "/dev/zero: is not an ordinary file"),
     ):
         with pytest.raises(InputError, match=told):
             with_recipe([word])

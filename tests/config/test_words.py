@@ -8,7 +8,7 @@ from helpers.support import configure
 from hydra.errors import HydraException
 
 import gridworld
-from gridworld.config.words import prepared, refuse_dashes, sentence
+from gridworld.config.words import prepared, refuse_unclear, sentence
 from gridworld.errors import InputError
 
 
@@ -74,16 +74,20 @@ def test_every_way_into_a_run_takes_whole_numbers(tmp_path: Path) -> None:
         (["--env.slip", "seed=3"], "--env.slip: a setting is written without dashes; write env.slip=VALUE"),
         (["--experiment"], "--experiment: a setting is written without dashes; write experiment=VALUE"),
         (["--resume", "runs/a"], "--resume runs/a: a setting is written without dashes; write resume=runs/a"),
+        (["-m", ""], "an empty word: is not a setting; a setting is written key=value, as in agent=dqn"),
+        (["seed=3", "ppo"], "ppo: is not a setting; write agent=ppo"),
+        (["--config-dir", "mine", "maze"], "maze: is not a setting; write env=maze"),
+        (['"seed=1"'], '"seed=1": is in quotation marks, which the shell passed on; leave them out'),
     ],
 )
-def test_settings_with_dashes_are_answered_by_what_is_right(words: list[str], told: str) -> None:
+def test_unclear_words_are_answered_by_what_is_right(words: list[str], told: str) -> None:
     with pytest.raises(InputError, match=f"^{re.escape(told)}$"):
-        refuse_dashes(words)
+        refuse_unclear(words)
 
 
 def test_options_have_dashes() -> None:
-    refuse_dashes([])
-    refuse_dashes(["-m", "--cfg", "job", "--config-dir=a", "--frobnicate", "--help", "agent.gamma=--seed"])
+    refuse_unclear([])
+    refuse_unclear(["-m", "--cfg", "job", "--config-dir=a", "--frobnicate", "--help", "agent.gamma=--seed"])
 
 
 @pytest.mark.parametrize(

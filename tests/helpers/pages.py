@@ -44,6 +44,7 @@ class Block:
     language: str
     file: str | None
     text: str
+    is_next: bool  # there is nothing between it and the block before
 
     @property
     def lines(self) -> list[str]:
@@ -54,7 +55,11 @@ class Block:
 
 def blocks(page: Path, *languages: str) -> list[Block]:
     """The blocks of a page, in order; of some languages, or of all."""
-    found = (Block(name, file or None, text) for name, file, text in _BLOCK.findall(page.read_text("utf-8")))
+    text, found, end = page.read_text("utf-8"), [], 0
+    for match in _BLOCK.finditer(text):
+        language, file, content = match.groups()
+        found.append(Block(language, file or None, content, not text[end : match.start()].strip()))
+        end = match.end()
     return [block for block in found if not languages or block.language in languages]
 
 
@@ -102,12 +107,12 @@ class Reader:
     def read(self, page: Path) -> None:
         """Run a page's commands and Python, write its files, and read what else looks like a command.
 
-        A block of text after one of Python is what that prints.
+        A block of text right after one of Python is what that prints.
         """
         names: dict[str, object] = {}
         printed = ""
         for block in blocks(page):
-            if block.language == "text" and printed:
+            if block.language == "text" and block.is_next and printed:
                 assert block.text.split() == printed.split(), page
                 printed = ""
                 continue

@@ -59,9 +59,9 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "a bit": (flip, ANOTHER),
     "empty": (lambda file: os.truncate(file, 0), ANOTHER),
     "gone": (lambda file: file.unlink(), "has no "),
-    "a folder": (replaced(lambda file: file.mkdir()), "is no ordinary file"),
+    "a folder": (replaced(lambda file: file.mkdir()), "is not an ordinary file"),
     "a link": (replaced(lambda file: file.symlink_to("/etc/hostname")), "is a symbolic link"),
-    "a pipe": (replaced(os.mkfifo), "is no ordinary file"),
+    "a pipe": (replaced(os.mkfifo), "is not an ordinary file"),
     "huge": (lambda file: os.truncate(file, 2**40), "is larger than "),
 }
 

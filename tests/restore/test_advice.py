@@ -4,7 +4,7 @@ import shlex
 from pathlib import Path
 
 import pytest
-from helpers.support import NO_FILES, script, train_in
+from helpers.support import NO_FILES, ROOT, script, train_in
 
 from gridworld.restore.advice import _still_falls, advice
 from gridworld.run.reader import RunReader
@@ -58,7 +58,7 @@ def test_a_run_that_nobody_can_read_gets_none(tmp_path: Path) -> None:
 def test_it_is_printed_and_a_certified_run_has_none(tmp_path: Path) -> None:
     failed = script("train.py", "agent=q_learning", "hydra.run.dir=a", *SHORT[:2], *NO_FILES, cwd=tmp_path)
     assert "  try:\n" in failed.stdout
-    assert "python scripts/diagnose.py a" in failed.stdout
+    assert f"python {ROOT}/scripts/diagnose.py a" in failed.stdout
     done = script("train.py", "agent=q_learning", "hydra.run.dir=b", *NO_FILES, cwd=tmp_path)
     assert "certified optimal" in done.stdout
     assert "try:" not in done.stdout

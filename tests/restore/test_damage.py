@@ -209,7 +209,7 @@ def pipe(path: Path) -> None:
 
 JOB = {"job": "seed=0", "hash": "1" * 32, "overrides": ["seed=0"]}
 HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
-    "sweep.json is a pipe": (lambda sweep: pipe(sweep / "sweep.json"), "error: .*is no ordinary file"),
+    "sweep.json is a pipe": (lambda sweep: pipe(sweep / "sweep.json"), "error: .*is not an ordinary file"),
     "sweep.json is nested": (
         lambda sweep: (sweep / "sweep.json").write_text('{"a":' * 10**5),
         r"error: .*sweep.json: (damaged|is empty or cut off)",
@@ -229,14 +229,14 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "summary.json is a pipe": (
         lambda sweep: pipe(sweep / "seed=0" / "summary.json"),
-        "failed .*summary.json: is no ordinary file",
+        "failed .*summary.json: is not an ordinary file",
     ),
     "a regret beyond all numbers": (
         lambda sweep: (
             in_json(sweep / "seed=0" / "summary.json", regret=10**400),
             seal(sweep / "seed=0", "summary.json"),
         ),
-        "failed .*summary.json: is no JSON, .*is too large a number",
+        "failed .*summary.json: is not JSON, .*is too large a number",
     ),
     "a status that is a list": (
         lambda sweep: in_json(sweep / "seed=0" / "manifest.json", status=[]),
@@ -290,9 +290,9 @@ def test_a_study_with_a_number_beyond_all_is_refused(
     shutil.copytree(good / "study", tmp_path / "study")
     in_json(tmp_path / "study" / name, importances={"agent.gamma": value}, about={"objective": {"n": value}})
     telling = tuned if name == "study.json" else claimed
-    with pytest.raises(InputError, match=f"{name}: is no JSON, .* is too large a number"):
+    with pytest.raises(InputError, match=f"{name}: is not JSON, .* is too large a number"):
         telling(tmp_path)
     text = (tmp_path / "study" / name).read_text()
     (tmp_path / "study" / name).write_text(text.replace(str(value), "1e999"))
-    with pytest.raises(InputError, match=f"{name}: is no JSON, .*1e999 is too large a number"):
+    with pytest.raises(InputError, match=f"{name}: is not JSON, .*1e999 is too large a number"):
         telling(tmp_path)

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from helpers.resuming import begin, differences, go_on, left_behind, stopped_after
-from helpers.support import SHORT, script, train_on_full_disk
+from helpers.support import ROOT, SHORT, script, train_on_full_disk
 
 from gridworld.engine.dqn import DQN
 from gridworld.errors import InputError
@@ -116,7 +116,8 @@ def test_a_really_full_disk(tmp_path: Path, calm: dict[str, Any]) -> None:
     done = train_on_full_disk(15_000, *WORDS, "hydra.run.dir=run", cwd=tmp_path)
     assert done.returncode == 2
     assert (
-        "error: run: File too large; put that right, then go on with python scripts/train.py" in done.stderr
+        f"error: run: File too large; put that right, then go on with python {ROOT}/scripts/train.py"
+        in done.stderr
     )
     again = script("train.py", "resume=run", cwd=tmp_path)
     assert again.returncode == 0, again.stderr

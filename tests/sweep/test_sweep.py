@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from helpers.pages import NO_PICTURES
-from helpers.support import script, start, train_on_full_disk
+from helpers.support import ROOT, script, start, train_on_full_disk
 
 from gridworld.commands import jobs as jobs_command
 from gridworld.run.reader import read_run
@@ -68,7 +68,7 @@ def two_jobs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.returncode == 0, done.stderr
     assert "sweep sweep: 2 jobs: 2 done" in done.stdout
     assert "curves: tensorboard --logdir sweep" in done.stdout
-    assert "report: python scripts/report.py sweep\n" in done.stdout
+    assert f"report: python {ROOT}/scripts/report.py sweep\n" in done.stdout
     assert results(done.stdout) == [["q_learning", "classic", "0 of 2 [0 %, 66 %]", "> 512"]]
     return folder
 
@@ -142,7 +142,7 @@ def test_what_fails_while_it_runs_is_told_and_tried_again_if_asked(tmp_path: Pat
     first = sweep(*words, "hydra.sweeper.stop_at_first_failure=true", cwd=tmp_path)
     assert first.returncode == 1
     assert list(statuses(folder).values()) == ["failed", "pending"]
-    assert "stopped at the first failure; go on with: python " in first.stderr
+    assert "stopped at the first failure; resume with: python " in first.stderr
     done = sweep(*words, cwd=tmp_path)
     assert done.returncode == 1, done.stderr
     assert "1 to run" in done.stderr
@@ -227,7 +227,7 @@ def test_ctrl_c_ends_it_and_it_says_how_to_go_on(tmp_path: Path) -> None:
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does on Ctrl-C
         _, errors = process.communicate(timeout=20)
     assert process.returncode == 130
-    assert "stopped by SIGINT; go on with: python " in errors
+    assert "stopped by SIGINT; resume with: python " in errors
     assert "Traceback" not in errors
     assert not members(process.pid)
     assert "interrupted" in statuses(tmp_path / "sweep").values()
@@ -277,7 +277,7 @@ def cut_off(run: Path) -> None:
     [
         (with_other_settings, "holds an unfinished run with other settings (total_timesteps=500"),
         (made_longer, "the run in seed=0 was made 700 steps long"),
-        (cut_off, "manifest.json: is no JSON, it was changed or cut off"),
+        (cut_off, "manifest.json: is not JSON, it was changed or cut off"),
     ],
 )
 def test_a_job_that_cannot_go_on_says_why_and_begins_anew_if_asked(
@@ -312,7 +312,7 @@ def test_a_full_disk_is_told_and_the_same_line_goes_on(most: int, stands: set[st
     assert full.returncode == 1
     assert "Traceback" not in full.stderr
     assert "File too large" in full.stderr
-    assert "go on with: python " in full.stderr.splitlines()[-1]
+    assert "resume with: python " in full.stderr.splitlines()[-1]
     if stands:
         assert set(statuses(tmp_path / "sweep").values()) == stands
         assert "File too large" in table(tmp_path / "sweep")["seed=0"]["error"]

@@ -86,7 +86,7 @@ def test_a_signal_gives_its_tasks_up(cluster: Cluster, tmp_path: Path) -> None:
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=20)
     assert process.returncode == 130
-    assert "stopped by SIGINT; go on with: python " in errors
+    assert "stopped by SIGINT; resume with: python " in errors
     assert "Traceback" not in errors
     assert "slurm: scancel" in errors or "tasks cancelled" in errors
     script("jobs.py", "sweep", cwd=tmp_path)
@@ -112,7 +112,7 @@ def test_no_job_begins_after_the_first_failure_if_asked(cluster: Cluster, tmp_pa
     words = (*a_class("own.Broken"), "seed=0,1,2", one_at_a_time[cluster.launcher])
     done = cluster.sweep(*words, "hydra.sweeper.stop_at_first_failure=true", cwd=tmp_path)
     assert done.returncode == 1
-    assert "stopped at the first failure; go on with: python " in done.stderr
+    assert "stopped at the first failure; resume with: python " in done.stderr
     assert Counter(statuses(tmp_path / "sweep").values()) == {"failed": 1, "pending": 2}
     assert list((tmp_path / "sweep").glob("*/manifest.json")) != []
 
@@ -129,7 +129,7 @@ def test_slurms_warning_interrupts_a_job_and_a_restart_has_the_rest(cluster: Clu
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 1
     assert list(statuses(folder).values()) == ["done", "interrupted", "pending"]
-    assert "the rest did not come to its end; go on with: python " in errors
+    assert "the rest did not come to its end; resume with: python " in errors
 
 
 @pytest.mark.parametrize("cluster", ["slurm"], indirect=True)

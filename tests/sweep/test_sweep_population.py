@@ -174,7 +174,7 @@ def test_a_signal_interrupts_all_and_nothing_is_lost(
             os.killpg(process.pid, number)
         _, errors = process.communicate(timeout=20)
     assert process.returncode == 128 + number, errors
-    assert f"stopped by {number.name}; go on with: python " in errors
+    assert f"stopped by {number.name}; resume with: python " in errors
     assert "Traceback" not in errors
     assert {row["status"] for row in rows(folder).values()} == {"interrupted"}
     ends = [logged(run)[-1] for run in map(folder.joinpath, rows(folder))]

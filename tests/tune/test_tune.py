@@ -41,7 +41,7 @@ def studied(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = script("tune.py", *QUICK, "tune.trials=6", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert "held-out seeds" in done.stdout
-    assert "  train it: python scripts/train.py recipe=study\n" in done.stdout
+    assert f"  train it: python {ROOT}/scripts/train.py recipe=study\n" in done.stdout
     told = "  curves over seeds: tensorboard --logdir study/_over_seeds  (of each run: study/confirm)\n"
     assert told in done.stdout
     assert any(folder.glob("study/_over_seeds/* on */events.out.tfevents.*"))
@@ -258,7 +258,7 @@ def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path
         process.send_signal(signal.SIGINT)
         told = process.stderr.read()  # until the last worker has let go of it
     assert process.returncode == 130
-    assert "stopped by SIGINT; nothing that ended is lost; go on with: python" in told
+    assert "stopped by SIGINT; nothing that ended is lost; resume with: python" in told
     check_ended(others)
     ended = rows(tmp_path)
 
@@ -328,7 +328,7 @@ def test_ctrl_c_while_workers_start_is_one_sentence(threads: int, tmp_path: Path
             told = process.stderr.read()
         assert process.returncode == 130
         assert "Traceback" not in told
-        assert "stopped by SIGINT; nothing that ended is lost; go on with: python" in told
+        assert "stopped by SIGINT; nothing that ended is lost; resume with: python" in told
 
 
 def test_every_key_of_the_settings_stands_in_its_yaml() -> None:

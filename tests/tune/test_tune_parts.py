@@ -369,7 +369,7 @@ def around(certified: int, step: int) -> list[float]:
     return [*spread[:certified], *[math.inf] * (20 - certified)]
 
 
-UNCLEAR = "cannot be told apart from"
+UNCLEAR = "cannot be distinguished from"
 
 
 @pytest.mark.parametrize(

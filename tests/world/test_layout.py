@@ -85,7 +85,7 @@ def test_what_is_no_map_is_refused(tmp_path):
     shipped = "neither a shipped layout .*" + ".*".join(SHIPPED)
     for layout, mistake in (
         *((name, shipped) for name in ("no_such_map", "missing/map.txt", "nul\0byte", tmp_path / "file/map")),
-        *((path, "is no ordinary file") for path in ("/dev/zero", tmp_path / "link", tmp_path / "pipe")),
+        *((path, "is not an ordinary file") for path in ("/dev/zero", tmp_path / "link", tmp_path / "pipe")),
         (tmp_path, "cannot be read"),
         *((what, "^layout=") for what in (None, 5, 1.5, "", b"classic", ["classic"], ("S", "G"), True)),
     ):

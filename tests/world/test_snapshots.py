@@ -1,4 +1,4 @@
-"""A method that could remember something, wherever it keeps that, is no function of its argument alone."""
+"""A method that could remember something, wherever it keeps that, is not a function of its argument alone."""
 
 import dataclasses
 import functools

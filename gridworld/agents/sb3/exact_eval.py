@@ -89,7 +89,7 @@ class ForeignPolicy:
         outputs = q if probabilities is None else probabilities
         assert outputs is not None
         if not np.isfinite(outputs).all():
-            raise InputError("the model's outputs are no finite numbers; its training has diverged")
+            raise InputError("the model's outputs are not finite numbers; its training has diverged")
         greedy = one_hot_policy(self._predicted(observation), outputs.shape[1])
         self._policy.set_training_mode(was_training)
         epsilon = float(getattr(self._model, "exploration_rate", 0.0))

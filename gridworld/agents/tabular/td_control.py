@@ -138,7 +138,7 @@ class TabularControl(ABC):
             if not error < np.inf:
                 raise InputError(
                     f"agent={config.name}: training diverged at step {steps:,}, the error of its update "
-                    "is no finite number; try a smaller learning rate"
+                    "is not a finite number; try a smaller learning rate"
                 )
             self._actions = self._next_actions(states, ended)
             self._log(ended, error, rate)

@@ -54,8 +54,8 @@ def diverged(run: Evidence) -> Finding | None:
         return None
     why = f"its values diverged: they reach {highest:.3g} where no policy earns more than {possible:.3g}"
     interval = run.setting("target_update_interval")
-    seldom = (run.change("target_update_interval", 4 * interval),) if interval else ()
-    return Finding("diverged", run.split.wrong, why, (slower(run)[0], *seldom))
+    rarely = (run.change("target_update_interval", 4 * interval),) if interval else ()
+    return Finding("diverged", run.split.wrong, why, (slower(run)[0], *rarely))
 
 
 def scaled(run: Evidence) -> Finding | None:
@@ -155,7 +155,8 @@ def _slow_table(run: Evidence, states: BoolArray) -> Finding | None:
     if left < _FORGOTTEN:
         return None
     why = (
-        f"its values have not got there: in {where}, {tried:,} updates left {left:.2g} of what it began with"
+        f"its values have not got there: in {where}, its first values still count for {left:.0%} after "
+        f"{'1 update' if tried == 1 else f'{tried:,} updates'}"
     )
     changes = [run.change("learning_rate_power", 0.0)] if power else []
     if rate < run.usual_rate:  # with as many updates, enough of it

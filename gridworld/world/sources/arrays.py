@@ -65,8 +65,8 @@ def mdp_from_arrays(name: str, arrays: Mapping[str, Any], where: str) -> Mdp:
             raise InputError(f"{where}: has no {key}, must hold {', '.join(_NEEDED)}")
     if unknown := [key for key in arrays if key not in _NEEDED + _OPTIONAL]:
         raise InputError(
-            f"{where}: {str(unknown[0])[:50]} is no array of a world; beside what is needed it may hold "
-            f"{', '.join(_OPTIONAL)}"
+            f"{where}: {str(unknown[0])[:50]} is not an array of a world; apart from what is needed it may "
+            f"hold {', '.join(_OPTIONAL)}"
         )
     given = {key: _array(where, key, value) for key, value in arrays.items()}
     if given["next_state"].ndim == 2:
@@ -144,7 +144,9 @@ def _array(where: str, key: str, value: Any) -> NDArray[Any]:
     except (TypeError, ValueError, RuntimeError):
         array = np.array(None)
     if array.dtype.kind == "O":
-        raise InputError(f"{where}: {key} is {type(value).__name__}, which is no array of numbers or text")
+        raise InputError(
+            f"{where}: {key} is {type(value).__name__}, which is not an array of numbers or text"
+        )
     return array
 
 
@@ -171,7 +173,7 @@ def _read(path: str | PathLike[str]) -> bytes:
     try:
         with open_users_file(given) as file:
             if file is None:
-                raise InputError(f"env.path={given}: is no ordinary file; give an .npz file")
+                raise InputError(f"env.path={given}: is not an ordinary file; give an .npz file")
             size = os.fstat(file.fileno()).st_size
             if size > _MOST_BYTES:
                 raise InputError(

@@ -63,7 +63,7 @@ def enumerate_env(
     Args:
         env_id: its registered id.
         kwargs: the arguments of `gymnasium.make`.
-        ignore: attributes of the environment that are no part of its state.
+        ignore: attributes of the environment that are not part of its state.
         most_states: more are refused as soon as they are found.
 
     Returns:

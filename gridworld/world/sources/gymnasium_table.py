@@ -214,7 +214,7 @@ def make_env(
     arguments = dict(kwargs or {})
     if arguments.get("render_mode") is not None:
         raise InputError(
-            f"env.kwargs: render_mode={arguments['render_mode']} is no part of the world; leave it out"
+            f"env.kwargs: render_mode={arguments['render_mode']} is not part of the world; leave it out"
         )
     module, _, registered = str(env_id).rpartition(":")
     if module:
@@ -236,7 +236,7 @@ def make_env(
         gym.spec(registered)
     except Exception as error:  # an id may name a module, which may raise anything
         raise InputError(
-            f"env.id={str(env_id)[:80]}: is no environment that Gymnasium knows ({short_reason(error)}); "
+            f"env.id={str(env_id)[:80]}: is not an environment that Gymnasium knows ({short_reason(error)}); "
             "give a registered id, e.g. FrozenLake-v1"
         ) from None
     try:

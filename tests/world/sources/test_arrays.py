@@ -175,7 +175,7 @@ def test_everything_optional(tmp_path):
     ("changed", "told"),
     [
         ({"start": None}, "has no start, must hold next_state, reward, terminated, start"),
-        ({"nonsense": [1.0]}, "nonsense is no array of a world; beside what is needed it may hold"),
+        ({"nonsense": [1.0]}, "nonsense is not an array of a world; apart from what is needed it may hold"),
         ({"reward": [0.0, 1.0]}, r"reward has shape \(2,\), next_state has \(2, 2, 1\)"),
         ({"reward": [["a", "b"], ["a", "b"]]}, "reward is <U1 .* must be an array of numbers"),
         ({"terminated": [[0, 0], [0, 1]]}, "terminated is int64 .* must be an array of booleans"),
@@ -209,7 +209,7 @@ def test_no_file_of_arrays(tmp_path, monkeypatch):
         (3, "env.path=3: must be the path"),
         (tmp_path / "text.npz", "text.npz: not an .npz file of arrays that can be read"),
         (tmp_path / "one.npy", "not an .npz file of arrays"),
-        (tmp_path / "pipe.npz", "is no ordinary file"),
+        (tmp_path / "pipe.npz", "is not an ordinary file"),
         (written(tmp_path, name=np.array([{}], dtype=object)), "cannot be loaded when allow_pickle=False"),
         (tmp_path / "bomb.npz", "its arrays have 8 MiB, more than 1"),
     ):

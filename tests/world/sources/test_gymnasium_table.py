@@ -214,13 +214,13 @@ def test_a_table_that_is_none_is_refused(changed, told):
 @pytest.mark.parametrize(
     ("env_id", "kwargs", "told"),
     [
-        ("FrozenLak-v1", {}, "env.id=FrozenLak-v1: is no environment .*Did you mean: `FrozenLake`"),
+        ("FrozenLak-v1", {}, "env.id=FrozenLak-v1: is not an environment .*Did you mean: `FrozenLake`"),
         ("FrozenLake-v9", {}, "env.id=FrozenLake-v9: .*`v1`"),
         ("no such id", {}, "env.id=no such id: "),
         (3, {}, "env.id=3: "),
         ("no_module.here:Any-v0", {}, "env.id=no_module.here:Any-v0: there is no module no_module; install"),
-        (":Any-v0", {}, "env.id=:Any-v0: is no environment"),
-        ("gymnasium:Lake-v1", {}, "env.id=gymnasium:Lake-v1: is no environment"),
+        (":Any-v0", {}, "env.id=:Any-v0: is not an environment"),
+        ("gymnasium:Lake-v1", {}, "env.id=gymnasium:Lake-v1: is not an environment"),
         ("gridworld:GridWorld-v0", {}, "gridworld:GridWorld-v0: has no transition table P"),
         ("CartPole-v1", {}, "CartPole-v1: has no transition table P.*env=enumerated"),
         ("FrozenLake-v1", {"is_slipery": True}, "env.kwargs={is_slipery: True}: .*argument 'is_slipery'"),
