@@ -20,7 +20,7 @@ with tempfile.TemporaryDirectory() as folder:
 for step, regret, goal in zip(
     *(callback.evaluations[name] for name in ("step", "regret", "goal_probability")), strict=True
 ):
-    print(f"{step:7,} steps: exact regret {regret:.3f}, reaches the goal with probability {goal:.2f}")
+    print(f"{step:7,} steps: exact regret {abs(regret):.3f}, reaches the goal with probability {goal:.2f}")
 
 score = gridworld.evaluate(best)
-print(f"the best model: regret {score.regret:.3f}, certified optimal: {score.certified}")
+print(f"the best model: regret {abs(score.regret):.3f}, certified optimal: {score.certified}")

@@ -135,7 +135,9 @@ class Run:
         if state["num_timesteps"] < 0 or state["num_updates"] < 0 or state["num_episodes"] < 0:
             raise StateError("counters must be at least 0")
         self.torch_generator.set_state(torch.from_numpy(state["torch_generator"]))
-        self.numpy_generator.set_state(state["numpy_generator"])
+        # numpy takes a state without its last two keys, too
+        keys = ("bit_generator", "state", "has_gauss", "gauss")
+        self.numpy_generator.set_state({key: state["numpy_generator"][key] for key in keys})
         set_generator_state(model.action_space.np_random, state["action_generator"])
         self.envs.set_state(state["environments"])
         model.num_timesteps, model._n_updates = int(state["num_timesteps"]), int(state["num_updates"])

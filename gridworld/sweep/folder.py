@@ -104,7 +104,10 @@ class SweepFolder:
     @contextlib.contextmanager
     def at_work(self) -> Iterator[None]:
         """Make the folder, and keep other sweeps out of it. Raises `InputError` if one is there."""
-        make_folder(self.path)
+        try:
+            make_folder(self.path)
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be made ({error.strerror})") from None
         with locked(self.path / LOCK, wait=1) as is_ours:
             if not is_ours:
                 raise InputError(f"{self.path}: another process runs this sweep; wait for it or stop it")

@@ -258,9 +258,10 @@ class Session:
         if self._events is not None:
             events = self._events
             closing += [partial(events.end_session, succeeded), lambda: events.log.sync(), events.close]
-        for close in closing:
-            with contextlib.nullcontext() if succeeded else contextlib.suppress(OSError, InputError):
-                close()
+        ignored = () if succeeded else (OSError, InputError)
+        with contextlib.suppress(*ignored), contextlib.ExitStack() as stack:
+            for close in reversed(closing):  # all of them, whatever one raises
+                stack.callback(close)
 
 
 def summarise(config: TrainConfig, curve: LearningCurve, last: Evaluation, seconds: float) -> Summary:

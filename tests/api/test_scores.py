@@ -153,7 +153,7 @@ def refused(*given: Any, **named: Any) -> str:
         ((), {"env": "classic"}, "give one of a model or table"),
         (("abc", "classic"), {}, "str is neither a model nor a table of numbers"),
         (([1] * 30,), {}, "env: is needed"),
-        (([1] * 30, "nope"), {}, "neither a shipped layout"),
+        (([1] * 30, "nope"), {}, "env=nope: there is no such world"),
         (([1] * 30, 3), {}, "env: int has no GridWorld in it"),
         (([1] * 30, "classic"), {"gamma": 2}, "gamma=2: must be from 0 to 1"),
         (([1] * 30, "classic"), {"max_episode_steps": 0}, "max_episode_steps"),

@@ -43,5 +43,6 @@ def test_the_notebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nbclient.NotebookClient(notebook, timeout=120, kernel_name="python3", resources=place).execute()
     output = str([cell.get("outputs") for cell in notebook.cells])
     assert "RunResult(dqn on classic, seed 0" in output
-    assert "dqn on classic: 100%" in output or "IntProgress" in output  # a bar
+    assert "dqn on classic: step 0 of 30,000 (0%)" in output
+    assert "(100%), regret 0" in output
     assert output.count("image/png") == 2

@@ -68,10 +68,10 @@ def run(
         if process.exitcode is None:
             process.kill()
             process.join()
-            raise subprocess.TimeoutExpired([name, *words], timeout, out.read_bytes(), err.read_bytes())
+            raise subprocess.TimeoutExpired([name, *words], timeout, None, err.read_bytes())
         seen = json.loads(report.read_text()) if report.is_file() else {}
-        texts = [path.read_text("utf-8") for path in (out, err)]
-        return Ended(process.exitcode, *texts, time.monotonic() - began, **seen)
+        printed = "" if stdout is not None else out.read_text("utf-8")  # of /dev/full there would be no end
+        return Ended(process.exitcode, printed, err.read_text("utf-8"), time.monotonic() - began, **seen)
 
 
 class Started:
@@ -159,7 +159,7 @@ def _context() -> Any:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["helpers.warm"])
     now = dict(os.environ)
-    path = os.pathsep.join([str(TESTS), str(TESTS.parent), _FRESH.get("PYTHONPATH", "")])
+    path = os.pathsep.join([str(TESTS), _FRESH.get("PYTHONPATH", "")])
     try:
         os.environ.clear()
         os.environ.update(_FRESH, PYTHONPATH=path)

@@ -20,6 +20,7 @@ import resource
 import runpy
 import signal
 import socket
+import subprocess
 import sys
 import tempfile
 import threading
@@ -45,7 +46,14 @@ from gridworld.report import writer
 from gridworld.tune import search as tune_search
 
 _CONF = Path(__file__).resolve().parents[2] / "conf"
-_PATH = [path for path in sys.path if path not in ("", *os.environ["PYTHONPATH"].split(os.pathsep))]
+_PATH: list[str] = json.loads(  # of a new process, without the folder of its program and PYTHONPATH
+    subprocess.run(
+        [sys.executable, "-c", "import json, sys; print(json.dumps(sys.path[1:]))"],
+        env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
+        check=True,
+        capture_output=True,
+    ).stdout
+)
 
 # Words of each form, from which Hydra's parsers learn the grammar.
 _WORDS = (

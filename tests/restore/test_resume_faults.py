@@ -37,7 +37,7 @@ def test_numbers_that_are_none_stop_a_run(agent: str, tmp_path: Path) -> None:
     words = [*SHORT[agent], *LESS, "checkpoint.every=100"]
     rate = "agent.arguments.learning_rate" if agent == "a2c" else "agent.learning_rate"
     with pytest.raises(
-        InputError, match=r"training diverged at update [\d,]+, after [\d,]+ steps: .* no finite"
+        InputError, match=r"training diverged at update [\d,]+, after [\d,]+ steps: .* is not finite"
     ):
         begin(tmp_path / "run", *words, f"{rate}=1e38")
     assert '"status": "failed"' in (tmp_path / "run" / "manifest.json").read_text()
