@@ -141,7 +141,7 @@ HOSTILE = {
     + "{arguments: {tensorboard_log: /tmp/x}}": "agent.arguments.tensorboard_log=/tmp/x is not a plain word",
     "agent: {policy_kwargs: {activation_fn: os.system}}": "activation_fn=os.system is from none of",
     "agent: {policy_kwargs: {features_extractor_kwargs: {a: evil.X}}}": "a=evil.X is not a plain word",
-    "agent: {policy_kwargs: {optimizer_kwargs: {_target_: os.system}}}": "_target_=os.system is no plain",
+    "agent: {policy_kwargs: {optimizer_kwargs: {_target_: os.system}}}": "_target_=os.system is not a plain",
     "agent: {replay_buffer_class: evil.Buffer}": "agent.replay_buffer_class=evil.Buffer is from none of",
     "agent: {rollout_buffer_kwargs: {path: a/b}}": "agent.rollout_buffer_kwargs.path=a/b is not a plain word",
 }

@@ -324,7 +324,7 @@ class _Search:
             own_observation=np.stack(observations) if observations else None,
         )
         names = tuple(each.name for each in self.states)
-        without = f" without {', '.join(self.ignore)} as told" if self.ignore else ""
+        without = f" without {', '.join(self.ignore)} as you said" if self.ignore else ""
         truth = f"enumerated, {mdp.num_states:,} states{without}"
         return replace(mdp, state_names=names if names[0] else (), truth=truth)
 

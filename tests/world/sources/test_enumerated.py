@@ -188,7 +188,7 @@ def test_any_deterministic_environment(variant: str, limit: int) -> None:
 def test_a_step_count_that_is_left_out(variant: str, limit: int | None) -> None:
     mdp = enumerate_env("Corridor-v0", {"variant": variant, "limit": limit or 0}, ignore=["steps"])
     assert (mdp.num_states, mdp.max_episode_steps, mdp.action_names) == (CELLS, limit, ("0", "1"))
-    assert mdp.truth == "enumerated, 5 states without steps as told"
+    assert mdp.truth == "enumerated, 5 states without steps as you said"
     assert mdp.goal.tolist() == [False] * 4 + [True]
     assert mdp.next_state[:, :, 0].tolist() == [[0, 1], [0, 2], [1, 3], [2, 4], [4, 4]]
     assert (mdp.own_observation is None) == (variant == "text")

@@ -228,7 +228,7 @@ def test_a_table_that_is_none_is_refused(changed, told):
         ("FrozenLake-v1", {"map_name": None}, "another table each time that it is made"),
         ("FrozenLake-v1", {"desc": ["FF", "FG"]}, "start is .*must be probabilities"),
         ("Taxi-v4", {"fickle_passenger": True}, "Taxi-v4: fickle_passenger=True changes the destination"),
-        ("Taxi-v4", {"render_mode": "human"}, "env.kwargs: render_mode=human is no part"),
+        ("Taxi-v4", {"render_mode": "human"}, "env.kwargs: render_mode=human is not part"),
     ],
 )
 def test_an_id_that_makes_no_world_is_refused(env_id, kwargs, told):
