@@ -795,4 +795,4 @@ def test_copies_that_differ_in_a_custom_attribute_are_refused() -> None:
     with pytest.raises(InputError, match="environment 1 of the DummyVecEnv is another task"):
         gridworld.evaluate(np.ones(16, dtype=int), copies)
     alike = DummyVecEnv([lambda: Times(lake(), 2.0)] * 2)
-    assert gridworld.evaluate(np.ones(16, dtype=int), alike).value > 0
+    assert gridworld.evaluate(np.ones(16, dtype=int), alike).regret == pytest.approx(2 * 0.99**5)
