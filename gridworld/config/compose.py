@@ -73,7 +73,7 @@ def named_world(name: str, **settings: Any) -> Mdp:
             f"; give an id of Gymnasium, as FrozenLake-v1, a map's file, or one of {', '.join(names)}"
         )
         raise InputError(f"env={name}: there is no such world{meant(name, names) or all_of_them}")
-    known = {field.name for field in dataclasses.fields(env)}
+    known = {field.name for field in dataclasses.fields(env)} - {"source"}
     if wrong := sorted(set(settings) - known):
         raise InputError(f"{wrong[0]}: is not a setting of env={name}{meant(wrong[0], sorted(known))}")
     env = dataclasses.replace(env, **settings)

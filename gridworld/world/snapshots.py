@@ -52,6 +52,7 @@ _TRUSTED = {
 _INSTALLED = ("site-packages", "dist-packages", sysconfig.get_path("stdlib"))  # in a library's path
 _DATA = (int, float, str, list, dict, set, np.ndarray, *_GENERATORS)  # of a module
 _LOCKS = (type(threading.Lock()), type(threading.RLock()))
+_CACHED = type(functools.lru_cache(lambda: None))
 _CALLS = 1000  # at least
 SO_UNKNOWN = (
     ", so what it makes of the task is not exactly known; "
@@ -257,10 +258,13 @@ class _Reader(cloudpickle.Pickler):  # type: ignore[misc]
     def persistent_id(self, obj: Any) -> Any:
         if id(obj) in self._known:
             return self._known[id(obj)]
-        if isinstance(obj, FunctionType | type):
-            of_function = getattr(obj, "__globals__", {}).get("__name__")  # `functools.wraps` has another's
-            if obj.__module__ not in self._modules and of_function not in self._modules:
+        if isinstance(obj, FunctionType):  # by its globals: `functools.wraps` gives it another's module
+            name = obj.__globals__.get("__name__", "")
+            is_of_module = vars(sys.modules.get(name, object)) is obj.__globals__
+            if is_of_module and name not in self._modules and obj.__module__ not in self._modules:
                 return obj.__qualname__
+        if isinstance(obj, type) and obj.__module__ in sys.modules.keys() - self._modules:
+            return obj.__qualname__
         if isinstance(obj, gym.Env) and not self._skips_envs:
             raise _AnotherEnvError
         if self._skips_envs and isinstance(obj, gym.Env | gym.Space):
@@ -269,6 +273,8 @@ class _Reader(cloudpickle.Pickler):  # type: ignore[misc]
 
     def reducer_override(self, obj: Any) -> Any:
         kind = type(obj)
+        if kind is _CACHED:
+            return object, (), obj.__wrapped__
         if isinstance(obj, ModuleType) and obj.__name__ in self._modules:
             held = {name: value for name, value in vars(obj).items() if isinstance(value, _DATA)}
             held.pop("__builtins__", None)
@@ -288,7 +294,9 @@ def _users_modules(package: str) -> dict[str, ModuleType]:
         top = name.partition(".")[0]
         if isinstance(module, ModuleType) and top not in _TRUSTED:
             path = vars(module).get("__file__")
-            is_installed = path is None or any(part in path for part in _INSTALLED)
+            has_code = any(isinstance(each, FunctionType) for each in list(vars(module).values()))
+            made_up = path is None and module.__spec__ is None and has_code  # by `ModuleType`
+            is_installed = not made_up and (path is None or any(part in path for part in _INSTALLED))
             if name == "__main__" or not is_installed or (path and top == package):
                 found[module.__name__] = module
     return found

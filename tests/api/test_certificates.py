@@ -777,3 +777,22 @@ def test_a_callback_keeps_the_statistics_of_its_own_environment_like_those_of_tr
     model = PPO("MlpPolicy", SEEN["normalised"](), n_steps=64, seed=0, device="cpu")
     model.learn(256, callback=callback)
     assert callback.evaluations["value"][-1] == gridworld.evaluate(model).value
+
+
+class Times(gym.RewardWrapper[Any, Any]):
+    """Its attribute has the name of one of SB3's Monitor, which says where an episode is."""
+
+    def __init__(self, env: Any, rewards: float) -> None:
+        super().__init__(env)
+        self.rewards = rewards
+
+    def reward(self, reward: Any) -> float:
+        return self.rewards * float(reward)
+
+
+def test_copies_that_differ_in_a_custom_attribute_are_refused() -> None:
+    copies = DummyVecEnv([lambda: Times(lake(), 1.0), lambda: Times(lake(), -1.0)])
+    with pytest.raises(InputError, match="environment 1 of the DummyVecEnv is another task"):
+        gridworld.evaluate(np.ones(16, dtype=int), copies)
+    alike = DummyVecEnv([lambda: Times(lake(), 2.0)] * 2)
+    assert gridworld.evaluate(np.ones(16, dtype=int), alike).regret == pytest.approx(2 * 0.99**5)

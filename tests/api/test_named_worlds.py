@@ -64,6 +64,13 @@ def test_other_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     slippery = gridworld.make_vec_env("cliff", n_envs=1, slip=0.1, max_episode_steps=7).envs
     assert slippery.max_episode_steps == 7
     assert same(slippery.mdp, gridworld.compose("env=cliff", "env.slip=0.1").env.compile())
+    world = gridworld.compile_mdp(gridworld.load("classic"))
+    for batch in (
+        gridworld.make_vec_env(world),
+        gridworld.make_vec_env(mdp=world),
+        gridworld.make_vec(world),
+    ):
+        assert getattr(batch, "envs", batch).max_episode_steps == 100
     model = PPO("MlpPolicy", gridworld.make_vec_env("river_swim", n_envs=2), n_steps=8, batch_size=16)
     assert gridworld.evaluate(model).outcome == gridworld.evaluate(model, "river_swim").outcome
 
@@ -77,6 +84,7 @@ def test_other_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             lambda: gridworld.make_vec_env("cliff", slop=1),
             "slop: is not a setting of env=cliff; did you mean slip",
         ),
+        (lambda: gridworld.make_vec_env("river_swim", source="deep_sea"), "source: is not a setting of"),
         (lambda: gridworld.make_vec_env("taxi_v4", slip=0.1), "slip: is not a setting of env=taxi_v4"),
         (lambda: gridworld.compile_mdp("classic"), "layout='classic': must be a map, as `load` reads one"),  # type: ignore[arg-type]
         (lambda: gridworld.evaluate([1], "Nowhere-v1"), "env.id=Nowhere-v1: "),

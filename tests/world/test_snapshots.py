@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import itertools
 import sys
+from types import ModuleType
 from typing import Any
 
 import gymnasium as gym
@@ -70,6 +71,29 @@ def pretending(reward: Any) -> Any:
     return reward
 
 
+@functools.lru_cache(maxsize=0)
+def cached(reward: Any) -> Any:
+    TOTAL[0] += 1
+    return reward
+
+
+SOURCE = "N = [0]\ndef reward(reward):\n    N[0] += 1\n    return reward"
+
+
+def executed() -> Any:
+    """A function of no module."""
+    names: dict[str, Any] = {}
+    exec(SOURCE, names)
+    return names["reward"]
+
+
+def made_up() -> Any:
+    """A function of a module without a file."""
+    sys.modules["made_up"] = module = ModuleType("made_up")
+    exec(SOURCE, vars(module))
+    return vars(module)["reward"]
+
+
 @torch.no_grad()
 def decorated(reward: Any) -> Any:
     TOTAL[0] += 1
@@ -112,6 +136,9 @@ def asked_of(function: Any) -> list[Any]:
         (by_default, "keeps a memory"),
         (pretending, "keeps a memory"),
         (decorated, "keeps a memory"),
+        (cached, "keeps a memory"),
+        (executed(), "keeps a memory"),
+        (made_up(), "keeps a memory"),
         (by_closure(), "keeps a memory"),
         (lambda reward: MODULE.counted(reward), "keeps a memory"),
         (lambda reward: float(reward) + 0 * next(TICKS), "keeps a memory"),
