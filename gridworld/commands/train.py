@@ -116,9 +116,8 @@ class RefuseUsedFolders(Callback):
         folder = Path(config.hydra.run.dir).absolute()  # a job may change the current folder
         check_free(Path(config.hydra.run.dir))
         if config.hydra.output_subdir is not None:
-            check_no_links(
-                Path(config.hydra.run.dir), config.hydra.output_subdir
-            )  # Hydra writes through them
+            # Hydra writes through links.
+            check_no_links(Path(config.hydra.run.dir), config.hydra.output_subdir)
         _at_end.enter_context(claimed(folder))
         if (folder / MANIFEST).exists() and is_started(folder):
             from gridworld.restore.resume import unfinished_of  # here, since it takes a second to import

@@ -32,12 +32,10 @@ CHOSEN = ("agent", "env", "observation", "preset", "tuned")
 _LARGEST = 2**16  # bytes
 _DEEPEST = 20  # levels
 _CHOICE = re.compile(r"\w[\w.-]*(/\w[\w.-]*)*")  # no way out of the folder of choices
-_WORD = re.compile(
-    r"(?:(~)|(\+{0,2}))(\w+(?:\.\w+)*)(?(1)(?:=.*)?|=(.*))", re.ASCII | re.DOTALL
-)  # an override
-_BARE = re.compile(
-    r"(?!(?:true|false|null|nan|inf)$)[a-z_][\w.-]*", re.ASCII | re.IGNORECASE
-)  # text as it is
+# an override
+_WORD = re.compile(r"(?:(~)|(\+{0,2}))(\w+(?:\.\w+)*)(?(1)(?:=.*)?|=(.*))", re.ASCII | re.DOTALL)
+# text as it is
+_BARE = re.compile(r"(?!(?:true|false|null|nan|inf)$)[a-z_][\w.-]*", re.ASCII | re.IGNORECASE)
 _NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
 
 

@@ -105,9 +105,8 @@ class EnumeratedConfig(GymnasiumConfig):
     """A deterministic environment of Gymnasium whose states are found by trying all actions."""
 
     source: Word = "enumerated"
-    ignore: list[Word] = field(
-        default_factory=list
-    )  # attributes that are not part of its state, by your word
+    # attributes that are not part of its state, by your word
+    ignore: list[Word] = field(default_factory=list)
 
     def compile(self) -> Mdp:
         from gridworld.world.sources.enumerated import enumerate_env

@@ -53,9 +53,8 @@ class Diagnosis:
     mdp: Mdp  # its world
     greedy: IntArray  # (S,), its greedy actions
     split: RegretSplit  # its regret by state
-    findings: tuple[
-        Finding, ...
-    ]  # what explains some of it, the largest share first; none if it is certified
+    # what explains some of it, the largest share first; none if it is certified
+    findings: tuple[Finding, ...]
     shares: tuple[float, ...]  # the share of the regret that each of them explains; they sum to 1
     cause_of: IntArray  # (S,), the number in `findings` of each state's cause, -1 where there is none
     offers: tuple[tuple[str, ...], ...]  # the words of at most three command lines to try

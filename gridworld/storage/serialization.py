@@ -44,10 +44,8 @@ def encode(state: State, compress: bool = False) -> memoryview:
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
         archive.writestr(zipfile.ZipInfo(_TREE), tree)
-        for (
-            name,
-            array,
-        ) in arrays.items():  # `ZipInfo` by name alone has no time: the same state, the same bytes
+        for name, array in arrays.items():
+            # `ZipInfo` by name alone has no time: the same state, the same bytes.
             archive.writestr(zipfile.ZipInfo(f"{name}.npy"), npy_bytes(array), method, compresslevel=1)
     return content.getbuffer()
 

@@ -22,9 +22,8 @@ from torch import Tensor
 from gridworld.errors import InputError, in_short
 from gridworld.storage.safe_read import read_bytes
 
-Parameters = dict[
-    str, dict[str, Tensor]
-]  # {"policy": its state_dict, "policy.optimizer": {"0.exp_avg": ...}}
+# {"policy": its state_dict, "policy.optimizer": {"0.exp_avg": ...}}
+Parameters = dict[str, dict[str, Tensor]]
 
 _LARGEST_PICKLE = 4 * 2**20  # bytes; it holds names, not numbers
 _VARIABLES = "pytorch_variables.pth"  # SB3's member for single tensors
