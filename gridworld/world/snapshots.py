@@ -263,7 +263,7 @@ class _Reader(cloudpickle.Pickler):  # type: ignore[misc]
             is_of_module = vars(sys.modules.get(name, object)) is obj.__globals__
             if is_of_module and name not in self._modules and obj.__module__ not in self._modules:
                 return obj.__qualname__
-        if isinstance(obj, type) and obj.__module__ in sys.modules.keys() - self._modules:
+        if isinstance(obj, type) and obj.__module__ in sys.modules and obj.__module__ not in self._modules:
             return obj.__qualname__
         if isinstance(obj, gym.Env) and not self._skips_envs:
             raise _AnotherEnvError
@@ -294,12 +294,18 @@ def _users_modules(package: str) -> dict[str, ModuleType]:
         top = name.partition(".")[0]
         if isinstance(module, ModuleType) and top not in _TRUSTED:
             path = vars(module).get("__file__")
-            has_code = any(isinstance(each, FunctionType) for each in list(vars(module).values()))
-            made_up = path is None and module.__spec__ is None and has_code  # by `ModuleType`
-            is_installed = not made_up and (path is None or any(part in path for part in _INSTALLED))
+            if path is None:
+                is_installed = not _is_made_up(module)
+            else:
+                is_installed = any(part in path for part in _INSTALLED)
             if name == "__main__" or not is_installed or (path and top == package):
                 found[module.__name__] = module
     return found
+
+
+def _is_made_up(module: ModuleType) -> bool:
+    """Whether a module without a file was made by `ModuleType` and given code; Cython's have types only."""
+    return module.__spec__ is None and any(isinstance(each, FunctionType) for each in vars(module).values())
 
 
 def _content(owner: Any, value: Any, known: Iterable[Any], skips_envs: bool = False) -> bytes:
