@@ -16,7 +16,6 @@ from gridworld.envs.vector_env import GridWorldVectorEnv
 from gridworld.errors import InputError
 from gridworld.world.chain import one_hot_policy
 from gridworld.world.evaluation import Evaluator, Score
-from gridworld.world.grid import GridMdp
 from gridworld.world.mdp import FloatArray, Mdp
 
 
@@ -189,6 +188,5 @@ def make_vec(mdp: Mdp, num_envs: int = 1, **kwargs: Any) -> GridWorldVectorEnv:
     """
     if not isinstance(mdp, Mdp):
         raise InputError(f"mdp={str(mdp)[:50]}: must be a compiled world, as `compile_env` makes one")
-    if not isinstance(mdp, GridMdp) or mdp.max_episode_steps is not None:
-        kwargs.setdefault("max_episode_steps", mdp.max_episode_steps)
+    kwargs.setdefault("max_episode_steps", mdp.default_step_limit)
     return GridWorldVectorEnv(num_envs, mdp=mdp, **kwargs)

@@ -107,8 +107,7 @@ def world_of(env: Any) -> Mdp:
     """The world of an environment or a batch, with its step limit."""
     task = _task(env)
     mdp, limit = task.mdp, task.own_limit
-    usual = STEP_LIMIT if isinstance(mdp, GridMdp) else mdp.max_episode_steps  # what a map's means
-    return mdp if limit in (None, usual) else replace(mdp, max_episode_steps=limit)
+    return mdp if limit in (None, mdp.default_step_limit) else replace(mdp, max_episode_steps=limit)
 
 
 def _task(env: Any) -> Task:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from gridworld.bounds import STEP_LIMIT
 from gridworld.errors import InputError
 from gridworld.world.layout import CLASSIC, MOVES, NUM_COLS, NUM_ROWS, Cell, Layout, load, positive_int
 from gridworld.world.mdp import BoolArray, IntArray, Mdp, checked_reward, finite, frozen, grid_places
@@ -38,6 +39,11 @@ class GridMdp(Mdp):
     neighbour: IntArray
     wall: BoolArray
     cliff: BoolArray
+
+    @property
+    def default_step_limit(self) -> int:
+        """The step limit of a batch that is given none: the world's own, or a map's 100."""
+        return self.max_episode_steps or STEP_LIMIT
 
     def text(self) -> str:
         """The map."""

@@ -71,6 +71,11 @@ class Mdp:
         """A."""
         return len(self.action_names)
 
+    @property
+    def default_step_limit(self) -> int | None:
+        """The step limit of a batch that is given none; None: its episodes have no limit."""
+        return self.max_episode_steps
+
     @cached_property
     def is_stochastic(self) -> bool:
         """Whether an action may have more than one outcome somewhere."""

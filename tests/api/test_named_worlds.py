@@ -71,6 +71,8 @@ def test_other_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         gridworld.make_vec(world),
     ):
         assert getattr(batch, "envs", batch).max_episode_steps == 100
+    shorter = gridworld.make_vec(gridworld.compile_env("cliff_walking"), max_episode_steps=100)
+    assert gridworld.compile_env(shorter).max_episode_steps == 100
     model = PPO("MlpPolicy", gridworld.make_vec_env("river_swim", n_envs=2), n_steps=8, batch_size=16)
     assert gridworld.evaluate(model).outcome == gridworld.evaluate(model, "river_swim").outcome
 

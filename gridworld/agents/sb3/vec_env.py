@@ -18,7 +18,6 @@ from gridworld.envs.observations import IMAGE_CELL_SIZE, ObservationTable, make_
 from gridworld.envs.vector_env import GridWorldVectorEnv, StateArray
 from gridworld.errors import InputError
 from gridworld.storage.serialization import independent_generator
-from gridworld.world.grid import GridMdp
 from gridworld.world.layout import CLASSIC, Layout
 from gridworld.world.mdp import Mdp
 
@@ -153,9 +152,8 @@ def make_vec_env(
             world["mdp"] = named_world(env, **settings)
         else:
             world["mdp" if isinstance(env, Mdp) else "layout"] = env
-    mdp = world.get("mdp")
-    if isinstance(mdp, Mdp) and not (isinstance(mdp, GridMdp) and mdp.max_episode_steps is None):
-        world.setdefault("max_episode_steps", mdp.max_episode_steps)
+    if isinstance(mdp := world.get("mdp"), Mdp):
+        world.setdefault("max_episode_steps", mdp.default_step_limit)
     envs = GridWorldVectorEnv(n_envs, autoreset_mode=AutoresetMode.SAME_STEP, **world)
     batch = GridWorldVecEnv(envs, make_observation(envs.mdp, observation, cell_size))
     batch.seed(seed)
