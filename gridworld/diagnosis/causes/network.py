@@ -1,9 +1,11 @@
 """Causes in a network, told by the oracle ablation: the same network, fitted to the exact answer.
 
-Of all states at once, with new weights or its own; and of the costliest one alone, for what it forgets.
+Of all states at once, with new weights or its own, and of the costliest one alone.
 """
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +14,9 @@ from gridworld.world.chain import one_hot_policy
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import IntArray
 
+if TYPE_CHECKING:
+    from gridworld.agents.sb3.oracle_fit import OneState
+
 _FEW = 4  # transitions of a state in a replay buffer
 _OFTEN = 10  # times as many visits
 
@@ -19,7 +24,11 @@ _OFTEN = 10  # times as many visits
 def cannot_represent(run: Evidence) -> Finding | None:
     """The same network with new weights cannot be fitted, or has a layer too narrow for the exact answer."""
     if _fits(run, fresh=True) is False:
-        how = "with new weights and fitted to the exact one, it still errs"
+        worst = costliest(run, run.split.wrong)
+        found, name = _alone(run, worst), run.mdp.state_name(worst)
+        can = found is None or found.told_apart
+        alone = f"can learn {name} alone" if can else f"cannot even tell {name} from the others"
+        how = f"with new weights and fitted to the exact one, it still errs; its own {alone}"
     elif units := _bottleneck(run):
         how = f"it has a layer of {units}, and the best table of rank {units} still errs"
     else:
@@ -40,10 +49,8 @@ def forgets(run: Evidence) -> Finding | None:
     states = run.split.wrong & (kept < _FEW) & (met >= _OFTEN * np.maximum(kept, 1.0))
     if not states.any():
         return None
-    from gridworld.agents.sb3.oracle_fit import one_state_fit  # imports torch
-
     worst = costliest(run, states)
-    found = one_state_fit(run.agent, run.own, np.flatnonzero(run.mdp.acting), worst)
+    found = _alone(run, worst)
     if found is None or not len(found.spoilt):
         return None
     where = run.mdp.state_name(worst)
@@ -101,3 +108,10 @@ def _fits(run: Evidence, fresh: bool) -> bool | None:
         return judge.score(one_hot_policy(greedy, run.mdp.num_actions)).certified
 
     return oracle_fit(run.agent, run.own, np.flatnonzero(run.mdp.acting), is_optimal, fresh)
+
+
+def _alone(run: Evidence, state: int) -> OneState | None:
+    """What comes of teaching its network one state only; None where that would take too long."""
+    from gridworld.agents.sb3.oracle_fit import one_state_fit  # imports torch
+
+    return one_state_fit(run.agent, run.own, np.flatnonzero(run.mdp.acting), state)
