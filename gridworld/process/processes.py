@@ -91,74 +91,94 @@ def run_in_processes(
     Raises:
         SystemExit: this process was told to stop by SIGINT or SIGTERM, and so was each; all have ended.
     """
-    context: Any = multiprocessing.get_context("fork" if forks else "spawn")
-    at_work: dict[Any, tuple[Any, Task | None]] = {}  # by connection: the process, its task
-    received: list[int] = []  # signals
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        received.append(number)
-        for process, _ in at_work.values():
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(process.pid, signal.SIGKILL if len(received) > 2 else number)
-
-    def following() -> Task | None:
-        return None if received else next_task()
-
-    def give(connection: Any, process: Any, task: Task | None) -> None:
-        """Let a process begin a task; None: let it end."""
-        at_work[connection] = process, task
-        with contextlib.suppress(OSError):  # it has ended
-            connection.send(task)
-
-    def start_missing() -> None:
-        while len(at_work) < count and (task := following()) is not None:
-            connection, theirs = context.Pipe()
-            with blocking(*_SIGNALS):  # until the process has handlers of its own
-                process = context.Process(target=_work, args=(theirs, os.getpid(), answer is not None))
-                process.start()
-                give(connection, process, task)
-            theirs.close()
-
-    def take(connection: Any) -> None:
-        """Take a result, answer a message, or note that the process has ended."""
-        process, task = at_work[connection]
-        try:
-            is_result, content = connection.recv()
-        except (EOFError, OSError):
-            del at_work[connection]
-            connection.close()
-            process.join()
-            if task is not None and not received:
-                ended(task, LostError(f"exit code {process.exitcode}"))
-            return
-        if is_result:
-            ended(task, content)
-            give(connection, process, following())
-        elif answer is not None:
-            reply = answer(content)
-            with contextlib.suppress(OSError):
-                connection.send(reply)
-
     for stream in (sys.stdout, sys.stderr):
         stream.flush()  # or a fork would write it once more
     if forks:
         gc.freeze()  # so that they share what there is
     else:
         resource_tracker.ensure_running()  # which else would unblock signals while a process starts
-    with handling(dict.fromkeys(_SIGNALS, stop)):
+    workers = _Workers(next_task, count, forks, ended, answer)
+    with handling(dict.fromkeys(_SIGNALS, workers.stop)):
+        workers.run(tick)
+    if workers.received:
+        raise SystemExit(128 + workers.received[0])
+
+
+class _Workers:
+    """The processes at work, and who takes what they say; the arguments are those of `run_in_processes`."""
+
+    def __init__(
+        self,
+        next_task: Callable[[], Task | None],
+        count: int,
+        forks: bool,
+        ended: Callable[[Any, Any], None],
+        answer: Callable[[Any], Any] | None,
+    ) -> None:
+        self.received: list[int] = []  # signals
+        self._next_task, self._count, self._ended, self._answer = next_task, count, ended, answer
+        self._context: Any = multiprocessing.get_context("fork" if forks else "spawn")
+        self._at_work: dict[Any, tuple[Any, Task | None]] = {}  # by connection: the process, its task
+
+    def run(self, tick: Callable[[], None]) -> None:
+        """Run tasks until all have ended; whatever stops that, no process is left."""
         try:
-            start_missing()
-            while at_work:
-                for connection in wait(list(at_work), _SECONDS_BETWEEN_TICKS):
-                    take(connection)
-                start_missing()
+            self._start_missing()
+            while self._at_work:
+                for connection in wait(list(self._at_work), _SECONDS_BETWEEN_TICKS):
+                    self._take(connection)
+                self._start_missing()
                 tick()
         finally:
-            for process, _ in at_work.values():
+            for process, _ in self._at_work.values():
                 process.kill()
                 process.join()
-    if received:
-        raise SystemExit(128 + received[0])
+
+    def stop(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal: pass it on."""
+        self.received.append(number)
+        for process, _ in self._at_work.values():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process.pid, signal.SIGKILL if len(self.received) > 2 else number)
+
+    def _next(self) -> Task | None:
+        return None if self.received else self._next_task()
+
+    def _start_missing(self) -> None:
+        while len(self._at_work) < self._count and (task := self._next()) is not None:
+            connection, theirs = self._context.Pipe()
+            with blocking(*_SIGNALS):  # until the process has handlers of its own
+                may_ask = self._answer is not None
+                process = self._context.Process(target=_work, args=(theirs, os.getpid(), may_ask))
+                process.start()
+                self._give(connection, process, task)
+            theirs.close()
+
+    def _give(self, connection: Any, process: Any, task: Task | None) -> None:
+        """Let a process begin a task; None: let it end."""
+        self._at_work[connection] = process, task
+        with contextlib.suppress(OSError):  # it has ended
+            connection.send(task)
+
+    def _take(self, connection: Any) -> None:
+        """Take a result, answer a message, or note that the process has ended."""
+        process, task = self._at_work[connection]
+        try:
+            is_result, content = connection.recv()
+        except (EOFError, OSError):
+            del self._at_work[connection]
+            connection.close()
+            process.join()
+            if task is not None and not self.received:
+                self._ended(task, LostError(f"exit code {process.exitcode}"))
+            return
+        if is_result:
+            self._ended(task, content)
+            self._give(connection, process, self._next())
+        elif self._answer is not None:
+            reply = self._answer(content)
+            with contextlib.suppress(OSError):
+                connection.send(reply)
 
 
 def _work(connection: Connection[Any, Any], parent: int, may_ask: bool) -> None:
