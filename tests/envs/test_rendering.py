@@ -123,7 +123,7 @@ def python(code, **environment):
     hidden = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "XDG_RUNTIME_DIR")
     kept = {name: value for name, value in os.environ.items() if name not in hidden}
     command = [sys.executable, "-W", "error", "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, env={**kept, **environment}, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, env={**kept, **environment}, timeout=180)
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout.split()
 

@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 from helpers import forks
 
-_STARTED_WITHIN = 30.0  # seconds
+_STARTED_WITHIN = 180.0  # seconds
 _DAEMONS = ("munged", "slurmctld", "slurmd")
 _CONFIGURATION = """
 ClusterName=test
@@ -133,7 +133,7 @@ def _daemon(
     finally:
         process.terminate()
         try:
-            process.wait(timeout=15)
+            process.wait(timeout=180)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()

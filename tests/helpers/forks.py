@@ -30,9 +30,11 @@ class Ended:
     code: int
     stdout: str
     stderr: str
-    seconds: float
-    megabytes: float = 0  # of one that was watched: at most, above what the process had to begin with
-    deeds: list[str] = field(default_factory=list)  # and what the audit hook saw and nobody may do
+    # Of one that was watched: the most memory, above what the process had to begin with; processor time, its
+    # children's included; and what the audit hook saw and nobody may do.
+    megabytes: float = 0
+    seconds: float = 0
+    deeds: list[str] = field(default_factory=list)
 
     @property
     def output(self) -> str:
@@ -63,7 +65,6 @@ def run(
             environment = {"TMPDIR": place, **environment}
             watched = (str(secret), str(report))
         process = _start(name, words, cwd, environment, str(out), str(err), watched)
-        began = time.monotonic()  # not what the first script waits for, until the server has imported all
         process.join(timeout)
         if process.exitcode is None:
             process.kill()
@@ -71,7 +72,7 @@ def run(
             raise subprocess.TimeoutExpired([name, *words], timeout, None, err.read_bytes())
         seen = json.loads(report.read_text()) if report.is_file() else {}
         printed = "" if stdout is not None else out.read_text("utf-8")  # of /dev/full there would be no end
-        return Ended(process.exitcode, printed, err.read_text("utf-8"), time.monotonic() - began, **seen)
+        return Ended(process.exitcode, printed, err.read_text("utf-8"), **seen)
 
 
 class Started:
@@ -129,7 +130,7 @@ class Started:
         if kind is not None:
             self.kill()
         self.stderr.close()
-        self.wait(60)
+        self.wait(180)
 
 
 def megabytes(name: str) -> float:

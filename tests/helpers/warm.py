@@ -228,18 +228,23 @@ def _work(request: dict[str, Any], files: list[int]) -> NoReturn:
 
 
 def _watch(cwd: str, secret: str, report: str) -> None:
-    """Write down what nobody may do to a reader of data, and at the end the memory that the process took."""
+    """Write down what nobody may do to a reader of data, and at the end what the process took."""
     sys.dont_write_bytecode = True
     allowed = (os.path.realpath(cwd), os.path.realpath(tempfile.gettempdir()))
     deeds: list[str] = []
     Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
-    before = megabytes("VmRSS")
+    before, began = megabytes("VmRSS"), sum(os.times()[:4])
     file = os.open(report, os.O_WRONLY | os.O_CREAT)
-    atexit.register(
-        lambda: os.write(
-            file, json.dumps({"megabytes": megabytes("VmHWM") - before, "deeds": deeds}).encode()
-        )
-    )
+
+    def report_what_it_took() -> None:
+        took = {
+            "megabytes": megabytes("VmHWM") - before,
+            "seconds": sum(os.times()[:4]) - began,
+            "deeds": deeds,
+        }
+        os.write(file, json.dumps(took).encode())
+
+    atexit.register(report_what_it_took)
 
     def is_outside(path: Any) -> bool:
         real = os.path.realpath(os.fsdecode(path))

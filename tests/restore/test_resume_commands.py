@@ -285,13 +285,13 @@ def test_a_map_that_changed_meanwhile(tmp_path: Path) -> None:
 def told_after(number: signal.Signals, folder: Path, *words: str, times: int = 1) -> str:
     """What a run says that gets a signal in the middle, or several."""
     with start("train.py", *words, "hydra.run.dir=run", cwd=folder) as process:
-        curve, deadline = folder / "run" / "curve.csv", time.monotonic() + 60
+        curve, deadline = folder / "run" / "curve.csv", time.monotonic() + 180
         while not (curve.exists() and curve.read_text().count("\n") > 2) and time.monotonic() < deadline:
             time.sleep(0.05)
         for _ in range(times):
             process.send_signal(number)
             time.sleep(0.1)
-        _, told = process.communicate(timeout=20)
+        _, told = process.communicate(timeout=180)
     assert process.returncode == 128 + number
     return str(told)
 

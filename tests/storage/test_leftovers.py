@@ -33,7 +33,7 @@ def writer(folder: Path, end: str, name: str) -> subprocess.Popen[str]:
     assert process.stdout is not None
     assert process.stdout.readline() == "half\n"
     if end != "waits":
-        process.communicate(timeout=60)
+        process.communicate(timeout=180)
         assert process.returncode == (-signal.SIGKILL if end == "dies" else 0)
     return process
 

@@ -209,7 +209,7 @@ def curve_begun(path: Path) -> bool:
     return path.read_text().count("\n") > 2
 
 
-def wait_for(condition: Callable[[], object], seconds: float = 60) -> None:
+def wait_for(condition: Callable[[], object], seconds: float = 180) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end
@@ -225,7 +225,7 @@ def test_ctrl_c_ends_it_and_it_says_how_to_go_on(tmp_path: Path) -> None:
     with start("train.py", *endless("seed=0,1", "hydra/launcher=basic"), cwd=tmp_path) as process:
         wait_for_a_job(tmp_path)
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does on Ctrl-C
-        _, errors = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=180)
     assert process.returncode == 130
     assert "stopped by SIGINT; resume with: python " in errors
     assert "Traceback" not in errors
@@ -251,7 +251,7 @@ def test_a_fork_that_is_killed_takes_no_other_job_along(tmp_path: Path) -> None:
     with start("train.py", *words, cwd=tmp_path) as process:
         wait_for_a_job(tmp_path)
         os.kill(max(int(each) for each in members(process.pid)), signal.SIGKILL)
-        _, errors = process.communicate(timeout=30)
+        _, errors = process.communicate(timeout=180)
     assert process.returncode == 0, errors
     assert "Traceback" not in errors
     assert list(statuses(tmp_path / "sweep").values()) == ["done"] * 4

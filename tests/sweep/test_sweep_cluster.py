@@ -84,7 +84,7 @@ def test_a_signal_gives_its_tasks_up(cluster: Cluster, tmp_path: Path) -> None:
     with cluster.start("seed=0,1,2", ENDLESS, cwd=tmp_path) as process:
         wait_for(lambda: any(curve_begun(path) for path in folder.glob("*/curve.csv")), "a job", process)
         process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=180)
     assert process.returncode == 130
     assert "stopped by SIGINT; resume with: python " in errors
     assert "Traceback" not in errors
@@ -126,7 +126,7 @@ def test_slurms_warning_interrupts_a_job_and_a_restart_has_the_rest(cluster: Clu
         wait_for(lambda: any(curve_begun(path) for path in folder.glob(curves)), "a job", process)
         tasks = cluster.slurms("squeue", "--noheader", "--format=%A").split()
         cluster.slurms("scancel", "--signal=USR2", *tasks)
-        _, errors = process.communicate(timeout=60)
+        _, errors = process.communicate(timeout=180)
     assert process.returncode == 1
     assert list(statuses(folder).values()) == ["done", "interrupted", "pending"]
     assert "the rest did not come to its end; resume with: python " in errors

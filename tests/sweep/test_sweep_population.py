@@ -172,7 +172,7 @@ def test_a_signal_interrupts_all_and_nothing_is_lost(
         wait_for(lambda: len(list(folder.glob("*/checkpoints/*.state"))) >= 3)
         for _ in range(times):
             os.killpg(process.pid, number)
-        _, errors = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=180)
     assert process.returncode == 128 + number, errors
     assert f"stopped by {number.name}; resume with: python " in errors
     assert "Traceback" not in errors

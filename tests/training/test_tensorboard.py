@@ -71,7 +71,7 @@ def ask(address: str, path: str, **question: Any) -> Any:
         data=json.dumps(question).encode() if question else None,
         headers={"Content-Type": "application/json"},
     )
-    with urllib.request.urlopen(request, timeout=30) as answer:
+    with urllib.request.urlopen(request, timeout=180) as answer:
         return json.load(answer)
 
 
@@ -106,7 +106,7 @@ def test_the_policy_develops_and_the_episode_moves(served: str) -> None:
             "query"
         ]
         address = f"{served}data/plugin/images/individualImage?{query}"
-        with urllib.request.urlopen(address, timeout=30) as answer:
+        with urllib.request.urlopen(address, timeout=180) as answer:
             assert answer.read(6) == b"GIF89a"
 
 

@@ -230,7 +230,7 @@ def workers_of(process: int, hundredths: int = 5) -> list[int]:
 
 
 def wait_for_workers(process: int, count: int, but: int = 0) -> list[int]:
-    end = time.monotonic() + 60
+    end = time.monotonic() + 180
     while time.monotonic() < end:
         if len(found := [worker for worker in workers_of(process) if worker != but]) >= count:
             return found
@@ -240,7 +240,7 @@ def wait_for_workers(process: int, count: int, but: int = 0) -> list[int]:
 
 def check_ended(processes: list[int]) -> None:
     """They are gone, or will be in a moment."""
-    end = time.monotonic() + 10
+    end = time.monotonic() + 180
     for process in processes:
         with contextlib.suppress(OSError):
             while Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z":
@@ -296,7 +296,7 @@ def test_a_search_of_one_worker_is_the_same_however_it_is_killed(tmp_path: Path)
 
 
 def wait_for_trials(database: Path, count: int) -> None:
-    end = time.monotonic() + 60
+    end = time.monotonic() + 180
     while time.monotonic() < end:
         with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(database)) as study:
             if len(study.execute("SELECT * FROM trials").fetchall()) >= count:
@@ -321,7 +321,7 @@ def test_a_database_that_disappears_is_one_sentence_and_no_worker_is_left(tmp_pa
 def test_ctrl_c_while_workers_start_is_one_sentence(threads: int, tmp_path: Path) -> None:
     for children in (1, 2):
         with start("tune.py", *QUICK, *LONG, f"threads={threads}", cwd=tmp_path) as process:
-            end = time.monotonic() + 60
+            end = time.monotonic() + 180
             while len(workers_of(process.pid, 0)) < children and time.monotonic() < end:
                 time.sleep(0.001)
             os.killpg(process.pid, signal.SIGINT)  # as a terminal does
