@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from gridworld.process.processes import LostError, run_in_processes
 from gridworld.process.signals import Interrupted, StopRequest
@@ -93,6 +92,7 @@ class Interruptible(io.BytesIO):
 
 def test_an_interruption_stays_one_where_a_cleanup_fails() -> None:
     """torch's writer, interrupted, raises an error of its own as it closes its file."""
+    import torch  # which the processes above need not import
 
     def save() -> None:
         with StopRequest().listening():

@@ -47,11 +47,12 @@ CASES = {
     },
     "dqn stock": [
         *(*SHORT["dqn"], "agent.engine=stock", "n_envs=8"),
-        *("agent.buffer_size=2000", "agent.gradient_steps=4"),
+        *("agent.buffer_size=1000", "agent.gradient_steps=2", "total_timesteps=1200"),
     ],
     "dqn stock that stores an observation once": [
         *(*SHORT["dqn"], "agent.engine=stock", "n_envs=8", "agent.optimize_memory_usage=true"),
-        *("+agent.replay_buffer_kwargs.handle_timeout_termination=false", "agent.gradient_steps=4"),
+        *("+agent.replay_buffer_kwargs.handle_timeout_termination=false", "agent.gradient_steps=1"),
+        "total_timesteps=1000",
     ],
     "ppo": [
         *SHORT["ppo"],
@@ -61,7 +62,9 @@ CASES = {
         "stratified_draws=true",
         "env.slip=0.1",
     ],
-    "ppo stock": [*SHORT["ppo"], "agent.engine=stock", "agent.log_interval=2", "n_envs=8"],
+    "ppo stock": [
+        *(*SHORT["ppo"], "agent.engine=stock", "agent.log_interval=2", "n_envs=8", "total_timesteps=1000"),
+    ],
     **{f"{name} stock": [*SHORT[name], "agent.engine=stock"] for name in ("a2c", "qrdqn", "trpo")},
     **{name: SHORT[name] for name in ("a2c", "qrdqn", "trpo", "q_learning", "sarsa", "expected_sarsa")},
 }
@@ -154,9 +157,8 @@ POINTS: list[tuple[Any, str, bool, int]] = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("agent", ["dqn", "ppo"])
-def test_a_run_that_is_killed_at_a_point_ends_as_if_it_was_not(agent: str, tmp_path: Path) -> None:
-    words = RUNS[agent]
+def test_a_run_that_is_killed_at_a_point_ends_as_if_it_was_not(tmp_path: Path) -> None:
+    words = RUNS["dqn"]
     begin(tmp_path / "calm", *words)
     calm = left_behind(tmp_path / "calm")
     folder = tmp_path / "run"
