@@ -283,7 +283,8 @@ class Population:
 
     def safe_point(self) -> Self | None:
         """Let all runs be saved, as nothing is half done; returns the population of those that go on."""
-        finite = [torch.isfinite(each.weights).all(dim=1).cpu().numpy() for each in self.all_networks]
+        sums = [each.weights.sum(dim=1) for each in self.all_networks]  # a third of what asking each costs
+        finite = [torch.isfinite(each).cpu().numpy() for each in sums]
         for run in self.going():
             if all(of_runs[run.row] for of_runs in finite):
                 run.safe_point(self.num_timesteps)
