@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import shlex
+from pathlib import Path
 
 EXIT_CODE = 2
 DISTRIBUTION = "gridworld-sb3"  # the package's name for pip; on PyPI another project has `gridworld`
@@ -56,5 +58,8 @@ def failure(error: OSError) -> str:
 
 
 def install_command(extra: str) -> str:
-    """What installs an optional part, whether the package was installed from a checkout or from PyPI."""
-    return f"pip install '{DISTRIBUTION}[{extra}]'"
+    """What installs an optional part, of a checkout or of an installed wheel."""
+    checkout = Path(__file__).parents[1]
+    if (checkout / "pyproject.toml").is_file():
+        return f"pip install -e {shlex.quote(f'{checkout}[{extra}]')}"
+    return f"pip install '{DISTRIBUTION}[{extra}]'"  # pip finds the wheel installed, and adds what is missing

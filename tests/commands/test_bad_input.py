@@ -175,8 +175,7 @@ def test_a_launcher_that_is_not_installed_names_its_extra(
     done = script("train.py", *line, cwd=tmp_path, real=True, PYTHONPATH=path)
     assert done.returncode == 2
     assert done.stderr == (
-        f"error: hydra/launcher={launcher}: {package} is not installed; "
-        f"pip install 'gridworld-sb3[{extra}]'\n"
+        f"error: hydra/launcher={launcher}: {package} is not installed; pip install -e '{ROOT}[{extra}]'\n"
     )
 
 

@@ -209,7 +209,7 @@ def test_a_command_line_that_cannot_be_meant(
 def test_without_optuna_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     told = refusal(monkeypatch, tmp_path, "agent=q_learning")
-    assert told == "tune.py: optuna is not installed; pip install 'gridworld-sb3[tune]'"
+    assert told == f"tune.py: optuna is not installed; pip install -e '{ROOT}[tune]'"
 
 
 LONG = (
