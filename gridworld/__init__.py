@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from gridworld.world.mdp import Mdp as Mdp
     from gridworld.world.sources.arrays import load_world as load_world
 
-__version__ = "0.1.0"
+__version__ = "0.1.0"  # pyproject.toml reads it here
 
 _NAMES = {  # the public names of each module
     "agents.sb3.exact_eval": "ExactEvalCallback",

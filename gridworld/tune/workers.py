@@ -57,7 +57,7 @@ class Workers:
         def ended(task: Task, result: Any) -> None:
             if isinstance(result, LostError):
                 lost[id(task)] += 1
-                tell(f"a worker was lost ({result}), attempt {lost[id(task)]} of {_MOST_LOST} at its task")
+                tell(f"a worker died ({result}), attempt {lost[id(task)]} of {_MOST_LOST} at its task")
                 if lost[id(task)] < _MOST_LOST:
                     again.append(task)
                     return
