@@ -75,7 +75,8 @@ def compile_mdp(
     """
     if not isinstance(layout, Layout):
         raise InputError(
-            f"layout={layout!r:.50}: must be a map, as `load` reads one; `compile_env` takes names"
+            f"layout={layout!r:.50}: must be a map; load({layout!r:.50}) is the one of a name or a file, and "
+            f"compile_env({layout!r:.50}) compiles the world of that name, with its rewards"
         )
     slip = finite("slip", slip)
     if not 0 <= slip <= 1:
