@@ -184,7 +184,7 @@ class _Workers:
 def _work(connection: Connection[Any, Any], parent: int, may_ask: bool) -> None:
     """What a process does."""
     os.setpgrp()  # a terminal's Ctrl-C reaches the parent, which passes it on once
-    threading.Thread(target=_end_with, args=(parent,), daemon=True, name="watch on the parent").start()
+    end_with(parent)
 
     def ask(message: Any) -> Any:
         connection.send((False, message))
@@ -196,10 +196,14 @@ def _work(connection: Connection[Any, Any], parent: int, may_ask: bool) -> None:
             connection.send((True, task(ask) if may_ask else task()))
 
 
-def _end_with(parent: int) -> None:
+def end_with(parent: int) -> None:
     """End this process soon after its parent, even if that is killed: first by SIGTERM, then in any case."""
-    while os.getppid() == parent:
-        time.sleep(_SECONDS_BETWEEN_CHECKS)
-    send_sigterm()
-    time.sleep(_GRACE_SECONDS)
-    os._exit(1)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_SECONDS_BETWEEN_CHECKS)
+        send_sigterm()
+        time.sleep(_GRACE_SECONDS)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True, name="watch on the parent").start()
