@@ -79,8 +79,8 @@ def main(arguments: Sequence[str]) -> None:
         _show(spec, options.cfg, options.package)
         return
     from gridworld.process.signals import Interrupted
+    from gridworld.tune.search import SearchError
     from gridworld.tune.study import tune
-    from gridworld.tune.workers import SearchError
 
     try:
         tune(spec)

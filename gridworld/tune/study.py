@@ -14,14 +14,14 @@ that it needs neither Optuna nor the database.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import itertools
 import math
 import os
 import shlex
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,17 +36,16 @@ from gridworld.config.settings import ON_RESULT, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console import command, printable, recorded_command_line, tell
-from gridworld.process.processes import can_fork
+from gridworld.process.processes import Processes, can_fork
 from gridworld.process.signals import Interrupted, exiting
 from gridworld.report.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
 from gridworld.report.writer import write_over_seeds
-from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, alone_in, check_writable
+from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, check_writable, claimed
 from gridworld.run.provenance import versions
 from gridworld.storage.atomic_write import (
     check_no_links,
     inside,
     is_locked,
-    make_folder,
     tidy,
     write_json,
     write_text,
@@ -60,18 +59,17 @@ from gridworld.tune.confirmation import (
     CONFIRM,
     Finalist,
     HeldOutRun,
-    HeldOutRuns,
     choose_finalists,
     held_out_runs,
     prepare,
     rank_finalists,
     read_results,
+    run_held_out,
     verdict_on,
 )
 from gridworld.tune.objective import ERROR, with_values
-from gridworld.tune.search import in_reach, open_study, search, study_url
+from gridworld.tune.search import SearchError, in_reach, open_study, search, study_url
 from gridworld.tune.study_spec import ConfFolders, StudySpec, compose_in
-from gridworld.tune.workers import SearchError, Workers
 
 SEARCH_JSON = "search.json"
 _EXPERIMENT, _WINNER = IN_A_STUDY
@@ -83,7 +81,12 @@ def tune(spec: StudySpec) -> None:
     check_study_folder(spec.folder)
     is_shared = spec.settings.storage is not None
     try:
-        with at_work_in(spec.folder, is_shared), exiting(signal.SIGINT, signal.SIGTERM):
+        with (
+            claimed(spec.folder, SEARCH_JSON, alone=not is_shared),
+            exiting(signal.SIGINT, signal.SIGTERM),
+        ):
+            if not is_shared:
+                tidy(spec.folder)
             _tune(spec)
     except SystemExit as stop:
         raise Interrupted(int(str(stop.code)) - 128) from None
@@ -94,7 +97,7 @@ def _tune(spec: StudySpec) -> None:
     is_begun = is_claimed(spec.folder, spec.name)
     study = open_study(url, spec.name, about, spec.space, must_exist=is_begun)
     claim(spec.folder, spec.name, about)
-    workers = Workers(int(spec.settings.workers), can_fork() and may_fork(spec.base))
+    workers = Processes(spec.settings.workers, can_fork() and may_fork(spec.base), attempts=4)
     if workers.forks:
         import_for(spec.base)  # once for all of them
     with in_reach(url):
@@ -126,7 +129,7 @@ def _about(spec: StudySpec) -> dict[str, Any]:
 
 
 def _conclude(
-    spec: StudySpec, study: optuna.Study, best: FrozenTrial, ranked: list[Finalist], workers: Workers
+    spec: StudySpec, study: optuna.Study, best: FrozenTrial, ranked: list[Finalist], workers: Processes
 ) -> None:
     """Confirm the winner, write the recipe and study.json, and print the outcome."""
     values, before = spec.space.values(best.params), spec.space.parameters_of(spec.base)
@@ -176,7 +179,7 @@ def _tuned(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
 
 
 def _confirm(
-    spec: StudySpec, winner: list[HeldOutRun], began_from: list[HeldOutRun], workers: Workers
+    spec: StudySpec, winner: list[HeldOutRun], began_from: list[HeldOutRun], workers: Processes
 ) -> dict[str, Any]:
     """Run both and compare them; an empty `winner` is for settings that the search began from."""
     runs = [run for pair in itertools.zip_longest(began_from, winner) for run in pair if run is not None]
@@ -185,7 +188,7 @@ def _confirm(
     prepare(spec.folder, runs)
     while runs:
         shares = workers.shares(runs, spec.base.agent.shape is not None)
-        workers.run_all(HeldOutRuns(tuple(share)) for share in shares)
+        workers.run(partial(run_held_out, share) for share in shares)
         runs = [run for run in runs if is_locked(run.folder / LOCK)]  # another machine is at work on them
     before = read_results(began_from)
     if winner:
@@ -205,22 +208,6 @@ def check_study_folder(folder: Path) -> None:
     check_writable(folder, "tune.folder")
     for names in ((), (CONFIRM,), (_EXPERIMENT,)):
         check_no_links(folder, *names)
-
-
-@contextlib.contextmanager
-def at_work_in(folder: Path, is_shared: bool = False) -> Iterator[None]:
-    """Make the folder and hold it, unless others share the study; one that stays empty is removed."""
-    make_folder(folder)
-    try:
-        with contextlib.nullcontext() if is_shared else alone_in(folder):
-            if not is_shared:
-                tidy(folder)
-            yield
-    finally:
-        with contextlib.suppress(OSError):
-            if [path.name for path in folder.iterdir()] == [LOCK]:
-                (folder / LOCK).unlink()
-            folder.rmdir()
 
 
 def is_claimed(folder: Path, name: str) -> bool:

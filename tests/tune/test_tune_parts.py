@@ -28,6 +28,7 @@ from test_tune import refused
 
 from gridworld.config.sweep import DimensionConfig
 from gridworld.errors import InputError
+from gridworld.process.processes import LostError, Processes
 from gridworld.storage.safe_read import sealed
 from gridworld.training.setup import check_settings
 from gridworld.training.together import run_alone
@@ -52,7 +53,6 @@ from gridworld.tune.objective import (
 )
 from gridworld.tune.search import open_study, search
 from gridworld.tune.study_spec import ConfFolders, SearchSpace, StudySpec, compose_study
-from gridworld.tune.workers import Workers
 
 SPACES = sorted(
     file.stem
@@ -197,21 +197,21 @@ def test_trials_and_seeds_that_train_together_are_those_that_train_one_by_one(
     ]
 
 
-class Inline(Workers):
-    """In place of trials, a function of their values; None is for a task that has killed its workers."""
+class Inline(Processes):
+    """In place of trials, a function of their values; None is for a task that has killed its processes."""
 
     def __init__(self, function: Callable[[Any, Callable[[Any], bool]], Outcome | None]) -> None:
         super().__init__(1, True)
         self._function = function
 
-    def run(self, next_task: Any, on_end: Any, answer: Any = print, on_tick: Any = None) -> None:
-        while (task := next_task()) is not None:
+    def run(self, tasks: Any, ended: Any = None, tick: Any = None, answer: Any = None) -> None:
+        for task in tasks:
             trials = task.trials.items()
             found = [self._function(values, answer_of(answer, name)) for name, (values, _) in trials]
-            on_end(task, None if None in found else found)
+            ended(task, LostError() if None in found else found)
 
 
-def answer_of(answer: Callable[[Report], bool], number: int) -> Callable[[Any], bool]:
+def answer_of(answer: Any, number: int) -> Callable[[Any], bool]:
     return lambda point: answer(Report(number, *point, can_prune=True))
 
 
@@ -330,18 +330,18 @@ def test_a_task_whose_worker_is_killed_is_run_again_until_it_has_killed_four(
 ) -> None:
     tasks = [Killed("never", 0, tmp_path), Killed("once", 1, tmp_path), Killed("ever", 9, tmp_path)]
     found = {}
-    Workers(2, forks=True).run(
-        lambda: tasks.pop(0) if tasks else None,
-        lambda task, result: found.update({task.name: result}),
-        lambda message: f"heard {message}",
+    Processes(2, forks=True, attempts=4).run(
+        tasks,
+        lambda task, result: found.update({task.name: str(result)}),
+        answer=lambda message: f"heard {message}",
     )
-    assert found == {"never": "never heard never", "once": "once heard once", "ever": None}
+    assert found == {"never": "never heard never", "once": "once heard once", "ever": "exit code -9"}
     assert capsys.readouterr().err.count("a worker was lost (exit code -9)") == 5
 
 
 @given(st.integers(1, 40), st.integers(0, 80), st.booleans())
 def test_workers_share_all_runs(count: int, runs: int, can_join: bool) -> None:
-    shares = list(Workers(count, True).shares(range(runs), can_join))
+    shares = list(Processes(count, True).shares(range(runs), can_join))
     assert [run for share in shares for run in share] == list(range(runs))
     assert max(map(len, shares), default=1) <= (32 if can_join else 1)
     assert len(shares) <= max(count, math.ceil(runs / (32 if can_join else 1)))
