@@ -49,9 +49,9 @@ def failure(error: OSError) -> str:
     what = error.strerror or str(error) or type(error).__name__
     if where and error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         folder = os.path.dirname(where) or os.curdir
-        what += f"; choose another folder than {folder}, or get the right to write to it"
+        what += f"; choose another folder, or make {folder} writable"
     elif error.errno in (errno.ENOSPC, errno.EDQUOT):
-        what += "; make room there"
+        what += "; free some space there"
     return f"{where}: {what}" if where else what
 
 

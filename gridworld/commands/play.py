@@ -1,6 +1,6 @@
-"""Play a world with the arrow keys, alone or beside a trained agent, and see how far you are from optimal.
+"""Play a world yourself, alone or next to a trained agent, and see how far you are from optimal.
 
-The agent takes a step whenever the person does, and continues alone when the person's episode is over.
+The agent takes a step whenever you do, and continues alone when your episode is over.
 """
 
 from __future__ import annotations

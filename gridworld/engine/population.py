@@ -380,8 +380,8 @@ def agree(runs: Sequence[Run]) -> bool:
         _agreed[key] = _try_out(runs)
         if not _agreed[key]:
             tell(
-                "population: this processor or torch adds up otherwise for several networks like these at "
-                "once; such runs train one by one"
+                "population: on this processor, networks like these get other bits when batched; such runs "
+                "train one by one"
             )
     return _agreed[key]
 

@@ -129,8 +129,8 @@ def printing() -> Iterator[None]:
         sys.stderr.flush()
         if _failures:
             raise InputError(
-                f"standard output: cannot be written ({_failures[0].strerror}), what was printed is not "
-                "complete; send it to where there is room"
+                f"standard output: cannot be written ({_failures[0].strerror}), so the output is "
+                "incomplete; write it to a disk with free space"
             )
 
 

@@ -177,7 +177,7 @@ class Processes:
 
     def _lose(self, task: Task, lost: int, why: str) -> None:
         if self.attempts > 1:
-            tell(f"a worker was lost ({why}), attempt {lost} of {self.attempts} at its task")
+            tell(f"a worker died ({why}), attempt {lost} of {self.attempts} at its task")
         if lost < self.attempts:
             self._again.append((task, lost))
         else:

@@ -59,7 +59,7 @@ def _reference(run: Evidence) -> Reference:
     try:
         schema = schema_of(run.world)
         if unknown := sorted(run.world.keys() - {each.name for each in dataclasses.fields(schema)}):
-            raise ValueError(f"env.{unknown[0]} is not known to this version")
+            raise ValueError(f"env.{unknown[0]} is unknown to this version")
         lines = run.layout.split("\n")
         if len(lines) * max(map(len, lines)) > _MOST_CELLS:
             raise ValueError(f"it has more than {_MOST_CELLS:,} cells")
@@ -70,12 +70,12 @@ def _reference(run: Evidence) -> Reference:
         random = evaluator.score(np.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions))
     except (ValueError, TypeError, ArithmeticError, np.linalg.LinAlgError) as error:
         # Whatever is wrong with another version's world, the runs' own scores are as good as before.
-        return Reference(run.optimal_value, problem=f"its world cannot be built again here ({error})")
+        return Reference(run.optimal_value, problem=f"its world cannot be rebuilt here ({error})")
     optimum, problem = evaluator.optimal_value, None
     if not math.isclose(optimum, run.optimal_value, rel_tol=_TOLERANCE, abs_tol=_TOLERANCE):
         problem = (
-            f"its optimal value is {optimum:.6g} here, and {run.optimal_value:.6g} according "
-            f"to {run.folder}; was it written by another version?"
+            f"its optimal value is {optimum:.6g} here, but {run.optimal_value:.6g} according to "
+            f"{run.folder}; was it written by another version?"
         )
     returns = evaluator.optimum.expected_return, random.outcome.expected_return
     return Reference(run.optimal_value, returns[0], random.value, returns[1], problem)

@@ -66,8 +66,8 @@ class SavedRun:
         kept = list(words) if self._trust else list(harmless_words(words, self.config))
         if left_out := len(words) - len(kept):
             tell(
-                f"{shown(self.run.folder)}: {left_out} of the {len(words)} words of its command line may run "
-                "code or lead elsewhere, and are not repeated; if you trust the run, say so"
+                f"{shown(self.run.folder)}: {left_out} of the {len(words)} words of its command line may "
+                "run code or leave its folder, and are omitted; open the run with trust to keep them"
             )
         return kept
 
@@ -83,7 +83,7 @@ class SavedRun:
             if (world.num_rows, world.num_cols) != (rows, columns):
                 raise InputError(
                     f"layout {world.name}: is {world.num_rows}x{world.num_cols}, the agent was trained on "
-                    f"{rows}x{columns}; take a map of that size"
+                    f"{rows}x{columns}; use a map of that size"
                 )
             mdp = env.compile_on(world)
         return Evaluator(mdp, self.config.evaluation.gamma, env.step_limit(mdp))

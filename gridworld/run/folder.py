@@ -109,7 +109,7 @@ def check_inside(path: Path, key: str) -> None:
     if normal == os.curdir:
         raise InputError(f"{key}={path}: is the current folder; name one in it, e.g. runs/mine")
     raise InputError(
-        f"{key}={path}: leads out of the current folder; if that is meant, say {os.path.abspath(path)}"
+        f"{key}={path}: leads out of the current folder; if you mean that, write {os.path.abspath(path)}"
     )
 
 
@@ -127,7 +127,7 @@ def alone_in(folder: Path, wait: float = 0) -> Iterator[None]:
     """Hold a folder for this process; an `InputError` if another still holds it after `wait` seconds."""
     with locked(folder / LOCK, wait) as is_ours:
         if not is_ours:
-            raise InputError(f"{shown(folder)}: another process is at work in it; wait for it or stop it")
+            raise InputError(f"{shown(folder)}: another process is using it; wait for it or stop it")
         yield
 
 

@@ -271,7 +271,7 @@ class AppendLog:
         """Refuse to continue where the file at this path is not this one any more."""
         opened = os.fstat(self._file.fileno())
         if not os.path.lexists(self.path) or not os.path.samestat(os.lstat(self.path), opened):
-            raise FolderLostError(f"{self.path}: was deleted or replaced during the run, which ends here")
+            raise FolderLostError(f"{self.path}: was deleted or replaced during the run, which stops here")
 
 
 def holds(folder: Path, mark: Any, pattern: str) -> bool:

@@ -62,7 +62,7 @@ def decode(data: bytes | memoryview, name: object = "a state") -> State:
     except InputError as error:
         raise StateError(str(error).removeprefix(f"{name}: ")) from None
     except (ValueError, TypeError, LookupError, RecursionError) as error:
-        raise StateError(f"its content makes no sense ({type(error).__name__})") from None
+        raise StateError(f"its content is invalid ({type(error).__name__})") from None
     if not isinstance(state, dict):
         raise StateError("its content is not a state")
     return state

@@ -82,8 +82,8 @@ class SweepFolder:
             self._load(path / SWEEP_JSON)
         elif used := next(iter(sorted(path.glob(f"*/{MANIFEST}"))), None):
             raise InputError(
-                f"{path}: has no {SWEEP_JSON}, but {used.parent} holds a run already; "
-                "choose another hydra.sweep.dir"
+                f"{path}: has no {SWEEP_JSON}, but {used.parent} contains a run; choose another "
+                "hydra.sweep.dir"
             )
 
     def check(self, jobs: Sequence[Job], extend: bool) -> None:
@@ -96,8 +96,8 @@ class SweepFolder:
         if self.entries and not extend and not common:
             asked = shlex.join(self._asked[-1]["overrides"])
             raise InputError(
-                f"{self.path}: holds the sweep '{asked}', which has no job in common with this one; choose "
-                "another hydra.sweep.dir, or add hydra.sweeper.extend=true to put both into one"
+                f"{self.path}: contains the sweep '{asked}', which has no job in common with this one; "
+                "choose another hydra.sweep.dir, or merge them with hydra.sweeper.extend=true"
             )
 
     @contextlib.contextmanager
@@ -166,12 +166,12 @@ class SweepFolder:
                 self.entries[digest] = JobEntry(job, digest, _words(item["overrides"]))
             names = {entry.job.lower() for entry in self.entries.values()}
             if not len(content["jobs"]) == len(self.entries) == len(names):
-                raise ValueError("two jobs have one folder, or one hash")
+                raise ValueError("two jobs have the same folder or hash")
         except (ValueError, LookupError, TypeError, AttributeError) as error:  # an `InputError` is one
             what = str(error) if isinstance(error, ValueError) else "a part is missing"
             what = what.removeprefix(f"{file}: ")
             raise InputError(
-                f"{file}: damaged ({what}); put back a good copy, or choose another hydra.sweep.dir"
+                f"{file}: damaged ({what}); restore a good copy, or choose another hydra.sweep.dir"
             ) from None
 
 
@@ -228,8 +228,8 @@ def _other_job(manifest: dict[str, Any], entry: JobEntry) -> str:
         lengths = [again["total_timesteps"] for again in manifest["resumed"] if "total_timesteps" in again]
     except (KeyError, TypeError, AttributeError):
         lengths = []
-    what = f"was made {lengths[-1]} steps long" if lengths else "has other settings than the job"
-    return f"the run in {entry.job} {what}, so that it is not this job's result; move it to keep it"
+    what = f"was made {lengths[-1]} steps long" if lengths else "has different settings from the job"
+    return f"the run in {entry.job} {what}, so it is not this job's result; move it to keep it"
 
 
 def _first_line(file: Path) -> str:

@@ -71,7 +71,7 @@ def run_sweep(words: list[str], context: HydraContext, master: DictConfig, setti
     except OSError as error:
         again = console.resume_command(folder.path)
         where = console.shell_path(folder.path)
-        tell_error(f"{where}: {reason(error)}; put that right, then resume with: {again}")
+        tell_error(f"{where}: {reason(error)}; fix that, then resume with: {again}")
         code = 1
     if code:
         raise SystemExit(code)
@@ -148,7 +148,7 @@ class _Sweep:
         for job in jobs:
             if job.hash in lost and self._row(job).status in (PENDING, INTERRUPTED):
                 folder = self._folder.path / self._names[job.hash]
-                mark_failed(folder, f"its process was lost ({lost[job.hash]})")
+                mark_failed(folder, f"its process died ({lost[job.hash]})")
 
     def _launch(self, groups: Sequence[Sequence[Job]]) -> dict[str, str]:
         """Run populations; returns why a process was lost, by the hashes of its jobs."""

@@ -120,7 +120,7 @@ class Session:
     def _checkpoint_every(self) -> int | str | None:
         every = self._config.checkpoint.every
         if every is not None and (unknown := self._agent.class_without_state()) is not None:
-            tell(f"checkpoints: none, since {unknown} does not define get_state and set_state")
+            tell(f"no checkpoints, since {unknown} does not define get_state and set_state")
             return None
         return every
 

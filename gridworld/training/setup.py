@@ -99,11 +99,13 @@ def notes(config: TrainConfig, mdp: Mdp) -> list[str]:
         elsewhere = "" if is_its else ", tuned in another world"
         found.append(f"recipe {config.recipe}{elsewhere}: {steps}; tuned=none {otherwise}")
     elif config.preset == AUTO and (fitting := fitting_preset(config, lambda: mdp)) is not None:
-        found.append(f"{why}: preset={fitting} is made for that; auto leaves it out with the given settings")
+        found.append(
+            f"{why}: preset={fitting} is meant for that, but is left out because of the given settings"
+        )
     if config.preset in (STOCHASTIC, LARGE):
         found.append(f"{why}: preset={config.preset}, {steps}; preset=none {otherwise}")
     if config.known_failure is not None:
-        found.append(f"agent={config.agent.name} is known to fall short: {config.known_failure}")
+        found.append(f"agent={config.agent.name} is known to fail: {config.known_failure}")
     return [*found, *filter(None, [objective_note(config, mdp)])]
 
 
@@ -124,6 +126,6 @@ def objective_note(config: TrainConfig, mdp: Mdp) -> str | None:
         return None
     key, right = config.agent.key("gamma"), fitting_discounts(judge)[0]
     return (
-        f"{key.lstrip('+')}={gamma:g}: what is optimal under it has a regret of {score.regret:.2g} under "
+        f"{key.lstrip('+')}={gamma:g}: its optimum has a regret of {score.regret:.2g} under "
         f"evaluation.gamma={judged:g}, too much for a certificate; take {key}={right:g}"
     )

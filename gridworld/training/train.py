@@ -49,7 +49,7 @@ def training(
         manifest = folder / MANIFEST
         is_empty = os.path.lexists(manifest) and not is_started(folder)
         if is_empty:
-            tell(f"{manifest}: is empty, and nothing of the run was saved; it begins anew")
+            tell(f"{manifest}: is empty, so nothing of the run was saved; it starts over")
         begin = partial(RunWriter.start, folder, dataclasses.asdict(config), mdp, overrides, replace=is_empty)
         return (yield from carry_out(config, folder, mdp, begin, log, world is compiled, on_built=on_built))
 
@@ -74,7 +74,7 @@ def carry_out(
         run = begin()
         log.open(run.log_file)
         if state is None:
-            log.add(f"begins: {shlex.join(recorded_command_line())}")
+            log.add(f"starts: {shlex.join(recorded_command_line())}")
         summary = yield from session.run(run)
     except BaseException as error:
         if run is not None and session is not None and not isinstance(error, FolderLostError):
@@ -84,8 +84,8 @@ def carry_out(
             raise InputError(f"{folder}: its checkpoint does not fit this run: {error}") from None
         if isinstance(error, OSError):
             resume = RunFolder(folder).resume_command(dataclasses.asdict(config))
-            how = f"go on with {resume}" if (folder / MANIFEST).exists() else "give the command again"
-            raise MachineError(f"{shown(folder)}: {reason(error)}; put that right, then {how}") from None
+            how = f"resume with {resume}" if (folder / MANIFEST).exists() else "run the command again"
+            raise MachineError(f"{shown(folder)}: {reason(error)}; fix that, then {how}") from None
         raise
     session.checkpoints.keep(1)
     run.end("finished", None, **session.progress())

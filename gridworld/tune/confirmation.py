@@ -80,7 +80,7 @@ def rank_finalists(
         if _name(trial, seed) not in study.user_attrs
     }
     if runs:
-        tell(f"the {len(trials)} finalists on {len(spec.final_seeds)} seeds more: {len(runs)} runs")
+        tell(f"the {len(trials)} finalists on {len(spec.final_seeds)} more seeds: {len(runs)} runs")
     shares = workers.shares(list(runs), spec.base.agent.shape is not None)
     tasks = (Trials(spec.objective, {name: runs[name] for name in names}) for names in shares)
 
@@ -157,7 +157,7 @@ def prepare(folder: Path, runs: Sequence[HeldOutRun]) -> None:
             remove_path(path)
     for run in runs:
         if damaged := _damage(run.folder):
-            tell(f"{damaged}; it is run again")
+            tell(f"{damaged}; it runs again")
             remove_path(run.folder)
 
 
@@ -178,7 +178,7 @@ def certified_since(folder: Path) -> float | None:
     if row.status == FAILED:
         return None
     if run is None or not run.is_finished:
-        raise InputError("it did not come to its end" + (f" ({row.error})" if row.error else ""))
+        raise InputError("it did not finish" + (f" ({row.error})" if row.error else ""))
     since = run.read_summary().get("certified_since_step")
     if since is not None and (type(since) is not int or since < 0):
         raise InputError(f"{run.summary_file}: certified_since_step must be a number of steps, or null")
@@ -204,9 +204,9 @@ class HeldOutResults:
         median, form = statistics.interval(statistics.median, [self.steps], 0), steps_up_to(self.total)
         share = self.certified
         text = (
-            f"certified on {share.count} of {share.total} "
-            f"[{100 * share.low:.0f} %, {100 * share.high:.0f} %], for good by step {form(median.point)} "
-            f"[{form(median.low)}, {form(median.high)}] in the median"
+            f"certified on {share.count} of {share.total} [{100 * share.low:.0f} %, {100 * share.high:.0f} "
+            f"%], for good from step {form(median.point)} [{form(median.low)}, {form(median.high)}] in the "
+            "median"
         )
         notes = []
         if self.failed:
@@ -231,7 +231,7 @@ def read_results(runs: Sequence[HeldOutRun]) -> HeldOutResults:
         try:
             found = certified_since(run.folder)
         except InputError as error:
-            tell(f"{run.folder}: is left out; {error}")
+            tell(f"{run.folder}: is left out: {error}")
             left_out.append(run.folder.name)
             continue
         steps.append(math.inf if found is None else found)
@@ -257,9 +257,9 @@ def verdict_on(winner: HeldOutResults, began_from: HeldOutResults) -> dict[str, 
     verdict = ("does not beat", "cannot be distinguished from", "beats")[1 + side]
     asked = len(winner.steps) + len(winner.left_out)
     sentence = (
-        f"On {asked} held-out seeds the winner {verdict} the settings that the search began from: "
-        f"{winner.text()}, against {began_from.text()}; a run of it is certified sooner with probability "
-        f"{number(sooner.point)} [{number(sooner.low)}, {number(sooner.high)}]."
+        f"On {asked} held-out seeds the winner {verdict} the baseline: {winner.text()}, against "
+        f"{began_from.text()}; its runs are certified sooner with probability {number(sooner.point)} "
+        f"[{number(sooner.low)}, {number(sooner.high)}]."
     )
     return {
         "verdict": verdict,

@@ -149,7 +149,7 @@ class Trials:
 
     def ended(self, outcomes: list[Outcome] | LostError) -> Iterator[tuple[Any, Outcome]]:
         """How each trial ended, by its number or name."""
-        lost = Outcome(error="the workers that ran it were killed")
+        lost = Outcome(error="its workers were killed")
         of_each = [lost] * len(self.trials) if isinstance(outcomes, LostError) else outcomes
         return zip(self.trials, of_each, strict=True)
 

@@ -105,7 +105,7 @@ def open_study(
         storage = None if is_gone else _connect(url)
         if storage is None or (must_exist and name not in optuna.get_all_study_names(storage)):
             raise InputError(
-                f"{_shown(url)}: does not have the study {name}, which has begun; bring its database back, "
+                f"{_shown(url)}: does not have the study {name}, which has started; restore its database, "
                 "or choose another tune.folder"
             )
         study = optuna.create_study(storage=storage, study_name=name, load_if_exists=True)
@@ -117,8 +117,8 @@ def open_study(
         raise
     except _DAMAGE as error:
         raise InputError(
-            f"{_shown(url)}: cannot be read as a study, it was changed or damaged "
-            f"({type(error).__name__}: {_first_line(error)[:200]}); put back a good copy"
+            f"{_shown(url)}: cannot be read as a study: it was changed or damaged ({type(error).__name__}: "
+            f"{_first_line(error)[:200]}); restore a good copy"
         ) from None
     return study
 
@@ -131,7 +131,7 @@ def _check_same(name: str, before: Mapping[str, Any], about: Mapping[str, Any]) 
             if was.get(key) != now.get(key):
                 told = [json.dumps(each.get(key)) for each in (was, now)]
                 raise InputError(
-                    f"tune.study={name}: was begun with another {part}: {key} was {told[0]}, now it is "
+                    f"tune.study={name}: was started with another {part}: {key} was {told[0]}, now it is "
                     f"{told[1]}; choose another tune.study, or set it back"
                 )
 
@@ -146,7 +146,7 @@ def _check_readable(study: optuna.Study, space: SearchSpace) -> None:
         int(trial.user_attrs.get(DRAW, 0))
         seeds = [read_score(seed) for seed in trial.user_attrs.get(SEEDS, [])]
         if trial.state != TrialState.FAIL and trial.distributions != space.distributions:
-            raise ValueError(f"trial {trial.number} is of another search space")
+            raise ValueError(f"trial {trial.number} belongs to another search space")
         if trial.state == TrialState.COMPLETE and not (seeds and math.isfinite(trial.value or 0.0)):
             raise ValueError(f"trial {trial.number} has no score")
     for key, value in study.user_attrs.items():
@@ -161,8 +161,8 @@ def in_reach(url: str) -> Iterator[None]:
         yield
     except (SQLAlchemyError, OptunaError) as error:
         raise SearchError(
-            f"{_shown(url)}: the study cannot be reached any more ({_first_line(error)}); bring the database "
-            "back, with what has ended in it, and run the command again"
+            f"{_shown(url)}: the study can no longer be reached ({_first_line(error)}); restore the "
+            "database, then run the command again"
         ) from None
 
 
@@ -196,7 +196,7 @@ def search(spec: StudySpec, study: optuna.Study, workers: Processes) -> None:
 
     try:
         if before < asked:
-            more = f", {before} of them there already" if before else ""
+            more = f", {before} of them already there" if before else ""
             tell(
                 f"study {spec.name} in {shell_path(spec.folder)}: {asked} trials of {spec.settings.seeds} "
                 f"seeds{more}, {workers.count * (spec.settings.together or 1)} at once"

@@ -105,8 +105,8 @@ def _tune(spec: StudySpec) -> None:
         trials = choose_finalists(study, spec)
         if not trials:
             errors = [error for trial in study.trials if (error := trial.user_attrs.get(ERROR))]
-            why = f"all {len(errors)} failed, the first: {errors[0]}" if errors else "there was no time"
-            raise SearchError(f"{shell_path(spec.folder)}: no trial came to a score; {why}")
+            why = f"all {len(errors)} failed, the first: {errors[0]}" if errors else "time ran out"
+            raise SearchError(f"{shell_path(spec.folder)}: no trial got a score; {why}")
         ranked = rank_finalists(spec, study, trials, workers)
         best = next(trial for trial in trials if trial.number == ranked[0].trial)
         _conclude(spec, study, best, ranked, workers)
@@ -139,7 +139,7 @@ def _conclude(
     winner = held_out_runs(spec.folder, name, _tuned(measured, values), spec.held_out) if is_new else []
     began_from = held_out_runs(spec.folder, "default", measured, spec.held_out)
     confirmed = _confirm(spec, winner, began_from, workers)
-    about = f"the best of {len(study.trials)} trials; study.json has what came of it"
+    about = f"the best of {len(study.trials)} trials; study.json has the results"
     recipe = write_recipe(spec.folder, spec.folders, spec.choices, tuned, about)
     outcome = {
         "winner": {"trial": best.number, "score": best.value, "values": values},
@@ -195,8 +195,7 @@ def _confirm(
         return verdict_on(read_results(winner), before)
     return {
         "verdict": "is",
-        "sentence": f"No trial came out better than the settings that the search began from: on {count} "
-        f"held-out seeds these are {before.text()}.",
+        "sentence": f"No trial beat the baseline: on {count} held-out seeds it is {before.text()}.",
     }
 
 

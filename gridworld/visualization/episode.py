@@ -56,7 +56,7 @@ def film(
     """
     if isinstance(env, GymnasiumConfig) and not is_trusted:
         tell(
-            printable(f"the episode is drawn from the run's tables; {env.id} itself is made with trust only")
+            printable(f"the episode is drawn from the run's tables; {env.id} itself is only drawn with trust")
         )
     elif isinstance(env, GymnasiumConfig):
         try:

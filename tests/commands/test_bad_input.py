@@ -49,7 +49,7 @@ def table(title: str) -> list[tuple[str, str]]:
 REAL = (*("env.layout={maps}/ragged.txt", "--config-dir {conf} agent=mine"),)
 
 
-OUT_OF_SIZE = "must be 0 or of a size from"
+OUT_OF_SIZE = "must be 0, or from"
 # (settings, words of the sentence): of the right type, and beyond what any number here holds
 ABSURD = [
     *(
@@ -140,9 +140,9 @@ def test_a_folder_that_cannot_be_a_runs_is_refused_and_left_alone(tmp_path: Path
     manifest = sealed({"status": "finished", "config": {}, "layout": []})
     (tmp_path / "used" / "manifest.json").write_text(json.dumps(manifest))
     before = sorted(tmp_path.rglob("*"))
-    longer = f"make that run longer by python {ROOT}/scripts/train.py resume=used total_timesteps=..."
+    longer = f"make that run longer with python {ROOT}/scripts/train.py resume=used total_timesteps=..."
     for folder, told in (
-        ("used", f"used: holds a run already; choose another folder, or {longer}"),
+        ("used", f"used: contains a run already; choose another folder, or {longer}"),
         ("file/run", "file/run: cannot be made, file is a file; choose another hydra.run.dir"),
         ("sweep", "sweep: is the folder of a sweep; choose another hydra.run.dir"),
     ):

@@ -235,7 +235,7 @@ def test_what_fails_is_a_trial_with_its_reason_and_the_study_goes_on(tmp_path: P
     assert [trial.state for trial in study.trials] == states
     table = (tmp_path / "trials.csv").read_text()
     assert "too large" in table
-    assert "the workers that ran it were killed" in table
+    assert "its workers were killed" in table
 
 
 def test_a_trial_that_is_worse_than_the_median_is_pruned(tmp_path: Path) -> None:
@@ -318,9 +318,7 @@ def test_a_final_run_that_fails_is_named_and_counted_as_failed(
     (finalist,) = ranked
     error = capsys.readouterr().err
     assert "trial=0,seed=2 failed, and counts as not certified: training diverged\n" in error
-    assert (
-        "trial=0,seed=4 failed, and counts as not certified: the workers that ran it were killed\n" in error
-    )
+    assert "trial=0,seed=4 failed, and counts as not certified: its workers were killed\n" in error
     assert (finalist.certified, finalist.seeds, finalist.failed) == (2, 4, 2)
     assert rank_finalists(spec, study, study.trials, Inline(lambda *_: next(results))) == ranked
 
@@ -336,7 +334,7 @@ def test_a_task_whose_worker_is_killed_is_run_again_until_it_has_killed_four(
         answer=lambda message: f"heard {message}",
     )
     assert found == {"never": "never heard never", "once": "once heard once", "ever": "exit code -9"}
-    assert capsys.readouterr().err.count("a worker was lost (exit code -9)") == 5
+    assert capsys.readouterr().err.count("a worker died (exit code -9)") == 5
 
 
 @given(st.integers(1, 40), st.integers(0, 80), st.booleans())
@@ -393,7 +391,7 @@ UNCLEAR = "cannot be distinguished from"
 def test_the_verdict(winner: Sequence[float], began_from: Sequence[float], verdict: str) -> None:
     found = verdict_on(results(*winner), results(*began_from))
     assert found["verdict"] == verdict
-    assert f"held-out seeds the winner {verdict} the settings" in found["sentence"]
+    assert f"held-out seeds the winner {verdict} the baseline" in found["sentence"]
 
 
 def test_the_verdict_says_which_runs_it_is_without(tmp_path: Path) -> None:
@@ -418,7 +416,7 @@ def test_the_verdict_says_which_runs_it_is_without(tmp_path: Path) -> None:
     found = verdict_on(read_results(winner), read_results(before))
     names = ", ".join(run.folder.name for run in winner[:4])
     assert found["sentence"].startswith("On 6 held-out seeds the winner ")
-    assert "certified on 2 of 2 [34 %, 100 %], for good by step 3,000" in found["sentence"]
+    assert "certified on 2 of 2 [34 %, 100 %], for good from step 3,000" in found["sentence"]
     assert f"(4 of 6 left out, without a result: {names})" in found["sentence"]
     assert f"(1 failed and count as not certified: {before[0].folder.name})" in found["sentence"]
     assert found["winner"]["left_out"] == tuple(run.folder.name for run in winner[:4])

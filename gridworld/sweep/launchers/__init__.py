@@ -57,7 +57,7 @@ def launcher_settings(config: DictConfig) -> tuple[str, dict[str, Any]]:
         missing = [name for name in commands if shutil.which(name) is None]
         if missing:
             raise InputError(
-                f"{choice}: there is no {missing[0]} on this machine; start the sweep on one of the cluster's"
+                f"{choice}: no {missing[0]} on this machine; start the sweep on a machine of the cluster"
             )
     return "basic" if kind == "forks" and not can_fork() else kind, own
 
