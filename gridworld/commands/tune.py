@@ -71,9 +71,9 @@ def main(arguments: Sequence[str]) -> None:
     if options.config_dir is not None and not options.config_dir.is_dir():
         raise InputError(f"--config-dir {options.config_dir}: no such folder")
     own = (options.config_dir,) if options.config_dir is not None else ()
-    from gridworld.tune.study_spec import ConfFolders, compose_study
+    from gridworld.tune.study_spec import compose_study
 
-    spec = compose_study(ConfFolders(conf_folder(), own), options.overrides)
+    spec = compose_study(options.overrides, own)
     if options.cfg:
         _show(spec, options.cfg, options.package)
         return

@@ -32,7 +32,7 @@ from optuna.trial import FrozenTrial, TrialState
 from gridworld.config.compose import search_path, to_config
 from gridworld.config.fields import Effect
 from gridworld.config.recipe_file import IN_A_STUDY, TRUST, overrides
-from gridworld.config.settings import ON_RESULT, with_effects
+from gridworld.config.settings import ON_RESULT, flat, with_effects
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console import command, printable, recorded_command_line, tell
@@ -69,7 +69,7 @@ from gridworld.tune.confirmation import (
 )
 from gridworld.tune.objective import ERROR, with_values
 from gridworld.tune.search import SearchError, in_reach, open_study, search, study_url
-from gridworld.tune.study_spec import ConfFolders, StudySpec, compose_in
+from gridworld.tune.study_spec import StudySpec, compose_with
 
 SEARCH_JSON = "search.json"
 _EXPERIMENT, _WINNER = IN_A_STUDY
@@ -140,7 +140,7 @@ def _conclude(
     began_from = held_out_runs(spec.folder, "default", measured, spec.held_out)
     confirmed = _confirm(spec, winner, began_from, workers)
     about = f"the best of {len(study.trials)} trials; study.json has the results"
-    recipe = write_recipe(spec.folder, spec.folders, spec.choices, tuned, about)
+    recipe = write_recipe(spec.folder, spec.conf, spec.choices, tuned, about)
     outcome = {
         "winner": {"trial": best.number, "score": best.value, "values": values},
         "finalists": [dataclasses.asdict(finalist) for finalist in ranked],
@@ -163,7 +163,7 @@ def _conclude(
 
 def _words_for(recipe: Path, spec: StudySpec) -> str:
     """What train.py needs with the recipe: the user's own folders, and trust in the user's own classes."""
-    words = [search_path(spec.folders.own)] if spec.folders.own else []
+    words = [search_path(spec.conf)] if spec.conf else []
     try:
         overrides(recipe)
     except InputError:
@@ -256,7 +256,7 @@ def _importances(study: optuna.Study) -> dict[str, float]:
 
 
 def write_recipe(
-    folder: Path, folders: ConfFolders, choices: Mapping[str, str], config: TrainConfig, about: str
+    folder: Path, conf: tuple[Path, ...], choices: Mapping[str, str], config: TrainConfig, about: str
 ) -> Path:
     """Write the winner as a recipe, and check that it composes to `config` again.
 
@@ -265,34 +265,24 @@ def write_recipe(
     --config-dir runs/STUDY experiment=winner.
     """
 
-    def composed(words: list[str], more: tuple[Path, ...] = ()) -> dict[str, Any]:
-        own = dataclasses.replace(folders, own=(*folders.own, *more))
-        return _relevant(to_config(compose_in(own, "train", words)))
+    def composed(words: list[str], *more: Path) -> dict[str, Any]:
+        return _relevant(to_config(compose_with((*conf, *more), "train", words)))
 
-    bare = composed([f"{group}={choice}" for group, choice in choices.items()])
-    values = _difference(bare, _relevant(config))
+    bare = dict(flat(composed([f"{group}={choice}" for group, choice in choices.items()])))
+    values = OmegaConf.create()
+    for key, value in flat(_relevant(config)):
+        if key not in bare or value != bare[key]:
+            OmegaConf.update(values, key, value)
     lines = ["# @package _global_", f"# {about}", "defaults:"]
     lines += [f"  - override /{group}: {choice}" for group, choice in choices.items()]
-    lines += ["  - _self_", "", OmegaConf.to_yaml(OmegaConf.create(values)) if values else ""]
+    lines += ["  - _self_", "", OmegaConf.to_yaml(values) if values else ""]
     path = inside(folder, _EXPERIMENT) / _WINNER
     path.parent.mkdir(exist_ok=True)
     write_text(path, "\n".join(lines), durable=True)
     for words in ([f"experiment={path.stem}"], overrides(path, trust=True)):
-        assert composed(words, (folder,)) == _relevant(config), f"{path} does not say what the winner is"
+        assert composed(words, folder) == _relevant(config), f"{path} does not say what the winner is"
     return path
 
 
 def _relevant(config: TrainConfig) -> dict[str, Any]:
     return with_effects(_OF_A_RECIPE, dataclasses.asdict(config))
-
-
-def _difference(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
-    found = {}
-    for key, value in after.items():
-        was = before.get(key)
-        if isinstance(value, dict) and isinstance(was, dict):
-            if inner := _difference(was, value):
-                found[key] = inner
-        elif key not in before or value != was:
-            found[key] = value
-    return found

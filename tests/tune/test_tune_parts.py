@@ -52,14 +52,13 @@ from gridworld.tune.objective import (
     with_values,
 )
 from gridworld.tune.search import open_study, search
-from gridworld.tune.study_spec import ConfFolders, SearchSpace, StudySpec, compose_study
+from gridworld.tune.study_spec import SearchSpace, StudySpec, compose_study
 
 SPACES = sorted(
     file.stem
     for file in (CONF / "agent").glob("*.yaml")
     if not file.stem.endswith("_sb3_defaults") and file.stem != "value_iteration"
 )
-FOLDERS = ConfFolders(CONF)
 TOTAL = 1000
 ONE_SEED = st.builds(
     SeedScore,
@@ -94,7 +93,7 @@ def test_the_score_of_known_seeds() -> None:
 
 @pytest.mark.parametrize("name", SPACES)
 def test_a_shipped_space_holds_the_shipped_settings_and_suggests_what_can_train(name: str) -> None:
-    asked = compose_study(FOLDERS, [f"agent={name}"])
+    asked = compose_study([f"agent={name}"])
     first = asked.space.parameters_of(asked.base)
     assert first is not None
     assert with_values(asked.base, asked.space.values(first)) == asked.base
@@ -156,7 +155,7 @@ def test_what_is_off_the_grid_is_outside(
     ],
 )
 def test_how_many_trials_train_together(words: list[str], together: int) -> None:
-    assert compose_study(FOLDERS, words).settings.together == together
+    assert compose_study(words).settings.together == together
 
 
 RATES = (0.01, 0.02, 1e30, 0.005, 0.003)
@@ -218,7 +217,7 @@ def answer_of(answer: Any, number: int) -> Callable[[Any], bool]:
 def asked(folder: Path, *words: str) -> tuple[StudySpec, optuna.Study]:
     """A search, and its study, which is begun or continued."""
     base = ("agent=q_learning", "total_timesteps=1500", "tune.seeds=2", "tune.workers=1")
-    spec = compose_study(FOLDERS, [*base, f"tune.folder={folder}", *words])
+    spec = compose_study([*base, f"tune.folder={folder}", *words])
     folder.mkdir(exist_ok=True)
     return spec, open_study(f"sqlite:///{folder / 'study.db'}", "one", {}, spec.space)
 
