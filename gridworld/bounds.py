@@ -54,11 +54,7 @@ def discount(key: str, value: float) -> None:
 
 
 def digits(text: str) -> str:
-    """A number as people write it; a whole one without point and exponent: 1e5 as 100000.
-
-    Raises:
-        ValueError: it is not a number.
-    """
+    """A number as people write it, a whole one without point and exponent: 1e5 as 100000; or `ValueError`."""
     number = float(text)
     is_whole = number.is_integer() and abs(number) <= _LARGEST_EXACT
     return str(int(number)) if is_whole and not text.lstrip("+-").isdecimal() else text

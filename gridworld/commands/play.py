@@ -288,9 +288,9 @@ def _parser() -> argparse.ArgumentParser:
 def _game(options: argparse.Namespace) -> Game:
     """A game in the world of the options; with an agent, its run's settings are the defaults."""
     given = {name: getattr(options, name) for name in _WORLD if getattr(options, name) is not None}
-    saved = None if options.agent is None else SavedRun(options.agent, options.trust, options.best)
-    if saved is not None and (fixed := [*options.words, *given.keys() & {"num_rows", "num_cols"}]):
+    if options.agent is not None and (fixed := [*options.words, *given.keys() & {"num_rows", "num_cols"}]):
         raise InputError(f"{fixed[0]}: with --agent, the world has the size it was trained on")
+    saved = None if options.agent is None else SavedRun(options.agent, options.trust, options.best)
     config = saved.config if saved is not None else compose(options.words) if options.words else None
     env = MapConfig() if config is None else config.env
     if isinstance(env, MapConfig):

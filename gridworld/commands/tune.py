@@ -71,15 +71,15 @@ def main(arguments: Sequence[str]) -> None:
     if options.config_dir is not None and not options.config_dir.is_dir():
         raise InputError(f"--config-dir {options.config_dir}: no such folder")
     own = (options.config_dir,) if options.config_dir is not None else ()
-    from gridworld.tune.study_spec import ConfFolders, compose_study
+    from gridworld.tune.study_spec import compose_study
 
-    spec = compose_study(ConfFolders(conf_folder(), own), options.overrides)
+    spec = compose_study(options.overrides, own)
     if options.cfg:
         _show(spec, options.cfg, options.package)
         return
     from gridworld.process.signals import Interrupted
+    from gridworld.tune.search import SearchError
     from gridworld.tune.study import tune
-    from gridworld.tune.workers import SearchError
 
     try:
         tune(spec)

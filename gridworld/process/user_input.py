@@ -129,10 +129,8 @@ def npz_arrays(
 ) -> dict[str, NDArray[Any]]:
     """Read all arrays of an .npz from its content, and nothing pickled; else an `InputError`.
 
-    Args:
-        where: the file, for messages; and `kind`, what it must be.
-        most: bytes that they may have in memory, for a file that may be compressed. None: as many as the
-            file has, which then must not be.
+    `where` is the file, and `kind` what it must be, for messages. They may have `most` bytes in memory; None:
+    as many as the file has, which then must not be compressed.
     """
     import numpy as np
 

@@ -14,11 +14,14 @@ from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from gridworld.errors import InputError
 from gridworld.report import chart
 from gridworld.report.analysis import METRICS, Band, Overall, Result, TaskAnalysis
 from gridworld.report.chart import INK, MUTED, PAPER, Chart, Styles, house_style
 from gridworld.report.setting_charts import sweep_charts, sweeps
 from gridworld.report.statistics import INFINITE, Interval
+from gridworld.world import metrics
+from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray
 
 _HEIGHT = 190.0  # points, of curves
@@ -93,6 +96,34 @@ def _curves(analysis: TaskAnalysis, styles: Styles, more: str) -> Iterator[Chart
             bounds=_bounds(late),
             references={"optimum": world.optimal_return},
         )
+
+
+def run_chart(
+    key: str, curve: Mapping[str, FloatArray], evaluator: Evaluator, summary: Mapping[str, Any]
+) -> Chart:
+    """The exact curves of one run's two policies in a metric. Raises `InputError` where there is none."""
+    metric = next((each for each in metrics.METRICS if each.name == key), None)
+    if metric is None:
+        known = ", ".join(each.name for each in metrics.METRICS)
+        raise InputError(f"metric={key!r:.80}: there is no such curve; it is one of {known}")
+    steps, bands = curve["step"], dict[str, Band]()
+    for name, column in (("greedy", key), ("with exploration", f"sampled_{key}")):
+        unknown = np.full(len(steps), math.nan)
+        bands[name] = Band(steps, curve[column], curve[column], unknown, unknown, int(steps[-1]))
+    mdp = evaluator.mdp
+    random = evaluator.score(np.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions))
+    optimum = metric.of(metrics.optimal_score(evaluator))
+    title = f"{metric.label[0].upper()}{metric.label[1:]} of {summary['agent']} on {summary['env']}"
+    return _draw_curves(
+        title,
+        title,
+        f"{metric.label}, exact, of the greedy policy and of the one that it explores with",
+        bands,
+        chart.styles(list(bands)),
+        metric.label,
+        _bounds(np.concatenate([*(band.point for band in bands.values()), [optimum]])),
+        references={"optimum": optimum, "uniformly random": metric.of(random)},
+    )
 
 
 def _description(what: str, statistic: str, results: Sequence[Result], more: str) -> str:

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-import gridworld
 from gridworld.config.train import check_bounds
 from gridworld.config.worlds import schema_of
 from gridworld.errors import InputError
@@ -30,6 +29,7 @@ from gridworld.report.evidence import (
 from gridworld.report.grouping import Group, Study, arrange
 from gridworld.report.statistics import Interval, Share
 from gridworld.report.tuning_study import TuningStudy, find_tunings
+from gridworld.run.provenance import versions
 from gridworld.run.reader import read_run, stored_world
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray
@@ -302,14 +302,15 @@ def gather(paths: Sequence[Path], seed: int = 0, log_steps: bool = False) -> Rep
     tunings, unread = find_tunings(paths)
     problems += [f"{task.task}: {task.world.problem}" for task in tasks if task.world.problem]
     problems += unread
-    versions: dict[str, list[Path]] = defaultdict(list)
+    by_version: dict[str, list[Path]] = defaultdict(list)
     for run in runs:
-        versions[run.version].append(run.folder)
+        by_version[run.version].append(run.folder)
+    own = str(versions()["gridworld"])
     notes = [
         f"{len(found)} {'runs were' if len(found) > 1 else 'run was'} written by gridworld {version}, "
-        f"this is {gridworld.__version__}: {found[0]}{' and others' if len(found) > 1 else ''}."
-        for version, found in sorted(versions.items())
-        if version != gridworld.__version__
+        f"this is {own}: {found[0]}{' and others' if len(found) > 1 else ''}."
+        for version, found in sorted(by_version.items())
+        if version != own
     ]
     overall = _overall(tasks, seed)
     return Report(study, tasks, overall, unusable, tuple(problems), tuple(notes), seed, tuple(tunings))

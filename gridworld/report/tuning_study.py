@@ -30,7 +30,7 @@ class TrialRow:
     row: Mapping[str, str]  # all columns, what was chosen by its key
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TuningStudy:
     """A finished study."""
 
@@ -46,6 +46,9 @@ class TuningStudy:
     importances: Mapping[str, float]
     finalists: Sequence[Sequence[str | float]]  # trial, score, certified; the winner first
     trials: Sequence[TrialRow]
+
+    def __repr__(self) -> str:
+        return f"TuningStudy({str(self.folder)!r}, {dict(self.values)}: {self.sentence})"
 
     @property
     def title(self) -> str:

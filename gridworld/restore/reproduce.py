@@ -124,7 +124,8 @@ def repeat(
     """
     first, *longer = lengths(then, config)
     overrides = then.manifest.get("overrides") or []
-    config = dataclasses.replace(config, total_timesteps=first)
+    logging = dataclasses.replace(config.logging, wandb=False)
+    config = dataclasses.replace(config, total_timesteps=first, logging=logging)
     own = training(config, folder, overrides, lambda env: mdp)
     if not members:
         run_alone(own)
@@ -143,10 +144,11 @@ def repeat(
 
 def _again(run: RunReader, place: Path, like: TrainConfig, trust: bool) -> Training[Summary]:
     """A run again, in a folder of its own, on the machine's part that another is trained on."""
-    settings = settings_of(run, trust)
+    settings = without_pictures(settings_of(run, trust))
     config = dataclasses.replace(
-        without_pictures(settings),
+        settings,
         total_timesteps=lengths(run, settings)[0],
+        logging=dataclasses.replace(settings.logging, wandb=False),
         device=like.device,
         threads=like.threads,
     )

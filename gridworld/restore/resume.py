@@ -88,13 +88,10 @@ class Unfinished:
         progress: bool = True,
         on_built: OnBuilt = ignore,
     ) -> Training[Summary]:
-        """Train to the end.
+        """Train to the end, which `total_timesteps` may set anew.
 
-        Args:
-            total_timesteps: the run's length from here on, in environment steps; None: as it was.
-            anyway: accept an environment in which the last bits of the numbers may differ.
-            progress: show progress, where the run's settings do so.
-            on_built: takes the agent before it learns.
+        `anyway` accepts an environment in which the last bits of the numbers may differ; progress is shown
+        where the run's settings do so, too; `on_built` takes the agent before it learns.
         """
         run, folder, old_total = self.run, self.run.folder, self.config.total_timesteps
         total = old_total if total_timesteps is None else total_timesteps

@@ -38,12 +38,9 @@ _UNDECODED = frozenset(map(chr, range(0xDC80, 0xDD00)))  # bytes of a path that 
 
 
 class SavedRun:
-    """A finished run with its settings and its world.
+    """A finished run with its settings, its world and its agent, at the end or at its `best` on the way.
 
-    Args:
-        folder: the run's folder.
-        trust: import the classes that the settings name, wherever they are from.
-        best: take the agent with the lowest regret on the way, not the one at the end.
+    With `trust`, the classes that the settings name are imported, wherever they are from.
     """
 
     @limited()

@@ -22,13 +22,12 @@ from typing import Any
 
 from gridworld.errors import InputError
 from gridworld.process.console import recorded_command_line
-from gridworld.run.folder import ERROR_FILE, HYDRA, LOCK, MANIFEST, SWEEP_JSON, check_writable
+from gridworld.run.folder import ERROR_FILE, HYDRA, LOCK, MANIFEST, SWEEP_JSON, alone_in, check_writable
 from gridworld.run.provenance import settings_hash, versions
 from gridworld.run.reader import RunReader, find_run
 from gridworld.storage.atomic_write import (
     check_no_links,
     is_locked,
-    locked,
     make_folder,
     tidy,
     write_json,
@@ -108,11 +107,7 @@ class SweepFolder:
             make_folder(self.path)
         except OSError as error:
             raise InputError(f"{self.path}: cannot be made ({error.strerror})") from None
-        with locked(self.path / LOCK, wait=1) as is_ours:
-            if not is_ours:
-                raise InputError(
-                    f"{self.path}: another process is running this sweep; wait for it or stop it"
-                )
+        with alone_in(self.path, wait=1):
             (self.path / STOP).unlink(missing_ok=True)
             tidy(self.path)
             yield

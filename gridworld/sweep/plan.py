@@ -30,7 +30,6 @@ from omegaconf.errors import OmegaConfBaseException
 from gridworld.config.compose import drop_hydra, to_config
 from gridworld.config.presets import with_preset
 from gridworld.config.settings import foreign, has_own_code
-from gridworld.config.sweep import SweepConfig
 from gridworld.config.train import AUTO, TrainConfig
 from gridworld.config.words import prepared
 from gridworld.config.worlds import EnvConfig
@@ -263,13 +262,12 @@ def runs_apart(launcher: str, config: TrainConfig) -> bool:
 
 
 def populations(
-    jobs: Sequence[Job], settings: SweepConfig, launcher: str, own: Mapping[str, Any], hydra: DictConfig
+    jobs: Sequence[Job], most: int | None, launcher: str, own: Mapping[str, Any]
 ) -> list[list[Job]]:
-    """Divide jobs into populations."""
+    """Divide jobs into populations of at most so many; None: as many as train faster, and memory holds."""
     shapes: dict[str, list[Job]] = {}
     for job in jobs:
         shapes.setdefault(job.hash if job.shape is None else f"shape {job.shape}", []).append(job)
-    most = 1 if runs_in_turn(settings, hydra) else _most(settings)
     found = []
     for members in shapes.values():
         workers = worker_count(own["n_jobs"]) if runs_apart(launcher, members[0].config) else 1
@@ -288,14 +286,8 @@ def populations(
     return found
 
 
-def runs_in_turn(settings: SweepConfig, hydra: DictConfig) -> bool:
-    """Whether jobs cannot train together: the first failure counts, or each has a current folder."""
-    return bool(settings.stop_at_first_failure or hydra.job.chdir)
-
-
-def _most(settings: SweepConfig) -> int | None:
-    """The largest population that is asked for; None: as many as train faster, and memory holds."""
-    asked = settings.population
+def largest_population(asked: object) -> int | None:
+    """The largest population by the setting, or None. Raises `InputError`."""
     if asked == AUTO:
         return None
     if type(asked) is int and asked >= 1:

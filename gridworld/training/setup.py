@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
+from importlib.util import find_spec
 
 from gridworld.agents import TrainingContext, WriteScalars, family
 from gridworld.config.presets import LARGE, STOCHASTIC, fitting_preset, is_recipe_for
@@ -12,7 +13,7 @@ from gridworld.config.train import AUTO, PICTURES, TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import ObservationTable
 from gridworld.envs.statistics_env import StatisticsVectorEnv
-from gridworld.errors import InputError
+from gridworld.errors import InputError, install_command
 from gridworld.world.evaluation import Evaluator, fitting_discounts, score_of_optimum
 from gridworld.world.mdp import Mdp
 
@@ -25,6 +26,8 @@ def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = comp
     family(config.agent).check(config)
     mdp = world(config.env)
     config.env.step_limit(mdp)
+    if config.logging.wandb and find_spec("wandb") is None:
+        raise InputError(f"logging.wandb=true: wandb is not installed; {install_command('wandb')}")
     wanted = config.recording
     if wanted.mp4:
         from gridworld.visualization.files import require_video

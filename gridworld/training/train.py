@@ -36,19 +36,11 @@ def training(
     world: Callable[[EnvConfig], Mdp] = compiled,
     on_built: OnBuilt = ignore,
 ) -> Training[Summary]:
-    """Train, evaluate and record as configured.
+    """Train, evaluate and record as configured; the manifest says that the command line changed `overrides`.
 
-    Args:
-        config: the run's settings.
-        folder: the run's, which everything is written to.
-        overrides: what the command line changed, for the manifest.
-        world: makes the configured world, or returns one that there is.
-        on_built: takes the agent before it learns.
-
-    Raises:
-        InputError: for a mistake in the settings, before anything is written, or where training diverges.
-        MachineError: where files cannot be written.
-        Interrupted: by a signal, after a checkpoint.
+    `world` makes the configured world, or returns an existing one; `on_built` takes the agent before it
+    learns. A mistake in the settings is an `InputError` before anything is written; so is a divergence.
+    Raises `MachineError` where files cannot be written, and `Interrupted` after a signal and a checkpoint.
     """
     with TrainLog() as log:
         mdp = check_settings(config, world)
@@ -91,7 +83,9 @@ def carry_out(
         if isinstance(error, StateError):
             raise InputError(f"{folder}: its checkpoint does not fit this run: {error}") from None
         if isinstance(error, OSError):
-            raise _unwritable(folder, config, error) from None
+            resume = RunFolder(folder).resume_command(dataclasses.asdict(config))
+            how = f"resume with {resume}" if (folder / MANIFEST).exists() else "run the command again"
+            raise MachineError(f"{shown(folder)}: {reason(error)}; fix that, then {how}") from None
         raise
     session.checkpoints.keep(1)
     run.end("finished", None, **session.progress())
@@ -112,10 +106,3 @@ def _note_end(run: RunWriter, log: TrainLog, error: BaseException, progress: dic
     if failed and not isinstance(error, InputError | StateError):
         write_text(run.error_file, traceback.format_exc())
     run.end(status, reason(error), **progress)
-
-
-def _unwritable(folder: Path, config: TrainConfig, error: OSError) -> MachineError:
-    run = RunFolder(folder)
-    resume = run.resume_command(dataclasses.asdict(config))
-    how = f"resume with {resume}" if run.manifest_file.exists() else "run the command again"
-    return MachineError(f"{shown(folder)}: {reason(error)}; fix that, then {how}")

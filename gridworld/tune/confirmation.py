@@ -24,6 +24,7 @@ from optuna.trial import FrozenTrial, TrialState
 from gridworld.config.train import TrainConfig
 from gridworld.errors import InputError
 from gridworld.process.console import tell
+from gridworld.process.processes import LostError, Processes
 from gridworld.report import statistics
 from gridworld.report.tables import number, steps_up_to
 from gridworld.run.provenance import settings_hash
@@ -34,7 +35,6 @@ from gridworld.sweep.job import JobError, run_in_sweep
 from gridworld.training.together import Training, run_together
 from gridworld.tune.objective import FINAL, SEEDS, Outcome, SeedScore, Trials, read_score, score
 from gridworld.tune.study_spec import StudySpec
-from gridworld.tune.workers import Ask, Workers
 from gridworld.world.mdp import FloatArray
 
 CONFIRM = "confirm"  # the folder of the winner's runs, in the study's
@@ -70,7 +70,7 @@ def choose_finalists(study: Study, spec: StudySpec) -> list[FrozenTrial]:
 
 
 def rank_finalists(
-    spec: StudySpec, study: Study, trials: Sequence[FrozenTrial], workers: Workers
+    spec: StudySpec, study: Study, trials: Sequence[FrozenTrial], workers: Processes
 ) -> list[Finalist]:
     """Run what the finalists lack on the final seeds; returns them, the winner first."""
     runs = {
@@ -84,16 +84,15 @@ def rank_finalists(
     shares = workers.shares(list(runs), spec.base.agent.shape is not None)
     tasks = (Trials(spec.objective, {name: runs[name] for name in names}) for names in shares)
 
-    def on_end(task: Trials, outcomes: Sequence[Outcome] | None) -> None:
-        lost = Outcome(error="its workers were killed")
-        ended = outcomes or [lost] * len(task.trials)
-        for (name, (_, (seed,))), outcome in zip(task.trials.items(), ended, strict=True):
+    def on_end(task: Trials, outcomes: list[Outcome] | LostError) -> None:
+        for name, outcome in task.ended(outcomes):
+            _, (seed,) = runs[name]
             if outcome.error:
                 tell(f"{name.removeprefix(FINAL)} failed, and counts as not certified: {outcome.error}")
             found = SeedScore(seed, None, _LOST_REGRET) if outcome.error else outcome.seeds[0]
             study.set_user_attr(name, dataclasses.asdict(found))
 
-    workers.run_all(tasks, on_end)
+    workers.run(tasks, on_end)
     attributes = study.user_attrs
     ranked = []
     for trial in trials:
@@ -118,19 +117,14 @@ class HeldOutRun:
     config: TrainConfig
 
 
-@dataclass(frozen=True)
-class HeldOutRuns:
-    """A worker's task: such runs, together where they can. What came of them is in their folders."""
-
-    runs: tuple[HeldOutRun, ...]
-
-    def __call__(self, ask: Ask) -> None:
-        for result in run_together([_run(run) for run in self.runs]):
-            if isinstance(result, Exception):
-                raise result
+def run_held_out(runs: Sequence[HeldOutRun]) -> None:
+    """Train such runs, together where they can; what came of them is in their folders."""
+    for result in run_together([_training(run) for run in runs]):
+        if isinstance(result, Exception):
+            raise result
 
 
-def _run(run: HeldOutRun) -> Training[None]:
+def _training(run: HeldOutRun) -> Training[None]:
     inside(run.folder.parents[1], CONFIRM, run.folder.name).mkdir(parents=True, exist_ok=True)
     try:
         yield from run_in_sweep(run.config, run.folder, [], stop_at_failure=False)

@@ -18,7 +18,7 @@ import time
 import uuid
 import warnings
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -31,6 +31,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from gridworld.errors import InputError
 from gridworld.process.console import ProgressLine, tell, time_left
+from gridworld.process.processes import LostError, Processes
 from gridworld.report.tuning_study import TRIALS_CSV
 from gridworld.storage.atomic_write import write_text
 from gridworld.storage.safe_read import csv_text
@@ -49,7 +50,6 @@ from gridworld.tune.objective import (
     read_score,
 )
 from gridworld.tune.study_spec import SearchSpace, StudySpec
-from gridworld.tune.workers import SearchError, Workers
 
 # Attributes of the study.
 ABOUT = "gridworld"  # what makes its trials comparable
@@ -63,6 +63,10 @@ _DAMAGE = (
     *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, AssertionError),
     *(SQLAlchemyError, OptunaError),
 )
+
+
+class SearchError(Exception):
+    """A search that had begun came to nothing, or cannot be continued; in one sentence."""
 
 
 def study_url(spec: StudySpec) -> str:
@@ -167,7 +171,7 @@ def _first_line(error: BaseException) -> str:
     return lines[0] if lines else type(error).__name__
 
 
-def search(spec: StudySpec, study: optuna.Study, workers: Workers) -> None:
+def search(spec: StudySpec, study: optuna.Study, workers: Processes) -> None:
     """Run trials until there are enough or it is time to end; keeps trials.csv up to date."""
     run, line = Search(spec, study), ProgressLine(spec.base.logging.progress)
     asked, before = spec.settings.trials, len(study.get_trials(deepcopy=False))
@@ -200,7 +204,7 @@ def search(spec: StudySpec, study: optuna.Study, workers: Workers) -> None:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", ExperimentalWarning)  # of multivariate sampling
                 warnings.filterwarnings("ignore", "The reported value is ignored")  # of a trial run again
-                workers.run(run.next, run.end, run.answer, on_tick)
+                workers.run(iter(run.next, None), run.end, on_tick, run.answer)
     finally:
         line.clear()
         write_trials(spec.folder, study, spec.space, durable=True)
@@ -251,10 +255,9 @@ class Search:
         trial.report(report.value, report.step)
         return report.can_prune and trial.should_prune()
 
-    def end(self, trials: Trials, outcomes: Sequence[Outcome] | None) -> None:
-        """Store how trials ended; None where they have killed too many workers."""
-        killed = Outcome(error="its workers were killed")
-        for number, outcome in zip(trials.trials, outcomes or [killed] * len(trials.trials), strict=True):
+    def end(self, trials: Trials, outcomes: list[Outcome] | LostError) -> None:
+        """Store how trials ended."""
+        for number, outcome in trials.ended(outcomes):
             trial = self.running.pop(number)
             if outcome.seeds:
                 trial.set_user_attr(SEEDS, [dataclasses.asdict(seed) for seed in outcome.seeds])

@@ -47,7 +47,7 @@ from gridworld.config.recipe_file import CHOSEN, with_recipe
 from gridworld.config.settings import effect_of
 from gridworld.config.sweep import DimensionConfig, TuneConfig
 from gridworld.config.train import AUTO, TrainConfig, check_bounds
-from gridworld.config.words import sentence
+from gridworld.config.words import conf_folder, sentence
 from gridworld.errors import InputError
 from gridworld.process.console import program
 from gridworld.process.processes import core_count
@@ -64,18 +64,10 @@ _TRIALS_AT_ONCE = 8  # over all workers; the sampler knows nothing of those that
 
 
 @dataclass(frozen=True)
-class ConfFolders:
-    """Where yaml files come from: `conf`, and the user's own folders, which are searched after it."""
-
-    conf: Path
-    own: tuple[Path, ...] = ()
-
-
-@dataclass(frozen=True)
 class StudySpec:
     """What a command line asks for."""
 
-    folders: ConfFolders
+    conf: tuple[Path, ...]  # the user's own folders of yaml files, which are searched after `conf/`
     base: TrainConfig  # the configuration that the search begins from
     choices: dict[str, str]  # of CHOSEN
     settings: TuneConfig  # without null where a default follows from the rest
@@ -112,12 +104,15 @@ class StudySpec:
         return range(self.final_seeds.stop, self.final_seeds.stop + self.settings.confirm_seeds)
 
 
-def compose_study(folders: ConfFolders, words: Sequence[str]) -> StudySpec:
-    """Compose and check everything that a command line asks for. Raises `InputError`."""
+def compose_study(words: Sequence[str], conf: tuple[Path, ...] = ()) -> StudySpec:
+    """Compose and check everything that a command line asks for; `conf` are folders of the user's own.
+
+    Raises `InputError`.
+    """
     register_schemas()
     try:
         of_search, of_run = _divide(with_recipe(words))
-        whole = compose_in(folders, "train", of_run)
+        whole = compose_with(conf, "train", of_run)
         choices = {group: str(whole.hydra.runtime.choices[group]) for group in CHOSEN}
         if choices["preset"] == AUTO:  # nothing was chosen, and nothing is to be for the winner
             choices["preset"] = "none"
@@ -126,7 +121,7 @@ def compose_study(folders: ConfFolders, words: Sequence[str]) -> StudySpec:
             choices["tuned"] = "none"
         if not any(override.key_or_group == "tune" for override in of_search):
             of_search = [*of_search, *_parse([f"tune={choices['agent']}"])]
-        search = compose_in(folders, "tune", of_search)
+        search = compose_with(conf, "tune", of_search)
         space_name = str(search.hydra.runtime.choices["tune"])
         settings = cast(TuneConfig, OmegaConf.to_object(search.tune))
     except (HydraException, OmegaConfBaseException, YAMLError) as error:
@@ -134,20 +129,20 @@ def compose_study(folders: ConfFolders, words: Sequence[str]) -> StudySpec:
     settings = _completed(settings, choices["agent"], base)
     space = SearchSpace(settings.space, space_name)
     space.check(base, check_settings(base))
-    spec = StudySpec(folders, base, choices, settings, space)
+    spec = StudySpec(conf, base, choices, settings, space)
     if spec.held_out.stop > _LARGEST_SEED:
         raise InputError(f"seed={base.seed}: leaves no room for the seeds after it, below 2**32")
     return spec
 
 
-def compose_in(folders: ConfFolders, name: str, overrides: Sequence[Override | str]) -> DictConfig:
-    """Compose `name` as Hydra does, with Hydra's own part. Raises Hydra's exceptions."""
+def compose_with(conf: tuple[Path, ...], name: str, overrides: Sequence[Override | str]) -> DictConfig:
+    """Compose `name`, also from these folders, with Hydra's own part. Raises Hydra's exceptions."""
     lines = [str(each.input_line) if isinstance(each, Override) else each for each in overrides]
-    if folders.own:
-        lines.append(search_path(folders.own))
+    if conf:
+        lines.append(search_path(conf))
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)  # a folder that is not there
-        return compose_whole(folders.conf.absolute(), name, lines)[0]
+        return compose_whole(conf_folder(), name, lines)[0]
 
 
 def _divide(words: Sequence[str]) -> tuple[list[Override], list[Override]]:

@@ -75,7 +75,8 @@ def compile_mdp(
     """
     if not isinstance(layout, Layout):
         raise InputError(
-            f"layout={layout!r:.50}: must be a Layout, as from `load`; for names, use `compile_env`"
+            f"layout={layout!r:.50}: must be a Layout; load({layout!r:.50}) reads a map by name or file, and "
+            f"compile_env({layout!r:.50}) compiles the world of that name, with its rewards"
         )
     slip = finite("slip", slip)
     if not 0 <= slip <= 1:

@@ -16,6 +16,7 @@ from helpers.support import CONF, SHORT, configure, script
 from hydra.core.global_hydra import GlobalHydra
 from hydra.version import getbase
 from omegaconf import OmegaConf
+from PIL import Image
 
 import gridworld
 from gridworld import InputError
@@ -109,6 +110,26 @@ def test_what_a_result_has() -> None:
     assert "certified since step 0" in repr(table)
 
 
+def test_a_run_shows_itself(run: gridworld.RunResult) -> None:
+    figure = run.plot("regret")
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names[:3] == ["greedy", "with exploration", "optimum"]
+    drawn = {tuple(line.get_ydata()) for line in figure.axes[0].lines}
+    assert tuple(run.curve["regret"]) in drawn
+    with pytest.raises(
+        InputError, match="metric='speed': there is no such curve; it is one of value, regret"
+    ):
+        run.plot("speed")
+    with Image.open(Path(run.folder or "") / "policy.png") as picture:
+        assert np.array_equal(np.asarray(picture), np.asarray(run.policy_map()))
+    html = run._repr_html_()
+    assert html.count('<img src="data:image/png;base64,') == 2
+    assert "not optimal: regret" in html
+    run.summary["agent"] = "<b>x</b>"
+    assert "<b>x</b>" not in run._repr_html_()
+    run.summary["agent"] = "q_learning"
+
+
 def test_settings_are_those_of_the_command_line() -> None:
     words = ["agent=ppo", "env=four_rooms", "seed=3", "agent.gamma=0.9"]
     by_call = gridworld.compose("agent=ppo", {"env": "four_rooms", "agent.gamma": 0.9}, seed=np.int64(3))
@@ -129,10 +150,10 @@ def test_settings_are_those_of_the_command_line() -> None:
         (("agent=dnq",), "agent=dnq: no such choice; choose from"),
         (("agent.lr=3",), "Key 'lr' not in 'DQNConfig'; did you mean learning_rate?"),
         (({"agent.gama": 0.9},), "did you mean gamma?"),
-        (("seed=1,2",), "seed=1,2: has several values; call train once for each"),
+        (("seed=1,2",), "seed=1,2: has several values; call gridworld.sweep with them"),
         (("-m",), "-m: is not an override; write KEY=VALUE"),
         (("dqn",), "dqn: is not an override; write KEY=VALUE"),
-        (("hydra.run.dir=x",), "the run's folder is given by folder="),
+        (("hydra.run.dir=x",), "here the folder is given by folder="),
         (({"seed": {1, 2}},), "seed: must be plain values, has a set"),
         (({3: 4},), "'3': must be the name of a setting"),
         (({"a b": 4},), "'a b': must be the name of a setting"),

@@ -18,7 +18,7 @@ from gridworld.config.worlds import BuiltConfig
 from gridworld.errors import InputError
 from gridworld.storage.safe_read import read_object
 from gridworld.tune.study import write_recipe
-from gridworld.tune.study_spec import ConfFolders, compose_in, compose_study
+from gridworld.tune.study_spec import compose_study, compose_with
 
 WINNERS = {
     "dqn": [
@@ -49,8 +49,8 @@ def test_a_winner_is_the_same_by_hydra_and_as_data(agent: str, tmp_path: Path) -
     choices |= {"preset": "stochastic" if agent == "ppo" else "none"}
     choices |= {"tuned": "none" if agent == "ppo" else f"cliff_{agent}"}
     words = [*(f"{group}={choice}" for group, choice in choices.items()), *WINNERS[agent]]
-    path = write_recipe(tmp_path, ConfFolders(CONF), choices, configure(*words), "a winner")
-    by_hydra = compose_in(ConfFolders(CONF, (tmp_path,)), "train", ["experiment=winner"])
+    path = write_recipe(tmp_path, (), choices, configure(*words), "a winner")
+    by_hydra = compose_with((tmp_path,), "train", ["experiment=winner"])
     assert of_words(f"recipe={path}") == to_config(by_hydra) == configure(*words)
     assert of_words(f"recipe={tmp_path}") == configure(*words)
 
@@ -87,7 +87,7 @@ def test_a_sweep_of_a_recipe_and_a_search_from_one(tmp_path: Path) -> None:
         wanted = configure("env=cliff", "agent=q_learning", "agent.gamma=0.98", f"seed={seed}")
         assert manifest["config"]["agent"] == dataclasses.asdict(wanted.agent)
         assert manifest["config"]["env"] == dataclasses.asdict(wanted.env)
-    asked = compose_study(ConfFolders(CONF), [recipe, "tune.trials=3"])
+    asked = compose_study([recipe, "tune.trials=3"])
     assert asked.base == configure("env=cliff", "agent=q_learning", "agent.gamma=0.98")
     assert (asked.choices["env"], asked.settings.trials) == ("cliff", 3)
 

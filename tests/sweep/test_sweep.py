@@ -328,7 +328,7 @@ def test_a_folder_that_is_in_use_or_damaged_is_refused(tmp_path: Path) -> None:
         assert is_ours
         done = sweep("seed=0", cwd=tmp_path)
     assert done.returncode == 2
-    assert done.stderr == "error: sweep: another process is running this sweep; wait for it or stop it\n"
+    assert done.stderr == "error: sweep: another process is using it; wait for it or stop it\n"
     (folder / "sweep.json").write_text('{"format": 1, "asked": [], "jobs": [{}]}')
     before = sorted(folder.iterdir())
     done = sweep("seed=0", cwd=tmp_path)

@@ -15,10 +15,9 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from hypothesis import given
 from hypothesis import strategies as st
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from gridworld.config.compose import register_schemas, to_config
-from gridworld.config.sweep import SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import sentence
 from gridworld.errors import InputError
@@ -27,7 +26,7 @@ from gridworld.run.reader import read_run
 from gridworld.run.writer import RunWriter
 from gridworld.storage.safe_read import read_object
 from gridworld.sweep.folder import folder_name
-from gridworld.sweep.plan import Configurations, Job, expand, plan, populations
+from gridworld.sweep.plan import Configurations, Job, expand, largest_population, plan, populations
 from gridworld.training.setup import check_settings
 
 
@@ -160,8 +159,7 @@ def test_jobs_are_divided_into_populations(
     monkeypatch.setattr("gridworld.sweep.plan.file_limit", lambda: files)
     config = configure("agent=ppo", f"device={device}")
     jobs = [Job((), (), str(number), None, config) for number in range(10)]
-    hydra = OmegaConf.create({"job": {"chdir": None}})
-    groups = populations(jobs, SweepConfig(population=population), launcher, {"n_jobs": 4}, hydra)
+    groups = populations(jobs, largest_population(population), launcher, {"n_jobs": 4})
     assert sorted(map(len, groups), reverse=True) == sizes
     assert [job for group in groups for job in group] == jobs
 

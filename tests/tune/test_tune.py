@@ -20,7 +20,7 @@ from optuna.trial import TrialState, create_trial
 from gridworld.commands import report as report_command
 from gridworld.commands import tune as tune_command
 from gridworld.errors import InputError
-from gridworld.tune.study import at_work_in
+from gridworld.run.folder import claimed
 
 QUICK = (
     *("agent=q_learning", "total_timesteps=1500", "recording.gif=false", "recording.learning=false"),
@@ -146,7 +146,7 @@ def test_a_folder_of_another_study_is_refused(
     told = refusal(monkeypatch, tmp_path, *QUICK)
     assert "study.db: does not have the study tune_q_learning_classic, which has started; restore" in told
     assert sorted(tmp_path.rglob("*")) == before
-    with at_work_in(tmp_path / "study"):
+    with claimed(tmp_path / "study"):
         assert "another process is using it" in refusal(monkeypatch, tmp_path, *QUICK)
 
 
