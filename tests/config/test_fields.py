@@ -135,8 +135,7 @@ HOSTILE = {
     CLASS + "{algorithm: evil.Agent}": "agent.algorithm=evil.Agent is not from one of",
     CLASS + "{algorithm: stable_baselines3_evil.A}": "agent.algorithm=stable_baselines3_evil.A is not from",
     CLASS + "{policy: evil.Policy}": "agent.policy=evil.Policy is not from one of",
-    CLASS
-    + "{arguments: {policy_kwargs: {optimizer_class: evil.Adam}}}": "class=evil.Adam is neither",
+    CLASS + "{arguments: {policy_kwargs: {optimizer_class: evil.Adam}}}": "class=evil.Adam is neither",
     CLASS + "{arguments: {whatever: [[evil.Adam]]}}": "agent.arguments.whatever=evil.Adam is neither a plain",
     CLASS + "{arguments: {tensorboard_log: /tmp/x}}": "agent.arguments.tensorboard_log=/tmp/x is neither",
     "agent: {policy_kwargs: {activation_fn: os.system}}": "activation_fn=os.system is not from one of",
