@@ -105,7 +105,7 @@ def run_chart(
     metric = next((each for each in metrics.METRICS if each.name == key), None)
     if metric is None:
         known = ", ".join(each.name for each in metrics.METRICS)
-        raise InputError(f"metric={key!r:.80}: must be one of {known}")
+        raise InputError(f"metric={key!r:.80}: no such curve; choose from {known}")
     steps, bands = curve["step"], dict[str, Band]()
     for name, column in (("greedy", key), ("with exploration", f"sampled_{key}")):
         unknown = np.full(len(steps), math.nan)

@@ -24,7 +24,7 @@ from gridworld.process.console import aligned, command, command_line, duration, 
 from gridworld.run.reader import read_run
 from gridworld.sweep.folder import DONE, FAILED, INTERRUPTED, JOBS_CSV, PENDING, RUNNING, STATUSES, JobRow
 
-_HEADINGS = ("agent", "task", "settings", "certified", "steps to certificate, median")
+_HEADINGS = ("agent", "task", "settings", "certified", "median steps")
 _OF_SETTINGS = ON_RESULT - {Effect.SEED, Effect.LABELS, Effect.MACHINE}
 _MOST_NAMED = 3  # jobs
 _LONGEST = 60  # characters of settings
@@ -114,7 +114,7 @@ def results_lines(folder: Path, rows: Sequence[JobRow]) -> list[str]:
     lines = aligned([[f"{cell} " for cell in row] for row in table], forms)  # two blanks between columns
     if lost:
         named = f"{', '.join(lost[:_MOST_NAMED])}{', ...' if len(lost) > _MOST_NAMED else ''}"
-        lines[0] += f"; {len(lost)} of {len(rows)} jobs are not counted: {named}"
+        lines.append(f"{len(lost)} of {len(rows)} jobs are not counted: {named}")
     return lines
 
 

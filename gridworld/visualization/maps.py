@@ -220,9 +220,9 @@ def draw_optimal_actions(canvas: Canvas, optimal: BoolArray) -> None:
         down, right = ways[state, action].tolist()
         point, length = canvas.point(state, 0.5 + 0.25 * right, 0.5 + 0.25 * down), 0.6 * canvas.cell
         if down or right:
-            draw.polygon(canvas.world, DISAGREES, _arrow(*point, down, right, length))
+            draw.polygon(canvas.world, INK, _arrow(*point, down, right, length))
         else:
-            draw.circle(canvas.world, DISAGREES, point, length / 5)
+            draw.circle(canvas.world, INK, point, length / 5)
 
 
 def _finish_policy_table(

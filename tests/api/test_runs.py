@@ -117,7 +117,7 @@ def test_a_run_shows_itself(run: gridworld.RunResult) -> None:
     drawn = {tuple(line.get_ydata()) for line in figure.axes[0].lines}
     assert tuple(run.curve["regret"]) in drawn
     with pytest.raises(
-        InputError, match="metric='speed': must be one of value, regret"
+        InputError, match="metric='speed': no such curve; choose from value, regret"
     ):
         run.plot("speed")
     with Image.open(Path(run.folder or "") / "policy.png") as picture:

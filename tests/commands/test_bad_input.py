@@ -182,7 +182,7 @@ def test_a_launcher_that_is_not_installed_names_its_extra(
 def test_slurm_is_started_where_it_is(tmp_path: Path) -> None:
     done = script("train.py", "-m", "seed=0,1", "hydra/launcher=slurm", cwd=tmp_path, PATH=str(tmp_path))
     assert done.returncode == 2
-    assert done.stderr.startswith("error: hydra/launcher=slurm: there is no sbatch on this machine; start")
+    assert done.stderr.startswith("error: hydra/launcher=slurm: no sbatch on this machine; start")
 
 
 def test_divergence_is_told_and_marked(tmp_path: Path) -> None:

@@ -265,7 +265,7 @@ def test_the_last_observation_is_carried_forward(maker: Maker, tmp_path: Path) -
 
 # (file, what is done to it, words): entries of JSON, a replacement, the whole content; None: it is removed.
 DAMAGES: list[tuple[str, Any, str]] = [
-    ("manifest.json", {"status": "running"}, "'running', not finished: it is still running, or was killed"),
+    ("manifest.json", {"status": "running"}, "'running', not finished: it is still running or was killed"),
     ("manifest.json", {"status": "interrupted", "error": "by SIGINT"}, "'interrupted', not finished: by SIG"),
     ("manifest.json", {"status": "failed", "error": "InputError: diverged"}, "not finished: InputError: div"),
     ("manifest.json", "", "is not JSON"),
@@ -280,7 +280,7 @@ DAMAGES: list[tuple[str, Any, str]] = [
     ("curve.csv", None, "has no curve.csv"),
     ("curve.csv", "", "curve.csv: has no rows"),
     ("curve.csv", b"\xff\xfe\x00", "is not UTF-8 text"),
-    ("curve.csv", (",[^,]*$", ""), "line 22 has 16 of 17 columns, it was cut off"),
+    ("curve.csv", (",[^,]*$", ""), "line 22 has 16 of 17 columns; it was cut off"),
     ("curve.csv", ("\n5000,[^,]+", "\n5000,nan"), "value is NaN"),
     ("curve.csv", ("\n5000,", "\n5000,x"), "value: could not convert string to float"),
     ("curve.csv", ("\n5000,", "\n500,"), "the steps do not increase"),

@@ -63,8 +63,8 @@ def test_a_mistaken_size_is_refused_before_anything_is_written(value: str, tmp_p
     assert done.returncode == 2
     shown = "None" if value == "null" else re.escape(value)
     assert re.fullmatch(
-        rf"error: hydra\.sweeper\.population={shown}: (must be the number of runs that train together at "
-        r"most, 1 for each by itself, or auto|Value .* is incompatible with type hint .*)\n",
+        rf"error: hydra\.sweeper\.population={shown}: (must be the largest number of runs that train "
+        r"together \(1: each alone\), or auto|Value .* is incompatible with type hint .*)\n",
         done.stderr,
     )
     assert list(tmp_path.iterdir()) == []
