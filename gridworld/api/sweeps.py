@@ -28,6 +28,7 @@ from gridworld.errors import InputError
 from gridworld.process.console import ProgressLine, printable
 from gridworld.process.user_input import limited
 from gridworld.report.tuning_study import TuningStudy, find_tunings
+from gridworld.report.writer import PAGE
 from gridworld.run.folder import MANIFEST
 from gridworld.run.reader import read_run
 from gridworld.sweep import folder as sweep_folder
@@ -42,7 +43,7 @@ end_with(int(sys.argv.pop(1)))
 main()
 """
 _PROGRESS = re.compile(r"(sweep|tune): \d")
-_ERROR = re.compile(r"(?:\S+: )?error: (.*)")  # also one of argparse
+_ERROR = re.compile(r"(?:gridworld \w+: )?error: (.*)")
 
 
 class SweepResult:
@@ -96,7 +97,7 @@ class SweepResult:
         """
         place = Path(out or self.folder / "report").expanduser()
         _run_command("report", [str(self.folder), "--out", str(place.absolute())], progress=False)
-        return place / "index.html"
+        return place / PAGE
 
     def __repr__(self) -> str:
         return f"SweepResult({str(self.folder)!r}, {counts_text(self._sweep.rows().values())})"

@@ -112,7 +112,7 @@ def test_wandb_while_it_trains(tmp_path: Path) -> None:
         ["-m", "seed=0,1", "hydra.sweep.dir=runs"],
         ["seed=2", callback, "hydra.run.dir=runs/seed=2"],
     ):
-        done = script("train.py", *words, *more, cwd=tmp_path, HOME=str(tmp_path), WANDB_MODE="offline")
+        done = script("train.py", *more, *words, cwd=tmp_path, HOME=str(tmp_path), WANDB_MODE="offline")
         assert done.returncode == 0, done.stderr
     found = {}
     for file in tmp_path.glob("wandb/offline-run-*/*.wandb"):

@@ -25,6 +25,7 @@ from gridworld.run.provenance import settings_hash
 from gridworld.run.reader import read_run
 from gridworld.run.writer import RunWriter
 from gridworld.storage.safe_read import read_object
+from gridworld.sweep import plan as sweep_plan
 from gridworld.sweep.folder import folder_name
 from gridworld.sweep.plan import Configurations, Job, expand, largest_population, plan, populations
 from gridworld.training.setup import check_settings
@@ -156,7 +157,7 @@ def test_jobs_are_divided_into_populations(
     sizes: list[int],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("gridworld.sweep.plan.file_limit", lambda: files)
+    monkeypatch.setattr(sweep_plan, "file_limit", lambda: files)
     config = configure("agent=ppo", f"device={device}")
     jobs = [Job((), (), str(number), None, config) for number in range(10)]
     groups = populations(jobs, largest_population(population), launcher, {"n_jobs": 4})

@@ -21,6 +21,8 @@ from gridworld.commands import report as report_command
 from gridworld.commands import tune as tune_command
 from gridworld.errors import InputError
 from gridworld.run.folder import claimed
+from gridworld.tune import study as tune_study
+from gridworld.tune import study_spec
 
 QUICK = (
     *("agent=q_learning", "total_timesteps=1500", "recording.gif=false", "recording.learning=false"),
@@ -165,7 +167,7 @@ def test_a_search_that_comes_to_nothing_is_no_mistake_of_the_command_line(
     def all_fail(spec: object, study: optuna.Study, *more: object) -> None:
         study.add_trial(create_trial(state=TrialState.FAIL, user_attrs={"error": "training diverged"}))
 
-    monkeypatch.setattr("gridworld.tune.study.search", all_fail)
+    monkeypatch.setattr(tune_study, "search", all_fail)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [str(ROOT / "scripts" / "tune.py"), *QUICK])
     with pytest.raises(SystemExit) as ended:
@@ -189,7 +191,7 @@ def test_a_search_space_that_makes_no_sense(
     (tmp_path / "tune").mkdir()
     head = "" if yaml.startswith("# @") else "# @package tune.space\n"
     (tmp_path / "tune" / "bad.yaml").write_text(head + yaml.replace("|", "\n"))
-    monkeypatch.setattr("gridworld.tune.study_spec._CORNERS", 5)  # it goes with none of them
+    monkeypatch.setattr(study_spec, "_CORNERS", 5)  # it goes with none of them
     told = refusal(monkeypatch, tmp_path, "agent=q_learning", "tune=bad", "--config-dir", ".")
     assert sentence in told
     assert "\n" not in told
