@@ -18,7 +18,7 @@ from stable_baselines3.common.env_util import make_vec_env as dummy_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
 from gridworld.agents import Learning, family, learn_together
-from gridworld.envs.observations import OneHotObservation, make_observation
+from gridworld.envs.observations import OneHotObservation
 from gridworld.training.setup import make_context
 from gridworld.world.mdp import Mdp
 
@@ -112,7 +112,7 @@ def steps_per_second(commands: Sequence[Sequence[str]], mdp: Mdp | None = None) 
     for number, words in enumerate(commands):
         config = compose(words)
         world = mdp or config.env.compile()
-        context = make_context(config, world, make_observation(world, config.observation.kind))
+        context = make_context(config, world)
         agent = family(config.agent).build(config.agent, context)
         learnings.append(Learning(agent, config.total_timesteps, partial(_note, made, number)))
     started = time.perf_counter()

@@ -20,7 +20,6 @@ from gridworld.agents import Agent, PolicySnapshot, family
 from gridworld.config.settings import check_foreign, read_config
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import MapConfig
-from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.process.console import tell
 from gridworld.process.user_input import DAMAGED, limited
@@ -96,11 +95,9 @@ class SavedRun:
     @limited()
     def agent(self) -> Agent:
         """The trained agent, a new object at every call."""
-        shows = self.config.observation
-        observation = make_observation(self.mdp, shows.kind, shows.cell_size)
         self.run.verify(self._model_file)
         few = dataclasses.replace(self.config, n_envs=min(self.config.n_envs, 2), callbacks=[])
-        context = dataclasses.replace(make_context(few, self.mdp, observation), only_asked=True)
+        context = dataclasses.replace(make_context(few, self.mdp), only_asked=True)
         agent = family(self.config.agent).build(self.config.agent, context)
         agent.load(self._model_file)
         return agent

@@ -90,7 +90,7 @@ class RunFolder:
         """The command line that resumes the run; for settings that the user has `trusted`, it says so."""
         parts = {key: (trusted or {}).get(key) for key in ("agent", "callbacks")}  # that are built again
         trust = " trust=true" if any(foreign(parts)) else ""
-        return f"{command('train')} resume={shlex.quote(shown(self.folder))}{trust}"
+        return f"{command('train')} resume={shell_path(self.folder)}{trust}"
 
 
 def shown(folder: Path) -> str:
@@ -99,6 +99,11 @@ def shown(folder: Path) -> str:
         return printable(str(folder.relative_to(users_folder())))
     except ValueError:
         return printable(str(folder))
+
+
+def shell_path(folder: Path) -> str:
+    """The same, quoted where a shell needs it."""
+    return shlex.quote(shown(folder))
 
 
 def check_inside(path: Path, key: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 from gridworld.process.console import aligned, printable
 from gridworld.process.signals import Interrupted
-from gridworld.run.folder import EVENTS, RunFolder, shown
+from gridworld.run.folder import EVENTS, RunFolder, shell_path
 from gridworld.run.reader import read_run
 from gridworld.world.metrics import METRICS
 
@@ -30,7 +29,7 @@ def train_and_tell(
         run = read_run(folder)
         print(interruption_text(interruption, run, run.manifest), file=sys.stderr)
         sys.exit(interruption.exit_code)
-    place = shlex.quote(shown(folder))
+    place = shell_path(folder)
     print(summary_text(summary, place, [] if summary["certified"] else advise(folder)))
     if any(folder.glob(EVENTS)):
         print(printable(f"  curves: tensorboard --logdir {place}"), flush=True)

@@ -21,6 +21,7 @@ from gridworld.config.settings import ON_RESULT, effect_of, flat, with_effects
 from gridworld.envs.rollout import wilson_interval
 from gridworld.errors import InputError
 from gridworld.process.console import aligned, command, command_line, duration, printable
+from gridworld.run.folder import shell_path
 from gridworld.run.reader import read_run
 from gridworld.sweep.folder import DONE, FAILED, INTERRUPTED, JOBS_CSV, PENDING, RUNNING, STATUSES, JobRow
 
@@ -82,13 +83,6 @@ def resume_command(folder: Path, *more: str) -> str:
     if not any(word.startswith("hydra.sweep.dir=") for word in words):
         more = (f"hydra.sweep.dir={folder}", *more)
     return printable(shlex.join([*words, *(word for word in more if word not in words)]))
-
-
-def shell_path(folder: Path) -> str:
-    """The folder as a user would type it here, quoted where a shell needs it."""
-    path = folder.absolute()
-    here = Path.cwd()
-    return printable(shlex.quote(str(path.relative_to(here) if path.is_relative_to(here) else path)))
 
 
 def results_lines(folder: Path, rows: Sequence[JobRow]) -> list[str]:

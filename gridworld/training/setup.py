@@ -11,7 +11,7 @@ from gridworld.agents import TrainingContext, WriteScalars, family
 from gridworld.config.presets import LARGE, STOCHASTIC, fitting_preset, is_recipe_for
 from gridworld.config.train import AUTO, PICTURES, TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
-from gridworld.envs.observations import ObservationTable
+from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError, install_command
 from gridworld.world.evaluation import Evaluator, fitting_discounts, score_of_optimum
@@ -43,11 +43,10 @@ def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = comp
 def make_context(
     config: TrainConfig,
     mdp: Mdp,
-    observation: ObservationTable,
     write_scalars: WriteScalars | None = None,
 ) -> TrainingContext:
     """Make `config.n_envs` fresh environments, and what else an agent is built from."""
-    share = config.exploring_starts
+    share, shown = config.exploring_starts, config.observation
     return TrainingContext(
         envs=StatisticsVectorEnv(
             config.n_envs,
@@ -56,13 +55,13 @@ def make_context(
             mdp=_with_exploring_starts(mdp, share) if share else mdp,
             stratified=config.stratified_draws,
         ),
-        observation=observation,
+        observation=make_observation(mdp, shown.kind, shown.cell_size),
         seed=config.seed,
         device=config.device,
         threads=config.threads,
         write_scalars=write_scalars,
         callbacks=config.callbacks,
-        features=config.observation.policy_kwargs(),
+        features=shown.policy_kwargs(),
     )
 
 

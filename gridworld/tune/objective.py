@@ -33,7 +33,6 @@ from gridworld.agents import Learning, family
 from gridworld.bounds import LARGEST_INTEGER
 from gridworld.config.compose import to_config
 from gridworld.config.train import TrainConfig
-from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError, reason
 from gridworld.process.processes import LostError
 from gridworld.process.signals import handling
@@ -234,9 +233,8 @@ def learning(
     """Train and evaluate as a run would, and keep nothing but the end."""
     config = dataclasses.replace(config, seed=seed)
     mdp = check_settings(config)
-    observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
     evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
-    context = make_context(config, mdp, observation)
+    context = make_context(config, mdp)
     agent = family(config.agent).build(config.agent, context)
     curve = LearningCurve(evaluator, agent, config, envs=context.envs)
     steps = 0

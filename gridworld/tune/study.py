@@ -40,7 +40,7 @@ from gridworld.process.processes import Processes, can_fork
 from gridworld.process.signals import Interrupted, exiting
 from gridworld.report.tuning_study import STUDY_JSON, TRIALS_CSV, TRIALS_SUM
 from gridworld.report.writer import write_over_seeds
-from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, check_writable, claimed
+from gridworld.run.folder import LOCK, MANIFEST, SWEEP_JSON, check_writable, claimed, shell_path
 from gridworld.run.provenance import versions
 from gridworld.storage.atomic_write import (
     check_no_links,
@@ -51,7 +51,6 @@ from gridworld.storage.atomic_write import (
     write_text,
 )
 from gridworld.storage.safe_read import LARGEST_CSV, file_sha256, read_sealed, sealed
-from gridworld.sweep.console import shell_path
 from gridworld.sweep.plan import may_fork
 from gridworld.training.setup import import_for
 from gridworld.training.tensorboard import hparams

@@ -12,7 +12,6 @@ from helpers.support import configure
 
 from gridworld.agents import Learning, family, learn_together
 from gridworld.engine import population
-from gridworld.envs.observations import make_observation
 from gridworld.training.setup import check_settings, make_context
 
 Words = tuple[str, ...]
@@ -55,8 +54,7 @@ class Learned:
     def learning(self) -> Learning:
         config = configure(*self.words)
         mdp = check_settings(config)
-        observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
-        context = make_context(config, mdp, observation, self._log)
+        context = make_context(config, mdp, self._log)
         self.agent = family(config.agent).build(config.agent, context)
         return Learning(self.agent, config.total_timesteps, self.on_step)
 

@@ -22,7 +22,6 @@ from helpers.support import ROOT, configure, script
 
 from gridworld.agents import family
 from gridworld.commands import reproduce as command
-from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.process.together import mixing
 from gridworld.restore.reproduce import population
@@ -180,9 +179,7 @@ def test_a_run_that_went_on_says_with_whom_and_cannot_be_repeated(tmp_path: Path
 def agents(count: int, *words: str) -> list[Any]:
     config = configure(*(words or ["agent=ppo"]))
     mdp = check_settings(config)
-    contexts = [
-        make_context(config, mdp, make_observation(mdp, config.observation.kind)) for _ in range(count)
-    ]
+    contexts = [make_context(config, mdp) for _ in range(count)]
     return [family(config.agent).build(config.agent, context) for context in contexts]
 
 

@@ -17,7 +17,6 @@ from gridworld.agents import Agent, TrainingContext, family
 from gridworld.agents.sb3 import check
 from gridworld.agents.sb3.agent import ACTIVATIONS, EngineAgent, SB3Agent
 from gridworld.agents.sb3.callbacks import FallingSetting
-from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.training.setup import make_context
 
@@ -25,8 +24,7 @@ from gridworld.training.setup import make_context
 def built(*words: str, log: Any = None) -> Agent:
     config = configure(*words)
     mdp = config.env.compile()
-    observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
-    context: TrainingContext = make_context(config, mdp, observation, log)
+    context: TrainingContext = make_context(config, mdp, log)
     return family(config.agent).build(config.agent, context)
 
 
