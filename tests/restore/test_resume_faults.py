@@ -85,7 +85,7 @@ def test_a_curve_that_cannot_be_written_ends_the_run(
 ) -> None:
     with monkeypatch.context() as patched:
         patched.setattr(AppendLog, "append", at_call(30, partial(fail, errno.EIO), AppendLog.append))
-        with pytest.raises(InputError, match=r"Input/output error; put that right, .* with .*resume="):
+        with pytest.raises(InputError, match=r"Input/output error; fix that, .* with .*resume="):
             begin(tmp_path, *WORDS)
     go_on(tmp_path)
     assert differences(left_behind(tmp_path), calm) == []
@@ -105,7 +105,7 @@ def test_a_really_full_disk(tmp_path: Path, calm: dict[str, Any]) -> None:
     done = train_on_full_disk(15_000, *WORDS, "hydra.run.dir=run", cwd=tmp_path)
     assert done.returncode == 2
     assert (
-        f"error: run: File too large; put that right, then go on with python {ROOT}/scripts/train.py"
+        f"error: run: File too large; fix that, then resume with python {ROOT}/scripts/train.py"
         in done.stderr
     )
     again = script("train.py", "resume=run", cwd=tmp_path)
@@ -116,7 +116,7 @@ def test_a_really_full_disk(tmp_path: Path, calm: dict[str, Any]) -> None:
 def test_no_room_for_the_manifest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patched:
         patched.setattr(run, "write_json", at_call(1, partial(fail, errno.ENOSPC), run.write_json))
-        with pytest.raises(InputError, match=r"run: No space left on device; .* give the command again$"):
+        with pytest.raises(InputError, match=r"run: No space left on device; .* run the command again$"):
             begin(tmp_path / "run", *WORDS)
     begin(tmp_path / "run", *WORDS)
 
