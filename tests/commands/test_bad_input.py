@@ -58,7 +58,7 @@ def table(title: str) -> list[tuple[str, str]]:
 # What the command line itself, Hydra or a file of the user's makes of it; the rest are settings that compose.
 OF_THE_COMMAND = re.compile(r"--|hydra\.|recipe=|\{conf\}|~|^[^=]*$|'|=null|=\[1|env=gymnasium|seed=(1,2|-1)")
 REFUSED = table("train.py")
-OUT_OF_SIZE = "must be 0 or of a size from"
+OUT_OF_SIZE = "must be 0, or from"
 # Of the right type, and beyond what any number here holds.
 ABSURD = [
     *(
@@ -164,9 +164,9 @@ def test_a_folder_that_cannot_be_a_runs_is_refused_and_left_alone(tmp_path: Path
     manifest = sealed({"status": "finished", "config": {}, "layout": []})
     (tmp_path / "used" / "manifest.json").write_text(json.dumps(manifest))
     before = sorted(tmp_path.rglob("*"))
-    longer = f"make that run longer by python {ROOT}/scripts/train.py resume=used total_timesteps=..."
+    longer = f"make that run longer with python {ROOT}/scripts/train.py resume=used total_timesteps=..."
     for folder, told in (
-        ("used", f"used: holds a run already; choose another folder, or {longer}"),
+        ("used", f"used: contains a run already; choose another folder, or {longer}"),
         ("file/run", "file/run: cannot be made, file is a file; choose another hydra.run.dir"),
         ("sweep", "sweep: is the folder of a sweep; choose another hydra.run.dir"),
     ):
@@ -187,7 +187,7 @@ def test_a_launcher_that_is_not_installed_names_its_extra(
     launcher: str, package: str, refusal: Refusal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    told = f"{package} is not installed; pip install 'gridworld-sb3[{launcher}]'"
+    told = f"{package} is not installed; pip install -e '{ROOT}[{launcher}]'"
     line = f"train.py -m seed=0,1 hydra/launcher={launcher}"
     assert refusal(line) == f"error: hydra/launcher={launcher}: {told}"
 
@@ -197,7 +197,7 @@ def test_slurm_is_started_where_it_is(
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     told = refusal("train.py -m seed=0,1 hydra/launcher=slurm")
-    assert told.startswith("error: hydra/launcher=slurm: there is no sbatch on this machine; start")
+    assert told.startswith("error: hydra/launcher=slurm: no sbatch on this machine; start")
 
 
 @pytest.mark.parametrize(("line", "words"), table("the other scripts"))

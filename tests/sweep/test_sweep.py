@@ -121,7 +121,7 @@ def test_settings_are_told_by_the_words_that_asked_for_them(tmp_path: Path) -> N
     assert [row[2] for row in results(followed.stdout)] == ["n_envs=3", "n_envs=4"]
     presets = script("train.py", "-m", *QUICK, "env=four_rooms", "preset=auto,none,large", cwd=tmp_path)
     assert [row[2] for row in results(presets.stdout)] == ["preset=auto", "preset=large"]
-    assert "preset=none makes the same runs as preset=auto, and these are run once" in presets.stderr
+    assert "preset=none repeats the runs of preset=auto; they run once" in presets.stderr
 
 
 def test_a_failure_stops_no_other_job(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -176,7 +176,7 @@ def test_an_unforeseen_error_or_a_killed_worker_takes_no_other_job_along(tmp_pat
     assert "Traceback" not in done.stderr
     broken, killed, working = table(tmp_path / "sweep").values()
     assert (broken["status"], broken["error"]) == ("failed", "RuntimeError: first second")
-    assert (killed["status"], killed["error"]) == ("failed", "its process was lost (exit code -9)")
+    assert (killed["status"], killed["error"]) == ("failed", "its process died (exit code -9)")
     assert (working["status"], working["error"]) == ("done", "")
     assert "in learn\n" in (tmp_path / "sweep" / broken["job"] / "error.txt").read_text()
     again = script("train.py", *words, cwd=tmp_path, PYTHONPATH=path)
@@ -270,7 +270,7 @@ def cut_off(run: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (with_other_settings, "holds an unfinished run with other settings (total_timesteps=500"),
+        (with_other_settings, "contains an unfinished run with other settings (total_timesteps=500"),
         (made_longer, "the run in seed=0 was made 700 steps long"),
         (cut_off, "manifest.json: is not JSON, it was changed or cut off"),
     ],
@@ -324,7 +324,7 @@ def test_a_lock_keeps_a_second_sweep_out_and_ends_with_its_block(tmp_path: Path)
         assert (first, second, is_locked(path)) == (True, False, True)
         done = sweep("seed=0", cwd=tmp_path)
     assert done.returncode == 2
-    assert done.stderr == "error: sweep: another process runs this sweep; wait for it or stop it\n"
+    assert done.stderr == "error: sweep: another process is using it; wait for it or stop it\n"
     assert not is_locked(path)
 
 
