@@ -301,7 +301,7 @@ def _as_python_interrupts(is_kept: bool) -> Iterator[None]:
     try:
         yield
     except Interrupted as interruption:
-        how = "; the same call goes on where it was saved" if is_kept else ""
+        how = "; make the same call to resume" if is_kept else ""
         if interruption.exit_code == 128 + signal.SIGINT:
             raise KeyboardInterrupt(f"{interruption}{how}") from None
         raise SystemExit(interruption.exit_code) from None

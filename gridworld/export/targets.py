@@ -60,7 +60,7 @@ these scores are exact, of the greedy policy and of the one that it explores wit
 ## Use
 
 ```bash
-pip install gridworld-sb3 huggingface_hub
+pip install huggingface_hub  # and gridworld, from its repository
 ```
 
 ```python

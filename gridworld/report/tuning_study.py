@@ -84,8 +84,8 @@ def _read(folder: Path) -> TuningStudy:
     content, of_trials = read_sealed(file), read_bytes(trials, LARGEST_CSV)
     if content.get(TRIALS_SUM, digest := sha256(of_trials)) != digest:  # the first format has none
         raise InputError(
-            f"{trials}: is not the table that {STUDY_JSON} was written with; it was changed or damaged, or "
-            "the search was continued and has not finished"
+            f"{trials}: does not match {STUDY_JSON}; it was changed or damaged, or a continued search has "
+            "not finished"
         )
     table = as_table(of_trials, trials)
     check_memory(trials, _OF_A_TRIAL * table.count("\n"))

@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any
 from gridworld.agents import Agent, Learning, family
 from gridworld.config.settings import privileges
 from gridworld.config.train import AUTO, TrainConfig
-from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.process.console import Progress, tell
 from gridworld.process.signals import StopRequest
@@ -106,8 +105,7 @@ class Session:
 
             self._wandb = WandbLog(config, [self._origin["identity"], folder.absolute()], state is not None)
         self._scalar_logs = [log for log in (self._events, self._wandb) if log is not None]
-        observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
-        context = make_context(config, mdp, observation, self._write_scalars if self._scalar_logs else None)
+        context = make_context(config, mdp, self._write_scalars if self._scalar_logs else None)
         self._agent = family(config.agent).build(config.agent, context)
         on_built(self._agent)
         self._visits = context.envs.visits
@@ -128,7 +126,7 @@ class Session:
     def _checkpoint_every(self) -> int | str | None:
         every = self._config.checkpoint.every
         if every is not None and (unknown := self._agent.class_without_state()) is not None:
-            tell(f"checkpoints: none, since {unknown} does not define get_state and set_state")
+            tell(f"no checkpoints, since {unknown} does not define get_state and set_state")
             return None
         return every
 

@@ -116,9 +116,7 @@ def test_a_run_shows_itself(run: gridworld.RunResult) -> None:
     assert names[:3] == ["greedy", "with exploration", "optimum"]
     drawn = {tuple(line.get_ydata()) for line in figure.axes[0].lines}
     assert tuple(run.curve["regret"]) in drawn
-    with pytest.raises(
-        InputError, match="metric='speed': there is no such curve; it is one of value, regret"
-    ):
+    with pytest.raises(InputError, match="metric='speed': no such curve; choose from value, regret"):
         run.plot("speed")
     with Image.open(Path(run.folder or "") / "policy.png") as picture:
         assert np.array_equal(np.asarray(picture), np.asarray(run.policy_map()))
@@ -147,7 +145,7 @@ def test_settings_are_those_of_the_command_line() -> None:
 @pytest.mark.parametrize(
     ("given", "sentence"),
     [
-        (("agent=dnq",), "agent=dnq: there is no such choice; there are"),
+        (("agent=dnq",), "agent=dnq: no such choice; choose from"),
         (("agent.lr=3",), "Key 'lr' not in 'DQNConfig'; did you mean learning_rate?"),
         (({"agent.gama": 0.9},), "did you mean gamma?"),
         (("seed=1,2",), "seed=1,2: has several values; call gridworld.sweep with them"),
@@ -173,7 +171,7 @@ def test_mistakes_are_told_in_one_sentence(given: tuple[object, ...], sentence: 
 
 def test_folders_that_cannot_be_used(tmp_path: Path) -> None:
     gridworld.train("agent=value_iteration", folder=tmp_path / "run", progress=False)
-    with pytest.raises(InputError, match="holds a run already; choose another folder"):
+    with pytest.raises(InputError, match="contains a run already; choose another folder"):
         gridworld.train("agent=value_iteration", folder=tmp_path / "run", progress=False)
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="choose another folder"):
@@ -195,14 +193,14 @@ def test_ctrl_c_leaves_a_run_that_the_same_call_goes_on_with(
 
     with monkeypatch.context() as patch:
         patch.setattr(Session, "_on_step", press)
-        with pytest.raises(KeyboardInterrupt, match="the same call goes on where it was saved"):
+        with pytest.raises(KeyboardInterrupt, match="make the same call to resume"):
             gridworld.train(*words, folder=tmp_path / "run", progress=False)
         with pytest.raises(KeyboardInterrupt):
             gridworld.train(*words, progress=False)
     assert signal.getsignal(signal.SIGINT) is handler
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
     assert (manifest["status"], manifest["checkpoint"]) == ("interrupted", manifest["reached"])
-    with pytest.raises(InputError, match="holds an unfinished run with other settings"):
+    with pytest.raises(InputError, match="contains an unfinished run with other settings"):
         gridworld.train(*words, seed=5, folder=tmp_path / "run", progress=False)
 
     continued = gridworld.train(*words, folder=tmp_path / "run", progress=False)
@@ -272,5 +270,7 @@ def test_a_run_is_opened_within_the_budget_and_ones_own_needs_none(
     with (tmp_path / "run" / "world.npz").open("r+b") as file:
         file.truncate(500_000)
     for read in (gridworld.open_run, gridworld.diagnose):
-        with pytest.raises(InputError, match=r"world\.npz: would take about 1\.5 MB of memory, the budget"):
+        with pytest.raises(
+            InputError, match=r"world\.npz: would take about 1\.5 MB of memory, but the budget"
+        ):
             read(tmp_path / "run")
