@@ -122,7 +122,7 @@ def test_a_run_shows_itself(run: gridworld.RunResult) -> None:
         assert np.array_equal(np.asarray(picture), np.asarray(run.policy_map()))
     html = run._repr_html_()
     assert html.count('<img src="data:image/png;base64,') == 2
-    assert "not optimal: regret" in html
+    assert "<b>certified optimal since step 2,000</b>" in html
     run.summary["agent"] = "<b>x</b>"
     assert "<b>x</b>" not in run._repr_html_()
     run.summary["agent"] = "q_learning"
