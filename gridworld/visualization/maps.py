@@ -78,7 +78,7 @@ def policy(subject: Subject) -> Draw:
 
 
 def learning(subject: Subject) -> Draw:
-    """The policy map, or table, over training as an animation of one size, with one scale of colours."""
+    """The policy map over training, in cells of `recording.cell_size`, or the table; one colour scale."""
     assert subject.history is not None
     mdp, optimal = subject.evaluator.mdp, subject.evaluator.solution.optimal
     moments = subject.history.moments()
@@ -86,7 +86,8 @@ def learning(subject: Subject) -> Draw:
     states = np.flatnonzero(board.floor) if board.panels else table_states(mdp, subject.visits)
     visited = states[known[states]]
     scale = linear(VIRIDIS, np.stack([moment.values[visited] for moment in moments]))
-    cell_size = fitting_cell_size(mdp, _LEARNING_SIDE if len(board.panels) <= 1 else _LEARNING_MOSAIC_SIDE)
+    side = _LEARNING_SIDE if len(board.panels) <= 1 else _LEARNING_MOSAIC_SIDE
+    cell_size = subject.config.recording.cell_size or fitting_cell_size(mdp, side)
 
     def sheet(moment: Moment) -> Sheet:
         values, greedy = moment.values.astype(np.float64), moment.greedy
@@ -186,7 +187,8 @@ def draw_policy_map(
         draw.circle(canvas.world, inks[state], point, round(0.2 * length))
         if letter >= SMALLEST_TEXT:
             name = mdp.action_names[greedy[state]]
-            canvas.write(name[:1].upper(), point, letter, colours[state].tolist())
+            # An animation has one palette, which smooth letters in all colours of the scale would overfill.
+            canvas.write(name[:1].upper(), point, letter, colours[state].tolist(), smooth=scale is None)
     canvas.write_numbers(
         *(values[:, None], known[:, None], colours[:, None], own.high, size),
         lambda state, _: canvas.point(state, 0.5, 0.83),
@@ -254,7 +256,8 @@ def draw_visit_map(
     mdp: Mdp, visits: NDArray[np.int64], caption: str = "", cell_size: int | None = None
 ) -> Frame:
     """Draw counts (S, A) as colours, on a logarithmic scale where they span decades."""
-    counts = visits.sum(axis=1, keepdims=True)
-    scale = counting(BLUES, counts[board_of(mdp).floor])
+    board = board_of(mdp)
+    counts = board.summed(visits.sum(axis=1))[:, None]
+    scale = counting(BLUES, counts[board.floor])
     numbers = np.where(counts > 0, counts, np.nan)
     return Canvas(mdp, cell_size).draw_numbers(numbers, scale, "visits", "never", caption)
