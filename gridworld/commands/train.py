@@ -9,6 +9,7 @@ import contextlib
 import copy
 import os
 import re
+import shlex
 import sys
 import threading
 import traceback
@@ -152,7 +153,7 @@ def _sum_up(sweep: Path, kind: object, error: BaseException | None, trace: objec
     from gridworld.report.writer import write_over_seeds
 
     if (folder := write_over_seeds(sweep, sweep)) is not None:
-        print(f"  over seeds: {printable(shown(folder))}, next to the jobs in TensorBoard")
+        print(printable(f"  curves over seeds: tensorboard --logdir {shlex.quote(shown(folder))}"))
 
 
 def run_job(settings: DictConfig) -> float:

@@ -85,8 +85,8 @@ def _curves(analysis: TaskAnalysis, styles: Styles, more: str) -> Iterator[Chart
         # The first tenth, where most is learnt, would flatten all the rest.
         late = np.concatenate([band.point[len(band.point) // 10 :] for band in bands.values()])
         yield draw(
-            f"{task} on-line return",
-            f"On-line return on {task}",
+            f"{task} online_return",
+            f"Online return on {task}",
             describe("mean return of the training episodes, exploration included", _BOOTSTRAP),
             bands,
             label="return",
@@ -233,7 +233,7 @@ def overall_charts(overall: Overall, styles: Styles) -> Iterator[Chart]:
         "Performance profiles over all tasks",
         f"share of runs whose optimality is above each level, as the mean over tasks{most}; 95 % pointwise "
         "intervals from the stratified bootstrap",
-        {agent: Band(levels, point, point, low, high, end) for agent, (point, low, high) in profiles.items()},
+        {agent: Band(levels, point, low, high, end) for agent, (point, low, high) in profiles.items()},
         styles,
         "runs above it",
         (0.0, 1.0),

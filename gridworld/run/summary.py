@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -10,6 +11,7 @@ from typing import Any
 
 from gridworld.process.console import aligned, printable
 from gridworld.process.signals import Interrupted
+from gridworld.process.user_input import users_folder
 from gridworld.run.folder import EVENTS, RunFolder, shown
 from gridworld.run.reader import read_run
 from gridworld.world.metrics import METRICS
@@ -18,6 +20,7 @@ Summary = dict[str, Any]
 
 MOST_NAMED = 5  # states of a policy that loops
 _ROUNDING = 1e-9  # of a probability
+_MOST_SELECTED = 40  # runs: of more TensorBoard selects none
 
 
 def train_and_tell(
@@ -33,8 +36,17 @@ def train_and_tell(
     place = shlex.quote(shown(folder))
     print(summary_text(summary, place, [] if summary["certified"] else advise(folder)))
     if any(folder.glob(EVENTS)):
-        print(printable(f"  curves: tensorboard --logdir {place}"), flush=True)
+        logs = shlex.quote(shown(_logs(folder.absolute())))
+        print(printable(f"  curves: tensorboard --logdir {logs}"), flush=True)
     return summary
+
+
+def _logs(folder: Path) -> Path:
+    """What TensorBoard is to show of a run: the folder above, since it calls a run that is alone "."."""
+    above = folder.parent
+    beside = itertools.chain(above.glob(f"*/{EVENTS}"), above.glob(f"*/*/{EVENTS}"))
+    are_few = len(list(itertools.islice(beside, _MOST_SELECTED + 1))) <= _MOST_SELECTED
+    return above if are_few and above != users_folder() else folder
 
 
 def interruption_text(interruption: Interrupted, run: RunFolder, manifest: Mapping[str, Any]) -> str:

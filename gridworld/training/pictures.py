@@ -29,7 +29,8 @@ from gridworld.world.evaluation import Evaluator
 
 # Pixels that pictures have in TensorBoard. It scales by skipping pixels: thin lines vanish, text frays.
 _IMAGES_TAB, _TIME_SERIES_CARD = 350, 240
-_GROUP = "pictures"  # of TensorBoard's tags: behind the learning curve
+# TensorBoard's groups, behind the learning curve. It sorts "/" and "_" alike: policy comes before rest.
+_FIRST, _OTHERS = "pictures", "pictures_rest"
 
 _log = logging.getLogger("gridworld")
 
@@ -135,7 +136,7 @@ class Pictures:
             return
         side = _IMAGES_TAB if picture.is_map else _TIME_SERIES_CARD
         drawn = draw(fitting_cell_size(self._evaluator.mdp, side))
-        tag = f"{_GROUP}/{picture.name}"
+        tag = f"{_FIRST if picture.while_training else _OTHERS}/{picture.name}"
         if isinstance(drawn, Animation):
             encoded, size = encode_gif(drawn, self._config.recording.fps), drawn.size
         else:
