@@ -148,7 +148,7 @@ def misfit(found: Mapping[str, NDArray[Any]], expected: Mapping[str, NDArray[Any
         if is_now != must_be:
             return f"{name} is {is_now}, it must be {must_be}"
         if not np.isfinite(found[name]).all():
-            return f"{name} holds numbers that are not finite"
+            return f"{name} contains numbers that are not finite"
     return None
 
 
@@ -178,11 +178,9 @@ def family(config: AgentConfig) -> Family:
     """Import the family of an agent's settings."""
     known = sorted(module.name for module in pkgutil.iter_modules(__path__))
     if config.family not in known:
-        raise InputError(
-            f"agent.family={config.family}: there is no such family; there are {', '.join(known)}"
-        )
+        raise InputError(f"agent.family={config.family}: no such family; choose from {', '.join(known)}")
     for key in ("family", "algorithm"):
         given, own = getattr(config, key), getattr(type(config), key)
         if own not in (given, MISSING):
-            raise InputError(f"agent.{key}={given}: these are the settings of {own}; choose agent=...")
+            raise InputError(f"agent.{key}={given}: these settings are {own}'s; choose agent=...")
     return cast("Family", importlib.import_module(f"gridworld.agents.{config.family}"))

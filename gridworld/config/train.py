@@ -103,6 +103,7 @@ class LoggingConfig:
     # evaluations between two pictures of the policy; 0 for none
     policy_map_every: int = setting(5, bounds(0))
     progress: bool = setting(True, affects(Effect.NOTHING))
+    wandb: bool = setting(False, affects(Effect.NOTHING))  # log the scalars to W&B as well, while it trains
 
 
 @dataclass(frozen=True)

@@ -221,7 +221,7 @@ class Population:
     @classmethod
     def networks_of(cls, runs: Sequence[Run]) -> list[Networks]:
         """The networks that runs learn with, as far as they differ in kind; the first acts."""
-        return [make_networks(runs)]
+        return [make_networks(runs, met=met_states(runs[0]))]
 
     def _optimizer(self) -> Optimizer:
         own = [run.model.policy.optimizer for run in self.runs]
@@ -283,7 +283,8 @@ class Population:
 
     def safe_point(self) -> Self | None:
         """Let all runs be saved, as nothing is half done; returns the population of those that go on."""
-        finite = [torch.isfinite(each.weights).all(dim=1).cpu().numpy() for each in self.all_networks]
+        sums = [each.weights.sum(dim=1) for each in self.all_networks]  # a third of what asking each costs
+        finite = [torch.isfinite(each).cpu().numpy() for each in sums]
         for run in self.going():
             if all(of_runs[run.row] for of_runs in finite):
                 run.safe_point(self.num_timesteps)
@@ -303,7 +304,7 @@ class Population:
             **run.get_state(),
             "optimizer": self.optimizer.get_state(run.row),
             **{
-                name: networks.weights[run.row].cpu().numpy().copy()
+                name: networks.whole()[run.row].cpu().numpy().copy()
                 for name, (networks, _) in self.weights(run).items()
             },
         }
@@ -311,9 +312,9 @@ class Population:
     def set_state(self, run: Run, state: State) -> None:
         run.set_state(state)
         for name, (networks, _) in self.weights(run).items():
-            own = networks.weights[run.row].cpu().numpy()
+            own = networks.whole()[run.row].cpu().numpy()
             fill(own, state[name], name)
-            networks.weights[run.row] = torch.as_tensor(own)
+            networks.set_row(run.row, torch.as_tensor(own))
         self.optimizer.set_state(run.row, state["optimizer"])
 
 
@@ -350,8 +351,12 @@ def make_networks(
     parameters: Callable[[Run], Sequence[nn.Parameter]] = lambda run: run.parameters,
     outputs: slice = slice(None),
     is_target: bool = False,
+    met: IntArray | None = None,
 ) -> Networks:
-    """The networks of some runs, or their target networks, with the weights that SB3's models have."""
+    """The networks of some runs, or their target networks, with the weights that SB3's models have.
+
+    `met` is as `met_states` has it.
+    """
     first, of_runs = runs[0], [parameters(run) for run in runs]
     vectors = [torch.cat([each.detach().reshape(-1) for each in own]) for own in of_runs]
     inputs, nets = (first.target if is_target else first.inputs), first.nets[outputs]
@@ -359,9 +364,25 @@ def make_networks(
     table = inputs.table()
     if DenseNetworks.fit(first.nets, first.parameters) and (inputs.is_look_up or table is not None):
         own = first.parameters if is_target else of_runs[0]
-        return DenseNetworks(torch.stack(vectors), own, nets, table)
+        return DenseNetworks(torch.stack(vectors), own, nets, table, met)
     assert len(runs) == 1
     return ModuleNetworks(vectors[0], of_runs[0], lambda states: inputs.forward(states)[outputs])
+
+
+def met_states(run: Run) -> IntArray | None:
+    """The states (U,) of a large world that a run can meet within its step limit; None if those are all.
+
+    Without weight decay, a first layer of unit vectors never changes in the columns of the others.
+    """
+    mdp, settings = run.envs.mdp, run.model.policy.optimizer.param_groups[0]
+    if mdp.num_states <= FEW_STATES or not run.inputs.is_look_up or settings.get("weight_decay"):
+        return None
+    found, front = mdp.start > 0, mdp.start_states
+    for _ in range(min(run.envs.step_limit, mdp.num_states)):
+        following = mdp.next_state[front][mdp.probability[front] > 0]
+        front = np.unique(following[~found[following]])
+        found[front] = True
+    return None if found.all() else np.flatnonzero(found)
 
 
 _agreed: dict[Hashable, bool] = {}  # by kind, number of runs and threads
@@ -380,8 +401,8 @@ def agree(runs: Sequence[Run]) -> bool:
         _agreed[key] = _try_out(runs)
         if not _agreed[key]:
             tell(
-                "population: this processor or torch adds up otherwise for several networks like these at "
-                "once; such runs train one by one"
+                "population: on this processor, networks like these get other bits when batched; such runs "
+                "train one by one"
             )
     return _agreed[key]
 

@@ -94,10 +94,11 @@ def put_weights(run: Run) -> None:
             setattr(model, name, value)
     optimizer.param_groups[0]["lr"] = run.setting("learning_rate", progress)
     for networks, parameters in population.weights(run).values():
-        copy_row(networks.weights[run.row], parameters)
+        copy_row(networks.whole()[run.row], parameters)
     shapes = [parameter.shape for parameter in population.fitted(run)]
     state = {name: torch.as_tensor(value) for name, value in population.optimizer.get_state(run.row).items()}
-    cuts = {name: cut(value, shapes) for name, value in state.items() if value.dim()}
+    spread = population.networks.spread
+    cuts = {name: cut(spread(value), shapes) for name, value in state.items() if value.dim()}
     for number, parameter in enumerate(population.fitted(run) if state else ()):
         optimizer.state[parameter] = {
             name: (cuts[name][number] if name in cuts else value).to(

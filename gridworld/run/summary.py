@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 from gridworld.process.console import aligned, printable
 from gridworld.process.signals import Interrupted
 from gridworld.process.user_input import users_folder
-from gridworld.run.folder import EVENTS, RunFolder, shown
+from gridworld.run.folder import EVENTS, RunFolder, shell_path
 from gridworld.run.reader import read_run
 from gridworld.world.metrics import METRICS
 
@@ -33,11 +32,10 @@ def train_and_tell(
         run = read_run(folder)
         print(interruption_text(interruption, run, run.manifest), file=sys.stderr)
         sys.exit(interruption.exit_code)
-    place = shlex.quote(shown(folder))
+    place = shell_path(folder)
     print(summary_text(summary, place, [] if summary["certified"] else advise(folder)))
     if any(folder.glob(EVENTS)):
-        logs = shlex.quote(shown(_logs(folder.absolute())))
-        print(printable(f"  curves: tensorboard --logdir {logs}"), flush=True)
+        print(f"  curves: tensorboard --logdir {shell_path(_logs(folder.absolute()))}", flush=True)
     return summary
 
 
@@ -53,12 +51,12 @@ def interruption_text(interruption: Interrupted, run: RunFolder, manifest: Mappi
     """How much of an interrupted run is saved, by its manifest, and the command that resumes it."""
     saved, reached = manifest.get("checkpoint"), manifest.get("reached")
     if not saved:
-        what = "nothing is saved, so that it will begin anew"
+        what = "nothing is saved, so it will start over"
     elif saved == reached:
         what = f"all {saved:,} steps are saved"
     else:
-        what = f"saved are {saved:,} of its {reached:,} steps"
-    return printable(f"{interruption}: {what}; go on with  {run.resume_command(manifest['config'])}")
+        what = f"{saved:,} of its {reached:,} steps are saved"
+    return printable(f"{interruption}: {what}; resume with  {run.resume_command(manifest['config'])}")
 
 
 def summary_text(summary: Summary, folder: str, advice: Sequence[str] = ()) -> str:
@@ -107,7 +105,7 @@ def _trade(name: str, summary: Summary) -> str:
     if name != "goal_probability" or summary["certified"]:
         return ""
     is_above = summary[name] > summary[f"optimal_{name}"] + _ROUNDING
-    return "  more often than the optimum, for less value" if is_above else ""
+    return "  more often than the optimum, but with less value" if is_above else ""
 
 
 def verdict(summary: Summary) -> str:

@@ -41,7 +41,14 @@ DECLARED = {
         *("recording.visits", "recording.learning", "recording.frames", "recording.gif", "recording.mp4"),
         *("recording.cell_size", "recording.fps"),
     },
-    Effect.NOTHING: {"logging.progress", "checkpoint.every", "recipe", "preset", "known_failure"},
+    Effect.NOTHING: {
+        "logging.progress",
+        "logging.wandb",
+        "checkpoint.every",
+        "recipe",
+        "preset",
+        "known_failure",
+    },
 }
 # Who goes by a setting of each effect; the task of the report's groups has a key of its own.
 EVERYBODY = {"identity", "sweep", "hparams", "group", "recipe", "search"}
@@ -151,6 +158,7 @@ def test_what_a_run_is_known_by_leaves_out_what_it_may_change_on_its_way() -> No
     kept = frozenset(Effect) - {Effect.LENGTH, Effect.NOTHING}
     found = with_effects(kept, content)
     del content["checkpoint"], content["total_timesteps"], content["logging"]["progress"]
+    del content["logging"]["wandb"]
     del content["recipe"], content["preset"], content["known_failure"], content["observation"]["features"]
     newer = ("callbacks", "exploration_bonus", "exploring_starts", "stratified_draws")
     assert [content.pop(key) for key in newer] == [[], 0, 0, False]  # as if there were none

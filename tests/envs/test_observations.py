@@ -204,7 +204,7 @@ def test_the_environments_own_observation():
 
 @pytest.mark.parametrize(
     ("kind", "why"),
-    [("own", "no observation of its own"), ("coordinates", "no places"), ("image", "no places")],
+    [("own", "no array observation"), ("coordinates", "no coordinates"), ("image", "no coordinates")],
 )
 def test_a_world_without_what_an_observation_shows(kind, why):
     with pytest.raises(InputError, match=f"^observation {kind}: .*row ha(s|ve) {why}") as refused:
@@ -226,7 +226,7 @@ def test_agents_train_on_the_environments_own_observation(algorithm, numbers):
     for engine in ("stock", "tabulated"):
         config = configure(f"agent={algorithm.lower()}", "observation=own", f"agent.engine={engine}")
         settings = dataclasses.replace(config.agent, **small)
-        context = make_context(config, mdp, make_observation(mdp, "own"))
+        context = make_context(config, mdp)
         agent = family(settings).build(settings, context)
         agent.learn(128, lambda steps: steps + 1)
         assert agent.model.num_timesteps >= 128

@@ -20,7 +20,7 @@ ASCII = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii"}
 MAP = "mäp.txt"
 FULL = (
     "error: standard output: cannot be written (No space left on device), "
-    "what was printed is not complete; send it to where there is room\n"
+    "so the output is incomplete; write it to a disk with free space\n"
 )
 
 
@@ -64,7 +64,7 @@ def test_progress(
     shown = capsys.readouterr().err.removesuffix("\n")
     start, middle, end = shown.removeprefix("\r").split("\r" if in_place else "\n")
     assert start == r"dqn on\x1bmap: step 0 of 2,000 (0%), a long note"
-    assert middle.rstrip() == r"dqn on\x1bmap: step 1,000 of 2,000 (50%), about 0 s left, b"
+    assert middle.rstrip() == r"dqn on\x1bmap: step 1,000 of 2,000 (50%), b, about 0 s left"
     assert end.rstrip() == r"dqn on\x1bmap: step 2,000 of 2,000 (100%), c"
     assert (len(end) == len(middle)) == in_place  # a line covers the one before
     console.Progress(10, "x", enabled=False).update(1, "y")

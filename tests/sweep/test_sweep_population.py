@@ -63,8 +63,8 @@ def test_a_mistaken_size_is_refused_before_anything_is_written(value: str, tmp_p
     assert done.returncode == 2
     shown = "None" if value == "null" else re.escape(value)
     assert re.fullmatch(
-        rf"error: hydra\.sweeper\.population={shown}: (must be the number of runs that train together at "
-        r"most, 1 for each by itself, or auto|Value .* is incompatible with type hint .*)\n",
+        rf"error: hydra\.sweeper\.population={shown}: (must be the largest number of runs that train "
+        r"together \(1: each alone\), or auto|Value .* is incompatible with type hint .*)\n",
         done.stderr,
     )
     assert list(tmp_path.iterdir()) == []
@@ -181,7 +181,7 @@ def test_a_signal_interrupts_all_and_nothing_is_lost(
     if not launcher:  # workers are ended, and go on from their last checkpoint
         assert all(end.startswith(f"INFO stopped by {number.name}: ") for end in ends), ends
     if not launcher and times == 1:
-        assert all(" steps are saved; go on with " in end for end in ends), ends
+        assert all(" steps are saved; resume with " in end for end in ends), ends
     done = script("train.py", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for run in map(folder.joinpath, rows(folder)):

@@ -14,7 +14,6 @@ import gridworld
 from gridworld.agents import family
 from gridworld.engine.environments import Environments
 from gridworld.envs import rollout
-from gridworld.envs.observations import make_observation
 from gridworld.envs.rollout import play, sample_episodes
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.envs.vector_env import GridWorldVectorEnv
@@ -127,7 +126,7 @@ def test_slips_do_not_depend_on_the_actions_of_training(monkeypatch, agent: str)
     if agent == "dqn":
         config.agent.learning_starts = 19_000
     mdp = config.env.compile()
-    context = make_context(config, mdp, make_observation(mdp, "one_hot"))
+    context = make_context(config, mdp)
     family(config.agent).build(config.agent, context).learn(config.total_timesteps, lambda steps: steps + 1)
     assert_independent(slip_table(mdp, walked))
 

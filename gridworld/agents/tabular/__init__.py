@@ -28,11 +28,13 @@ def check(config: TrainConfig) -> None:
     agent = config.agent
     if config.observation.kind != "none":
         what = f"observation={config.observation.kind}"
-        raise InputError(f"{what}: agent={agent.name} keeps a table over the states themselves; must be none")
+        raise InputError(f"{what}: agent={agent.name} keeps a table over states; must be none")
     if config.callbacks:
-        raise InputError(f"callbacks: are Stable-Baselines3's, agent={agent.name} calls none; leave them out")
+        raise InputError(
+            f"callbacks: agent={agent.name} does not call Stable-Baselines3's callbacks; leave them out"
+        )
     if config.device not in ("cpu", "auto"):
-        raise InputError(f"device={config.device}: agent={agent.name} runs on the processor; must be cpu")
+        raise InputError(f"device={config.device}: agent={agent.name} runs on the CPU; must be cpu")
 
 
 def import_for(config: AgentConfig) -> None:

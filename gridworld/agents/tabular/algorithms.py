@@ -121,8 +121,8 @@ class ValueIteration:
         if not np.isfinite(solution.q).all():
             worst = mdp.state_name(int(np.argmin(solution.v)))
             raise InputError(
-                f"agent.gamma={config.gamma}: from {worst} no end can be reached, "
-                "which costs without end; take a gamma below 1"
+                f"agent.gamma={config.gamma}: no end can be reached from {worst}, which costs infinitely "
+                "much; use a gamma below 1"
             )
         self._algorithm = config.algorithm
         self.q: FloatArray = solution.q
@@ -160,7 +160,7 @@ class ValueIteration:
     def load(self, path: Path) -> None:
         arrays = read_model(path, self._algorithm, {"q": self.q, "optimal": self.optimal})
         if not arrays["optimal"].any(axis=1).all():
-            raise InputError(f"{path}: optimal names no action in some states")
+            raise InputError(f"{path}: optimal has no action for some states")
         self.q, self.optimal = arrays["q"], arrays["optimal"]
 
 

@@ -137,8 +137,8 @@ class TabularControl(ABC):
             error = update(q, visits, pairs, targets, rate, config.learning_rate_power)
             if not error < np.inf:
                 raise InputError(
-                    f"agent={config.name}: training diverged at step {steps:,}, the error of its update "
-                    "is not a finite number; try a smaller learning rate"
+                    f"agent={config.name}: training diverged at step {steps:,}, its error is not finite; "
+                    "try a smaller learning rate"
                 )
             self._actions = self._next_actions(states, ended)
             self._log(ended, error, rate)
