@@ -109,7 +109,7 @@ def run_chart(
     steps, bands = curve["step"], dict[str, Band]()
     for name, column in (("greedy", key), ("with exploration", f"sampled_{key}")):
         unknown = np.full(len(steps), math.nan)
-        bands[name] = Band(steps, curve[column], curve[column], unknown, unknown, int(steps[-1]))
+        bands[name] = Band(steps, curve[column], unknown, unknown, int(steps[-1]))
     mdp = evaluator.mdp
     random = evaluator.score(np.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions))
     optimum = metric.of(metrics.optimal_score(evaluator))
