@@ -27,7 +27,7 @@ from gridworld.envs.rendering import (
 )
 from gridworld.visualization.animation import animation_of_frames
 from gridworld.visualization.canvas import Canvas, directions, greedy_paths, moving_actions
-from gridworld.visualization.picture import Draw, Moment, Subject, agents_gamma, visits_of
+from gridworld.visualization.picture import Draw, Moment, Subject, agents_gamma
 from gridworld.visualization.sheet import (
     BLUES,
     DISAGREES,
@@ -59,7 +59,7 @@ _NO_OPTIMUM = "no finite optimum"
 
 def policy(subject: Subject) -> Draw:
     """The map of the subject's greedy policy."""
-    mdp, snapshot, visits = subject.evaluator.mdp, subject.snapshot, visits_of(subject)
+    mdp, snapshot, visits = subject.evaluator.mdp, subject.snapshot, subject.visits
     optimal, known = subject.evaluator.solution.optimal, explored(mdp, visits)
     caption = _policy_caption(subject, subject.steps)
     if board_of(mdp).panels:
@@ -115,7 +115,7 @@ def q_error(subject: Subject) -> Draw:
     if board_of(mdp).panels:
         return lambda cell_size: draw_error_map(mdp, error, caption, cell_size)
     columns = ["V"] if snapshot.q is None else mdp.action_names
-    table = StateTable(mdp, table_states(mdp, visits_of(subject)), columns)
+    table = StateTable(mdp, table_states(mdp, subject.visits), columns)
     picture = table.draw_numbers(
         error, linear(ORANGES, error[table.states], low=0.0), "error", _NO_OPTIMUM, caption
     )
@@ -125,6 +125,7 @@ def q_error(subject: Subject) -> Draw:
 def visits(subject: Subject) -> Draw:
     """The map of how often training took an action in each state."""
     mdp, counts = subject.evaluator.mdp, subject.visits
+    assert counts is not None
     caption = f"where {counts.sum():,} training steps were taken"
     if board_of(mdp).panels:
         return lambda cell_size: draw_visit_map(mdp, counts, caption, cell_size)
