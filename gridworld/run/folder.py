@@ -156,7 +156,8 @@ def claimed(folder: Path, begun: str = MANIFEST, alone: bool = True) -> Iterator
             with contextlib.suppress(OSError):
                 if not (folder / begun).exists():
                     tidy(folder)
-                    remove_path(inside(folder, HYDRA))  # which is there for a run that never started
+                    if begun == MANIFEST:  # what Hydra wrote for a run that never started
+                        remove_path(inside(folder, HYDRA))
                     (folder / LOCK).unlink(missing_ok=True)
                     folder.rmdir()
                     if is_first:
