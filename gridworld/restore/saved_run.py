@@ -16,11 +16,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gridworld.agents import Agent, PolicySnapshot, family
+from gridworld.agents import Agent, PolicySnapshot
 from gridworld.config.settings import check_foreign, read_config
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import MapConfig
-from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.process.console import tell
 from gridworld.process.user_input import DAMAGED, limited
@@ -99,12 +98,10 @@ class SavedRun:
     @limited()
     def agent(self) -> Agent:
         """The trained agent, a new object at every call."""
-        shows = self.config.observation
-        observation = make_observation(self.mdp, shows.kind, shows.cell_size)
         self.run.verify(self._model_file)
         few = dataclasses.replace(self.config, n_envs=min(self.config.n_envs, 2), callbacks=[])
-        context = dataclasses.replace(make_context(few, self.mdp, observation), only_asked=True)
-        agent = family(self.config.agent).build(self.config.agent, context)
+        context = dataclasses.replace(make_context(few, self.mdp), only_asked=True)
+        agent: Agent = self.config.agent.build(context)
         agent.load(self._model_file)
         return agent
 
@@ -135,7 +132,7 @@ def settings_of(
             callbacks = config.callbacks if trains else []
             used = {"agent": dataclasses.asdict(config.agent), "callbacks": callbacks}
             check_foreign(used, str(run.manifest_file), allow)
-        family(config.agent).check(config)
+        config.agent.check(config)
     except RecursionError:
         raise InputError(f"{run.manifest_file}: config is nested too deeply") from None
     return config

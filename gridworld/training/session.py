@@ -19,10 +19,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gridworld.agents import Agent, Learning, family
+from gridworld.agents import Agent, Learning
 from gridworld.config.settings import privileges
 from gridworld.config.train import AUTO, TrainConfig
-from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.process.console import Progress, tell
 from gridworld.process.signals import StopRequest
@@ -96,10 +95,9 @@ class Session:
         self._events: EventWriter | None = None
         if config.logging.tensorboard:
             self._events = EventWriter(folder, None if state is None else state["marks"]["events"])
-        observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
         write_scalars = None if self._events is None else self._events.scalars
-        context = make_context(config, mdp, observation, write_scalars)
-        self._agent = family(config.agent).build(config.agent, context)
+        context = make_context(config, mdp, write_scalars)
+        self._agent: Agent = config.agent.build(context)
         on_built(self._agent)
         self._visits = context.envs.visits
         self._curve = LearningCurve(self._evaluator, self._agent, config, context.envs)

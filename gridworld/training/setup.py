@@ -6,11 +6,11 @@ import dataclasses
 import functools
 from collections.abc import Callable
 
-from gridworld.agents import TrainingContext, WriteScalars, family
+from gridworld.agents import TrainingContext, WriteScalars
 from gridworld.config.presets import LARGE, STOCHASTIC, fitting_preset, is_recipe_for
 from gridworld.config.train import AUTO, PICTURES, TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
-from gridworld.envs.observations import ObservationTable
+from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
 from gridworld.errors import InputError
 from gridworld.world.evaluation import Evaluator, fitting_discounts, score_of_optimum
@@ -22,7 +22,7 @@ _QUICKLY_SOLVED = 6000  # outcomes of all states and actions
 def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = compiled) -> Mdp:
     """Check everything that can be checked without the agent's library; returns the run's world."""
     check(config)
-    family(config.agent).check(config)
+    config.agent.check(config)
     mdp = world(config.env)
     config.env.step_limit(mdp)
     wanted = config.recording
@@ -37,12 +37,7 @@ def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = comp
     return mdp
 
 
-def make_context(
-    config: TrainConfig,
-    mdp: Mdp,
-    observation: ObservationTable,
-    write_scalars: WriteScalars | None = None,
-) -> TrainingContext:
+def make_context(config: TrainConfig, mdp: Mdp, write_scalars: WriteScalars | None = None) -> TrainingContext:
     """Make `config.n_envs` fresh environments, and what else an agent is built from."""
     share = config.exploring_starts
     return TrainingContext(
@@ -53,7 +48,7 @@ def make_context(
             mdp=_with_exploring_starts(mdp, share) if share else mdp,
             stratified=config.stratified_draws,
         ),
-        observation=observation,
+        observation=make_observation(mdp, config.observation.kind, config.observation.cell_size),
         seed=config.seed,
         device=config.device,
         threads=config.threads,
@@ -72,7 +67,7 @@ def import_for(config: TrainConfig) -> None:
     """Import what a run of this configuration takes, for processes that are forked from this one."""
     from gridworld.visualization.picture import drawer
 
-    family(config.agent).import_for(config.agent)
+    config.agent.import_libraries()
     for picture in PICTURES:
         if getattr(config.recording, picture.setting):
             drawer(picture.drawer)

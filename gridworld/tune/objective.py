@@ -29,11 +29,10 @@ from typing import Any
 from omegaconf import OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from gridworld.agents import Learning, family
+from gridworld.agents import Learning
 from gridworld.bounds import LARGEST_INTEGER
 from gridworld.config.compose import to_config
 from gridworld.config.train import TrainConfig
-from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError, reason
 from gridworld.process.signals import handling
 from gridworld.training.learning_curve import LearningCurve
@@ -225,10 +224,9 @@ def learning(
     """Train and evaluate as a run would, and keep nothing but the end."""
     config = dataclasses.replace(config, seed=seed)
     mdp = check_settings(config)
-    observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
     evaluator = Evaluator(mdp, config.evaluation.gamma, config.env.step_limit(mdp))
-    context = make_context(config, mdp, observation)
-    agent = family(config.agent).build(config.agent, context)
+    context = make_context(config, mdp)
+    agent = config.agent.build(context)
     curve = LearningCurve(evaluator, agent, config, envs=context.envs)
     steps = 0
 

@@ -10,9 +10,8 @@ import pytest
 import torch
 from helpers.support import configure
 
-from gridworld.agents import Learning, family, learn_together
+from gridworld.agents import Learning, learn_together
 from gridworld.engine import population
-from gridworld.envs.observations import make_observation
 from gridworld.training.setup import check_settings, make_context
 
 Words = tuple[str, ...]
@@ -54,10 +53,7 @@ class Learned:
 
     def learning(self) -> Learning:
         config = configure(*self.words)
-        mdp = check_settings(config)
-        observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
-        context = make_context(config, mdp, observation, self._log)
-        self.agent = family(config.agent).build(config.agent, context)
+        self.agent = config.agent.build(make_context(config, check_settings(config), self._log))
         return Learning(self.agent, config.total_timesteps, self.on_step)
 
     def _log(self, values: dict[str, Any], step: int) -> None:

@@ -13,7 +13,6 @@ from helpers.support import configure
 
 import gridworld
 from gridworld import GridWorldEnv, InputError
-from gridworld.agents import family
 from gridworld.envs.inspection import observation_like
 from gridworld.envs.observations import KINDS, TableObservation, make_observation
 from gridworld.training.setup import make_context
@@ -226,8 +225,8 @@ def test_agents_train_on_the_environments_own_observation(algorithm, numbers):
     for engine in ("stock", "tabulated"):
         config = configure(f"agent={algorithm.lower()}", "observation=own", f"agent.engine={engine}")
         settings = dataclasses.replace(config.agent, **small)
-        context = make_context(config, mdp, make_observation(mdp, "own"))
-        agent = family(settings).build(settings, context)
+        context = make_context(config, mdp)
+        agent = settings.build(context)
         agent.learn(128, lambda steps: steps + 1)
         assert agent.model.num_timesteps >= 128
         assert agent.snapshot().greedy.shape == (mdp.num_states,)

@@ -19,10 +19,8 @@ from helpers.support import SHORT, configure
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gridworld.agents import family
 from gridworld.commands import jobs as jobs_command
 from gridworld.config.compose import to_config
-from gridworld.envs.observations import make_observation
 from gridworld.errors import InputError
 from gridworld.report.evidence import read
 from gridworld.report.setting_charts import tuning_charts
@@ -87,9 +85,8 @@ def fuzz_config(random: random.Random, folder: Path) -> None:
     merged = OmegaConf.merge(settings, OmegaConf.create(content))
     config = to_config(merged)  # type: ignore[arg-type]
     mdp = check_settings(config)
-    observation = make_observation(mdp, config.observation.kind, config.observation.cell_size)
     Evaluator(mdp, config.evaluation.gamma, config.env.max_episode_steps)
-    family(config.agent).build(config.agent, make_context(config, mdp, observation))
+    config.agent.build(make_context(config, mdp))
 
 
 def spoil(random: random.Random, content: dict[Any, Any]) -> None:
