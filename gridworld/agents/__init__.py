@@ -149,5 +149,5 @@ def misfit(found: Mapping[str, NDArray[Any]], expected: Mapping[str, NDArray[Any
         if is_now != must_be:
             return f"{name} is {is_now}, it must be {must_be}"
         if not np.isfinite(found[name]).all():
-            return f"{name} holds numbers that are not finite"
+            return f"{name} contains numbers that are not finite"
     return None

@@ -28,7 +28,7 @@ from gridworld.world.chain import one_hot_policy
 from gridworld.world.mdp import Mdp
 
 _LAST = 0.6  # of training; what it does after that is its behaviour
-_OURS = {"gamma": "each probe has its own", "seed": "see --seed", "device": "it is cpu"}
+_OURS = {"gamma": "each probe sets its own", "seed": "see --seed", "device": "it is always cpu"}
 _FEW_QUANTILES = {"n_quantiles": 25}  # of a policy that has them; 200 take ten times as long
 
 

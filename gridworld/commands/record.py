@@ -1,4 +1,4 @@
-"""Draw a finished run: its episodes as numbered PNGs, GIF, APNG or MP4, and maps of what it learnt."""
+"""Draw a finished run: episodes as numbered PNGs, GIF, APNG or MP4, and maps of what it learnt."""
 
 from __future__ import annotations
 
@@ -92,8 +92,8 @@ def _parser() -> argparse.ArgumentParser:
     kinds += " (default png gif; mp4 needs the extra `video`)"
     option("--format", nargs="+", choices=(*files.FORMATS, *MAPS), default=["png", "gif"], help=kinds)
     option("--cell-size", type=whole(2), help="pixels (default 100, 80 in maps, less on large worlds)")
-    option("--fps", type=whole(1, 100), default=4, help="frames a second, 1 to 100 (default 4)")
-    option("--episodes", type=whole(1, 1000), default=1, help="one after the other (default 1)")
-    option("--seed", type=whole(0), default=0, help="of the first episode (default 0)")
+    option("--fps", type=whole(1, 100), default=4, help="frames per second, 1 to 100 (default 4)")
+    option("--episodes", type=whole(1, 1000), default=1, help="number of episodes (default 1)")
+    option("--seed", type=whole(0), default=0, help="seed of the first episode (default 0)")
     option("--out", type=Path, help="the folder to write to (default RUN/recording)")
     return parser

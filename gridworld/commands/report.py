@@ -1,8 +1,8 @@
-"""Put many runs side by side: statistics over seeds with intervals, curves and tables, as one page.
+"""Compare many runs on one page: statistics over seeds with intervals, curves and tables.
 
-RUNS are folders of runs, of sweeps, or any above them. The exit code is 0 if every run found is counted and
-whole, 1 if the report was written but names something to look into (a run that is unfinished or contradicts
-another, a damaged file), 2 if there was nothing to report.
+RUNS are folders of runs or sweeps, or any above them. Exit code: 0 if every run is complete and counted, 1 if
+the report has warnings (an unfinished run, two contradictory runs, a damaged file), 2 if there is nothing to
+report.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str]) -> None:
         print(line, file=sys.stderr)
     print(printable(str(page)))
     if options.open and not webbrowser.open(page.absolute().as_uri()):
-        print(printable(f"--open: there is no browser here; open {page} in yours"), file=sys.stderr)
+        print(printable(f"--open: no browser found here; open {page} in yours"), file=sys.stderr)
     if sentences:
         sys.exit(1)
 
@@ -62,17 +62,21 @@ def main(arguments: Sequence[str]) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = parser_of("report", __doc__, "runs")
     option = parser.add_argument
-    option("--out", type=Path, help="its folder (default: report/ in the one folder given, else runs/report)")
+    option(
+        "--out",
+        type=Path,
+        help="folder to write to (default: report/ in the only folder given, or runs/report)",
+    )
     option("--open", action="store_true", help="show the page in the browser")
-    readme = f"also put the results into this Markdown file, between its lines {' and '.join(MARKERS)}"
+    readme = f"also write the results into this Markdown file, between its lines {' and '.join(MARKERS)}"
     option("--readme", type=Path, help=readme)
-    formats = f"of the figures' files, any of {' '.join(FORMATS)}; with no word, none (default: all of them)"
+    formats = f"formats of the figures, any of {' '.join(FORMATS)}; none without a word (default: all)"
     option("--formats", nargs="*", choices=FORMATS, default=FORMATS, metavar="FORMAT", help=formats)
-    logarithm = "curves against the logarithm of the steps (without it, where an agent is ten times slower)"
+    logarithm = "curves on a logarithmic step axis (automatic where one agent is ten times slower)"
     option("--log-steps", action="store_true", help=logarithm)
-    most = f"say of so many runs at most why they are not certified (default {_MOST_DIAGNOSED}; 0: of none)"
+    most = f"diagnose at most so many runs that are not certified (default {_MOST_DIAGNOSED}, 0 for none)"
     option("--diagnose", type=whole(0), default=_MOST_DIAGNOSED, metavar="COUNT", help=most)
-    option("--seed", type=whole(0), default=0, help="of the bootstrap (default 0)")
+    option("--seed", type=whole(0), default=0, help="seed of the bootstrap (default 0)")
     return parser
 
 

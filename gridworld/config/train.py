@@ -75,7 +75,7 @@ class AgentConfig:
         for key in ("family", "algorithm"):
             given, own = getattr(self, key), getattr(type(self), key)
             if own not in (given, MISSING):
-                raise InputError(f"agent.{key}={given}: these are the settings of {own}; choose agent=...")
+                raise InputError(f"agent.{key}={given}: these settings are {own}'s; choose agent=...")
 
     def build(self, context: Any) -> Any:
         """Build an `Agent` in a `TrainingContext`; InputError: a setting that only its library can judge."""
@@ -128,6 +128,7 @@ class LoggingConfig:
     # evaluations between two pictures of the policy; 0 for none
     policy_map_every: int = setting(5, bounds(0))
     progress: bool = setting(True, affects(Effect.NOTHING))
+    wandb: bool = setting(False, affects(Effect.NOTHING))  # log the scalars to W&B as well, while it trains
 
 
 @dataclass(frozen=True)

@@ -23,11 +23,11 @@ _FLOAT = re.compile(r"(?<![\w.$'\"])[-+]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][-+]?\d+
 _SENTENCES = (  # a pattern of a message of Hydra's: what is said instead
     (
         r"Config group override must be a string|^argument of type '\w+' is not iterable$",
-        "a choice is a name, and null is none: write preset=none, tuned=none, or ~experiment",
+        "a choice must be a name, not null; write preset=none, tuned=none, or ~experiment",
     ),
     (
         r"Interpolation key '([^']*)' not found",
-        "{}: is missing, and other settings refer to it; give it a value",
+        "{}: is missing, but other settings refer to it; give it a value",
     ),
     (
         r"Error resolving interpolation '\$\{env\}_\$\{agent\}'",
@@ -35,7 +35,7 @@ _SENTENCES = (  # a pattern of a message of Hydra's: what is said instead
     ),
     (
         r"Multiple values for (\S+)\. To override a value use 'override \S+: (.*)'",
-        "+{0}={1}: {0} has a place for its choice already, which a plus would add; write {0}={1}",
+        "+{0}={1}: {0} is always chosen, so it takes no plus; write {0}={1}",
     ),
 )
 _HINTS = (  # a pattern of what is said: what would have been right
@@ -43,7 +43,7 @@ _HINTS = (  # a pattern of what is said: what would have been right
     ("Could not append to config", "; leave out the plus"),
     (
         r"'\d+\.0' of type 'float' could not be converted to Integer",
-        "; in a yaml, write a whole number without point and exponent",
+        "; in YAML, write whole numbers without a decimal point or exponent",
     ),
 )
 _LISTED = 24  # choices of a group that are listed at most; of more, those with a similar name
@@ -99,8 +99,8 @@ def _check_recipe(name: str, folders: Sequence[Path]) -> None:
     known = sorted(file.stem for folder in folders for file in (folder / "tuned").glob("*.yaml"))
     if re.fullmatch(r"\w+", name) and name not in known:
         near = difflib.get_close_matches(name, known)
-        hint = f"; close to it are {', '.join(near)}" if near else ""
-        raise InputError(f"tuned={name}: there is no such recipe{hint}; --help lists them all")
+        hint = f"; close matches: {', '.join(near)}" if near else ""
+        raise InputError(f"tuned={name}: no such recipe{hint}; --help lists them all")
 
 
 @functools.cache
@@ -150,7 +150,7 @@ def sentence(error: BaseException) -> str:
         return f"{mark.name}: line {mark.line + 1}, column {mark.column + 1}: is not valid YAML: {problem}"
     if missing := re.search(r"[Mm]issing mandatory value: (\S+)", message):
         key = missing[1] if "." in missing[1] else getattr(error, "full_key", None) or missing[1]
-        return f"{key}: has no value; give {key}=..., or have the yaml that is chosen for it do so"
+        return f"{key}: has no value; give {key}=..., or set it in a yaml file"
     for pattern, words in _SENTENCES:
         if found := re.search(pattern, message):
             return words.format(*found.groups())
@@ -193,14 +193,14 @@ def _unknown_choice(message: str) -> str:
     where, _, name = missing.group(1).rpartition("/")
     if where == "experiment":
         choices = sorted({*choices, *pairs()})
-    fact = f"{where}={name}: there is no such choice"
+    fact = f"{where}={name}: no such choice"
     if where == "env" and re.search(r"-v\d+$", name):
-        return f"{fact}; an environment of Gymnasium is env=gymnasium env.id={name}{meant(name, choices)}"
+        return f"{fact}; for a Gymnasium environment, write env=gymnasium env.id={name}{meant(name, choices)}"
     if len(choices) <= _LISTED:
-        return f"{fact}; there are {', '.join(choices)}{meant(name, choices)}"
+        return f"{fact}; choose from {', '.join(choices)}{meant(name, choices)}"
     near = [choice for choice in choices if choice.startswith(name)]
     near = near or difflib.get_close_matches(name, choices)
-    hint = f"; close to it are {', '.join(near)}" if near else ""
+    hint = f"; close matches: {', '.join(near)}" if near else ""
     return f"{fact}{hint}; --help lists them all"
 
 
@@ -211,7 +211,7 @@ def _suggestion(facts: str, message: str) -> str:
     if added := re.search(r"Could not override '([^']*)'.*Key '([^']*)' is not in struct", facts, re.DOTALL):
         place, name = added.groups()
         if place.startswith("tune.space"):
-            return "; what is searched is written in a yaml of conf/tune, which tune=NAME chooses"
+            return "; the search space is a yaml file in conf/tune, chosen by tune=NAME"
         entry = place if place.endswith(f".{name}") else f"{place}.{name}"
         return f"; a new entry of a dictionary needs a plus: +{entry}=..."
     if unknown := re.search(r"Key '([^']*)' not in '\w+'", facts):

@@ -46,7 +46,7 @@ class Trial:
     why: str = ""  # why it did not come to its end
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis:
     """Why a run is not optimal."""
 
@@ -79,6 +79,9 @@ class Diagnosis:
     def first_change(self) -> str:
         """The word for a command line to try first; "" where there is none."""
         return next((each.changes[0] for each in self.findings[:1] if each.changes), "")
+
+    def __repr__(self) -> str:
+        return "\n  to try: ".join([f"Diagnosis: {self.sentence()}", *map(shlex.join, self.offers)])
 
     def sentence(self) -> str:
         """The verdict in one sentence."""

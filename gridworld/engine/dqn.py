@@ -18,7 +18,7 @@ import torch
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 
 from gridworld.engine.networks import Array, Networks, make_networks
-from gridworld.engine.population import FEW_STATES, Population, Run
+from gridworld.engine.population import FEW_STATES, Population, Run, met_states
 from gridworld.engine.replay import CountedReplay, Replay, Transitions, UniformReplay
 from gridworld.envs.vector_env import Step
 from gridworld.storage.serialization import State
@@ -32,7 +32,8 @@ class DQN(Population):
         self._outputs: Array | None = None  # of the networks as they are, of all states
         self._greedy: IntArray | None = None  # (P, S), by these
         self._best: Array | None = None  # (P, S), what the target networks say of each state's best action
-        self.target = make_networks([run.target for run in runs if run.target is not None])
+        targets = [run.target for run in runs if run.target is not None]
+        self.target = make_networks(targets, met_states(runs[0]))
         model, envs = runs[0].model, runs[0].envs
         self.replay: Replay = (
             CountedReplay(len(runs), envs.mdp.num_states, envs.mdp.num_actions)
@@ -136,7 +137,7 @@ class DQN(Population):
     def _update(self, steps: int) -> None:
         """Make gradient steps, each on a minibatch of its own."""
         if self._best is None:
-            self._best = self.of_best_action(self._shaped(self.target.run()[0]))
+            self._best = self.of_best_action(self._shaped(self.target.run_met()[0]))
         going, best, learning_rates = self.active.copy(), self._best, self.settings("learning_rate")
         gamma = np.array([run.model.gamma for run in self.runs], dtype=np.float32)[:, None]
         at_once, losses = max(1, _DRAWN_AT_ONCE // self.replay.width(self.batch_size)), []

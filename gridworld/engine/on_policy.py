@@ -48,9 +48,9 @@ class OnPolicy(Population):
 
     @property
     def outputs(self) -> tuple[Array, Array]:
-        """Logits (P, S, A) and values (P, S) of all states."""
+        """Logits (P, S, A) and values (P, S) of all states that are ever met."""
         if self._outputs is None:
-            logits, values = self.networks.run()
+            logits, values = self.networks.run_met()
             self._outputs = logits, values[..., 0]
         return self._outputs
 
@@ -65,6 +65,9 @@ class OnPolicy(Population):
 
     def snapshot(self, run: Run) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
         logits, values = self.outputs
+        if self.networks.kept is not None:
+            logits, values = self.networks.run()
+            values = values[..., 0]
         probabilities = torch.as_tensor(logits[run.row]).softmax(dim=-1).numpy()
         return values[run.row].astype(np.float64), probabilities.astype(np.float64), None
 

@@ -218,7 +218,7 @@ class Population:
     @classmethod
     def networks_of(cls, runs: Sequence[Run]) -> list[Networks]:
         """The networks that runs learn with, as far as they differ in kind; the first acts."""
-        return [make_networks([run.network for run in runs])]
+        return [make_networks([run.network for run in runs], met_states(runs[0]))]
 
     def _optimizer(self) -> Optimizer:
         own = [run.model.policy.optimizer for run in self.runs]
@@ -276,7 +276,8 @@ class Population:
 
     def safe_point(self) -> Self | None:
         """Let all runs be saved, as nothing is half done; returns the population of those that go on."""
-        finite = [torch.isfinite(each.weights).all(dim=1).cpu().numpy() for each in self.all_networks]
+        sums = [each.weights.sum(dim=1) for each in self.all_networks]  # a third of what asking each costs
+        finite = [torch.isfinite(each).cpu().numpy() for each in sums]
         for run in self.going():
             if all(of_runs[run.row] for of_runs in finite):
                 run.safe_point(self.num_timesteps)
@@ -296,7 +297,7 @@ class Population:
             **run.get_state(),
             "optimizer": self.optimizer.get_state(run.row),
             **{
-                name: networks.weights[run.row].cpu().numpy().copy()
+                name: networks.whole()[run.row].cpu().numpy().copy()
                 for name, (networks, _) in self.weights(run).items()
             },
         }
@@ -304,9 +305,9 @@ class Population:
     def set_state(self, run: Run, state: State) -> None:
         run.set_state(state)
         for name, (networks, _) in self.weights(run).items():
-            own = networks.weights[run.row].cpu().numpy()
+            own = networks.whole()[run.row].cpu().numpy()
             fill(own, state[name], name)
-            networks.weights[run.row] = torch.as_tensor(own)
+            networks.set_row(run.row, torch.as_tensor(own))
         self.optimizer.set_state(run.row, state["optimizer"])
 
 
@@ -340,6 +341,22 @@ def train(runs: Sequence[Run], states: Sequence[State | None]) -> None:
         run.on_step = run.on_safe_point = None  # which hold what holds the run
 
 
+def met_states(run: Run) -> IntArray | None:
+    """The states (U,) of a large world that a run can meet within its step limit; None if those are all.
+
+    Without weight decay, a first layer of unit vectors never changes in the columns of the others.
+    """
+    mdp, settings = run.envs.mdp, run.model.policy.optimizer.param_groups[0]
+    if mdp.num_states <= FEW_STATES or not run.network.is_look_up or settings.get("weight_decay"):
+        return None
+    found, front = mdp.start > 0, mdp.start_states
+    for _ in range(min(run.envs.step_limit, mdp.num_states)):
+        following = mdp.next_state[front][mdp.probability[front] > 0]
+        front = np.unique(following[~found[following]])
+        found[front] = True
+    return None if found.all() else np.flatnonzero(found)
+
+
 _agreed: dict[Hashable, bool] = {}  # by kind, number of runs and threads
 
 
@@ -356,8 +373,8 @@ def agree(runs: Sequence[Run]) -> bool:
         _agreed[key] = _try_out(runs)
         if not _agreed[key]:
             tell(
-                "population: this processor or torch adds up otherwise for several networks like these at "
-                "once; such runs train one by one"
+                "population: on this processor, networks like these get other bits when batched; such runs "
+                "train one by one"
             )
     return _agreed[key]
 

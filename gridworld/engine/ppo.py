@@ -79,12 +79,17 @@ class _Log:
     def means(self) -> dict[str, Array]:
         """(P,) each; SB3 has the divergence of the last epoch, and the loss of the last minibatch."""
         epoch = np.stack(self._epoch, axis=1)
-        taken, last = epoch > 0, epoch == epoch.max(axis=1, keepdims=True)
+        last = epoch == epoch.max(axis=1, keepdims=True)
+        steps = (epoch > 0).sum(axis=1)  # of each run, its first ones
         found = {}
         for name in self._losses[0]:
-            losses = np.stack([each[name] for each in self._losses], axis=1)
-            chosen = last if name == "approx_kl" else taken
-            if name == "loss":
-                chosen = np.arange(epoch.shape[1]) == taken.sum(axis=1, keepdims=True) - 1
-            found[name] = np.where(chosen, losses, 0).sum(axis=1) / np.maximum(chosen.sum(axis=1), 1)
+            losses, means = np.stack([each[name] for each in self._losses], axis=1), np.zeros(len(steps))
+            for count in np.unique(steps):  # apart, since how numpy adds up depends on how many there are
+                rows, own = steps == count, slice(count)
+                chosen = last[rows, own] if name == "approx_kl" else np.ones_like(last[rows, own])
+                if name == "loss":
+                    chosen[:, :-1] = False
+                added = np.where(chosen, losses[rows, own], 0).sum(axis=1)
+                means[rows] = added / np.maximum(chosen.sum(axis=1), 1)
+            found[name] = means
         return found

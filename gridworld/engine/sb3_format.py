@@ -96,12 +96,13 @@ def put_weights(run: Run) -> None:
             setattr(model, name, value)
     optimizer.param_groups[0]["lr"] = run.setting("learning_rate", progress)
     for networks, parameters in population.weights(run).values():
-        parts = cut(networks.weights[run.row], [parameter.shape for parameter in parameters])
+        parts = cut(networks.whole()[run.row], [parameter.shape for parameter in parameters])
         for parameter, part in zip(parameters, parts, strict=True):
             parameter.data.copy_(part)  # which may be a view of the row, and leaves a graph as it is
     shapes = [parameter.shape for parameter in population.fitted(run)]
     state = {name: torch.as_tensor(value) for name, value in population.optimizer.get_state(run.row).items()}
-    cuts = {name: cut(value, shapes) for name, value in state.items() if value.dim()}
+    spread = population.networks.spread
+    cuts = {name: cut(spread(value), shapes) for name, value in state.items() if value.dim()}
     for number, parameter in enumerate(population.fitted(run) if state else ()):
         optimizer.state[parameter] = {
             name: (cuts[name][number] if name in cuts else value).to(

@@ -177,7 +177,7 @@ def frame_size(mdp: Mdp, cell_size: int = CELL_SIZE) -> tuple[int, int]:
     board = board_of(mdp)
     width, height = (board.cols + 2) * cell_size, (board.rows + 2) * cell_size
     if width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
-        remedy = f"; take a cell_size below {cell_size}" if cell_size > 1 else ""
+        remedy = f"; use a cell_size below {cell_size}" if cell_size > 1 else ""
         world = f"layout {mdp.name}" if isinstance(mdp, GridMdp) else mdp.name
         raise InputError(f"{world}: a frame of {width} x {height} pixels is too large to draw{remedy}")
     return width, height

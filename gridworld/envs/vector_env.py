@@ -92,7 +92,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
         stratified: bool = False,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
-            raise InputError(f"render_mode={render_mode!r}: a batch can be drawn as rgb_array only (or None)")
+            raise InputError(f"render_mode={render_mode!r}: a batch can only be drawn as rgb_array (or None)")
         try:
             self._autoreset = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -150,9 +150,7 @@ class GridWorldVectorEnv(VectorEnv[StateArray, NDArray[Any], Any]):
             options: `reset_mask`, (num_envs,) booleans, says which environments; without it, all.
         """
         if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int | np.integer)):
-            raise InputError(
-                f"seed={seed!r}: must be one whole number; all environments draw from one generator"
-            )
+            raise InputError(f"seed={seed!r}: must be one whole number; all environments share one generator")
         super().reset(seed=None if seed is None else int(seed))
         mask = (options or {}).get("reset_mask")
         if mask is None:

@@ -129,8 +129,8 @@ def printing() -> Iterator[None]:
         sys.stderr.flush()
         if _failures:
             raise InputError(
-                f"standard output: cannot be written ({_failures[0].strerror}), what was printed is not "
-                "complete; send it to where there is room"
+                f"standard output: cannot be written ({_failures[0].strerror}), so the output is "
+                "incomplete; write it to a disk with free space"
             )
 
 
@@ -168,12 +168,9 @@ def tell_error(text: str) -> None:
 
 
 def aligned(rows: Sequence[Sequence[str]], columns: Sequence[str]) -> list[str]:
-    """Align cells in columns that are at least a blank apart, a line for each row.
+    """Align cells in columns that are a blank apart, a line for each row.
 
-    Args:
-        rows: the cells, as many in every row as there are `columns`.
-        columns: for each, "<" to align left (words) or ">" to align right (numbers), and its least width,
-            e.g. ">9". A column is as wide as its widest cell.
+    `columns` says for each "<" to align left (words) or ">" right (numbers), and its least width, as ">9".
     """
     forms = [
         f"{column[0]}{max([int(column[1:]), *(len(row[index]) for row in rows)])}"
@@ -248,21 +245,35 @@ def telling_if_slow(what: str) -> Iterator[None]:
     if not is_limited() or _is_telling.get():
         yield
         return
-    token, over, began = _is_telling.set(True), threading.Event(), time.monotonic()
+    token, began = _is_telling.set(True), time.monotonic()
 
-    def tell_now_and_then() -> None:
-        while not over.wait(_SECONDS_BETWEEN_LINES):
-            seconds = time.monotonic() - began
-            print(f"{printable(what)}: {seconds:.0f} s so far; Ctrl-C ends it", file=sys.stderr, flush=True)
+    def tell_seconds() -> None:
+        seconds = time.monotonic() - began
+        print(f"{printable(what)}: {seconds:.0f} s so far; Ctrl-C ends it", file=sys.stderr, flush=True)
 
-    teller = threading.Thread(target=tell_now_and_then, daemon=True)
-    teller.start()
+    try:
+        with repeating(_SECONDS_BETWEEN_LINES, tell_seconds):
+            yield
+    finally:
+        _is_telling.reset(token)
+
+
+@contextmanager
+def repeating(seconds: float, call: Callable[[], None]) -> Iterator[None]:
+    """Call a function every so many seconds, in a thread, while the block runs."""
+    over = threading.Event()
+
+    def work() -> None:
+        while not over.wait(seconds):
+            call()
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
     try:
         yield
     finally:
         over.set()
-        teller.join()
-        _is_telling.reset(token)
+        thread.join()
 
 
 def time_left(done: int, to_do: int, seconds: float) -> str:

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-import gridworld
 from gridworld.config.train import check_bounds
 from gridworld.config.worlds import schema_of
 from gridworld.errors import InputError
@@ -30,6 +29,7 @@ from gridworld.report.evidence import (
 from gridworld.report.grouping import Group, Study, arrange
 from gridworld.report.statistics import Interval, Share
 from gridworld.report.tuning_study import TuningStudy, find_tunings
+from gridworld.run.provenance import versions
 from gridworld.run.reader import read_run, stored_world
 from gridworld.world.evaluation import Evaluator
 from gridworld.world.mdp import FloatArray
@@ -59,7 +59,7 @@ def _reference(run: Evidence) -> Reference:
     try:
         schema = schema_of(run.world)
         if unknown := sorted(run.world.keys() - {each.name for each in dataclasses.fields(schema)}):
-            raise ValueError(f"env.{unknown[0]} is not known to this version")
+            raise ValueError(f"env.{unknown[0]} is unknown to this version")
         lines = run.layout.split("\n")
         if len(lines) * max(map(len, lines)) > _MOST_CELLS:
             raise ValueError(f"it has more than {_MOST_CELLS:,} cells")
@@ -70,12 +70,12 @@ def _reference(run: Evidence) -> Reference:
         random = evaluator.score(np.full((mdp.num_states, mdp.num_actions), 1 / mdp.num_actions))
     except (ValueError, TypeError, ArithmeticError, np.linalg.LinAlgError) as error:
         # Whatever is wrong with another version's world, the runs' own scores are as good as before.
-        return Reference(run.optimal_value, problem=f"its world cannot be built again here ({error})")
+        return Reference(run.optimal_value, problem=f"its world cannot be rebuilt here ({error})")
     optimum, problem = evaluator.optimal_value, None
     if not math.isclose(optimum, run.optimal_value, rel_tol=_TOLERANCE, abs_tol=_TOLERANCE):
         problem = (
-            f"its optimal value is {optimum:.6g} here, and {run.optimal_value:.6g} according "
-            f"to {run.folder}; was it written by another version?"
+            f"its optimal value is {optimum:.6g} here, but {run.optimal_value:.6g} according to "
+            f"{run.folder}; was it written by another version?"
         )
     returns = evaluator.optimum.expected_return, random.outcome.expected_return
     return Reference(run.optimal_value, returns[0], random.value, returns[1], problem)
@@ -302,14 +302,15 @@ def gather(paths: Sequence[Path], seed: int = 0, log_steps: bool = False) -> Rep
     tunings, unread = find_tunings(paths)
     problems += [f"{task.task}: {task.world.problem}" for task in tasks if task.world.problem]
     problems += unread
-    versions: dict[str, list[Path]] = defaultdict(list)
+    by_version: dict[str, list[Path]] = defaultdict(list)
     for run in runs:
-        versions[run.version].append(run.folder)
+        by_version[run.version].append(run.folder)
+    own = str(versions()["gridworld"])
     notes = [
         f"{len(found)} {'runs were' if len(found) > 1 else 'run was'} written by gridworld {version}, "
-        f"this is {gridworld.__version__}: {found[0]}{' and others' if len(found) > 1 else ''}."
-        for version, found in sorted(versions.items())
-        if version != gridworld.__version__
+        f"this is {own}: {found[0]}{' and others' if len(found) > 1 else ''}."
+        for version, found in sorted(by_version.items())
+        if version != own
     ]
     overall = _overall(tasks, seed)
     return Report(study, tasks, overall, unusable, tuple(problems), tuple(notes), seed, tuple(tunings))

@@ -74,7 +74,7 @@ _SHOWN = {  # title of a metric, and the statistic that the figures of a sweep s
     "certified": ("seeds certified", "share of seeds certified at the end"),
     "steps": (
         "steps to certificate",
-        "steps to the first certificate, median over seeds; none where half of them have no certificate",
+        "steps to the first certificate, median over seeds; none where fewer than half have one",
     ),
     "regret": ("final regret", "interquartile mean (IQM) over seeds"),
 }
@@ -151,7 +151,7 @@ def _heatmap(sweep: Sweep, metric: str, name: str, title: str, description: str)
     shown_columns = [clipped(value, max(4, _LINE // len(columns))) for value in columns]
     axes.set_xticks(np.arange(len(columns)) + 0.5, shown_columns, color=INK, size=SMALL)
     axes.set_yticks(np.arange(len(rows)) + 0.5, [clipped(value, 14) for value in rows], color=INK, size=SMALL)
-    grey = "; grey cells have no finite value" if (levels < low).any() else ""
+    grey = "; grey: no finite value" if (levels < low).any() else ""
     return Chart(name, title, f"{description}; darker is better{grey}", figure)
 
 
@@ -197,7 +197,7 @@ def _history(tuning: TuningStudy) -> Chart:
     return Chart(
         f"{tuning.name} history",
         f"Score by trial, {tuning.title.lower()}",
-        "a dot for each trial, on a logarithmic scale, lower is better, and a line for the best so far",
+        "one dot per trial, and a line for the best so far; logarithmic scale, lower is better",
         figure,
     )
 
@@ -226,7 +226,7 @@ def _parallel(tuning: TuningStudy, done: Sequence[TrialRow]) -> Chart:
     scores, low, high = _scores(ranked)
     columns = [_axis({"type": "float", "low": low, "high": high, "log": True}, scores.tolist())]
     columns += [_axis(tuning.space[key], [trial.row[key] for trial in ranked]) for key in keys]
-    title = "What the best tenth of the finished trials chose, and the winner"
+    title = "Settings of the best tenth of the finished trials, and of the winner"
     figure, axes = chart.new_figure(title, 250, width=WIDE)
     axes.set(xlim=(0, max(1, len(keys))), ylim=(0, 1), xticks=[], yticks=[])
     lines = [list(enumerate(heights)) for heights in zip(*(each for each, _ in columns), strict=True)]
@@ -245,8 +245,8 @@ def _parallel(tuning: TuningStudy, done: Sequence[TrialRow]) -> Chart:
     return Chart(
         f"{tuning.name} parallel coordinates",
         f"Parallel coordinates, {tuning.title.lower()}",
-        f"a line for each finished trial through its score and values; the best {bold} stand out, "
-        "the winner most",
+        f"one line per finished trial through its score and settings; the best {bold} are highlighted, the "
+        "winner most",
         figure,
     )
 

@@ -209,7 +209,7 @@ def scores_table(task: TaskAnalysis) -> Table:
     rows: list[list[Cell]] = [
         [result.group.agent, *(estimate(result, key, "mean") for key in keys)] for result in task.results
     ]
-    caption = f"Means over seeds on {task.task}, of the greedy policy where nothing else is said"
+    caption = f"Means over seeds on {task.task}, of the greedy policy unless stated otherwise"
     columns = ["agent", *(METRICS[key].title for key in keys)]
     return _table_of(task.results, f"{task.task} scores", caption, columns, rows)
 
@@ -258,7 +258,7 @@ def runs_table(study: Study) -> Table:
         rows.append([group.task, group.agent, run.seed, certified, run.regret, first])
         rows[-1] += [run.steps, run.seconds, str(run.folder)]
     columns = ["task", "agent", "seed", "certified", "regret", "first certificate", "steps", "seconds"]
-    return Table("runs", "Every run that is counted", [*columns, "folder"], rows)
+    return Table("runs", "All runs that are counted", [*columns, "folder"], rows)
 
 
 def reasons_table(study: Study, reasons: Reasons) -> Table:
@@ -269,7 +269,7 @@ def reasons_table(study: Study, reasons: Reasons) -> Table:
         if (reason := reasons.get(run.folder)) is not None
     ]
     missing = sum(not run.certified for _, run in study.runs) - len(rows)
-    rest = f"; {missing} more were not looked into, see --diagnose" if missing else ""
+    rest = f"; {missing} more were not diagnosed, see --diagnose" if missing else ""
     columns = ["agent", "task", "seed", "regret", "largest cause", "to try"]
     return Table("not certified", f"Why runs are not certified{rest}", columns, rows)
 
@@ -304,10 +304,10 @@ def tuning_tables(tuning: TuningStudy) -> tuple[Table, Table, Table]:
         ]
         for trial in tuning.trials
     ]
-    caption = f"The winner, trial {tuning.winner}, beside what the search began from"
-    finalists = "The finalists, by all of their seeds"
+    caption = f"The winner, trial {tuning.winner}, and the baseline"
+    finalists = "The finalists, over all of their seeds"
     return (
-        Table(f"{tuning.name} winner", caption, ["key", "winner", "began from", "importance"], changed),
+        Table(f"{tuning.name} winner", caption, ["key", "winner", "baseline", "importance"], changed),
         Table(f"{tuning.name} finalists", finalists, ["trial", "score", "certified"], tuning.finalists),
         Table(
             f"{tuning.name} trials", "All trials", ["trial", "status", "score", *others, *tuning.space], rows

@@ -79,7 +79,7 @@ def check_out(folder: Path) -> None:
         raise InputError(f"--out {folder}: is not a folder; choose a new one")
     existing = next(parent for parent in folder.absolute().parents if parent.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
-        raise InputError(f"--out {folder}: {existing} cannot be written to; choose another folder")
+        raise InputError(f"--out {folder}: {existing} is not writable; choose another folder")
 
 
 def write_report(report: Report, folder: Path, formats: Sequence[str] = FORMATS) -> Path:
@@ -226,7 +226,7 @@ def write_over_seeds(runs: Path, folder: Path) -> Path | None:
         for sentence in report.damage[:MOST_SHOWN]:
             tell(sentence)
         if len(report.damage) > MOST_SHOWN:
-            tell(f"{runs}: {len(report.damage) - MOST_SHOWN} more files are damaged; the report has all")
+            tell(f"{runs}: {len(report.damage) - MOST_SHOWN} more files are damaged; the report lists all")
         if all(len(group.runs) < 2 for group in report.study.groups):
             return None
         with replacing_folder(folder / OVER_SEEDS) as new:
@@ -234,7 +234,7 @@ def write_over_seeds(runs: Path, folder: Path) -> Path | None:
     except NothingFinishedError:  # who ran them has said so
         return None
     except (InputError, OSError) as error:
-        tell(f"{folder / OVER_SEEDS}: is not written, {reason(error)}")
+        tell(f"{folder / OVER_SEEDS}: cannot be written, {reason(error)}")
         return None
     return folder / OVER_SEEDS
 

@@ -37,12 +37,9 @@ _UNDECODED = frozenset(map(chr, range(0xDC80, 0xDD00)))  # bytes of a path that 
 
 
 class SavedRun:
-    """A finished run with its settings and its world.
+    """A finished run with its settings, its world and its agent, at the end or at its `best` on the way.
 
-    Args:
-        folder: the run's folder.
-        trust: import the classes that the settings name, wherever they are from.
-        best: take the agent with the lowest regret on the way, not the one at the end.
+    With `trust`, the classes that the settings name are imported, wherever they are from.
     """
 
     @limited()
@@ -68,8 +65,8 @@ class SavedRun:
         kept = list(words) if self._trust else list(harmless_words(words, self.config))
         if left_out := len(words) - len(kept):
             tell(
-                f"{shown(self.run.folder)}: {left_out} of the {len(words)} words of its command line may run "
-                "code or lead elsewhere, and are not repeated; if you trust the run, say so"
+                f"{shown(self.run.folder)}: {left_out} of the {len(words)} words of its command line may "
+                "run code or leave its folder, and are omitted; open the run with trust to keep them"
             )
         return kept
 
@@ -85,7 +82,7 @@ class SavedRun:
             if (world.num_rows, world.num_cols) != (rows, columns):
                 raise InputError(
                     f"layout {world.name}: is {world.num_rows}x{world.num_cols}, the agent was trained on "
-                    f"{rows}x{columns}; take a map of that size"
+                    f"{rows}x{columns}; use a map of that size"
                 )
             mdp = env.compile_on(world)
         return Evaluator(mdp, self.config.evaluation.gamma, env.step_limit(mdp))

@@ -109,7 +109,7 @@ def check_inside(path: Path, key: str) -> None:
     if normal == os.curdir:
         raise InputError(f"{key}={path}: is the current folder; name one in it, e.g. runs/mine")
     raise InputError(
-        f"{key}={path}: leads out of the current folder; if that is meant, say {os.path.abspath(path)}"
+        f"{key}={path}: leads out of the current folder; if you mean that, write {os.path.abspath(path)}"
     )
 
 
@@ -123,35 +123,35 @@ def check_writable(folder: Path, key: str) -> None:
 
 
 @contextlib.contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
-    """Hold a run's folder for this process; an `InputError` if another process holds it."""
-    with locked(folder / LOCK, wait=0) as is_ours:
+def alone_in(folder: Path, wait: float = 0) -> Iterator[None]:
+    """Hold a folder for this process; an `InputError` if another still holds it after `wait` seconds."""
+    with locked(folder / LOCK, wait) as is_ours:
         if not is_ours:
-            raise InputError(f"{shown(folder)}: another process is at work in it; wait for it or stop it")
+            raise InputError(f"{shown(folder)}: another process is using it; wait for it or stop it")
         yield
 
 
 @contextlib.contextmanager
-def claimed(folder: Path) -> Iterator[None]:
-    """Make a run's folder and hold it for this process; afterwards, undo that where no run was started.
+def claimed(folder: Path, begun: str = MANIFEST, alone: bool = True) -> Iterator[None]:
+    """Make a folder and hold it for this process; afterwards, undo that unless it has the file `begun`.
 
-    An `OSError` of the block names the folder, if it names nothing.
+    Where others may work in it too, it is not `alone`. An `OSError` of the block names the folder, if it
+    names nothing.
     """
     is_first = not folder.parent.exists()
     make_folder(folder.parent)
     folder.mkdir(exist_ok=True)
-    with alone_in(folder):
+    with alone_in(folder) if alone else contextlib.nullcontext():
         try:
             yield
         except OSError as error:
             error.filename = error.filename or shown(folder)  # a failed write names no file
             raise
         finally:
-            # Remove what Hydra wrote for a run that never started.
             with contextlib.suppress(OSError):
-                if not (folder / MANIFEST).exists():
+                if not (folder / begun).exists():
                     tidy(folder)
-                    remove_path(inside(folder, HYDRA))
+                    remove_path(inside(folder, HYDRA))  # which is there for a run that never started
                     (folder / LOCK).unlink(missing_ok=True)
                     folder.rmdir()
                     if is_first:

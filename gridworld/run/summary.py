@@ -41,12 +41,12 @@ def interruption_text(interruption: Interrupted, run: RunFolder, manifest: Mappi
     """How much of an interrupted run is saved, by its manifest, and the command that resumes it."""
     saved, reached = manifest.get("checkpoint"), manifest.get("reached")
     if not saved:
-        what = "nothing is saved, so that it will begin anew"
+        what = "nothing is saved, so it will start over"
     elif saved == reached:
         what = f"all {saved:,} steps are saved"
     else:
-        what = f"saved are {saved:,} of its {reached:,} steps"
-    return printable(f"{interruption}: {what}; go on with  {run.resume_command(manifest['config'])}")
+        what = f"{saved:,} of its {reached:,} steps are saved"
+    return printable(f"{interruption}: {what}; resume with  {run.resume_command(manifest['config'])}")
 
 
 def summary_text(summary: Summary, folder: str, advice: Sequence[str] = ()) -> str:
@@ -95,7 +95,7 @@ def _trade(name: str, summary: Summary) -> str:
     if name != "goal_probability" or summary["certified"]:
         return ""
     is_above = summary[name] > summary[f"optimal_{name}"] + _ROUNDING
-    return "  more often than the optimum, for less value" if is_above else ""
+    return "  more often than the optimum, but with less value" if is_above else ""
 
 
 def verdict(summary: Summary) -> str:

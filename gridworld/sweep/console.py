@@ -63,9 +63,9 @@ def tell_end(
     elif any(row.job not in mistakes for row in failed):
         lines.append(f"to try them again: {resume_command(folder, 'hydra.sweeper.retry_failed=true')}")
     elif any(row.status == RUNNING for row in rows):
-        lines.append(f"the rest runs elsewhere; to see how it goes: {resume_command(folder)}")
+        lines.append(f"the rest runs elsewhere; to see its progress:  {resume_command(folder)}")
     elif any(row.status not in (DONE, FAILED) for row in rows):
-        lines.append(f"the rest did not come to its end; resume with: {resume_command(folder)}")
+        lines.append(f"the rest did not finish; resume with: {resume_command(folder)}")
     for line in lines:
         print(printable(line), file=sys.stderr, flush=True)
 

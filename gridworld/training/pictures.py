@@ -35,7 +35,7 @@ _log = logging.getLogger("gridworld")
 
 
 @dataclass(frozen=True, eq=False)
-class _Subject:
+class PictureSubject:
     """See `visualization.picture.Subject`."""
 
     config: TrainConfig
@@ -116,9 +116,9 @@ class Pictures:
                 with self._left_out_if_too_large(f"TensorBoard's {picture.name}"):
                     self._show(picture, drawer(picture.drawer)(subject), evaluation.step)
 
-    def _subject(self, evaluation: Evaluation, visits: NDArray[np.int64]) -> _Subject:
+    def _subject(self, evaluation: Evaluation, visits: NDArray[np.int64]) -> PictureSubject:
         of_run = self._config, self._is_trusted, self._evaluator
-        return _Subject(*of_run, evaluation.snapshot, evaluation.step, visits, self._history)
+        return PictureSubject(*of_run, evaluation.snapshot, evaluation.step, visits, self._history)
 
     @contextlib.contextmanager
     def _left_out_if_too_large(self, label: str) -> Iterator[None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
+from importlib.util import find_spec
 
 from gridworld.agents import TrainingContext, WriteScalars
 from gridworld.config.presets import LARGE, STOCHASTIC, fitting_preset, is_recipe_for
@@ -12,7 +13,7 @@ from gridworld.config.train import AUTO, PICTURES, TrainConfig, check
 from gridworld.config.worlds import EnvConfig, compiled
 from gridworld.envs.observations import make_observation
 from gridworld.envs.statistics_env import StatisticsVectorEnv
-from gridworld.errors import InputError
+from gridworld.errors import InputError, install_command
 from gridworld.world.evaluation import Evaluator, fitting_discounts, score_of_optimum
 from gridworld.world.mdp import Mdp
 
@@ -25,6 +26,8 @@ def check_settings(config: TrainConfig, world: Callable[[EnvConfig], Mdp] = comp
     config.agent.check(config)
     mdp = world(config.env)
     config.env.step_limit(mdp)
+    if config.logging.wandb and find_spec("wandb") is None:
+        raise InputError(f"logging.wandb=true: wandb is not installed; {install_command('wandb')}")
     wanted = config.recording
     if wanted.mp4:
         from gridworld.visualization.files import require_video
@@ -94,11 +97,13 @@ def notes(config: TrainConfig, mdp: Mdp) -> list[str]:
         elsewhere = "" if is_its else ", tuned in another world"
         found.append(f"recipe {config.recipe}{elsewhere}: {steps}; tuned=none {otherwise}")
     elif config.preset == AUTO and (fitting := fitting_preset(config, lambda: mdp)) is not None:
-        found.append(f"{why}: preset={fitting} is made for that; auto leaves it out with the given settings")
+        found.append(
+            f"{why}: preset={fitting} is meant for that, but is left out because of the given settings"
+        )
     if config.preset in (STOCHASTIC, LARGE):
         found.append(f"{why}: preset={config.preset}, {steps}; preset=none {otherwise}")
     if config.known_failure is not None:
-        found.append(f"agent={config.agent.name} is known to fall short: {config.known_failure}")
+        found.append(f"agent={config.agent.name} is known to fail: {config.known_failure}")
     return [*found, *filter(None, [objective_note(config, mdp)])]
 
 
@@ -119,6 +124,6 @@ def objective_note(config: TrainConfig, mdp: Mdp) -> str | None:
         return None
     key, right = config.agent.key("gamma"), fitting_discounts(judge)[0]
     return (
-        f"{key.lstrip('+')}={gamma:g}: what is optimal under it has a regret of {score.regret:.2g} under "
+        f"{key.lstrip('+')}={gamma:g}: its optimum has a regret of {score.regret:.2g} under "
         f"evaluation.gamma={judged:g}, too much for a certificate; take {key}={right:g}"
     )

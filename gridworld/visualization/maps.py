@@ -213,6 +213,18 @@ def _arrow(x: float, y: float, down: int, right: int, size: float) -> list[Point
     ]
 
 
+def draw_optimal_actions(canvas: Canvas, optimal: BoolArray) -> None:
+    """Draw an arrow for each optimal action (S, A), outwards from the middle; a dot for one that stays."""
+    ways, draw = directions(canvas.mdp), drawing.import_pygame().draw
+    for state, action in np.argwhere(optimal & canvas.board.floor[:, None]).tolist():
+        down, right = ways[state, action].tolist()
+        point, length = canvas.point(state, 0.5 + 0.25 * right, 0.5 + 0.25 * down), 0.6 * canvas.cell
+        if down or right:
+            draw.polygon(canvas.world, DISAGREES, _arrow(*point, down, right, length))
+        else:
+            draw.circle(canvas.world, DISAGREES, point, length / 5)
+
+
 def _finish_policy_table(
     table: StateTable,
     states: IntArray,

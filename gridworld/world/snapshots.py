@@ -55,8 +55,8 @@ _LOCKS = (type(threading.Lock()), type(threading.RLock()))
 _CACHED = type(functools.lru_cache(lambda: None))
 _CALLS = 1000  # at least
 SO_UNKNOWN = (
-    ", so what it makes of the task is not exactly known; "
-    "leave it out, or make it a function of its argument alone"
+    ", so its effect on the task is not exactly known; leave it out, or make it a function of its argument "
+    "alone"
 )
 
 
@@ -236,7 +236,7 @@ def asked(where: str, owner: Any, method: str, arguments: list[Any], chain: Iter
     except Exception as error:  # it may be anybody's
         raise InputError(f"{where}: {name} raised {in_short(error)}") from error
     if remembered(where, name, owner, chain) != before:
-        raise InputError(f"{where}: {name} keeps a memory or draws random numbers{SO_UNKNOWN}")
+        raise InputError(f"{where}: {name} keeps memory or draws random numbers{SO_UNKNOWN}")
     return found
 
 
@@ -347,7 +347,7 @@ def remembered(where: str, name: str, owner: Any, chain: Iterable[Any] = ()) -> 
     try:
         found = _content(owner, (generators, _held(owner, ("env",)), type(owner)), known)
     except _AnotherEnvError:
-        raise InputError(f"{where}: {name} looks into an environment{SO_UNKNOWN}") from None
+        raise InputError(f"{where}: {name} reads from an environment{SO_UNKNOWN}") from None
     except Exception as error:  # open files, generators, sockets
         cannot = f"what {name} refers to cannot be read ({in_short(error)})"
         raise InputError(f"{where}: {cannot}{SO_UNKNOWN}") from error

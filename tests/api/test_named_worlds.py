@@ -80,7 +80,7 @@ def test_other_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [
-        (lambda: gridworld.evaluate([1], "clif"), "env=clif: there is no such world; did you mean cliff"),
+        (lambda: gridworld.evaluate([1], "clif"), "env=clif: no such world; did you mean cliff"),
         (lambda: gridworld.compile_env("nowhere"), "env=nowhere: .* one of aima_4x3, "),
         (
             lambda: gridworld.make_vec_env("cliff", slop=1),
@@ -88,7 +88,7 @@ def test_other_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ),
         (lambda: gridworld.make_vec_env("river_swim", source="deep_sea"), "source: is not a setting of"),
         (lambda: gridworld.make_vec_env("taxi_v4", slip=0.1), "slip: is not a setting of env=taxi_v4"),
-        (lambda: gridworld.compile_mdp("classic"), "layout='classic': must be a map, as `load` reads one"),  # type: ignore[arg-type]
+        (lambda: gridworld.compile_mdp("classic"), "layout='classic': must be a Layout, as from `load`"),  # type: ignore[arg-type]
         (lambda: gridworld.evaluate([1], "Nowhere-v1"), "env.id=Nowhere-v1: "),
         (lambda: gridworld.evaluate([1], "arrays"), "env.path: has no value"),
     ],

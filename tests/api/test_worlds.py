@@ -31,9 +31,9 @@ def test_compile_env_takes_whatever_holds_a_world():
 @pytest.mark.parametrize(
     ("env", "told"),
     [
-        (gym.make("CartPole-v1"), "env: CartPoleEnv has no GridWorld in it and no transition table"),
-        (make_vec_env("CartPole-v1", 1), "env: CartPoleEnv has no GridWorld in it"),
-        (3, "env: int has no GridWorld in it"),
+        (gym.make("CartPole-v1"), "env: CartPoleEnv contains neither a GridWorld nor a transition table"),
+        (make_vec_env("CartPole-v1", 1), "env: CartPoleEnv contains neither a GridWorld"),
+        (3, "env: int contains neither a GridWorld"),
         (gym.make("Taxi-v4", fickle_passenger=True), "Taxi-v4: fickle_passenger=True"),
     ],
 )

@@ -153,7 +153,7 @@ def test_what_a_class_refuses_is_the_users_mistake() -> None:
         gridworld.check(PPO, {"clip_range": "wide"}, probes=["choice"])
     with pytest.raises(InputError, match="PPO cannot be built"):
         gridworld.check(PPO, {"policy_kwargs": {"depth": 3}}, probes=["choice"])
-    with pytest.raises(InputError, match="keeps a memory from step to step"):
+    with pytest.raises(InputError, match="keeps memory between steps"):
         gridworld.check("sb3_contrib.RecurrentPPO", probes=["choice"])
 
 
@@ -165,7 +165,7 @@ def test_the_command_ends_with_0_or_1(capsys: pytest.CaptureFixture[str]) -> Non
     assert ended.value.code == 1
     told = capsys.readouterr().out
     assert "constant     FAILED" in told
-    assert "\n    the value is not learnt at all" in told
+    assert "\n    values are not learnt at all" in told
     assert "failed 1 of 1 probes (constant)" in told
 
 

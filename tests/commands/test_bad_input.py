@@ -49,7 +49,7 @@ def table(title: str) -> list[tuple[str, str]]:
 REAL = (*("env.layout={maps}/ragged.txt", "--config-dir {conf} agent=mine"),)
 
 
-OUT_OF_SIZE = "must be 0 or of a size from"
+OUT_OF_SIZE = "must be 0, or from"
 # (settings, words of the sentence): of the right type, and beyond what any number here holds
 ABSURD = [
     *(
@@ -140,9 +140,9 @@ def test_a_folder_that_cannot_be_a_runs_is_refused_and_left_alone(tmp_path: Path
     manifest = sealed({"status": "finished", "config": {}, "layout": []})
     (tmp_path / "used" / "manifest.json").write_text(json.dumps(manifest))
     before = sorted(tmp_path.rglob("*"))
-    longer = f"make that run longer by python {ROOT}/scripts/train.py resume=used total_timesteps=..."
+    longer = f"make that run longer with python {ROOT}/scripts/train.py resume=used total_timesteps=..."
     for folder, told in (
-        ("used", f"used: holds a run already; choose another folder, or {longer}"),
+        ("used", f"used: contains a run already; choose another folder, or {longer}"),
         ("file/run", "file/run: cannot be made, file is a file; choose another hydra.run.dir"),
         ("sweep", "sweep: is the folder of a sweep; choose another hydra.run.dir"),
     ):
@@ -175,8 +175,7 @@ def test_a_launcher_that_is_not_installed_names_its_extra(
     done = script("train.py", *line, cwd=tmp_path, real=True, PYTHONPATH=path)
     assert done.returncode == 2
     assert done.stderr == (
-        f"error: hydra/launcher={launcher}: {package} is not installed; "
-        f"pip install 'gridworld-sb3[{extra}]'\n"
+        f"error: hydra/launcher={launcher}: {package} is not installed; pip install -e '{ROOT}[{extra}]'\n"
     )
 
 

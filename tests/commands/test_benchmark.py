@@ -23,7 +23,10 @@ measure, training, worlds, population, peers, whole = (
 
 def test_the_benchmark_looks_where_it_writes_before_it_measures(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    for out, words in ((tmp_path, "is a folder; name a file in it"), (tmp_path / "file" / "x", "no folder")):
+    for out, words in (
+        (tmp_path, "is a folder; name a file in it"),
+        (tmp_path / "file" / "x", "no such folder"),
+    ):
         with pytest.raises(InputError, match=words):
             benchmark.main(["--quick", "--out", str(out)])
 

@@ -81,7 +81,7 @@ def test_a_signal_ends_a_run_cleanly(number: signal.Signals, code: int, tmp_path
         _, errors = process.communicate(timeout=180)
     assert process.returncode == code
     assert f"stopped by {number.name}: all " in errors
-    assert f"steps are saved; go on with  python {ROOT}/scripts/train.py resume=run" in errors
+    assert f"steps are saved; resume with  python {ROOT}/scripts/train.py resume=run" in errors
     assert "Traceback" not in errors
     assert json.loads((tmp_path / "run" / "manifest.json").read_text())["status"] == "interrupted"
 
@@ -147,7 +147,7 @@ def test_evaluate_scores_again_exactly_and_by_sampling(
     done = script("evaluate.py", str(finished), "--layout", "cliff", cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr == (
-        "error: layout cliff: is 4x12, the agent was trained on 5x6; take a map of that size\n"
+        "error: layout cliff: is 4x12, the agent was trained on 5x6; use a map of that size\n"
     )
 
 
@@ -204,9 +204,7 @@ def test_record_says_where_it_cannot_write(
     monkeypatch.setattr(Path, "open", refuse)  # as a file server may, whatever the permissions say
     with pytest.raises(SystemExit) as ended:
         run(record_command.main)
-    told = (
-        f"{out}/episode.gif: Permission denied; choose another folder than {out}, or get the right to write"
-    )
+    told = f"{out}/episode.gif: Permission denied; choose another folder, or make {out} writable"
     assert (ended.value.code, capsys.readouterr().err) == (2, f"error: {told} to it\n")
 
 

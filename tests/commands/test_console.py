@@ -48,12 +48,12 @@ def test_help_version_and_words_that_are_no_command(
     for word, advice in (
         ("trian", "did you mean gridworld train?"),
         ("evaluate.py", "did you mean gridworld evaluate?"),
-        ("agent=dqn", "settings stand after a command: gridworld train agent=dqn"),
+        ("agent=dqn", "settings come after a command: gridworld train agent=dqn"),
         ("x\x1b[1m", f"it is one of {', '.join(COMMANDS)}"),
     ):
         out, errors = told(word, code=2)
         shown = word.replace("\x1b", "\\x1b")
-        assert (out, errors) == ("", f"error: gridworld: there is no command {shown}; {advice}\n")
+        assert (out, errors) == ("", f"error: gridworld: unknown command {shown}; {advice}\n")
 
 
 def test_signals_are_listened_for_before_what_takes_time() -> None:

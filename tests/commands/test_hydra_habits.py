@@ -53,8 +53,8 @@ def test_tune_shows_what_train_would_run(capsys: pytest.CaptureFixture[str], tmp
         "# @package env\nmax_episode_steps: 100\nlayout: classic\n"
     )
     for more, told in (
-        (["--cfg", "--package", "nowhere"], "--package nowhere: there is no such part of the configuration"),
-        (["-p", "env"], "--package env: shows a part of the configuration; it goes with --cfg"),
+        (["--cfg", "--package", "nowhere"], "--package nowhere: no such part of the configuration"),
+        (["-p", "env"], "--package env: shows a part of the configuration; use it with --cfg"),
     ):
         with pytest.raises(InputError, match=told):
             shows(*words, *more)

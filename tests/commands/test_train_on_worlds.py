@@ -65,7 +65,7 @@ def test_the_environment_of_a_run_is_made_with_trust_only(trust: bool, folder: P
     ):
         done = script(*words, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
-        told = "the episode is drawn from the run's tables; FrozenLake-v1 itself is made with trust only"
+        told = "the episode is drawn from the run's tables; FrozenLake-v1 itself is only drawn with trust"
         assert (told in done.stderr) == (not trust)
         with Image.open(run / film) as picture:
             sizes[film] = picture.size

@@ -102,10 +102,10 @@ def test_a_manifest_reads_back_the_very_settings(overrides: list[str]) -> None:
         (("seed",), True, "config.seed=True: must be int"),
         (("env", "slip"), None, "config.env.slip=None: must be float"),
         (("agent", "algorithm"), "q_learning", "config.agent: has an unknown key batch_size"),
-        (("agent", "algorithm"), "os.system", "config.agent.algorithm='os.system' is not known here"),
+        (("agent", "algorithm"), "os.system", "config.agent.algorithm='os.system' is unknown"),
         (("agent", "surprise"), 1, "config.agent: has an unknown key surprise"),
-        (("agent",), [], "config.agent.algorithm=None is not known here"),
-        (("evaluation",), 3, "config.evaluation: must be settings, is 3"),
+        (("agent",), [], "config.agent.algorithm=None is unknown"),
+        (("evaluation",), 3, "config.evaluation: must be a mapping, is 3"),
     ],
 )
 def test_a_strangers_manifest_is_checked_field_by_field(

@@ -41,7 +41,14 @@ DECLARED = {
         *("recording.visits", "recording.learning", "recording.frames", "recording.gif", "recording.mp4"),
         *("recording.cell_size", "recording.fps"),
     },
-    Effect.NOTHING: {"logging.progress", "checkpoint.every", "recipe", "preset", "known_failure"},
+    Effect.NOTHING: {
+        "logging.progress",
+        "logging.wandb",
+        "checkpoint.every",
+        "recipe",
+        "preset",
+        "known_failure",
+    },
 }
 # Who goes by a setting of each effect; the task of the report's groups has a key of its own.
 EVERYBODY = {"identity", "sweep", "hparams", "group", "recipe", "search"}

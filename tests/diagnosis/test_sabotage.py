@@ -55,7 +55,10 @@ def test_the_first_cause_is_what_was_done(each: Sabotage) -> None:
     assert found.phrase in PHRASES.values()
     assert len(str(found.phrase).split()) <= 4
     if found.cause == "network":
-        assert "its own can learn row" in found.sentence() or "cannot even tell row" in found.sentence()
+        assert (
+            "as trained, it can learn row" in found.sentence()
+            or "cannot even distinguish row" in found.sentence()
+        )
 
 
 @pytest.mark.skipif(not ALL, reason="takes a quarter of an hour")

@@ -172,6 +172,17 @@ def test_runs_that_differ_in_all_that_may_differ(agent: str, meetings: list[int]
     assert max(meetings) == 3
 
 
+def test_what_is_logged_of_updates_of_different_lengths_is_as_alone() -> None:
+    """Sums over 32 minibatches, of which some runs end earlier; how numpy adds up depends on their number."""
+    limits = ["0.0003", "0.003", "0.01", "0.03", "null", "null"]
+    assert_as_alone(
+        [
+            (*SMALL["ppo"], "agent.n_epochs=8", f"agent.target_kl={limit}", f"seed={seed}")
+            for seed, limit in enumerate(limits)
+        ]
+    )
+
+
 # Settings of which each needs its own arrays, or its own branch of an update, beside the agent's own.
 APART = [
     *("env.slip=0.1", "env.slip=0.2", "env.step_reward=-0.1", "exploring_starts=0.5", "env=cliff"),

@@ -23,9 +23,9 @@ NUM_ENVS, STEPS = 16, 32
 KINDS = ["one_hot", "coordinates", "none", "image"]
 
 
-def twins(algorithm: type, kind: str, **arguments: Any) -> tuple[Run, Any]:
+def twins(algorithm: type, kind: str, step_limit: int = 12, **arguments: Any) -> tuple[Run, Any]:
     """A run of the engine and SB3's model with the same weights and generators, in a slippery world."""
-    envs = StatisticsVectorEnv(NUM_ENVS, slip=0.2, max_episode_steps=12)
+    envs = StatisticsVectorEnv(NUM_ENVS, slip=0.2, max_episode_steps=step_limit)
     observation = make_observation(envs.mdp, kind)
     policy = "CnnPolicy" if kind == "image" else "MlpPolicy"
     models = []
@@ -225,6 +225,50 @@ def test_the_same_seed_walks_and_learns_the_same(algorithm: Any) -> None:
     put_weights(run)
     for mine, peer in zip(run.model.policy.parameters(), theirs.policy.parameters(), strict=True):
         assert torch.allclose(mine, peer, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("algorithm", [PPO, A2C, DQN, QRDQN])
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size of")
+def test_only_the_states_within_the_step_limit_learn(algorithm: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a large world, what is never met keeps its weights, and the others learn as if all could."""
+    for module in (population, dqn, on_policy):
+        monkeypatch.setattr(module, "FEW_STATES", 0)
+    off_policy = algorithm in (DQN, QRDQN)
+    settings = {"learning_starts": 0, "buffer_size": 800, "train_freq": 2} if off_policy else {"n_steps": 8}
+    settings |= {"batch_size": 16} if algorithm is not A2C else {}
+
+    def learner(steps: int, state: Any = None) -> Run:
+        run, _ = twins(algorithm, "one_hot", step_limit=3, **settings)
+        run.total_timesteps = steps
+        population.train([run], [state])
+        assert run.error is None
+        put_weights(run)
+        return run
+
+    def weights(run: Run) -> list[Any]:
+        optimizer = run.model.policy.optimizer.state_dict()["state"]
+        moments = [each for state in optimizer.values() for each in state.values()]
+        return [each.detach().clone() for each in (*run.model.policy.parameters(), *moments)]
+
+    made, half, whole = learner(0), learner(256), learner(512)
+    met = population.met_states(whole)
+    assert met is not None
+    assert 0 < len(met) < 30 / 2
+    nets: Any = whole.population.networks
+    assert nets.weights.shape[1] < nets.whole().shape[1]
+    unmet = np.delete(np.arange(30), met)
+    firsts = [(net[0].weight, before[0].weight) for net, before in zip(whole.nets, made.nets, strict=True)]
+    for first, before in firsts:
+        assert torch.equal(first[:, unmet], before[:, unmet])
+        assert not torch.equal(first[:, met], before[:, met])
+    resumed = learner(512, half.population.get_state(half))
+    assert all(map(torch.equal, weights(resumed), weights(whole)))
+    _, probabilities, q = whole.population.snapshot(whole)  # of all states
+    assert np.abs((q if off_policy else probabilities)[unmet]).all()  # type: ignore[index]
+    monkeypatch.setattr(population, "met_states", lambda run: None)
+    monkeypatch.setattr(dqn, "met_states", lambda run: None)
+    for mine, peer in zip(weights(whole), weights(learner(512)), strict=True):
+        assert torch.allclose(mine, peer, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("algorithm", [PPO, A2C, TRPO])

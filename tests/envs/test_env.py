@@ -115,7 +115,7 @@ def test_an_env_takes_a_compiled_world_alone(make):
     for _ in range(50):
         assert repr(env.step(action)) == repr(same.step(action))
     for other in ({"slip": 0.3}, {"layout": "maze"}, {"num_rows": 9}, {"trap_reward": 0}):
-        with pytest.raises(InputError, match="mdp=four_rooms: is compiled with its layout, slip and rewards"):
+        with pytest.raises(InputError, match="mdp=four_rooms: has its own layout, slip and rewards"):
             make(mdp=mdp, **other)
     with pytest.raises(InputError, match="mdp=classic: must be a compiled world"):
         make(mdp="classic")

@@ -98,7 +98,7 @@ def slurm(folder: Path, variables: dict[str, str]) -> Iterator[dict[str, str]]:
 def ray_head(folder: Path, variables: dict[str, str]) -> Iterator[dict[str, str]]:
     """The variables of the environment by which a program finds it. Its workers get `variables`."""
     if importlib.util.find_spec("ray") is None and not os.environ.get("GRIDWORLD_REQUIRE_RAY"):
-        pytest.skip("no Ray to test with: pip install 'gridworld-sb3[ray]'")
+        pytest.skip("no Ray to test with: pip install -e '.[ray]'")
     port, *_ = _free_ports(1)
     token = folder / "token"  # its own, whatever the user has in the home folder
     token.write_text(secrets.token_hex(32))

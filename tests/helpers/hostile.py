@@ -425,7 +425,7 @@ _ESCAPES = "\x1b]0;owned\x07\x1b[2J\r\n\u202e"
 _SCRIPT = "<script>fetch('//x')</script><img src=x onerror=alert(1)>{{7*7}}](javascript:x)"
 _HUNGRY = "its network: would take about"
 _NO_WORLD = "world.npz: not a world that can be read"
-_RESUMED = "resumed must be a list of when the run went on"
+_RESUMED = "resumed must be a list of resumptions"
 
 
 def model(**changes: Content) -> Spoil:
@@ -462,13 +462,13 @@ _ROWS: dict[str, list[tuple[Any, ...]]] = {
      model(policy__pth=torch_file(b"\x80\x02cbuiltins\nbytearray\n\x8a\x05\x00\xe8vH\x17\x85R."))),
     ("zip_bomb", "compressed members", packed("model.zip", "policy.pth", 2**28)),
     ("zip_bomb_inside", "compressed members", model(policy__pth=torch_file(lambda _: bytes(2**28), _PACKED))),
-    ("zip_whose_members_share_their_bytes", "members are larger than itself",
+    ("zip_whose_members_share_their_bytes", "members are larger than the file",
      file("model.zip", shared_members)),
     ("a_tensor_without_numbers", "its pickle asks for torch._utils _rebuild_sparse_tensor",
      tensor(lambda there: there.to_sparse())),
     ("a_tensor_of_a_trillion_numbers", "it must be float32",
      tensor(lambda _: torch.zeros(1).expand(_TRILLION))),
-    ("weights_that_are_no_numbers", "holds numbers that are not finite",
+    ("weights_that_are_no_numbers", "contains numbers that are not finite",
      tensor(lambda there: there.fill_(float("nan")))),
     ("weights_of_another_type", "it must be float32", tensor(lambda there: there.double())),
     ("weights_left_out", "is missing", tensor(lambda _: None)),
@@ -482,9 +482,9 @@ _ROWS: dict[str, list[tuple[Any, ...]]] = {
     ("model_that_waits_for_a_writer", "model.zip: is not an ordinary file", waiting("model.zip")),
     ("model_of_twenty_gigabytes", "model.zip: is larger than", grown("model.zip", 20 * 2**30)),
     # settings
-    ("target_among_an_optimisers_arguments", "optimizer_kwargs.eps._target_=os.system is not a plain word",
+    ("target_among_an_optimisers_arguments", "optimizer_kwargs.eps._target_=os.system is neither a plain",
      settings({f"{_KWARGS}.optimizer_kwargs": {"eps": {"_target_": "os.system", "command": _CANARY}}})),
-    ("function_in_a_classs_place", "activation_fn=os.system is from none of",
+    ("function_in_a_classs_place", "activation_fn=os.system is not from one of",
      settings({f"{_KWARGS}.activation_fn": "os.system"})),
     ("function_of_a_known_library", "must be the import path of a",
      settings({f"{_KWARGS}.features_extractor_class": "stable_baselines3.common.save_util.load_from_pkl"})),
@@ -501,10 +501,10 @@ _ROWS: dict[str, list[tuple[Any, ...]]] = {
     ("images_that_fill_the_memory", _HUNGRY, all_of(_seen_as_image(4), _corridors(66, 64)), 1000),
 ],
 "qrdqn": [
-    ("algorithm_of_ones_own", "algorithm=evil.Agent is from none of",
+    ("algorithm_of_ones_own", "algorithm=evil.Agent is not from one of",
      settings({"agent.algorithm": "evil.Agent"})),
-    ("policy_of_ones_own", "policy=evil.Agent is from none of", settings({"agent.policy": "evil.Agent"})),
-    ("class_deep_among_the_arguments", "optimizer_class=evil.Agent is not a plain word",
+    ("policy_of_ones_own", "policy=evil.Agent is not from one of", settings({"agent.policy": "evil.Agent"})),
+    ("class_deep_among_the_arguments", "optimizer_class=evil.Agent is neither a plain",
      _argument(policy_kwargs=[[{"x": [{"optimizer_class": "evil.Agent"}]}]])),
     ("log_folder_among_the_arguments", "agent.arguments.tensorboard_log=",
      _argument(tensorboard_log="{base}/outside")),
@@ -527,7 +527,7 @@ _ROWS: dict[str, list[tuple[Any, ...]]] = {
     ("world_that_never_ends", "world.npz: is a symbolic link", linked("world.npz", "/dev/zero")),
     ("world_that_waits_for_a_writer", "world.npz: is not an ordinary file", waiting("world.npz")),
     ("world_of_450_megabytes", "world.npz: would take about 1.35 GB", grown("world.npz", 450_000_000)),
-    ("world_that_grows", f"{_NO_WORLD} (its members are larger than itself)",
+    ("world_that_grows", f"{_NO_WORLD} (its members are larger than the file)",
      members("world.npz", {"own_observation.npy": lambda _: npy("|u1", 2 * 10**8) + bytes(2 * 10**8)},
              _PACKED)),
     ("world_whose_header_is_cut_off", f"{_NO_WORLD} (('EOF in multi-line",
@@ -542,7 +542,7 @@ _ROWS: dict[str, list[tuple[Any, ...]]] = {
     # a table's files
     ("pickle_in_a_table", "Object arrays cannot be loaded", model(q__npy=pickled_array)),
     ("table_of_a_trillion_numbers", "not a model of sarsa", model(q__npy=npy("<f8", _TRILLION))),
-    ("table_that_is_a_bomb", "its members are larger than itself", packed("model.zip", "q.npy", 2**28)),
+    ("table_that_is_a_bomb", "its members are larger than the file", packed("model.zip", "q.npy", 2**28)),
     ("pickle_as_visits", FINE, file("visits.npy", pickled_array)),
     ("visits_that_are_the_secret", FINE, linked("visits.npy", "{base}/secret.txt")),
     ("visits_of_a_trillion_cells", FINE, file("visits.npy", npy("<i8", _TRILLION, 4))),

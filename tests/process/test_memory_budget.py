@@ -31,8 +31,8 @@ def test_the_sentence_says_what_it_would_take_the_budget_and_how_to_raise_it(
         with pytest.raises(BudgetError) as refused:
             check_memory("a model", 14.8e9)
     assert str(refused.value) == (
-        "a model: would take about 14.8 GB of memory, the budget is 1 GB; if you trust it and have room "
-        "for it, set GRIDWORLD_BUDGET=15GB"
+        "a model: would take about 14.8 GB of memory, but the budget is 1 GB; if you trust it and have the "
+        "memory, set GRIDWORLD_BUDGET=15GB"
     )
     monkeypatch.setenv(VARIABLE, "15GB")
     with limited():

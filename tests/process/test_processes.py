@@ -11,16 +11,12 @@ from typing import Any
 
 import pytest
 
-from gridworld.process.processes import LostError, run_in_processes
+from gridworld.process.processes import LostError, Processes
 
 
 def run(tasks: Sequence[Callable[[], Any]], count: int = 2, forks: bool = True) -> list[Any]:
     found: dict[int, Any] = {}
-    waiting = list(tasks)
-    run_in_processes(
-        lambda: waiting.pop(0) if waiting else None,
-        *(count, forks, lambda task, result: found.update({tasks.index(task): result})),
-    )
+    Processes(count, forks).run(tasks, lambda task, result: found.update({tasks.index(task): result}))
     return [found[number] for number in range(len(tasks))]
 
 

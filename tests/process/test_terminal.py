@@ -70,7 +70,7 @@ def test_a_goal_that_is_reached_more_often_for_less_is_explained() -> None:
     summary = USUAL | {"certified": False, "endless_cells": [], "endless_states": []}
     summary |= {"timeout_probability": 0.0, "optimal_goal_probability": 0.9863}
     [line] = [line for line in summary_text(summary, "x").splitlines() if "goal probability" in line]
-    assert line.endswith("0.9863   more often than the optimum, for less value")
+    assert line.endswith("0.9863   more often than the optimum, but with less value")
 
 
 def test_the_list_of_a_sweeps_jobs(

@@ -53,7 +53,7 @@ def replaced(put: Callable[[Path], object]) -> Callable[[Path], None]:
     return harm
 
 
-ANOTHER = "is not the file that the run wrote, its checksum is not the one in manifest.json"
+ANOTHER = "is not the file that the run wrote: its checksum differs from manifest.json"
 DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "cut off": (lambda file: os.truncate(file, file.stat().st_size // 2), ANOTHER),
     "a bit": (flip, ANOTHER),
@@ -109,7 +109,7 @@ def test_what_leaves_the_numbers_whole_is_named_and_the_run_counted(
         assert f"warning: {file}" in told
         assert f"<li>{file}" in page
     assert f"note: {runs / 'sarsa0'}: is not diagnosed; {damaged[0]}: is not the file" in told
-    assert "cannot be built again" not in page  # another run has the same world
+    assert "cannot be rebuilt" not in page  # another run has the same world
     rows = (runs.parent / "out" / "tables" / "runs.csv").read_text().splitlines()[1:]
     assert len(rows) == 6
     assert not any("a copy" in row for row in rows)

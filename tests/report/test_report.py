@@ -151,7 +151,7 @@ def test_reasons_are_asked_of_each_cell_before_the_second_of_any(maker: Maker, t
         "why not",
         ["cause True (2 of 2)", "cause False (1 of 1)"],
     )
-    assert "; 4 more were not looked into" in tables.reasons_table(report.study, found).caption
+    assert "; 4 more were not diagnosed" in tables.reasons_table(report.study, found).caption
 
 
 def test_runs_that_differ_are_reported_apart_and_the_report_says_so(tmp_path: Path) -> None:
@@ -169,7 +169,7 @@ def test_runs_that_differ_are_reported_apart_and_the_report_says_so(tmp_path: Pa
         ("ppo (learning_rate=0.005, n_epochs=5)", "classic"): 4,
     }
     assert report.study.notes == (
-        "ppo on classic was run with 3 different configurations, which are reported apart; they differ in "
+        "ppo on classic was run with 3 different configurations, reported separately; they differ in "
         "agent.learning_rate, agent.n_epochs.",
     )
     assert not report.sentences()
@@ -270,7 +270,7 @@ DAMAGES: list[tuple[str, Any, str]] = [
     ("manifest.json", {"status": "failed", "error": "InputError: diverged"}, "not finished: InputError: div"),
     ("manifest.json", "", "is not JSON"),
     ("manifest.json", "[" * 200_000, "is not JSON"),
-    ("manifest.json", "[]", "holds no JSON object"),
+    ("manifest.json", "[]", "must be a JSON object"),
     ("manifest.json", {"config": 3}, "config must be the run's settings"),
     ("manifest.json", {"layout": "S.G"}, "layout must be a list"),
     ("manifest.json", None, "has no manifest.json"),
@@ -278,14 +278,14 @@ DAMAGES: list[tuple[str, Any, str]] = [
     ("summary.json", {"train_seconds": 10**400}, "is too large a number"),
     ("summary.json", {"optimal_value": None}, "optimal_value=None must be a number"),
     ("curve.csv", None, "has no curve.csv"),
-    ("curve.csv", "", "curve.csv: has no row"),
+    ("curve.csv", "", "curve.csv: has no rows"),
     ("curve.csv", b"\xff\xfe\x00", "is not UTF-8 text"),
     ("curve.csv", (",[^,]*$", ""), "line 22 has 16 of 17 columns, it was cut off"),
     ("curve.csv", ("\n5000,[^,]+", "\n5000,nan"), "value is NaN"),
     ("curve.csv", ("\n5000,", "\n5000,x"), "value: could not convert string to float"),
-    ("curve.csv", ("\n5000,", "\n500,"), "the steps do not rise"),
-    ("curve.csv", ("\n0,[^\n]*", ""), "the steps do not rise from 0 on"),
-    ("curve.csv", ("regret", "lack"), "has no column regret; is it of another version?"),
+    ("curve.csv", ("\n5000,", "\n500,"), "the steps do not increase"),
+    ("curve.csv", ("\n0,[^\n]*", ""), "the steps do not increase from 0"),
+    ("curve.csv", ("regret", "lack"), "has no column regret; was it written by another version?"),
     ("curve.csv", ("(\n5000,[^,]+,[^,]+),0,", r"\1,2,"), "certified must be 0 or 1 in every row"),
 ]
 
@@ -323,10 +323,10 @@ def test_another_version_is_named_and_its_settings_stay_as_they_are(maker: Maker
     maker.write(tmp_path / "new", 0, 3000, env__wind=3, evaluation__mode="fast")
     in_json(tmp_path / "new", "manifest.json", versions={"gridworld": "9.9"})
     report = gather([tmp_path])
-    assert len(report.study.groups) == 2  # a world with wind is another task
+    assert len(report.study.groups) == 2  # a world with wind is a different task
     assert report.notes == (f"1 run was written by gridworld 9.9, this is 0.1.0: {tmp_path / 'new'}.",)
     (problem,) = [task.world.problem for task in report.tasks if task.world.problem]
-    assert "env.wind is not known to this version" in problem
+    assert "env.wind is unknown to this version" in problem
 
 
 def test_two_runs_of_one_seed_are_counted_once(
@@ -335,18 +335,18 @@ def test_two_runs_of_one_seed_are_counted_once(
     maker.write(tmp_path / "first", 0, 3000)
     maker.write(tmp_path / "same", 0, 3000, recording__fps=7)
     report_of(tmp_path)
-    same = f"{tmp_path / 'same'} has the settings and the seed of {tmp_path / 'first'}, and the same curve"
+    same = f"{tmp_path / 'same'} has the same settings and seed as {tmp_path / 'first'}, and the same curve"
     assert same in capsys.readouterr().err
     maker.write(tmp_path / "z-other", 0)
     folder = report_of(tmp_path, code=1)
-    assert "but ANOTHER curve (final regret 0.932065 against 0)" in capsys.readouterr().err
+    assert "but a DIFFERENT curve (final regret 0.932065, not 0)" in capsys.readouterr().err
     assert [row["folder"] for row in rows_of(folder / "tables" / "runs.csv")] == [str(tmp_path / "first")]
 
 
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("empty", "holds no run, there is no manifest.json in it or below it"),
+        ("empty", "contains no run: no manifest.json in it or below it"),
         ("file.txt", "is a file; give the folder of a run"),
         ("missing", "no such folder; give the folder of a run"),
     ],
@@ -403,7 +403,9 @@ def test_a_search_for_runs_ends_and_names_what_may_not_be_read(
         assert gather([tmp_path]).problems == (locked,)
     monkeypatch.setattr("gridworld.report.evidence.MOST_ENTRIES", 50)
     (problem,) = gather([tmp_path]).problems
-    assert problem.startswith(f"{tmp_path}: holds more than 50 files and folders, the rest was not searched")
+    assert problem.startswith(
+        f"{tmp_path}: contains more than 50 files and folders; the rest was not searched"
+    )
 
 
 # ---- figures -------------------------------------------------------------------------------------------
@@ -430,7 +432,7 @@ def test_swept_settings_are_a_line_or_a_heatmap_and_the_opening_is_short(
     cells = [tuple(colour) for colour in mesh.to_rgba(mesh.get_array()).reshape(-1, 4).tolist()]
     assert cells.count(to_rgba("#c6c6c6")) == 5  # half of their seeds or more are never certified
     assert len(set(cells)) == 3  # 3 epochs, 10, never: the worst finite number has another colour
-    assert drawn[f"classic ppo steps by {keys}"].caption.endswith("grey cells have no finite value.")
+    assert drawn[f"classic ppo steps by {keys}"].caption.endswith("grey: no finite value.")
     assert "the 7 best of 9" in drawn["classic regret"].caption
     (only,) = sweeps([result for result in task.results if "n_epochs=3)" in result.group.agent])
     assert next(sweep_charts(only, "classic")).title == "Seeds certified by learning_rate"
@@ -650,7 +652,7 @@ def test_only_a_report_is_replaced(
     for out, words in (
         ("mine", "holds thesis.tex, which is not part of a report"),
         ("file", "is not a folder"),
-        ("file/below", "cannot be written to"),
+        ("file/below", "is not writable"),
     ):
         with pytest.raises(InputError, match=words):
             command.main([str(tmp_path), "--out", str(tmp_path / out)])
@@ -664,7 +666,7 @@ def test_only_a_report_is_replaced(
     monkeypatch.setattr(command.webbrowser, "open", lambda uri: not uri.endswith("runs/report/report.html"))
     command.main(["a", "b", "--open", "--formats"])
     told = capsys.readouterr()
-    assert (told.out, told.err[:35]) == ("runs/report/report.html\n", "--open: there is no browser here; o")
+    assert (told.out, told.err[:35]) == ("runs/report/report.html\n", "--open: no browser found here; o")
     assert logging.getLogger("matplotlib").handlers  # it says nothing on standard error
 
 

@@ -193,9 +193,7 @@ def test_how_far_an_unfinished_run_came_is_told_as_not_verified(tmp_path: Path) 
     content = json.loads((run / "manifest.json").read_text()) | {"status": "interrupted"}
     (run / "manifest.json").write_text(json.dumps(sealed(content)))
     (sentence,) = gather([tmp_path]).sentences()
-    assert (
-        "last evaluated after 20,000 steps, says curve.csv, which is not verified before the end" in sentence
-    )
+    assert "last evaluated after 20,000 steps, according to the unverified curve.csv" in sentence
 
 
 def in_json(path: Path, **values: object) -> None:
@@ -220,7 +218,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "jobs of one folder": (
         lambda sweep: in_json(sweep / "sweep.json", jobs=[JOB, JOB | {"hash": "2"}]),
-        r"error: .*sweep.json: damaged \(two jobs have one folder, or one hash\)",
+        r"error: .*sweep.json: damaged \(two jobs have the same folder or hash\)",
     ),
     "jobs.csv is a pipe": (lambda sweep: pipe(sweep / "jobs.csv"), "3 jobs: 1 pending, 1 done, 1 failed"),
     "jobs.csv is huge": (
@@ -278,7 +276,7 @@ def test_a_checkpoint_of_an_impossible_number_is_passed_over(
         path.rename(path.with_name(f"{value}.state"))
     go_on(tmp_path / "run")
     told = capsys.readouterr().err
-    assert ".state: passed over, it " in told
+    assert ".state: skipped, it " in told
     assert read_run(tmp_path / "run").is_finished
 
 

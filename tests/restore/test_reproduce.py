@@ -139,8 +139,8 @@ def test_what_differs_in_the_environment_is_told(
     assert "    torch: 1.0 then, " in shown
     assert "    processor torch: MMX then, " in shown
     assert "    ATEN_CPU_CAPABILITY: \\x1b[2Javx2 then, none now" in shown
-    assert "    went on after step 512: numpy 1 is now 2\\x1b[2J (anyway=true)\n" in shown
-    assert "    went on after step 512: commit: abc then, later now\n" in shown
+    assert "    resumed after step 512: numpy 1 is now 2\\x1b[2J (anyway=true)\n" in shown
+    assert "    resumed after step 512: commit: abc then, later now\n" in shown
     assert "600" not in shown
     assert not list(differences(describe(), describe()))
 
@@ -172,9 +172,9 @@ def test_a_run_that_was_merely_interrupted_is_identical(
     [
         (
             {"step": 1200, "instead_of": 2000},
-            "it got another length after 1,200 of 2,000 steps, before its end",
+            "its length was changed after 1,200 of 2,000 steps, before its end",
         ),
-        ({"step": 2000}, "made longer, and its manifest does not say from what length"),
+        ({"step": 2000}, "made longer, but its manifest does not say from what length"),
         ({"step": 9000, "instead_of": 9000}, "the lengths .* must grow"),
     ],
     ids=["unfinished", "unknown", "shrinking"],
@@ -198,7 +198,7 @@ def test_a_run_is_kept_where_it_is_asked_for(
         path.name for path in run.iterdir() if "tfevents" not in path.name
     }
     assert (kept / "policy.png").read_bytes() == (run / "policy.png").read_bytes()
-    with pytest.raises(InputError, match="holds a run already"):
+    with pytest.raises(InputError, match="contains a run already"):
         reproduce(run, capsys, "--keep", str(kept))
     with pytest.raises(InputError, match=r"--keep=\.\./x: leads out of the current folder"):
         reproduce(run, capsys, "--keep", "../x")
@@ -218,7 +218,7 @@ def test_a_run_that_cannot_be_repeated_is_no_other_result(
 
 def test_without_its_event_file_no_run_is_identical(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     next(copy.glob("events*")).unlink()
-    with pytest.raises(InputError, match="but not all of the run is there"):
+    with pytest.raises(InputError, match="but files of the run are missing"):
         reproduce(copy, capsys)
     found = verdicts(capsys.readouterr().out)
     assert found == dict.fromkeys(PARTS, "identical") | {

@@ -63,7 +63,7 @@ def test_resume_and_the_same_command_again(stopped: Path, calm: dict[str, object
     cwd = stopped.parent
     done = script("train.py", "resume=run", "logging.progress=false", cwd=cwd)
     assert done.returncode == 0, done.stderr
-    assert "run: goes on after 1,200 of 2,000 steps" in done.stderr
+    assert "run: resumes after 1,200 of 2,000 steps" in done.stderr
     assert "q_learning on classic, seed 0: 2,000 steps" in done.stdout
     assert differences(left_behind(stopped), calm) == []
 
@@ -76,7 +76,9 @@ def test_resume_and_the_same_command_again(stopped: Path, calm: dict[str, object
     assert differences(left_behind(cwd / "other"), calm) == []
     third = script("train.py", *WORDS, "hydra.run.dir=other", cwd=cwd)
     assert third.returncode == 2
-    assert "other: holds a run already; choose another folder, or make that run longer by" in third.stderr
+    assert (
+        "other: contains a run already; choose another folder, or make that run longer with" in third.stderr
+    )
 
 
 @pytest.mark.parametrize(
@@ -85,11 +87,11 @@ def test_resume_and_the_same_command_again(stopped: Path, calm: dict[str, object
         (["resume="], "resume=: must be the folder of a run"),
         (["resume=nowhere"], "nowhere: no such folder"),
         (["resume=.."], "resume=..: leads out of the current folder"),
-        (["resume=run", "seed=1"], "seed=1: a run goes on with the settings that it began with; beside"),
-        (["-m", "resume=run"], "-m: a run goes on with the settings"),
+        (["resume=run", "seed=1"], "seed=1: a run is resumed with its own settings; besides"),
+        (["-m", "resume=run"], "-m: a run is resumed with its own settings"),
         (["resume=run", "total_timesteps=1.5"], "total_timesteps=1.5: must be a number of environment steps"),
-        (["resume=run", "total_timesteps=1000"], "has come to 1,200 of 2,000 steps; it can be made longer"),
-        (["resume=run", "resume=other"], "resume=other: resume is given already; give it once"),
+        (["resume=run", "total_timesteps=1000"], "has done 1,200 of 2,000 steps; it can be made longer"),
+        (["resume=run", "resume=other"], "resume=other: resume is given twice; give it once"),
         (["resume=run", "anyway=maybe"], "anyway=maybe: must be true or false"),
     ],
     ids=lambda value: str(value)[:40],
@@ -115,7 +117,7 @@ def test_a_run_is_one_process_alone(stopped: Path) -> None:
             before = left_there(folder)
             done = script("train.py", *words, cwd=stopped.parent)
             assert done.returncode == 2
-            assert f"{name}: another process is at work in it" in done.stderr
+            assert f"{name}: another process is using it" in done.stderr
             assert left_there(folder) == before
 
 
@@ -153,7 +155,7 @@ def test_a_finished_run_is_made_longer(tmp_path: Path, capsys: pytest.CaptureFix
     words = [*SHORT["ppo"], *LESS, "evaluation.every=700"]
     begin(tmp_path / "long", *words, "total_timesteps=4000")
     begin(tmp_path / "run", *words)
-    with pytest.raises(InputError, match=r"is finished; to make it longer, say how long: .*=4000"):
+    with pytest.raises(InputError, match=r"is finished; to make it longer: .*=4000"):
         go_on(tmp_path / "run")
     go_on(tmp_path / "run", 4000)
     assert capsys.readouterr().err.endswith(": 4,000 steps instead of 2,000\n")
@@ -203,7 +205,7 @@ def test_a_finished_run_without_a_checkpoint_that_fits_is_kept(harm: str, total:
             curve.close()
         file.write_bytes(b"" if harm == "empty" else encode(state))
     before = left_there(tmp_path / "run")
-    with pytest.raises(InputError, match=r"is finished, and checkpoints/ has no checkpoint .* a new run in"):
+    with pytest.raises(InputError, match=r"is finished, but checkpoints/ has no checkpoint .* a new run in"):
         go_on(tmp_path / "run", total)
     assert left_there(tmp_path / "run") == before
 
@@ -238,7 +240,7 @@ def test_another_environment_is_refused_or_noted(
 ) -> None:
     with monkeypatch.context() as patched:
         patched.setattr(provenance, name, lambda: now)
-        with pytest.raises(InputError, match=rf"begun in another environment \({told}\).*anyway=true"):
+        with pytest.raises(InputError, match=rf"started in another environment \({told}\).*anyway=true"):
             go_on(stopped)
         open_unfinished(stopped).resume(anyway=True)
     (again,) = manifest(stopped)["resumed"]  # type: ignore[misc, attr-defined]
@@ -253,14 +255,14 @@ def test_another_commit_is_told_and_noted(
     monkeypatch.setattr(provenance, "source", lambda: Source("abc", b"some changes"))
     go_on(stopped)
     told = capsys.readouterr().err
-    assert "run: the source tree is another, which is noted: commit: " in told
+    assert "run: the source code has changed, as its manifest will say: commit: " in told
     assert " then, abc now; uncommitted source: " in told
     (again,) = manifest(stopped)["resumed"]  # type: ignore[misc, attr-defined]
     assert again["git"]["commit"] == "abc"
     assert (stopped / again["git"]["diff"]["file"]).read_bytes() == b"some changes"
     go_on(stopped, 3000)
     assert "git" not in manifest(stopped)["resumed"][1]  # type: ignore[index]
-    assert "the source tree" not in capsys.readouterr().err
+    assert "the source code" not in capsys.readouterr().err
 
 
 def test_a_map_that_changed_meanwhile(tmp_path: Path) -> None:
@@ -276,9 +278,7 @@ def test_a_map_that_changed_meanwhile(tmp_path: Path) -> None:
     assert "the world world.txt has changed since" in refused.stderr
     done = script("train.py", "resume=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert (
-        "its world world.txt has changed since; it continues with the one that it began with" in done.stderr
-    )
+    assert "its world world.txt has changed; the run continues with its original world" in done.stderr
     assert manifest(tmp_path / "run")["layout"] == ["S..", "..G"]
 
 
@@ -303,7 +303,7 @@ def test_a_signal_saves_and_ends_soon(number: signal.Signals, tmp_path: Path) ->
     left = manifest(tmp_path / "run")
     assert left["status"] == "interrupted"
     assert left["checkpoint"] == left["reached"] > 0  # type: ignore[operator]
-    assert f"stopped by {number.name}: all {left['reached']:,} steps are saved; go on with" in told
+    assert f"stopped by {number.name}: all {left['reached']:,} steps are saved; resume with" in told
     assert list((tmp_path / "run").rglob("*.part")) == []
 
 
@@ -352,7 +352,7 @@ def test_a_second_signal_ends_a_run_that_cannot_be_saved_yet(tmp_path: Path) -> 
     """A rollout of many seconds cannot be saved in its middle: the first signal waits for its end."""
     words = ("agent=a2c", "agent.arguments.n_steps=30000", "total_timesteps=100000000")
     told = told_after(signal.SIGTERM, tmp_path, *words, "evaluation.every=1000", times=2)
-    assert "stopped by SIGTERM: nothing is saved, so that it will begin anew; go on with" in told
+    assert "stopped by SIGTERM: nothing is saved, so it will start over; resume with" in told
 
 
 def test_an_interrupted_job_of_a_sweep_goes_on(tmp_path: Path) -> None:

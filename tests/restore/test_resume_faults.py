@@ -94,9 +94,7 @@ def test_a_curve_that_cannot_be_written_ends_the_run(
 ) -> None:
     with monkeypatch.context() as patched:
         patched.setattr(AppendLog, "append", failing(AppendLog.append, 30, code))
-        with pytest.raises(
-            InputError, match=rf"{os.strerror(code)}; put that right, then go on with .*resume="
-        ):
+        with pytest.raises(InputError, match=rf"{os.strerror(code)}; fix that, then resume with .*resume="):
             begin(tmp_path, *WORDS)
     go_on(tmp_path)
     assert differences(left_behind(tmp_path), calm) == []
@@ -116,7 +114,7 @@ def test_a_really_full_disk(tmp_path: Path, calm: dict[str, Any]) -> None:
     done = train_on_full_disk(15_000, *WORDS, "hydra.run.dir=run", cwd=tmp_path)
     assert done.returncode == 2
     assert (
-        f"error: run: File too large; put that right, then go on with python {ROOT}/scripts/train.py"
+        f"error: run: File too large; fix that, then resume with python {ROOT}/scripts/train.py"
         in done.stderr
     )
     again = script("train.py", "resume=run", cwd=tmp_path)
@@ -127,7 +125,7 @@ def test_a_really_full_disk(tmp_path: Path, calm: dict[str, Any]) -> None:
 def test_no_room_for_the_manifest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patched:
         patched.setattr(run, "write_json", failing(run.write_json, 1, errno.ENOSPC))
-        with pytest.raises(InputError, match=r"run: No space left on device; .* give the command again$"):
+        with pytest.raises(InputError, match=r"run: No space left on device; .* run the command again$"):
             begin(tmp_path / "run", *WORDS)
     begin(tmp_path / "run", *WORDS)
 

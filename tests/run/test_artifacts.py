@@ -100,7 +100,7 @@ def test_the_commands_take_the_best(
     best = json.loads((forgetful / "summary.json").read_text())["best_step"]
     evaluate.main([run, "--best", "--episodes", "10"])
     shown = capsys.readouterr().out
-    assert shown.startswith(f"greedy policy of {run} at its best, step {best:,}, on classic\n")
+    assert shown.startswith(f"greedy policy of {run} (best model, step {best:,}) on classic\n")
     evaluate.main([run, "--episodes", "10"])
     assert capsys.readouterr().out.splitlines()[1:] != shown.splitlines()[1:]
     for name, words in (("best", ["--best"]), ("last", [])):
@@ -169,7 +169,7 @@ def test_an_interruption_is_in_the_log_and_goes_on(
         patched.setattr(session.Session, "_on_step", interrupted)
         with pytest.raises(Interrupted):
             begin(tmp_path, *FORGETFUL)
-    assert log(tmp_path)[-1].startswith("INFO stopped by SIGINT: all 1,500 steps are saved; go on with  ")
+    assert log(tmp_path)[-1].startswith("INFO stopped by SIGINT: all 1,500 steps are saved; resume with  ")
     assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == list(range(0, 1501, 250))
     go_on(tmp_path)
     assert [line.split(":")[0] for line in log(tmp_path)[2:-1]] == [f"INFO {tmp_path}"]

@@ -22,7 +22,7 @@ from gridworld.training.together import run_alone
 
 LESS = ["recording.frames=false", "recording.gif=false", "logging.progress=false"]
 WORDS = [*SHORT["q_learning"], *LESS, "checkpoint.every=600"]
-TOLD = r"was deleted or replaced during the run, which ends here"
+TOLD = r"was deleted or replaced during the run, which stops here"
 POINTS: dict[str, tuple[Any, str]] = {
     "after a checkpoint": (Checkpoints, "save"),
     "while pictures are drawn": (Pictures, "finish"),

@@ -121,7 +121,7 @@ def test_settings_are_told_by_the_words_that_asked_for_them(tmp_path: Path) -> N
     assert [row[2] for row in results(followed.stdout)] == ["n_envs=3", "n_envs=4"]
     presets = script("train.py", "-m", *QUICK, "env=four_rooms", "preset=auto,none,large", cwd=tmp_path)
     assert [row[2] for row in results(presets.stdout)] == ["preset=auto", "preset=large"]
-    assert "preset=none makes the same runs as preset=auto, and these are run once" in presets.stderr
+    assert "preset=none repeats the runs of preset=auto; they run once" in presets.stderr
 
 
 def test_a_failure_stops_no_other_job(tmp_path: Path) -> None:
@@ -183,7 +183,7 @@ def test_a_worker_that_is_killed_takes_no_other_job_along(tmp_path: Path) -> Non
     assert done.returncode == 1, done.stderr
     rows = table(tmp_path / "sweep").values()
     assert [row["status"] for row in rows] == ["failed", "done"]
-    assert {row["error"] for row in rows} == {"its process was lost (exit code -9)", ""}
+    assert {row["error"] for row in rows} == {"its process died (exit code -9)", ""}
     again = with_own_classes(*words, cwd=tmp_path)
     assert "0 to run" in again.stderr  # what failed is remembered
 
@@ -275,7 +275,7 @@ def cut_off(run: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        (with_other_settings, "holds an unfinished run with other settings (total_timesteps=500"),
+        (with_other_settings, "contains an unfinished run with other settings (total_timesteps=500"),
         (made_longer, "the run in seed=0 was made 700 steps long"),
         (cut_off, "manifest.json: is not JSON, it was changed or cut off"),
     ],
@@ -328,7 +328,7 @@ def test_a_folder_that_is_in_use_or_damaged_is_refused(tmp_path: Path) -> None:
         assert is_ours
         done = sweep("seed=0", cwd=tmp_path)
     assert done.returncode == 2
-    assert done.stderr == "error: sweep: another process runs this sweep; wait for it or stop it\n"
+    assert done.stderr == "error: sweep: another process is using it; wait for it or stop it\n"
     (folder / "sweep.json").write_text('{"format": 1, "asked": [], "jobs": [{}]}')
     before = sorted(folder.iterdir())
     done = sweep("seed=0", cwd=tmp_path)

@@ -116,9 +116,9 @@ def went_on(run: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (shutil.rmtree, r"is not in .*/asked any more; put its folder back"),
-        (other_settings, r"has other settings now; put back the one that was trained with it"),
-        (went_on, r"was resumed from a checkpoint meanwhile; that cannot be repeated"),
+        (shutil.rmtree, r"is no longer in .*/asked; put its folder back"),
+        (other_settings, r"has different settings now; put back the run that was trained with it"),
+        (went_on, r"has since been resumed from a checkpoint, which cannot be repeated"),
     ],
 )
 def test_what_became_of_another_run_is_told_before_training(
@@ -142,7 +142,7 @@ def test_what_another_run_did_later_is_no_matter_and_a_renamed_run_is_none_of_th
     members = population(read_run(tmp_path / "asked" / "seed=0"))
     assert [member.folder.name for member in members] == NAMES
     (tmp_path / "asked" / "seed=0").rename(tmp_path / "mine")
-    with pytest.raises(InputError, match=r"mine: .* on 3 runs .* has the name of none of them"):
+    with pytest.raises(InputError, match=r"mine: .* on the 3 runs .* its folder was renamed"):
         population(read_run(tmp_path / "mine"))
 
 
@@ -167,7 +167,7 @@ def test_a_run_that_went_on_says_with_whom_and_cannot_be_repeated(tmp_path: Path
         content = manifest_of(folder)
         assert content["numbers_depend_on"] == runs
         assert content["resumed"][0].get("numbers_depend_on") == (None if how == "alone" else runs)
-        sentence = rf"it was resumed after step 512 {how}, which cannot be repeated"
+        sentence = rf"it was resumed {how} after step 512, which cannot be repeated"
         with pytest.raises(InputError, match=sentence):
             population(read_run(folder))
 

@@ -15,10 +15,9 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from hypothesis import given
 from hypothesis import strategies as st
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from gridworld.config.compose import register_schemas, to_config
-from gridworld.config.sweep import SweepConfig
 from gridworld.config.train import TrainConfig
 from gridworld.config.words import sentence
 from gridworld.errors import InputError
@@ -27,7 +26,7 @@ from gridworld.run.reader import read_run
 from gridworld.run.writer import RunWriter
 from gridworld.storage.safe_read import read_object
 from gridworld.sweep.folder import folder_name
-from gridworld.sweep.plan import Configurations, Job, expand, plan, populations
+from gridworld.sweep.plan import Configurations, Job, expand, largest_population, plan, populations
 from gridworld.training.setup import check_settings
 
 
@@ -69,14 +68,14 @@ def test_every_combination_is_a_job(loader: ConfigLoader) -> None:
 @pytest.mark.parametrize(
     ("word", "sentence"),
     [
-        ("seed=range(0)", "seed=range(0): there is nothing in it"),
-        ("seed=range(5,5)", "there is nothing in it"),
-        ("env=glob(mars*)", "there is nothing in it"),
+        ("seed=range(0)", "seed=range(0): is empty"),
+        ("seed=range(5,5)", "is empty"),
+        ("env=glob(mars*)", "is empty"),
         (
             "seed=range(1000000000)",
-            "more than 1,000 jobs; if so many are meant, raise",
+            "more than 1,000 jobs; if you mean that, raise",
         ),
-        ("seed=interval(0,1)", "jobs are made of a list"),
+        ("seed=interval(0,1)", "a sweep takes a list"),
     ],
 )
 def test_what_makes_no_sweep_is_refused(loader: ConfigLoader, word: str, sentence: str) -> None:
@@ -119,7 +118,7 @@ def test_a_sweep_runs_the_same_job_once_and_knows_mistakes() -> None:
     assert [job.mistake for job in jobs] == [None, None, "seed=-1: must be from 0 to 4294967295"]
     assert [job.notes for job in jobs] == [(), (), ()]
     (job,) = of("preset=auto seed=0", "preset=none seed=0")
-    assert job.notes[-1] == "preset=none makes the same runs as preset=auto, and these are run once"
+    assert job.notes[-1] == "preset=none repeats the runs of preset=auto; they run once"
 
 
 def job(*overrides: str, swept: Sequence[str] = (), digest: str = "0123456789abcdef") -> Job:
@@ -160,8 +159,7 @@ def test_jobs_are_divided_into_populations(
     monkeypatch.setattr("gridworld.sweep.plan.file_limit", lambda: files)
     config = configure("agent=ppo", f"device={device}")
     jobs = [Job((), (), str(number), None, config) for number in range(10)]
-    hydra = OmegaConf.create({"job": {"chdir": None}})
-    groups = populations(jobs, SweepConfig(population=population), launcher, {"n_jobs": 4}, hydra)
+    groups = populations(jobs, largest_population(population), launcher, {"n_jobs": 4})
     assert sorted(map(len, groups), reverse=True) == sizes
     assert [job for group in groups for job in group] == jobs
 
@@ -265,10 +263,13 @@ def test_a_yaml_says_what_is_swept_and_that_it_is_a_sweep(conf: Path, tmp_path: 
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ("experiment=grid env=maze", "[agent.learning_rate,env]: env has no list of values; give it one"),
-        ("experiment=other,maze_dqn", "hydra.sweeper: is set in a file that only some of the jobs choose"),
+        ("experiment=grid env=maze", "[agent.learning_rate,env]: env has no list of values; add"),
+        ("experiment=other,maze_dqn", "hydra.sweeper: is set by only some of the jobs"),
         ("experiment=no_text", "hydra.sweeper.params.seed: must be text as on the command line, such as 0,1"),
-        ("hydra.sweep.subdir=x seed=0", "hydra.sweep.subdir=x: a sweep names the folders of its jobs itself"),
+        (
+            "hydra.sweep.subdir=x seed=0",
+            "hydra.sweep.subdir=x: a sweep names the folders of its jobs by their settings",
+        ),
     ],
 )
 def test_a_yaml_that_cannot_be_swept_is_refused(words: str, told: str, conf: Path, tmp_path: Path) -> None:
@@ -302,9 +303,9 @@ def test_lists_that_vary_together(loader: ConfigLoader) -> None:
     [
         (
             ["agent", "seed"],
-            "[agent,seed]: lists that vary together are equally long; agent has 2, seed has 3",
+            "[agent,seed]: lists that vary together must have equal lengths; agent has 2, seed has 3",
         ),
-        (["agent", "n_envs"], "[agent,n_envs]: n_envs has no list of values; give it one, n_envs=A,B"),
+        (["agent", "n_envs"], "[agent,n_envs]: n_envs has no list of values; add n_envs=A,B"),
         (["agent", "sed"], "[agent,sed]: sed has no list of values"),
         (["agent"], "[agent]: must name two settings or more"),
         (

@@ -181,7 +181,7 @@ def test_a_signal_interrupts_all_and_nothing_is_lost(
     if not launcher:  # workers are ended, and go on from their last checkpoint
         assert all(end.startswith(f"INFO stopped by {number.name}: ") for end in ends), ends
     if not launcher and times == 1:
-        assert all(" steps are saved; go on with " in end for end in ends), ends
+        assert all(" steps are saved; resume with " in end for end in ends), ends
     done = script("train.py", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for run in map(folder.joinpath, rows(folder)):

@@ -219,13 +219,13 @@ def test_a_finished_run_is_not_overwritten_and_its_manifest_cannot_import_what_i
 ) -> None:
     shutil.copytree(trained("dqn"), tmp_path / "run")
     before = (tmp_path / "run" / "model.zip").read_bytes()
-    with pytest.raises(InputError, match="holds a run already"):
+    with pytest.raises(InputError, match="contains a run already"):
         train_in(tmp_path / "run", *SHORT["dqn"], "seed=1")
     assert (tmp_path / "run" / "model.zip").read_bytes() == before
     manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
     manifest["config"]["agent"]["policy_kwargs"]["activation_fn"] = "this.Foo"
     (tmp_path / "run" / "manifest.json").write_text(json.dumps(sealed(manifest)))
-    with pytest.raises(InputError, match=r"activation_fn=this\.Foo is from none of torch"):
+    with pytest.raises(InputError, match=r"activation_fn=this\.Foo is not from one of torch"):
         SavedRun(tmp_path / "run")
     assert "this" not in sys.modules
 

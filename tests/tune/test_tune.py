@@ -20,7 +20,7 @@ from optuna.trial import TrialState, create_trial
 from gridworld.commands import report as report_command
 from gridworld.commands import tune as tune_command
 from gridworld.errors import InputError
-from gridworld.tune.study import at_work_in
+from gridworld.run.folder import claimed
 
 QUICK = (
     *("agent=q_learning", "total_timesteps=1500", "recording.gif=false", "recording.learning=false"),
@@ -82,7 +82,7 @@ def test_its_winner_is_a_recipe_of_train_py(words: list[str], studied: Path) -> 
 def test_the_same_line_goes_on_with_the_study(studied: Path) -> None:
     before = rows(studied)
     more = script("tune.py", *QUICK, "tune.trials=8", cwd=studied)
-    assert "6 of them there already" in more.stderr
+    assert "6 of them already there" in more.stderr
     assert [row["trial"] for row in rows(studied)] == [str(number) for number in range(8)]
     assert rows(studied)[:6] == before
 
@@ -97,7 +97,7 @@ def test_damaged_runs_of_the_confirmation_are_run_again(studied: Path, tmp_path:
     assert again.returncode == 0, again.stderr
     for file in harmed:
         (told,) = [line for line in again.stderr.splitlines() if f"{file.parent.name}/{file.name}: " in line]
-        assert told.endswith("; it is run again")
+        assert told.endswith("; it runs again")
     confirmed = json.loads((tmp_path / "study" / "study.json").read_text())["confirmation"]
     assert "left out" not in confirmed["sentence"]
     report_command.main([str(tmp_path / "study"), "--formats"])
@@ -117,9 +117,9 @@ def test_the_report_shows_the_study(studied: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        (["tune=narrow"], "was begun with another search space: agent.exploration_final_eps was"),
-        (["agent.gamma=0.8"], "was begun with another configuration: agent.gamma was 0.9, now it is 0.8"),
-        (["tune.seeds=3"], "was begun with another objective: seeds was [0, 1], now it is [0, 1, 2]"),
+        (["tune=narrow"], "was started with another search space: agent.exploration_final_eps was"),
+        (["agent.gamma=0.8"], "was started with another configuration: agent.gamma was 0.9, now it is 0.8"),
+        (["tune.seeds=3"], "was started with another objective: seeds was [0, 1], now it is [0, 1, 2]"),
     ],
 )
 def test_a_study_of_another_search_is_refused(
@@ -144,10 +144,10 @@ def test_a_folder_of_another_study_is_refused(
     (tmp_path / "study" / "study.db").unlink()
     before = sorted(tmp_path.rglob("*"))
     told = refusal(monkeypatch, tmp_path, *QUICK)
-    assert "study.db: does not have the study tune_q_learning_classic, which has begun; bring" in told
+    assert "study.db: does not have the study tune_q_learning_classic, which has started; restore" in told
     assert sorted(tmp_path.rglob("*")) == before
-    with at_work_in(tmp_path / "study"):
-        assert "another process is at work in it" in refusal(monkeypatch, tmp_path, *QUICK)
+    with claimed(tmp_path / "study"):
+        assert "another process is using it" in refusal(monkeypatch, tmp_path, *QUICK)
 
 
 def refusal(monkeypatch: pytest.MonkeyPatch, folder: Path, *arguments: str) -> str:
@@ -172,7 +172,7 @@ def test_a_search_that_comes_to_nothing_is_no_mistake_of_the_command_line(
         tune_command.main(QUICK)
     assert ended.value.code == 1
     told = capsys.readouterr().err.splitlines()[-1]
-    assert told == "error: study: no trial came to a score; all 1 failed, the first: training diverged"
+    assert told == "error: study: no trial got a score; all 1 failed, the first: training diverged"
 
 
 def refused(title: str) -> list[list[str]]:
@@ -209,7 +209,7 @@ def test_a_command_line_that_cannot_be_meant(
 def test_without_optuna_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     told = refusal(monkeypatch, tmp_path, "agent=q_learning")
-    assert told == "tune.py: optuna is not installed; pip install 'gridworld-sb3[tune]'"
+    assert told == f"tune.py: optuna is not installed; pip install -e '{ROOT}[tune]'"
 
 
 LONG = (
@@ -253,12 +253,12 @@ def test_a_worker_is_killed_and_the_search_interrupted_and_gone_on_with(tmp_path
         killed = wait_for_workers(process.pid, 2)[0]
         os.kill(killed, signal.SIGKILL)
         told = next(line for line in process.stderr if "lost" in line)
-        assert told.strip() == "a worker was lost (exit code -9), attempt 1 of 4 at its task"
+        assert told.strip() == "a worker died (exit code -9), attempt 1 of 4 at its task"
         others = wait_for_workers(process.pid, 2, but=killed)
         process.send_signal(signal.SIGINT)
         told = process.stderr.read()  # until the last worker has let go of it
     assert process.returncode == 130
-    assert "stopped by SIGINT; nothing that ended is lost; resume with: python" in told
+    assert "stopped by SIGINT; finished trials are kept; resume with: python" in told
     check_ended(others)
     ended = rows(tmp_path)
 
@@ -310,7 +310,7 @@ def test_a_database_that_disappears_is_one_sentence_and_no_worker_is_left(tmp_pa
         (tmp_path / "study" / "study.db").unlink()
         told = process.stderr.read().splitlines()
     assert process.returncode == 1
-    errors = [line for line in told if "study cannot be reached any more" in line]
+    errors = [line for line in told if "study can no longer be reached" in line]
     assert len(errors) == 1
     assert errors[0].startswith("error: tune.storage=sqlite:////")
     assert not [line for line in told if "Traceback" in line or "Error" in line]
@@ -328,7 +328,7 @@ def test_ctrl_c_while_workers_start_is_one_sentence(threads: int, tmp_path: Path
             told = process.stderr.read()
         assert process.returncode == 130
         assert "Traceback" not in told
-        assert "stopped by SIGINT; nothing that ended is lost; resume with: python" in told
+        assert "stopped by SIGINT; finished trials are kept; resume with: python" in told
 
 
 def test_every_key_of_the_settings_stands_in_its_yaml() -> None:

@@ -181,9 +181,9 @@ def test_what_cannot_be_written_is_named_and_nothing_else_is_touched(
 
 
 FAILURES = [
-    (errno.EACCES, "a/b.gif", "a/b.gif: Permission denied; choose another folder than a, or get the right"),
-    (errno.EROFS, "b.gif", "b.gif: Read-only file system; choose another folder than ., or get the right"),
-    (errno.ENOSPC, "a/b.gif", "a/b.gif: No space left on device; make room there"),
+    (errno.EACCES, "a/b.gif", "a/b.gif: Permission denied; choose another folder, or make a writable"),
+    (errno.EROFS, "b.gif", "b.gif: Read-only file system; choose another folder, or make . writable"),
+    (errno.ENOSPC, "a/b.gif", "a/b.gif: No space left on device; free some space there"),
     (errno.EISDIR, "a/b.gif", "a/b.gif: Is a directory"),
     (errno.EIO, None, "Input/output error"),
     (None, None, "cannot write mode P as PNG"),

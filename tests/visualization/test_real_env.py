@@ -68,7 +68,7 @@ def test_large_frames_are_made_smaller():
 @pytest.mark.parametrize(
     ("env_id", "words"),
     [
-        ("NoSuchWorld-v0", "is not an environment .*doesn't exist"),
+        ("NoSuchWorld-v0", "is not registered with Gymnasium .*doesn't exist"),
         *((name, r"cannot be rendered: [^\n]*$") for name in ("Pendulum-v1", "CartPole-v1", "Blackjack-v1")),
     ],
 )

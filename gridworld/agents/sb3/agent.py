@@ -72,7 +72,7 @@ def build(config: SB3Config, context: TrainingContext) -> SB3Agent:
         if unknown is not None:
             ours = None
             if not context.only_asked:
-                tell(f"engine: stock, since the tabulated one does not cover {unknown}")
+                tell(f"engine: stock, since the tabulated engine does not support {unknown}")
     keeps = ours is None and not context.only_asked
     model = make_model(config, context, algorithm, arguments, with_buffers=keeps)
     if ours is not None:
@@ -128,7 +128,7 @@ class SB3Agent(Agent):
                 warnings.simplefilter("ignore")  # which come again while it learns
                 why = why_no_table(self._model.policy, self.observation)
         except Exception as error:  # the class may be anybody's
-            raise failed(self.config, "cannot be asked", error) from error
+            raise failed(self.config, "cannot be evaluated", error) from error
         if why is not None:
             raise unfit(self.config, why)
 

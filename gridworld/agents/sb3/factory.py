@@ -54,7 +54,7 @@ def failed(config: SB3Config, what: str, error: Exception) -> InputError:
     if isinstance(config, SB3ClassConfig):
         given |= {name: value for name, value in config.arguments.items() if name != "policy_kwargs"}
     suspects = ", ".join(f"{config.where}.{name}={value}" for name, value in given.items())
-    return unfit(config, f"{what}: {in_short(error)}" + (f"; look at {suspects}" if suspects else ""))
+    return unfit(config, f"{what}: {in_short(error)}" + (f"; check {suspects}" if suspects else ""))
 
 
 def algorithm_and_arguments(
@@ -141,7 +141,7 @@ class NoBuffer(BaseBuffer):
         pass
 
     def _get_samples(self, *arguments: Any, **options: Any) -> Any:
-        raise NotImplementedError("nothing was kept")
+        raise NotImplementedError("this buffer stores nothing")
 
 
 def make_model(

@@ -120,7 +120,7 @@ class SB3Config(AgentConfig):
         found = vars(given) if is_dataclass(given) else given
         if not isinstance(found, dict):
             raise InputError(
-                f"{self.where}.policy_kwargs={found}: must be settings, e.g. {{net_arch:[64,64]}}"
+                f"{self.where}.policy_kwargs={found}: must be a mapping, e.g. {{net_arch:[64,64]}}"
             )
         return {name: value for name, value in found.items() if value is not None and value != {}}
 
@@ -182,9 +182,7 @@ class SB3Config(AgentConfig):
             raise InputError(f"{key}={value}: must be a whole number, or [N,step] or [N,episode]")
         Bounds(1, MOST_STEPS).check(key, count, value)
         if unit == "episode" and run.n_envs > 1:
-            raise InputError(
-                f"{key}={value}: SB3 counts episodes of one environment only; must be with n_envs=1"
-            )
+            raise InputError(f"{key}={value}: SB3 counts episodes of a single environment only; set n_envs=1")
 
     def build(self, context: Any) -> Any:
         from gridworld.agents.sb3.agent import build
@@ -238,7 +236,7 @@ class SB3ClassConfig(SB3Config):
         for name, value in self.arguments.items():
             key, number = f"agent.arguments.{name}", value
             if name in ("policy", "env", "seed", "device"):
-                raise InputError(f"{key}: is a setting of the run; must not be among the class's arguments")
+                raise InputError(f"{key}: is a setting of the run, not an argument of the class")
             if name in (*FALLING, *SCHEDULES) and falls(value):
                 number = parse_schedule(key, value).initial
             if name in _BOUNDS and value is not None:

@@ -94,7 +94,9 @@ class GridWorldVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         if len(list(self._get_indices(indices))) != self.num_envs:
-            raise InputError(f"{attr_name}: the batch has one set of attributes; set it for all environments")
+            raise InputError(
+                f"{attr_name}: the environments of a native batch share their attributes; set it for all"
+            )
         setattr(self.envs, attr_name, value)
 
     def env_method(
@@ -103,7 +105,7 @@ class GridWorldVecEnv(VecEnv):
         if method_name == _MASKS:
             allowed = np.ones(self.envs.mdp.num_actions, dtype=np.bool_)
             return [allowed] * len(list(self._get_indices(indices)))
-        raise InputError(f"{method_name}: the environments of a native batch have no methods of their own")
+        raise InputError(f"{method_name}: the environments of a native batch have no individual methods")
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
         """True for Monitor, whose `episode` entries the infos have."""

@@ -116,8 +116,8 @@ class ValueIteration(TabularAgent):
         if not np.isfinite(solution.q).all():
             worst = mdp.state_name(int(np.argmin(solution.v)))
             raise InputError(
-                f"agent.gamma={config.gamma}: from {worst} no end can be reached, "
-                "which costs without end; take a gamma below 1"
+                f"agent.gamma={config.gamma}: no end can be reached from {worst}, which costs infinitely "
+                "much; use a gamma below 1"
             )
         self.config, self.q = config, solution.q
         self.optimal: BoolArray = solution.optimal
@@ -145,7 +145,7 @@ class ValueIteration(TabularAgent):
     def load(self, path: Path) -> None:
         arrays = self.read(path)
         if not arrays["optimal"].any(axis=1).all():
-            raise InputError(f"{path}: optimal names no action in some states")
+            raise InputError(f"{path}: optimal has no action for some states")
         self.q, self.optimal = arrays["q"], arrays["optimal"]
 
 

@@ -51,15 +51,13 @@ class TabularConfig(AgentConfig):
         super().check(run)
         if run.observation.kind != "none":
             what = f"observation={run.observation.kind}"
-            raise InputError(
-                f"{what}: agent={self.name} keeps a table over the states themselves; must be none"
-            )
+            raise InputError(f"{what}: agent={self.name} keeps a table over states; must be none")
         if run.callbacks:
             raise InputError(
-                f"callbacks: are Stable-Baselines3's, agent={self.name} calls none; leave them out"
+                f"callbacks: agent={self.name} does not call Stable-Baselines3's callbacks; leave them out"
             )
         if run.device not in ("cpu", "auto"):
-            raise InputError(f"device={run.device}: agent={self.name} runs on the processor; must be cpu")
+            raise InputError(f"device={run.device}: agent={self.name} runs on the CPU; must be cpu")
 
     def weights(self, path: Path, most: int) -> dict[str, Any]:
         return read_arrays(path, most)
@@ -174,8 +172,8 @@ class TabularControl(TabularAgent):
             error = update(q, visits, step.pairs, targets, rate, config.learning_rate_power)
             if not error < np.inf:
                 raise InputError(
-                    f"agent={config.name}: training diverged at step {steps:,}, the error of its update "
-                    "is not a finite number; try a smaller learning rate"
+                    f"agent={config.name}: training diverged at step {steps:,}, its error is not finite; "
+                    "try a smaller learning rate"
                 )
             self._actions = self._next_actions(step)
             self._log(step, error, rate)

@@ -34,8 +34,8 @@ def faulty_class(run: Evidence) -> Finding | None:
     own, seed = run.config.agent.algorithm, run.config.seed
     when = f"{'still at' if lost else 'at'} steps {' and '.join(steps)} (seeds {seed} and {seed + 1})"
     why = (
-        f"its class is at fault: {sound.algorithm} in the place of {own}, with the same settings, is "
-        f"certified {when}; check.py {own} tells what is wrong"
+        f"its class is at fault: with the same settings, {sound.algorithm} is certified {when}; check.py "
+        f"{own} shows what is wrong"
     )
     return Finding("implementation", run.split.wrong, why, (f"agent.algorithm={sound.algorithm}",))
 

@@ -146,17 +146,17 @@ class _Search:
                 now = self._snapshots.keys(self.ignore)
                 changed = _listed(name for name, each in now.items() if each != before.get(name))
                 remedy = self._remedy or (
-                    "; take an environment with a fixed layout and start, or name in env.ignore what nothing "
-                    "depends on"
+                    "; use an environment with a fixed layout and start, or list irrelevant attributes in "
+                    "env.ignore"
                 )
                 raise self.refusal(
-                    f"a reset leads to another state with another seed or at another time (in {changed}), so "
-                    f"that its states cannot be enumerated from one start{remedy}"
+                    f"a reset does not always lead to the same state (in {changed}), so its states cannot "
+                    f"be enumerated from one start{remedy}"
                 )
 
     @property
     def _remedy(self) -> str:
-        return "; it has a transition table, so take env=gymnasium" if hasattr(self._env, "P") else ""
+        return "; it has a transition table, so use env=gymnasium" if hasattr(self._env, "P") else ""
 
     def _key(self) -> bytes:
         try:
@@ -177,7 +177,7 @@ class _Search:
         for place, state in enumerate(waiting):  # which grows
             if beyond is None and state.depth >= (limit or _DEEPEST):
                 if limit is None:
-                    still = f"after {_DEEPEST:,} steps there are still new states"
+                    still = f"after {_DEEPEST:,} steps it still finds new states"
                     raise self.refusal(f"{still}, since its {self._what_changes()}")
                 beyond, size = place, len(self.states)
                 self._most_states = min(self._most_states, size + _BEYOND)
@@ -229,8 +229,7 @@ class _Search:
             left_out = ", ".join(self.ignore)
             without = f" without {left_out}, which env.ignore leaves out" if left_out else ""
             raise self.refusal(
-                "the same state is shown by different observations, so that what an agent sees is no "
-                f"function of the state{without}"
+                f"the same state has different observations, so they are not a function of the state{without}"
             )
         return state
 
@@ -242,8 +241,8 @@ class _Search:
         self._num_bytes += len(copy) + (0 if array is None else array.nbytes)
         if size > self._most_states:
             raise self.refusal(
-                f"more than {self._most_states:,} states can be reached, and more than that cannot be solved "
-                f"for, since its {self._what_changes()}"
+                f"more than {self._most_states:,} states can be reached, too many to solve, since its "
+                f"{self._what_changes()}"
             )
         if self._num_bytes > _MOST_BYTES:
             raise self.refusal(
@@ -280,8 +279,8 @@ class _Search:
             fits = False
         if not fits:
             raise self.refusal(
-                f"an observation is {' '.join(str(observation).split())[:80]}, which does not fit its "
-                f"space {' '.join(str(space).split())[:120]}"
+                f"an observation is {' '.join(str(observation).split())[:80]}, which is not in its space "
+                f"{' '.join(str(space).split())[:120]}"
             )
         return array
 
@@ -295,8 +294,8 @@ class _Search:
         most = max(map(len, values.values()))
         names = _listed(name for name, found in values.items() if len(found) == most)
         return (
-            f"{names} keeps changing; take a smaller one, set a limit (env.kwargs.max_episode_steps), or "
-            f"leave out what nothing depends on, e.g. env.ignore=[{names.split(',')[0]}]"
+            f"{names} keeps changing; use a smaller one, set a limit (env.kwargs.max_episode_steps), or "
+            f"ignore irrelevant attributes, e.g. env.ignore=[{names.split(',')[0]}]"
         )
 
     def compiled(self, limit: int | None) -> Mdp:
@@ -324,7 +323,7 @@ class _Search:
             own_observation=np.stack(observations) if observations else None,
         )
         names = tuple(each.name for each in self.states)
-        without = f" without {', '.join(self.ignore)} as you said" if self.ignore else ""
+        without = f" without {', '.join(self.ignore)}, as you asked" if self.ignore else ""
         truth = f"enumerated, {mdp.num_states:,} states{without}"
         return replace(mdp, state_names=names if names[0] else (), truth=truth)
 
@@ -337,7 +336,7 @@ class _Search:
         limit = int(time[truncated & ~terminated].min())
         if ((truncated != (time >= limit)) & tried & ~terminated).any():
             raise self.refusal(
-                "it truncates some episodes earlier than others, which no step limit of the world says"
+                "it truncates some episodes earlier than others, so it has no single step limit"
             )
         return limit
 
@@ -428,6 +427,6 @@ class _Replay:
             left_out = ", ".join(self._search.ignore)
             depends = f"depends on {left_out}, which env.ignore leaves out, " if left_out else ""
             raise self._search.refusal(
-                f"after {self._steps} steps of an episode its {what} is not the enumerated one{shown}, so it "
-                f"{depends}is random, has state outside of its attributes, or a wrapper that changes it"
+                f"after {self._steps} steps of an episode its {what} is not the enumerated one{shown}, so "
+                f"it {depends}is random, has state outside its attributes, or has a wrapper that changes it"
             )

@@ -34,8 +34,12 @@ A2C, KWARGS = "stable_baselines3.A2C", "+agent.arguments.policy_kwargs"
 @pytest.mark.parametrize(
     ("algorithm", "overrides", "words"),
     [
-        ("sb3_contrib.RecurrentPPO", "agent.policy=MlpLstmPolicy", "keeps a memory from step to step"),
-        ("sb3_contrib.ARS", "~agent.arguments.gamma", "has neither probabilities and values nor Q values"),
+        ("sb3_contrib.RecurrentPPO", "agent.policy=MlpLstmPolicy", "keeps memory between steps"),
+        (
+            "sb3_contrib.ARS",
+            "~agent.arguments.gamma",
+            "has neither action probabilities and values nor Q values",
+        ),
         ("stable_baselines3.SAC", "seed=0", "cannot be built: AssertionError: The algorithm only supports"),
         ("stable_baselines3.A3C", "seed=0", "agent.algorithm=stable_baselines3.A3C: must be the import path"),
         ("torch.nn.ReLU", "seed=0", "must be the import path of a BaseAlgorithm class"),
@@ -76,7 +80,7 @@ def test_ones_own_class_in_ones_own_yaml(tmp_path: Path, monkeypatch: pytest.Mon
     assert settings["arguments"] == {"caution": 0.9, "gamma": 0.9}
 
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(InputError, match=r"algorithm=my_agents\.Mine is from none of"):
+    with pytest.raises(InputError, match=r"algorithm=my_agents\.Mine is not from one of"):
         SavedRun(tmp_path / "out").snapshot()
     assert SavedRun(tmp_path / "out", trust=True).snapshot().greedy.shape == (30,)
 
@@ -107,8 +111,8 @@ def outcome(folder: Path, *words: str) -> str:
         (
             "dqn",
             "agent.policy_kwargs.activation_fn=torch.nn.Module",
-            "agent=dqn: DQN cannot be asked: NotImplementedError: Module [Module] is missing the required "
-            '"forward" function; look at agent.policy_kwargs.activation_fn=torch.nn.Module',
+            "agent=dqn: DQN cannot be evaluated: NotImplementedError: Module [Module] is missing the "
+            'required "forward" function; check agent.policy_kwargs.activation_fn=torch.nn.Module',
         ),
         ("dqn", "agent.policy_kwargs.activation_fn=torch.nn.ModuleList", "torch.nn.ModuleList"),
         ("dqn", "agent.policy_kwargs.activation_fn=torch.nn.Dropout", ""),

@@ -167,7 +167,7 @@ def test_what_does_not_trains_without_checkpoints(
 ) -> None:
     words = [*any_class(*SILENT[name]), *LESS]
     begin(tmp_path / "run", *words, "checkpoint.every=100")
-    line = f"checkpoints: none, since own_code.{name} does not define get_state and set_state\n"
+    line = f"no checkpoints, since own_code.{name} does not define get_state and set_state\n"
     assert capsys.readouterr().err.count(line) == 1
     assert line in (tmp_path / "run" / "train.log").read_text()
     assert Checkpoints(tmp_path / "run").files() == []
@@ -212,7 +212,7 @@ def test_it_is_called_as_sb3_calls_it_and_may_end_training(
     told = "callbacks[0]: own_code.Recording stopped training after 304 steps\n"
     assert told in capsys.readouterr().err
     assert told in (tmp_path / "run" / "train.log").read_text()
-    with pytest.raises(InputError, match=r"holds a run already; choose another folder$"):
+    with pytest.raises(InputError, match=r"contains a run already; choose another folder$"):
         check_free(tmp_path / "run")  # it has no checkpoint to go on from
 
 
@@ -258,7 +258,7 @@ OWN = "{_target_: own_code."
         ("[{_target_: Stirring}]", "must be a mapping of _target_, the import path"),
         (f"[{OWN}Stiring}}]", r"callbacks\[0\]\._target_=own_code\.Stiring: must be the import path of"),
         ("[{_target_: torch.nn.ReLU}]", "must be the import path of a BaseCallback class"),
-        ("[{_target_: nowhere.Stirring}]", "there is no module nowhere; is the folder"),
+        ("[{_target_: nowhere.Stirring}]", "no module nowhere; is its folder"),
         (f"[{OWN}Stirring, every: 3, evry: 3}}]", "got an unexpected keyword argument 'evry'"),
         (f"[{OWN}Failing}}]", r"callbacks\[0\]: own_code\.Failing cannot be built: .*no server"),
     ],
@@ -271,5 +271,5 @@ def test_mistakes_are_found_before_training(callbacks: str, told: str, tmp_path:
 
 def test_a_tabular_agent_has_none() -> None:
     config = configure("agent=sarsa", STIRRING)
-    with pytest.raises(InputError, match=r"^callbacks: are Stable-Baselines3's, agent=sarsa calls none"):
+    with pytest.raises(InputError, match=r"^callbacks: agent=sarsa does not call Stable-Baselines3's"):
         config.agent.check(config)

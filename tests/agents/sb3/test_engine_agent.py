@@ -68,7 +68,7 @@ def test_what_it_does_not_know_learns_in_sb3s_loop_and_a_line_says_why(
         agent = built("agent=dqn", setting)
         assert type(agent) is SB3Agent
         assert type(agent.model) is DQN
-    assert f"engine: stock, since the tabulated one does not cover {setting}" in capsys.readouterr().err
+    assert f"engine: stock, since the tabulated engine does not support {setting}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_a_class_with_its_arguments(agent: str, capsys: pytest.CaptureFixture[st
     assert capsys.readouterr().err == ""
     unknown = "agent.arguments.policy_kwargs.activation_fn=torch.nn.RReLU"
     assert type(built(f"agent={agent}", f"+{unknown}")) is SB3Agent
-    assert f"engine: stock, since the tabulated one does not cover {unknown}" in capsys.readouterr().err
+    assert f"engine: stock, since the tabulated engine does not support {unknown}" in capsys.readouterr().err
     config = configure(f"agent={agent}", "agent.engine=fast")
     with pytest.raises(InputError, match=r"agent\.engine=fast: must be tabulated or stock"):
         config.agent.check(config)
