@@ -13,7 +13,6 @@ import stable_baselines3
 from helpers.support import CONF, NO_FILES, configure, script, train_in
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from gridworld.agents import family
 from gridworld.agents.sb3.factory import algorithm_and_arguments
 from gridworld.commands.manual import manual
 from gridworld.config.train import check
@@ -32,7 +31,7 @@ def test_an_agent_in_a_world_brings_its_recipe() -> None:
         words = f"env={env}", f"agent={agent}"
         config = configure(*words)
         check(config)
-        family(config.agent).check(config)
+        config.agent.check(config)
         assert (config.recipe, config.preset, config.agent.name) == (recipe, "auto", agent)
         assert configure(f"experiment={recipe}") == config  # as it was called before
         without = configure(*words, "tuned=none", "preset=none")

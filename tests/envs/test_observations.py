@@ -13,7 +13,6 @@ from helpers.support import configure
 
 import gridworld
 from gridworld import GridWorldEnv, InputError
-from gridworld.agents import family
 from gridworld.envs.inspection import observation_like
 from gridworld.envs.observations import KINDS, TableObservation, make_observation
 from gridworld.training.setup import make_context
@@ -204,7 +203,7 @@ def test_the_environments_own_observation():
 
 @pytest.mark.parametrize(
     ("kind", "why"),
-    [("own", "no array observation"), ("coordinates", "no coordinates"), ("image", "no coordinates")],
+    [("own", "no observation of its own"), ("coordinates", "no coordinates"), ("image", "no coordinates")],
 )
 def test_a_world_without_what_an_observation_shows(kind, why):
     with pytest.raises(InputError, match=f"^observation {kind}: .*row ha(s|ve) {why}") as refused:
@@ -227,7 +226,7 @@ def test_agents_train_on_the_environments_own_observation(algorithm, numbers):
         config = configure(f"agent={algorithm.lower()}", "observation=own", f"agent.engine={engine}")
         settings = dataclasses.replace(config.agent, **small)
         context = make_context(config, mdp)
-        agent = family(settings).build(settings, context)
+        agent = settings.build(context)
         agent.learn(128, lambda steps: steps + 1)
         assert agent.model.num_timesteps >= 128
         assert agent.snapshot().greedy.shape == (mdp.num_states,)

@@ -103,15 +103,15 @@ def test_a_step_in_arrays_is_the_same_step(mode):
     endings = 0
     for actions in moves(100, 6):
         *expected, infos = plain.step(actions)
-        *got, ended = quick.advance(actions)
-        assert same(got, expected)
-        assert (ended is None) == (infos == {})
-        if ended is not None:
-            states, over = ended.states, ended.mask
-            assert (states.dtype, over.dtype) == (np.int64, np.bool_)
+        step = quick.advance(actions)
+        assert same(step[:4], expected)
+        assert (len(step.which) == 0) == (infos == {})
+        if len(step.which):
+            over = np.isin(np.arange(6), step.which)
+            assert step.reached.dtype == np.int64
             assert over.tolist() == infos["_final_obs"].tolist()
-            assert np.where(over, states, None).tolist() == infos["final_obs"].tolist()
-            assert np.array_equal(states[~over], got[0][~over])  # where the step led to the others
+            assert np.where(over, step.reached, None).tolist() == infos["final_obs"].tolist()
+            assert np.array_equal(step.reached[~over], step.states[~over])
             endings += 1
     assert (endings > 10) == (mode is AutoresetMode.SAME_STEP)
 

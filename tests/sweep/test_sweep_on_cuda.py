@@ -20,7 +20,6 @@ from helpers.resuming import differences, go_on, left_behind, stopped_after
 from helpers.stand_in_cuda import stand_in
 from helpers.support import ROOT, configure, script
 
-from gridworld.agents import family
 from gridworld.commands import reproduce as command
 from gridworld.errors import InputError
 from gridworld.process.together import mixing
@@ -180,7 +179,7 @@ def agents(count: int, *words: str) -> list[Any]:
     config = configure(*(words or ["agent=ppo"]))
     mdp = check_settings(config)
     contexts = [make_context(config, mdp) for _ in range(count)]
-    return [family(config.agent).build(config.agent, context) for context in contexts]
+    return [config.agent.build(context) for context in contexts]
 
 
 def test_on_cuda_networks_are_of_one_kind_only_where_that_is_asked_for() -> None:
@@ -211,5 +210,5 @@ def test_all_tensors_are_made_where_the_weights_are(words: list[str]) -> None:
 @pytest.mark.parametrize(("device", "found"), [("cpu", True), ("cuda", False), ("auto", False), ("?", True)])
 def test_the_device_is_found_by_its_name(device: str, found: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert family(configure("agent=ppo").agent).on_processor(device) is found
-    assert family(configure("agent=sarsa").agent).on_processor(device)
+    assert configure("agent=ppo").agent.on_processor(device) is found
+    assert configure("agent=sarsa").agent.on_processor(device)
