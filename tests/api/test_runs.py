@@ -115,9 +115,7 @@ def test_a_run_shows_itself(run: gridworld.RunResult) -> None:
     assert names[:3] == ["greedy", "with exploration", "optimum"]
     drawn = {tuple(line.get_ydata()) for line in figure.axes[0].lines}
     assert tuple(run.curve["regret"]) in drawn
-    with pytest.raises(
-        InputError, match="metric='speed': no such curve; choose from value, regret"
-    ):
+    with pytest.raises(InputError, match="metric='speed': no such curve; choose from value, regret"):
         run.plot("speed")
     with Image.open(Path(run.folder or "") / "policy.png") as picture:
         assert np.array_equal(np.asarray(picture), np.asarray(run.policy_map()))
