@@ -16,7 +16,7 @@ def test_a_job_in_its_own_folder_speaks_of_the_users(tmp_path: Path) -> None:
     quiet = ["recording.frames=false", "recording.gif=false", "recording.learning=false"]
     done = script("train.py", *words, *quiet, "hydra.job.chdir=true", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "  files: runs/own\n  curves: tensorboard --logdir runs/own\n" in done.stdout
+    assert "  files: runs/own\n  curves: tensorboard --logdir runs\n" in done.stdout
     again = script("train.py", *words, "hydra.job.chdir=true", cwd=tmp_path)
     assert f"python {ROOT}/scripts/train.py resume=runs/own total_timesteps=" in again.stderr
 

@@ -10,7 +10,6 @@ import pytest
 import stable_baselines3
 from helpers.support import CONF, DEEP, configure
 
-from gridworld.agents import family
 from gridworld.config.settings import agent_schemas, read_config
 from gridworld.config.train import TrainConfig, check
 from gridworld.config.worlds import SOURCES
@@ -47,7 +46,7 @@ def test_every_choice_composes_and_could_train(
     for choice in (choice for of, choice in CHOICES if of == group):
         config = configure(f"{group}={choice}", *COMPLETED.get(choice, []))
         check(config)
-        family(config.agent).check(config)
+        config.agent.check(config)
         for part in dataclasses.fields(TrainConfig):
             assert not isinstance(getattr(config, part.name), dict)
         if choice in COMPLETED:  # for the others see api/test_worlds.py

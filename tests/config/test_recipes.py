@@ -11,7 +11,6 @@ import pytest
 import stable_baselines3
 from helpers.support import CONF, NO_FILES, configure, script, train_in
 
-from gridworld.agents import family
 from gridworld.agents.sb3.factory import algorithm_and_arguments
 from gridworld.commands.manual import manual
 from gridworld.config.train import check
@@ -29,7 +28,7 @@ def test_an_agent_in_a_world_brings_its_recipe() -> None:
         env, agent = PAIRS[recipe]
         config = configure(f"env={env}", f"agent={agent}")
         check(config)
-        family(config.agent).check(config)
+        config.agent.check(config)
         assert (config.recipe, config.preset, config.agent.name) == (recipe, "auto", agent)
         text = (CONF / "tuned" / f"{recipe}.yaml").read_text("utf-8")
         assert text.startswith("# @package _global_\n# certified on ")
@@ -69,7 +68,7 @@ def test_the_command_line_beats_the_recipe_and_the_recipe_the_agent() -> None:
     for study in STUDIES:  # these leave recipes and presets out
         config = configure(f"experiment={study}")
         check(config)
-        family(config.agent).check(config)
+        config.agent.check(config)
         assert (config.recipe, config.preset in ("none", "auto")) == (None, True)
     assert configure("~experiment") == configure()
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from helpers.support import configure
 
-from gridworld.agents import Learning, family, learn_together
+from gridworld.agents import Learning, learn_together
 from gridworld.engine import population
 from gridworld.training.setup import check_settings, make_context
 
@@ -53,9 +53,7 @@ class Learned:
 
     def learning(self) -> Learning:
         config = configure(*self.words)
-        mdp = check_settings(config)
-        context = make_context(config, mdp, self._log)
-        self.agent = family(config.agent).build(config.agent, context)
+        self.agent = config.agent.build(make_context(config, check_settings(config), self._log))
         return Learning(self.agent, config.total_timesteps, self.on_step)
 
     def _log(self, values: dict[str, Any], step: int) -> None:

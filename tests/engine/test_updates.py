@@ -137,7 +137,7 @@ def test_updates_from_rollouts(
     states, actions, advantages, returns = samples(run, n_steps * NUM_ENVS)
     log_prob, values = run.population.log_policy()
     buffer, shape = theirs.rollout_buffer, (NUM_ENVS, n_steps)  # samples are environment by environment
-    buffer.observations = run.inputs.rows(states).reshape(*shape, *buffer.obs_shape).swapaxes(0, 1)
+    buffer.observations = run.network.rows(states).reshape(*shape, *buffer.obs_shape).swapaxes(0, 1)
     buffer.actions = actions.reshape(shape).T[..., None]
     for name, table in (
         ("values", values[0, states]),
@@ -195,7 +195,7 @@ def test_updates_from_replay(
         dones, cut = rng.random((2, NUM_ENVS)) < 0.3
         ours.replay.store(*(each[None] for each in (states, actions, following, rewards, dones & ~cut)))
         infos = [{"TimeLimit.truncated": bool(each)} for each in cut]
-        rows = [run.inputs.rows(each) for each in (states, following)]
+        rows = [run.network.rows(each) for each in (states, following)]
         buffer.add(*rows, actions, rewards, dones, infos)
     with torch.no_grad():  # a target network of its own
         ours.target.weights += 0.1 * torch.randn_like(ours.target.weights)
@@ -291,7 +291,7 @@ def test_rollouts_and_advantages_are_sb3s(algorithm: Any) -> None:
     ends = (rollout.terminated | rollout.truncated)[:, 0]
     assert ends.sum() > rollout.truncated.sum() > 0
     buffer.values = values[0][states]
-    cut = rollout.truncated[:, 0] * theirs.gamma * values[0][rollout.last_states[:, 0]]
+    cut = rollout.truncated[:, 0] * theirs.gamma * values[0][rollout.reached[:, 0]]
     buffer.rewards = (rollout.rewards[:, 0] + cut).astype(np.float32)
     buffer.episode_starts = np.concatenate([np.ones((1, NUM_ENVS)), ends[:-1]]).astype(np.float32)
     last = torch.as_tensor(values[0][rollout.final_states[0]])

@@ -14,7 +14,6 @@ from stable_baselines3.common.env_checker import check_env as check_for_sb3
 
 import gridworld
 from gridworld import GridWorldEnv, InputError
-from gridworld.agents import family
 from gridworld.envs.inspection import observation_like
 from gridworld.envs.observations import KINDS, TableObservation, make_observation
 from gridworld.training.setup import make_context
@@ -190,7 +189,7 @@ def test_the_environments_own_observation():
 
 @pytest.mark.parametrize(
     ("kind", "why"),
-    [("own", "no array observation"), ("coordinates", "no coordinates"), ("image", "no coordinates")],
+    [("own", "no observation of its own"), ("coordinates", "no coordinates"), ("image", "no coordinates")],
 )
 def test_a_world_without_what_an_observation_shows(kind, why):
     with pytest.raises(InputError, match=f"^observation {kind}: .*row ha(s|ve) {why}") as refused:
@@ -212,7 +211,7 @@ def test_agents_train_on_the_environments_own_observation(agent, small, engine):
         mdp = world(own_observation=own)
         config = configure(f"agent={agent}", "observation=own", f"agent.engine={engine}")
         settings = dataclasses.replace(config.agent, **small)
-        trained = family(settings).build(settings, make_context(config, mdp))
+        trained = settings.build(make_context(config, mdp))
         trained.learn(128, lambda steps: steps + 1)
         assert trained.model.num_timesteps >= 128
         assert trained.snapshot().greedy.shape == (mdp.num_states,)

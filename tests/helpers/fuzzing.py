@@ -19,7 +19,6 @@ from helpers.support import SHORT, configure
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gridworld.agents import family
 from gridworld.commands import jobs as jobs_command
 from gridworld.config.compose import to_config
 from gridworld.errors import InputError
@@ -87,7 +86,7 @@ def fuzz_config(random: random.Random, folder: Path) -> None:
     config = to_config(merged)  # type: ignore[arg-type]
     mdp = check_settings(config)
     Evaluator(mdp, config.evaluation.gamma, config.env.max_episode_steps)
-    family(config.agent).build(config.agent, make_context(config, mdp))
+    config.agent.build(make_context(config, mdp))
 
 
 def spoil(random: random.Random, content: dict[Any, Any]) -> None:

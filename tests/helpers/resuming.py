@@ -15,7 +15,6 @@ from helpers.support import configure
 from helpers.support import train_in as begin
 from tensorboard.compat.proto.event_pb2 import Event
 
-from gridworld.agents import sb3, tabular
 from gridworld.restore.resume import open_unfinished, unfinished_of
 from gridworld.run.checkpoints import Checkpoints
 from gridworld.run.reader import is_started
@@ -132,8 +131,8 @@ def weights(content: bytes, folder: Path) -> dict[str, Any]:
         return {}
     path = folder / ".model_to_compare"
     path.write_bytes(content)
-    family = tabular if b"algorithm.npy" in content else sb3
-    found = family.weights(path, 10**8)
+    agent = configure("agent=sarsa" if b"algorithm.npy" in content else "agent=dqn").agent
+    found = agent.weights(path, 10**8)
     path.unlink()
     return found
 

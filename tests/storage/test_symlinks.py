@@ -55,7 +55,7 @@ def test_confirming_takes_no_folder_away_through_a_link(link: str, tmp_path: Pat
     with pytest.raises(InputError, match=REFUSED):
         confirm.prepare(tmp_path / "study", [run])
     with pytest.raises(InputError, match=REFUSED):
-        confirm.HeldOutRuns((run,))(lambda message: None)
+        confirm.run_held_out([run])
     assert contents(victim) == before
 
 

@@ -20,7 +20,6 @@ from helpers.resuming import differences, go_on, left_behind, stopped_after
 from helpers.stand_in_cuda import stand_in
 from helpers.support import ROOT, configure, script
 
-from gridworld.agents import family
 from gridworld.commands import reproduce as command
 from gridworld.errors import InputError
 from gridworld.process.together import mixing
@@ -174,7 +173,7 @@ def test_all_tensors_are_made_where_the_weights_are(words: list[str]) -> None:
     runs = []
     for _ in range(2):
         context = make_context(config, mdp)
-        agent: Any = family(config.agent).build(config.agent, context)
+        agent: Any = config.agent.build(context)
         runs.append(agent.run)
     population = type(runs[0].population)(runs, [run.population.get_state(run) for run in runs])
     networks, active = population.networks, np.ones(2, dtype=np.bool_)
@@ -190,5 +189,5 @@ def test_all_tensors_are_made_where_the_weights_are(words: list[str]) -> None:
 @pytest.mark.parametrize(("device", "found"), [("cpu", True), ("cuda", False), ("auto", False), ("?", True)])
 def test_the_device_is_found_by_its_name(device: str, found: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert family(configure("agent=ppo").agent).on_processor(device) is found
-    assert family(configure("agent=sarsa").agent).on_processor(device)
+    assert configure("agent=ppo").agent.on_processor(device) is found
+    assert configure("agent=sarsa").agent.on_processor(device)

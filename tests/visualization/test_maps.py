@@ -243,11 +243,12 @@ def test_pictures_can_be_switched_off_and_the_learning_gif_lasts_as_long_as_its_
     tmp_path: Path,
 ) -> None:
     names = ("policy_map", "q_error", "visits", "frames", "gif")
-    settings = [*(f"recording.{name}=false" for name in names), "recording.fps=5"]
+    settings = [*(f"recording.{name}=false" for name in names), "recording.fps=5", "recording.cell_size=50"]
     train_in(tmp_path, *SHORT["q_learning"], *settings)
     assert [path.name for path in tmp_path.iterdir() if path.suffix in (".png", ".gif")] == ["learning.gif"]
     total = 0
     with Image.open(tmp_path / "learning.gif") as film:
+        assert film.width == 50 * (6 + 2)
         for index in range(film.n_frames):
             film.seek(index)
             total += film.info["duration"]

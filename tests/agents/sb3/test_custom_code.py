@@ -16,7 +16,6 @@ from helpers.resuming import begin, differences, go_on, left_behind, rows, stopp
 from helpers.support import SHORT, configure
 
 from gridworld.agents.sb3.model_file import read_weights
-from gridworld.agents.tabular import check as check_tabular
 from gridworld.config.recipe_file import overrides
 from gridworld.errors import InputError
 from gridworld.restore.resume import open_unfinished
@@ -260,5 +259,6 @@ def test_mistakes_are_found_before_training(callbacks: str, told: str, tmp_path:
 
 
 def test_a_tabular_agent_has_none() -> None:
+    config = configure("agent=sarsa", STIRRING)
     with pytest.raises(InputError, match=r"^callbacks: agent=sarsa does not call Stable-Baselines3's"):
-        check_tabular(configure("agent=sarsa", STIRRING))
+        config.agent.check(config)
