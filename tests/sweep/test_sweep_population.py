@@ -71,7 +71,7 @@ def test_members_that_are_refused_or_diverge_leave_the_others_alone(tmp_path: Pa
     assert "training diverged at update" in together["agent.learning_rate=1e+20"]["error"]
     assert differing(tmp_path / "together", tmp_path / "calm") == {}
     assert logged(tmp_path / "together" / "agent.learning_rate=0.001") == [
-        "INFO begins: ",
+        "INFO starts: ",
         "INFO finished after 1,536 steps",
     ]
 
