@@ -138,7 +138,7 @@ class RunResult:
         with contextlib.suppress(InputError):  # the world is too large for a map
             pictures.append(encode_png(np.asarray(self.policy_map())))
         sources = (f"data:image/png;base64,{base64.b64encode(each).decode()}" for each in pictures)
-        images = "".join(f'<img src="{each}" style="max-width:100%;max-height:290px"> ' for each in sources)
+        images = "".join(f'<img src="{each}" style="max-width:100%;max-height:340px"> ' for each in sources)
         why = "" if self.summary["certified"] else "; gridworld.diagnose(run) says why"
         sentence = escape(run_summary.verdict(self.summary))
         return f"<p>{escape(repr(self))}<br><b>{sentence}</b>{why}</p>{images}"

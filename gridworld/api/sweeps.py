@@ -68,6 +68,7 @@ class SweepResult:
             if row.status == sweep_folder.DONE:
                 summary = read_run(self.folder / row.job).read_summary()
                 content |= {k: each for k, each in summary.items() if not isinstance(each, dict | list)}
+                content["regret"] *= not summary["certified"]  # 0 but for rounding
             rows.append(content)
         return rows
 
@@ -248,7 +249,7 @@ def _run_command(name: str, words: Sequence[str], progress: bool) -> None:
                 process.send_signal(signal.SIGINT)
     line.clear()
     if is_stopped:
-        raise KeyboardInterrupt(f"{name} was stopped; the same call with its folder does the rest")
+        raise KeyboardInterrupt("stopped; the same call with this folder does the rest")
     if errors := [found[1] for found in map(_ERROR.match, lines) if found]:
         raise InputError(errors[-1])
     if process.returncode and not progress:
@@ -258,7 +259,9 @@ def _run_command(name: str, words: Sequence[str], progress: bool) -> None:
 
 
 def _word(key: str, path: Path) -> str:
-    return f"{key}={literal(str(path.absolute()), key)}"
+    place = str(path.absolute())
+    is_plain = re.fullmatch(r"[\w./-]+", place)
+    return f"{key}={place if is_plain else literal(place, key)}"
 
 
 def _value(text: str) -> Any:

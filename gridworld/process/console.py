@@ -208,6 +208,7 @@ class ProgressLine:
         """Remove the line from a terminal."""
         if self._shown:
             print(f"\r{'':{len(self._shown)}}\r", end="", file=sys.stderr, flush=True)
+            self._shown = ""
 
     def close(self) -> None:
         """Leave the line on a terminal as it is, and begin another."""

@@ -41,7 +41,7 @@ def test_a_sweep_is_the_commands(swept: gridworld.SweepResult, folder: Path) -> 
         *(("q_learning", 0.1, 0), ("q_learning", 2, 0), ("sarsa", 0.1, 0), ("sarsa", 2, 0))
     ]
     alone = gridworld.train("agent=sarsa", "env.slip=0.1", *SMALL)
-    assert swept.rows[2]["regret"] == alone.summary["regret"] == swept.runs[1].summary["regret"]
+    assert swept.rows[2]["value"] == alone.summary["value"] == swept.runs[1].summary["value"]
     assert "slip" in swept.rows[1]["error"]
     assert repr(gridworld.open_sweep(folder)) == repr(swept)
 
@@ -105,7 +105,7 @@ def test_ctrl_c_ends_a_sweep_that_the_same_call_completes(tmp_path: Path) -> Non
 
     presser = threading.Thread(target=press, daemon=True)
     presser.start()
-    with pytest.raises(KeyboardInterrupt, match="the same call with its folder does the rest"):
+    with pytest.raises(KeyboardInterrupt, match="the same call with this folder does the rest"):
         gridworld.sweep(*words, folder=place, progress=False)
     presser.join()
     statuses = [row["status"] for row in gridworld.open_sweep(place).rows]

@@ -578,9 +578,9 @@ def test_figures_and_tables_are_files_too(written: Path) -> None:
 
 def test_the_same_runs_give_the_same_bytes(written: Path, study: Report) -> None:
     runs = written.parent
-    before = {path: path.read_bytes() for path in written.rglob("*.*") if "tfevents" not in path.name}
-    assert len(before) > 50
-    report_of(runs, code=1, options=FORMATS)
+    before = {path: path.read_bytes() for path in (*written.glob("*.html"), *written.glob("tables/*"))}
+    assert len(before) > 10
+    report_of(runs, code=1)
     assert before == {path: path.read_bytes() for path in before}
     overall = gather([runs], seed=1).overall
     assert overall is not None

@@ -16,17 +16,9 @@ from helpers.support import SHORT, script, train_in
 
 from gridworld.training.learning_curve import CHARTS
 
-SWEPT = {
-    f"agent={agent},agent.learning_rate={rate},seed={seed}"
-    for agent in ("q_learning", "sarsa")
-    for rate in (0.1, 0.5)
-    for seed in (0, 1)
-}
-OVER_SEEDS = {
-    f"_over_seeds/{agent} (learning_rate={rate}) on classic"
-    for agent in ("q_learning", "sarsa")
-    for rate in (0.1, 0.5)
-}
+PAIRS = [(agent, rate) for agent in ("q_learning", "sarsa") for rate in (0.1, 0.5)]
+SWEPT = {f"agent={agent},agent.learning_rate={rate},seed={seed}" for agent, rate in PAIRS for seed in (0, 1)}
+OVER_SEEDS = {f"_over_seeds/{agent} (learning_rate={rate}) on classic" for agent, rate in PAIRS}
 SHOWN = {agent: SHORT[agent] for agent in ("dqn", "ppo", "q_learning", "value_iteration")}
 
 
